@@ -1,0 +1,50 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+PARTIAL := $(VENV)/.partial
+
+.DEFAULT_GOAL := help
+.PHONY: help setup run test test-all check bench clean
+
+help:  ## show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
+
+setup: $(READY)  ## create .venv and install lfrtorch with its tools (PYTHON=python3.12 to choose)
+	@echo "Ready: $(BIN)/python"
+
+run: $(READY)  ## identify the Bouc-Wen benchmark (ARGS="seed=1 ..." is passed on)
+	@$(BIN)/python train.py +bench=boucwen $(ARGS)
+
+test: $(READY)  ## fast tests (ARGS="-k name ..." is passed on)
+	@$(BIN)/python -m pytest $(ARGS)
+
+test-all: $(READY)  ## all tests, the slow ones too
+	@$(BIN)/python -m pytest -m "" $(ARGS)
+
+check: $(READY)  ## format, lint, types, import order
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/basedpyright
+	@$(BIN)/lint-imports --no-logo
+
+bench: $(READY)  ## time one Levenberg-Marquardt iteration
+	@$(BIN)/python benchmarks/lm_iteration.py $(ARGS)
+
+clean:  ## remove caches and builds; .venv and runs stay
+	@rm -rf build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	@find . \( -path ./$(VENV) -o -path ./runs \) -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +
+
+# The mark .partial says that a set-up did not come to its end: the next one then starts afresh.
+$(READY): pyproject.toml constraints.txt
+	@if [ -e $(PARTIAL) ]; then rm -rf $(VENV); fi
+	@if [ ! -x $(BIN)/python ]; then \
+	    $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	        echo "lfrtorch needs Python 3.11 or newer, which $(PYTHON) is not." \
+	            "Name another one: make setup PYTHON=python3.12" >&2; exit 1; }; \
+	fi
+	@echo "Setting up $(VENV): a minute or two, once."
+	@mkdir -p $(VENV) && touch $(PARTIAL)
+	@[ -x $(BIN)/python ] || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@rm $(PARTIAL) && touch $@

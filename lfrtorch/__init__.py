@@ -1,0 +1,42 @@
+"""Identification of nonlinear LFR state-space models from input-output data.
+
+records -> estimate_bla -> initialise -> fit -> simulate, save, load
+"""
+
+from importlib.metadata import version
+
+from lfrtorch import datasets
+from lfrtorch.adam import Adam
+from lfrtorch.bla import LinearModel, estimate_bla
+from lfrtorch.cell import LFRCell
+from lfrtorch.initialise import initialise
+from lfrtorch.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.lfr import LFR
+from lfrtorch.metrics import nrmse, rmse
+from lfrtorch.model import Model, load
+from lfrtorch.nonlinearity import Network
+from lfrtorch.records import Channel, Record, Scaler
+from lfrtorch.trainer import FitResult, fit
+
+__version__ = version("lfrtorch")
+
+__all__ = [
+    "LFR",
+    "Adam",
+    "Channel",
+    "FitResult",
+    "LFRCell",
+    "LevenbergMarquardt",
+    "LinearModel",
+    "Model",
+    "Network",
+    "Record",
+    "Scaler",
+    "datasets",
+    "estimate_bla",
+    "fit",
+    "initialise",
+    "load",
+    "nrmse",
+    "rmse",
+]

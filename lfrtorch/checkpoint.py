@@ -1,0 +1,93 @@
+"""A checkpoint: a folder with a JSON description and safetensors weights, no code and no pickle."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+FORMAT = "lfrtorch"
+VERSION = 1
+DESCRIPTION, WEIGHTS = "model.json", "weights.safetensors"
+
+
+def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Tensor]) -> Path:
+    """Write a checkpoint folder whole or not at all; an existing checkpoint is replaced.
+
+    Raises:
+        ValueError: ``folder`` exists and is not a checkpoint.
+    """
+    folder = Path(folder)
+    if folder.exists() and not (folder / DESCRIPTION).is_file() and any_inside(folder):
+        raise ValueError(
+            f"'{folder}' exists and is not a checkpoint; choose another folder to save to."
+        )
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        text = {"format": FORMAT, "version": VERSION, **description}
+        (fresh / DESCRIPTION).write_text(json.dumps(text, indent=2) + "\n")
+        save_file({k: t.detach().contiguous().cpu() for k, t in weights.items()}, fresh / WEIGHTS)
+        os.chmod(fresh, 0o777 & ~_umask())
+        if folder.exists():
+            old = fresh.with_name(fresh.name + "-old")
+            folder.rename(old)
+            fresh.rename(folder)
+            shutil.rmtree(old)
+        else:
+            fresh.rename(folder)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    return folder
+
+
+def read(folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Description and weights of a checkpoint folder, or of a run's folder that holds ``model/``.
+
+    Raises:
+        ValueError: no checkpoint there, a damaged one, or one of another program or newer version.
+    """
+    folder = Path(folder)
+    if not (folder / DESCRIPTION).is_file() and (folder / "model" / DESCRIPTION).is_file():
+        folder = folder / "model"
+    if not (folder / DESCRIPTION).is_file():
+        raise ValueError(
+            f"'{folder}' is not a checkpoint: no {DESCRIPTION} in it or in its model/ folder; "
+            "give the folder of a run or of a saved model."
+        )
+    try:
+        description = json.loads((folder / DESCRIPTION).read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"'{folder / DESCRIPTION}' is damaged ({error}); save it anew.") from None
+    if not isinstance(description, dict) or description.get("format") != FORMAT:
+        raise ValueError(f"'{folder / DESCRIPTION}' was not written by {FORMAT}.")
+    if not isinstance(description.get("version"), int) or description["version"] > VERSION:
+        raise ValueError(
+            f"'{folder}' has checkpoint version {description.get('version')} and this program "
+            f"reads up to {VERSION}; install a newer {FORMAT}."
+        )
+    try:
+        weights = load_file(folder / WEIGHTS)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(
+            f"'{folder / WEIGHTS}' is damaged or missing ({error}); restore it or train anew."
+        ) from None
+    return description, weights
+
+
+def any_inside(folder: Path) -> bool:
+    """Whether ``folder`` is a file or a folder that is not empty."""
+    return not folder.is_dir() or any(folder.iterdir())
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

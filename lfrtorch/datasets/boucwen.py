@@ -1,0 +1,378 @@
+"""Bouc-Wen hysteretic benchmark: official estimation procedure, official tests, and the simulator.
+
+The system is a mass, spring and damper with a hysteretic force z, driven by a force u (N); its
+output is the displacement y (m)::
+
+    m y'' + c y' + k y + z = u
+    z' = alpha y' - beta (gamma |y'| z + delta y' |z|)          (the published nu is 1)
+
+It is integrated at 15 kHz and its signals are used at 750 Hz.
+
+References:
+    J.P. Noël and M. Schoukens (2016), "Hysteretic benchmark with a dynamic nonlinearity",
+    Workshop on Nonlinear System Identification Benchmarks.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from math import ceil, floor, prod
+from numbers import Integral
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from scipy.io import loadmat
+from scipy.signal import firwin, resample
+
+from lfrtorch.datasets import Dataset, Published
+from lfrtorch.records import Channel, Record
+
+__all__ = ["load", "multisine", "simulate", "sweep"]
+
+# Parameters of the published system, SI units.
+_M, _C, _K = 2.0, 10.0, 5e4
+_ALPHA, _BETA, _GAMMA, _DELTA = 5e4, 1e3, 0.8, -1.1
+
+_FS = 750.0  # Hz, of the records
+_RATIO = 20  # integration rate over _FS
+_H = 1 / (_RATIO * _FS)  # s, step of the integration
+_TOLERANCE = 1e-13  # of Newton's residual, relative; rounding leaves about 1e-15
+_MAX_NEWTON = 50  # iterations a step; 2 or 3 are usual
+_TAPS = 31  # of each low-pass filter
+
+_BAND = (5.0, 150.0)  # Hz, of the multisines
+_PERIOD = 8192  # samples at 750 Hz, of the multisine test
+_SWEEP = 153_000  # samples at 750 Hz, of the sweep test: 204 s
+_TESTS = {"multisine": _PERIOD, "sinesweep": _SWEEP}  # official file names, and samples
+_SWEEP_SKIP = 2000  # samples, unscored transient of the sweep test
+_TEST_OFFSET = 2000  # seed of the simulated multisine test, beyond the training seed
+
+_FILES = "BoucWen/BoucWenFiles/Test signals/Validation signals"  # below the benchmarks' folder
+
+_PAPER = "Schoukens and Tóth (2020), table 1"
+_PUBLISHED = (
+    Published("LTI (paper)", {"multisine": 15.8e-5, "sweep": 17.7e-5}, _PAPER),
+    Published("NL-LFR (paper)", {"multisine": 5.31e-5, "sweep": 4.19e-5}, _PAPER, (1, 1)),
+    Published("NL-LFR (paper)", {"multisine": 0.72e-5, "sweep": 0.32e-5}, _PAPER, (2, 1)),
+    Published("NL-LFR (paper)", {"multisine": 0.74e-5, "sweep": 0.56e-5}, _PAPER, (2, 2)),
+    Published(
+        "decoupled PNLSS",
+        {"multisine": 1.34e-5, "sweep": 1.12e-5},
+        "Fakhrizadeh Esfahani et al. (2018)",
+    ),
+)
+
+
+def load(
+    *,
+    seed: int = 0,
+    validation_seed_offset: int = 1000,
+    samples: int = _PERIOD,
+    rms: float = 50.0,
+    noise_rms: float = 8e-6,
+    root: str | Path | None = None,
+) -> Dataset:
+    """Simulated estimation data, and the official tests where their files are at hand.
+
+    Training and validation are each one steady-state period of a multisine realisation, with
+    measurement noise. The tests are noise free: ``"multisine"`` is one steady-state period and
+    ``"sweep"`` starts from rest, its first 2000 samples unscored. A test without its files is
+    simulated: the sweep is the official one up to rounding, the multisine is another realisation
+    of the official kind (drawn from ``seed + 2000``). ``Record.source`` says which it is.
+
+    Args:
+        seed: of the training realisation and its noise.
+        validation_seed_offset: added to ``seed`` for the validation realisation.
+        samples: of one estimation period, at 750 Hz.
+        rms: of the estimation input, N.
+        noise_rms: of the measurement noise before the decimation, m; the low-pass filters leave
+            0.92 of it: 7.35e-6 m of the official 8e-6 m.
+        root: folder that holds ``BoucWen/BoucWenFiles/...`` as the package nonlinear_benchmarks
+            lays it out; by default that package's cache folder, if there is one.
+
+    Shape:
+        u (N) and y (m) of training and validation: (samples, 1); of the multisine test:
+        (8192, 1); of the sweep test: (153000, 1).
+
+    Raises:
+        ValueError: an argument out of range, or a test file that cannot be used.
+        FileNotFoundError: ``root`` holds no test file, or one of a pair is missing.
+    """
+    if seed < 0 or seed + validation_seed_offset < 0:
+        raise ValueError(
+            f"seed={seed} with validation_seed_offset={validation_seed_offset}: both seed and "
+            "seed + validation_seed_offset must be 0 or more."
+        )
+    if validation_seed_offset in (0, _TEST_OFFSET):
+        raise ValueError(
+            f"validation_seed_offset={validation_seed_offset} makes the validation record the "
+            f"{'simulated test' if validation_seed_offset else 'training'} realisation; "
+            "use another offset, for example 1000."
+        )
+    folder = _official_folder(root)
+    estimation: dict[str, Any] = {"samples": samples, "rms": rms, "noise_rms": noise_rms}
+    return Dataset(
+        name="boucwen",
+        train=[_realisation("train", seed, **estimation)],
+        validation=[_realisation("validation", seed + validation_seed_offset, **estimation)],
+        tests=[_multisine_test(folder, seed + _TEST_OFFSET), _sweep_test(folder)],
+        noise_rms=noise_rms,
+        published=_PUBLISHED,
+    )
+
+
+def multisine(
+    *, samples: int = _PERIOD, rms: float = 50.0, seed: int | np.random.Generator = 0
+) -> NDArray[np.float64]:
+    """One period of the official random-phase multisine at 15 kHz: full grid, 5 Hz to 150 Hz.
+
+    Lines floor(5 / f0) to ceil(150 / f0), f0 = 750 / samples Hz, of equal magnitude and uniform
+    phase. Every 20th sample, ``multisine(...)[::20]``, is the input of a record.
+
+    Args:
+        samples: of the period at 750 Hz, 150 or more.
+        rms: standard deviation, N.
+        seed: of the phases, or a generator to draw them from.
+
+    Shape:
+        (20 samples,), N.
+
+    Raises:
+        ValueError: a period that cannot hold the band, or an rms that is not positive.
+    """
+    least = ceil(_FS / _BAND[0])
+    if not isinstance(samples, Integral) or samples < least:
+        raise ValueError(
+            f"a period of {samples} samples at {_FS:g} Hz cannot hold the excited band, "
+            f"{_BAND[0]:g} to {_BAND[1]:g} Hz; give a whole number of at least {least} samples."
+        )
+    if not (np.isfinite(rms) and rms > 0):
+        raise ValueError(f"the input's rms is {rms} N; give a positive number (officially 50 N).")
+    f0 = _FS / samples
+    lines = np.arange(floor(_BAND[0] / f0), ceil(_BAND[1] / f0) + 1)
+    phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, lines.size)
+    spectrum = np.zeros(samples * _RATIO // 2 + 1, complex)
+    spectrum[lines] = np.exp(1j * phase)
+    u = np.fft.irfft(spectrum, samples * _RATIO)
+    return rms * u / np.std(u, ddof=1)  # ddof: the official files have it
+
+
+def sweep() -> NDArray[np.float64]:
+    """Input of the official sweep test at 15 kHz, from its formula: 18 Hz to 52 Hz in 204 s.
+
+    u(t) = 40 sin(2 pi (18 t + t^2 / 12)): 10 Hz a minute. (The description says 20 Hz to 50 Hz
+    and 40 N rms; the official file has 18 Hz to 52 Hz and 40 N peak.)
+
+    Shape:
+        (3060000,), N.
+    """
+    t = np.arange(_SWEEP * _RATIO) / (_RATIO * _FS)
+    return 40 * np.sin(2 * np.pi * (18 * t + t**2 / 12))
+
+
+def simulate(
+    u: ArrayLike,
+    *,
+    factors: tuple[int, ...] = (2, 2, 5),
+    noise_rms: float = 0.0,
+    seed: int | np.random.Generator = 0,
+) -> NDArray[np.float64]:
+    """Displacement at 750 Hz under a force at 15 kHz, from rest.
+
+    Args:
+        u: force at 15 kHz.
+        factors: of the successive decimations, 20 together: the estimation data and the multisine
+            test use (2, 2, 5), the sweep test (20,).
+        noise_rms: of Gaussian noise in 0 to 375 Hz, m, added before the decimation.
+        seed: of the noise, or a generator to draw it from.
+
+    Shape:
+        u: (T,), N, T a multiple of 20. Returns: (T / 20,), m.
+
+    Raises:
+        ValueError: a force of wrong shape or with NaN, factors that do not give 750 Hz, negative
+            noise, or a force too large for the integration.
+    """
+    u = np.ascontiguousarray(u, dtype=np.float64)
+    if u.ndim != 1 or u.size % _RATIO or u.size < 4 * _RATIO:
+        raise ValueError(
+            f"the force has shape {u.shape}; give one dimension at 15 kHz, a multiple of "
+            f"{_RATIO} samples and at least {4 * _RATIO}."
+        )
+    if not np.isfinite(u).all():
+        raise ValueError("the force has NaN or infinite samples; give finite numbers.")
+    if prod(factors) != _RATIO or min(factors) < 2:
+        raise ValueError(
+            f"decimation factors {tuple(factors)}: 15 kHz to 750 Hz needs factors of 2 or more "
+            f"that multiply to {_RATIO}, for example (2, 2, 5)."
+        )
+    if not (np.isfinite(noise_rms) and noise_rms >= 0):
+        raise ValueError(
+            f"the noise rms is {noise_rms} m; give 0 (no noise) or a positive number "
+            "(officially 8e-6 m)."
+        )
+    y = _newmark(u)
+    if not np.isfinite(y[-1]):
+        raise ValueError(
+            f"the integration fails under a force of up to {np.abs(u).max():.3g} N; "
+            "use a smaller one (the benchmark's rms is 50 N)."
+        )
+    if noise_rms:
+        white = np.random.default_rng(seed).standard_normal(u.size // _RATIO)
+        # Zeros above 375 Hz in the spectrum: resample interpolates over the period T exactly.
+        y = y + noise_rms * np.asarray(resample(white, u.size), dtype=np.float64)
+    for factor in factors:
+        y = _decimate(y, factor)
+    return y
+
+
+@njit(cache=True)
+def _newmark(u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Displacement (T,) under a force (T,), both at 15 kHz; NaN from where Newton fails.
+
+    Newmark (1/2, 1/4), with the trapezoidal rule for z. The balance of forces is linear in the
+    acceleration a, so that a step is one equation in the rate s = z', solved by Newton.
+    """
+    half = _H / 2
+    inertia = _M + half * _C + half**2 * _K
+    out = np.full(u.size, np.nan)
+    y = v = z = s = 0.0
+    a = u[0] / _M
+    out[0] = y
+    for i in range(1, u.size):
+        # Without the new rates, which add half**2 a to y, half a to v and half s to z.
+        y_last = y + 2 * half * v + half**2 * a
+        v_last = v + half * a
+        z_last = z + half * s
+        force = u[i] - _C * v_last - _K * y_last - z_last
+        scale = 1 + abs(s) + (_ALPHA + _BETA * abs(z_last)) * abs(v_last)
+        for _ in range(_MAX_NEWTON):
+            a = (force - half * s) / inertia
+            v = v_last + half * a
+            z = z_last + half * s
+            residual = s - _ALPHA * v + _BETA * (_GAMMA * abs(v) * z + _DELTA * v * abs(z))
+            if abs(residual) <= _TOLERANCE * scale:
+                break
+            dv = -_ALPHA + _BETA * (_GAMMA * np.sign(v) * z + _DELTA * abs(z))
+            dz = _BETA * (_GAMMA * abs(v) + _DELTA * v * np.sign(z))
+            s -= residual / (1 - dv * half**2 / inertia + dz * half)
+        else:
+            return out
+        y = y_last + half**2 * a
+        out[i] = y
+    return out
+
+
+def _decimate(x: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
+    """Every ``factor``-th sample (T / factor,) of x (T,), low-passed without delay.
+
+    Hamming-window FIR with its cut-off at the new Nyquist frequency; the ends are continued by
+    odd mirror images.
+    """
+    padded = np.pad(x, _TAPS // 2, mode="reflect", reflect_type="odd")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, _TAPS)[::factor]
+    return windows @ firwin(_TAPS, 1 / factor, window="hamming")
+
+
+def _realisation(name: str, seed: int, *, samples: int, rms: float, noise_rms: float) -> Record:
+    """One steady-state period by the official procedure, at any length of period.
+
+    From rest, the transient dropped: one period of 8192 samples, or as many shorter ones as
+    last that long. One more period follows, dropped for the filters' end effects.
+    """
+    rng = np.random.default_rng(seed)
+    u = multisine(samples=samples, rms=rms, seed=rng)
+    transient = ceil(_PERIOD / samples)
+    y = simulate(np.tile(u, transient + 2), noise_rms=noise_rms, seed=rng)
+    y = y[transient * samples : (transient + 1) * samples]
+    return _record(u[::_RATIO], y, name=name, start="periodic", source="simulated")
+
+
+def _multisine_test(folder: Path, seed: int) -> Record:
+    official = _read_official(folder, "multisine")
+    if official is None:
+        return _realisation("multisine", seed, samples=_PERIOD, rms=50.0, noise_rms=0.0)
+    return _record(*official, name="multisine", start="periodic", source="official")
+
+
+def _sweep_test(folder: Path) -> Record:
+    signals, source = _read_official(folder, "sinesweep"), "official"
+    if signals is None:
+        u = sweep()
+        signals, source = (u[::_RATIO], simulate(u, factors=(_RATIO,))), "simulated"
+    return _record(*signals, name="sweep", start="zero", skip=_SWEEP_SKIP, source=source)
+
+
+def _record(u: NDArray[np.float64], y: NDArray[np.float64], **kwargs: Any) -> Record:
+    channels: dict[str, Any] = {"inputs": (Channel("u", "N"),), "outputs": (Channel("y", "m"),)}
+    return Record(u, y, fs=_FS, **channels, **kwargs)
+
+
+def _cache() -> Path:
+    """Where the package nonlinear_benchmarks keeps its downloads."""
+    if sys.platform == "win32":
+        folder = os.environ.get("LOCALAPPDATA", "~/AppData/Local") + "/nonlinear_benchmarks"
+    elif sys.platform == "darwin":
+        folder = "~/Library/Application Support/nonlinear_benchmarks"
+    else:
+        folder = "~/.nonlinear_benchmarks"
+    return Path(os.path.expanduser(folder))
+
+
+def _official_folder(root: str | Path | None) -> Path:
+    """Folder of the official test files; below a ``root`` that is given there must be some."""
+    if root is None:
+        return _cache() / _FILES
+    folder = Path(root).expanduser() / _FILES
+    if not any(path.is_file() for test in _TESTS for path in _pair(folder, test)):
+        raise FileNotFoundError(
+            f"no Bouc-Wen test files in '{root}': expected '{_FILES}/uval_multisine.mat', "
+            "yval_multisine.mat, uval_sinesweep.mat and yval_sinesweep.mat below it. Give the "
+            "folder that holds 'BoucWen', or leave root out to simulate the tests."
+        )
+    return folder
+
+
+def _pair(folder: Path, test: str) -> list[Path]:
+    return [folder / f"{letter}val_{test}.mat" for letter in "uy"]
+
+
+def _read_official(
+    folder: Path, test: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Input (N) and output (m) of a test, (samples,) each; ``None`` if neither file is there."""
+    u, y = paths = _pair(folder, test)
+    missing = [path for path in paths if not path.is_file()]
+    if missing == paths:
+        return None
+    if missing:
+        raise FileNotFoundError(
+            f"'{missing[0]}' is missing although its partner is there; put it back, or remove "
+            "both to have the test simulated."
+        )
+    return _read_mat(u, _TESTS[test]), _read_mat(y, _TESTS[test])
+
+
+def _read_mat(path: Path, samples: int) -> NDArray[np.float64]:
+    """The signal (samples,) that a .mat file holds under its own name."""
+    advice = "download the file again, or remove it and its partner to have the test simulated."
+    try:
+        signal = np.asarray(loadmat(path)[path.stem])
+    except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
+        raise ValueError(
+            f"'{path}' holds no readable '{path.stem}' ({error!r}); {advice}"
+        ) from error
+    if (
+        signal.dtype.kind not in "iuf"
+        or signal.shape not in ((1, samples), (samples, 1))
+        or not np.isfinite(signal).all()
+    ):
+        raise ValueError(
+            f"'{path}': '{path.stem}' has shape {signal.shape} and type {signal.dtype}; expected "
+            f"(1, {samples}) and real numbers without NaN; {advice}"
+        )
+    return signal.ravel().astype(np.float64)

@@ -1,0 +1,169 @@
+"""The identified model: an LFR with its scaling, ready to simulate in physical units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch.nn import Module
+
+from lfrtorch import checkpoint
+from lfrtorch.cell import LFRCell
+from lfrtorch.lfr import LFR
+from lfrtorch.nonlinearity import Network
+from lfrtorch.records import Channel, Record, Scaler, Start
+from lfrtorch.simulate import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """An LFR and what it takes to use it: scaling with offsets, rate, channel names and units.
+
+    Args:
+        lfr: the model in normalised units.
+        scaler: physical to normalised units, at both ends.
+        fs: sampling frequency in Hz.
+        inputs, outputs: channel names and units.
+    """
+
+    lfr: LFR
+    scaler: Scaler
+    fs: float
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """nx, nz, nw and the number of neurons nn (0 for a map that is not a network)."""
+        cell = self.lfr.cell
+        nn = len(cell.static.bz) if isinstance(cell.static, Network) else 0
+        return {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw, "nn": nn}
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters P."""
+        return sum(p.numel() for p in self.lfr.parameters())
+
+    @property
+    def parameters_net(self) -> int:
+        """P less the gauge directions, which change the parameters and not the output.
+
+        nx² for the coordinates of x, nz² and nw² for those of z and w (a network absorbs them),
+        and max(0, nw - ny) for a constant w that hides in the origin of the state.
+        """
+        cell = self.lfr.cell
+        gauge = cell.nx**2
+        if isinstance(cell.static, Network):
+            gauge += cell.nz**2 + cell.nw**2 + max(0, cell.nw - cell.ny)
+        return self.parameters - gauge
+
+    def simulate(
+        self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None
+    ) -> NDArray[np.float64]:
+        """Simulated output in physical units.
+
+        Args:
+            data: a record, or an input in physical units.
+            start: ``"zero"`` (x = 0, the equilibrium at the input's offset) or ``"periodic"``;
+                where left out, the record's own, and ``"zero"`` for a bare input.
+            x0: start state in the model's coordinates, for ``start="zero"``.
+
+        Shape:
+            data: (T, nu) or (T,), x0: (nx,) -> (T, ny).
+
+        Raises:
+            ValueError: an input of the wrong shape, rate or with NaN or infinite samples.
+        """
+        return self.scaler.restore_y(self.signals(data, start=start, x0=x0).y[0].double().numpy())
+
+    def signals(
+        self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None
+    ) -> Trajectory:
+        """All signals x, z, w, y of the same simulation, normalised, on the CPU, with R = 1."""
+        if not isinstance(data, Record):
+            u = np.asarray(data)
+            data = Record(u, np.zeros((len(u), len(self.outputs))), self.fs, name="input")
+        if data.u.shape[1] != len(self.inputs):
+            names = ", ".join(c.name for c in self.inputs)
+            raise ValueError(
+                f"record '{data.name}' has {data.u.shape[1]} input(s) and the model "
+                f"{len(self.inputs)} ({names}); give a column for each."
+            )
+        if not np.isclose(data.fs, self.fs):
+            raise ValueError(
+                f"record '{data.name}' is sampled at {data.fs} Hz and the model at {self.fs} Hz; "
+                "resample the record."
+            )
+        like = self.lfr.cell.A
+        u = torch.as_tensor(self.scaler.normalise_u(data.u)).to(like).unsqueeze(0)
+        state = None if x0 is None else torch.as_tensor(np.asarray(x0)).to(like).reshape(1, -1)
+        if state is not None and state.shape[1] != self.lfr.cell.nx:
+            raise ValueError(f"x0 has {state.shape[1]} entries; the model has {self.lfr.cell.nx}.")
+        trajectory = self.lfr.trajectory(u, state, start or data.start)
+        return Trajectory(*(signal.cpu() for signal in trajectory))
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the checkpoint folder; ``lfrtorch.load`` reads it back to the same bits."""
+        cell, s = self.lfr.cell, self.scaler
+        static: dict[str, Any] | None = None
+        if isinstance(cell.static, Network):
+            static = {"type": "Network", "nn": len(cell.static.bz)}
+            static["activation"] = cell.static.activation
+        elif cell.static is not None:
+            static = {"type": type(cell.static).__name__}
+        description = {
+            "sizes": {"nu": cell.nu, "ny": cell.ny, "nx": cell.nx, "nz": cell.nz, "nw": cell.nw},
+            "static": static,
+            "dtype": str(cell.A.dtype).removeprefix("torch."),
+            "fs": self.fs,
+            "inputs": [c._asdict() for c in self.inputs],
+            "outputs": [c._asdict() for c in self.outputs],
+        }
+        weights = dict(self.lfr.cell.state_dict())
+        scaling = ("u_offset", "u_scale", "y_offset", "y_scale")
+        weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in scaling}
+        return checkpoint.write(folder, description, weights)
+
+
+def load(folder: str | Path, *, static: Module | None = None) -> Model:
+    """The model in a checkpoint folder, or in the ``model/`` folder of a run's folder.
+
+    Args:
+        folder: where it was saved.
+        static: the module of the static nonlinearity, where it was the user's own class (a
+            checkpoint holds weights, never code).
+
+    Raises:
+        ValueError: no checkpoint, a damaged one, or one of another program or a newer version.
+    """
+    description, weights = checkpoint.read(folder)
+    try:
+        sizes, made = description["sizes"], description["static"]
+        dtype = getattr(torch, description["dtype"])
+        scaler = Scaler(
+            *(
+                weights.pop(f"scaler.{name}").numpy()
+                for name in ("u_offset", "u_scale", "y_offset", "y_scale")
+            )
+        )
+        if made is not None and made["type"] == "Network":
+            static = Network(sizes["nz"], sizes["nw"], made["nn"], made["activation"], dtype=dtype)
+        elif made is not None and static is None:
+            raise ValueError(
+                f"'{folder}' holds a static nonlinearity of class {made['type']}, which is not "
+                "part of this package; pass an instance of it: load(folder, static=...)."
+            )
+        cell = LFRCell(**sizes, static=static, dtype=dtype)
+        cell.load_state_dict(weights)
+        channels = [
+            tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")
+        ]
+        return Model(LFR(cell), scaler, float(description["fs"]), *channels)
+    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise ValueError(
+            f"'{folder}' is damaged: its description and weights do not fit ({error})."
+        ) from None

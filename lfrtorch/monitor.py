@@ -1,0 +1,105 @@
+"""What a user sees while a fit runs: a progress line and TensorBoard."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import TextIO
+
+import torch
+from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
+
+from lfrtorch import plots
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+from lfrtorch.trainer import Progress
+
+
+class ProgressLine:
+    """One live line on a terminal; elsewhere a line now and then.
+
+    Args:
+        every: iterations between lines where the output is not a terminal.
+        stream: where to write; standard output where left out.
+    """
+
+    def __init__(self, every: int = 10, stream: TextIO | None = None) -> None:
+        self.every = every
+        self.stream = sys.stdout if stream is None else stream
+
+    def __call__(self, model: Model, progress: Progress) -> None:
+        """Show the progress."""
+        live = self.stream.isatty()
+        last = progress.iteration == progress.limit
+        if live or last or progress.iteration % self.every == 0:
+            text = progress_text(progress, model.outputs[0].unit)
+            self.stream.write(f"\r{text}\033[K" if live else text + "\n")
+            self.stream.flush()
+
+    def close(self) -> None:
+        """End the live line."""
+        if self.stream.isatty():
+            self.stream.write("\n")
+
+
+def progress_text(progress: Progress, unit: str) -> str:
+    """Iteration, errors (a star marks the best so far), optimiser's scalars, time left."""
+    parts = [
+        f"{progress.iteration:>{len(str(progress.limit))}}/{progress.limit}",
+        f"train {progress.train:.3e} {unit}".rstrip(),
+    ]
+    if not math.isnan(progress.validation):
+        star = "*" if progress.best else " "
+        parts.append(f"validation {progress.validation:.3e} {unit}".rstrip() + star)
+    shown = {"damping": "damping", "gain_ratio": "gain", "gradient_norm": "|gradient|"}
+    for key, label in shown.items():
+        if key in progress.report and math.isfinite(progress.report[key]):
+            parts.append(f"{label} {progress.report[key]:.2g}")
+    if progress.iteration:
+        parts.append(f"{progress.seconds_left:.0f} s left")
+    return "  ".join(parts)
+
+
+class TensorBoard:
+    """Scalars of every iteration, and figures of the validation record now and then.
+
+    Args:
+        folder: of the event file.
+        record: record whose spectrum and static map are drawn, usually the validation record.
+        y_lti: output of the linear model on it, (T, ny), for the error beside ours.
+        every: iterations between figures; they cost about half a second.
+    """
+
+    def __init__(
+        self, folder: str | Path, record: Record, y_lti: plots.Array, every: int = 50
+    ) -> None:
+        self.writer = SummaryWriter(str(folder))
+        self.record, self.y_lti, self.every = record, y_lti, every
+
+    def __call__(self, model: Model, progress: Progress) -> None:
+        """Log one iteration."""
+        step = progress.iteration
+        self.writer.add_scalar("rmse/train", progress.train, step)
+        if not math.isnan(progress.validation):
+            self.writer.add_scalar("rmse/validation", progress.validation, step)
+        for name, value in progress.report.items():
+            self.writer.add_scalar(f"optimiser/{name}", value, step)
+        radius = torch.linalg.eigvals(model.lfr.cell.A.detach()).abs().max()
+        self.writer.add_scalar("model/spectral_radius_A", radius, step)
+        if step % self.every == 0:
+            y_hat = model.simulate(self.record)
+            self.figure("validation/spectrum", plots.spectrum(self.record, self.y_lti, y_hat), step)
+
+    def figure(self, name: str, figure: Figure, step: int) -> None:
+        """Add a figure."""
+        self.writer.add_figure(name, figure, step, close=False)
+
+    def text(self, name: str, text: str) -> None:
+        """Add a text in a fixed-width font."""
+        self.writer.add_text(name, "\n".join("    " + line for line in text.splitlines()))
+
+    def close(self) -> None:
+        """Write what is pending."""
+        self.writer.close()

@@ -1,0 +1,70 @@
+"""Static nonlinearities z -> w: any torch.nn.Module from (..., nz) to (..., nw) will do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn import Module, Parameter
+
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "tanh": torch.tanh,
+    "sigmoid": torch.sigmoid,
+    "relu": torch.relu,
+    "rbf": lambda v: torch.exp(-v.square()),
+}
+
+
+class Network(Module):
+    """One hidden layer: w = Ww σ(Wz z + bz) + bw.
+
+    Args:
+        nz: inputs.
+        nw: outputs.
+        nn: neurons.
+        activation: σ: ``"tanh"``, ``"sigmoid"``, ``"relu"`` or ``"rbf"`` (exp(-v²)).
+        device, dtype: as everywhere in torch.
+
+    Shape:
+        Wz: (nn, nz), bz: (nn,), Ww: (nw, nn), bw: (nw,); z: (..., nz) -> w: (..., nw).
+    """
+
+    def __init__(
+        self,
+        nz: int,
+        nw: int,
+        nn: int,
+        activation: str = "tanh",
+        *,
+        device: torch.device | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        if activation not in ACTIVATIONS:
+            raise ValueError(
+                f"activation is {activation!r}; use one of {', '.join(sorted(ACTIVATIONS))}."
+            )
+        self.activation = activation
+        self.Wz = Parameter(torch.empty(nn, nz, device=device, dtype=dtype))
+        self.bz = Parameter(torch.empty(nn, device=device, dtype=dtype))
+        self.Ww = Parameter(torch.empty(nw, nn, device=device, dtype=dtype))
+        self.bw = Parameter(torch.empty(nw, device=device, dtype=dtype))
+        self.reset_parameters()
+
+    def reset_parameters(self, generator: torch.Generator | None = None) -> None:
+        """Wz, bz, Ww ~ U(-1, 1) and bw = 0, the draw of Schoukens and Tóth (2020)."""
+        with torch.no_grad():
+            for weight in (self.Wz, self.bz, self.Ww):
+                weight.uniform_(-1.0, 1.0, generator=generator)
+            self.bw.zero_()
+
+    def forward(self, z: Tensor) -> Tensor:
+        """w (..., nw) of z (..., nz)."""
+        hidden = ACTIVATIONS[self.activation](z @ self.Wz.mT + self.bz)
+        return hidden @ self.Ww.mT + self.bw
+
+    def extra_repr(self) -> str:
+        """Sizes and activation, for ``print(module)``."""
+        (nn, nz), nw = self.Wz.shape, len(self.Ww)
+        return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}"

@@ -1,0 +1,137 @@
+"""Figures of a result: they read signals and histories and compute no model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from lfrtorch.records import Record
+from lfrtorch.trainer import Progress
+
+Array = NDArray[np.float64]
+
+OUTPUT, LTI, NL_LFR = "tab:blue", "tab:red", "tab:green"
+"""Colours of the measured output, the linear model's error and the NL-LFR's, as in the paper."""
+
+MOST_POINTS = 20_000
+"""Samples drawn of a long signal as a cloud."""
+
+
+def spectrum(record: Record, y_lti: Array, y_hat: Array) -> Figure:
+    """Magnitude of the measured output and of both errors against frequency, one panel an output.
+
+    Shape:
+        y_lti, y_hat: (T, ny), simulated outputs in physical units.
+    """
+    figure, axes = _panels(record)
+    y = record.y[record.skip :]
+    f = np.fft.rfftfreq(len(y), 1.0 / record.fs)
+    for i, ax in enumerate(axes):
+        for signal, label, colour in _signals(record, y_lti, y_hat, i):
+            ax.plot(f[1:], _decibel(signal)[1:], ".", ms=2, color=colour, label=label)
+        unit = record.outputs[i].unit or "1"
+        ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {unit})", xlim=(0, f[-1]))
+        ax.legend(loc="upper right", markerscale=5)
+    axes[0].set_title(_title(record))
+    axes[-1].set_xlabel("frequency (Hz)")
+    return figure
+
+
+def response(record: Record, y_lti: Array, y_hat: Array) -> Figure:
+    """Measured output and both errors against time, one panel an output.
+
+    Shape:
+        y_lti, y_hat: (T, ny), simulated outputs in physical units.
+    """
+    figure, axes = _panels(record)
+    t = np.arange(record.skip, record.samples) / record.fs
+    for i, ax in enumerate(axes):
+        for signal, label, colour in _signals(record, y_lti, y_hat, i):
+            ax.plot(t, signal, lw=0.5, color=colour, label=label)
+        ax.set(ylabel=str(record.outputs[i]), xlim=(t[0], t[-1]))
+        legend = ax.legend(loc="upper right")
+        for handle in legend.get_lines():
+            handle.set_linewidth(2)
+    axes[0].set_title(_title(record))
+    axes[-1].set_xlabel("time (s)" if record.fs != 1.0 else "sample")
+    return figure
+
+
+def static_map(z: Array, w: Array) -> Figure:
+    """The static nonlinearity over the region that the data visited.
+
+    One input: w against z with the data's density below. Two: w in colour over the (z1, z2) plane.
+    More: w against each z in turn.
+
+    Shape:
+        z: (samples, nz), w: (samples, nw), normalised units, along a simulation.
+    """
+    step = max(1, len(z) // MOST_POINTS)
+    z, w = z[::step], w[::step]
+    nz, nw = z.shape[1], w.shape[1]
+    columns = nz if nz > 2 else 1
+    figure = Figure(figsize=(5.5 * columns, 4.0 * nw), layout="constrained")
+    grid = figure.subplots(nw, columns, squeeze=False)
+    for j in range(nw):
+        for i, ax in enumerate(grid[j]):
+            if nz == 2:
+                points = ax.scatter(z[:, 0], z[:, 1], c=w[:, j], s=3, cmap="coolwarm", lw=0)
+                figure.colorbar(points, ax=ax, label=f"w{j + 1}")
+                ax.set(xlabel="z1", ylabel="z2")
+                continue
+            order = np.argsort(z[:, i])
+            style = "-" if nz == 1 else "."
+            ax.plot(z[order, i], w[order, j], style, ms=1, color=NL_LFR)
+            density = ax.twinx()
+            density.hist(z[:, i], bins=80, color="0.8", density=True)
+            density.set(yticks=[], ylim=(0, 4 * density.get_ylim()[1]))
+            ax.set_zorder(density.get_zorder() + 1)
+            ax.patch.set_visible(False)
+            ax.set(xlabel=f"z{i + 1} (grey: density of the data)", ylabel=f"w{j + 1}")
+    figure.suptitle("static nonlinearity over the visited region (normalised)")
+    return figure
+
+
+def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Figure:
+    """Errors on training and validation records against iteration, the kept iterate marked."""
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    ax = figure.subplots()
+    iterations = [p.iteration for p in history]
+    ax.semilogy(iterations, [p.train for p in history], color="0.3", label="training")
+    validation = np.array([p.validation for p in history])
+    if np.isfinite(validation).any():
+        ax.semilogy(iterations, validation, color=NL_LFR, label="validation")
+    ax.axvline(chosen, color="0.6", ls=":", label=f"kept: iteration {chosen}")
+    ax.set(xlabel="iteration", ylabel=f"simulation RMSE{f' ({unit})' if unit else ''}")
+    ax.grid(True, which="both", alpha=0.2)
+    ax.legend()
+    return figure
+
+
+def _panels(record: Record) -> tuple[Figure, list[Axes]]:
+    ny = record.y.shape[1]
+    figure = Figure(figsize=(8, 1.5 + 3.0 * ny), layout="constrained")
+    return figure, list(figure.subplots(ny, 1, squeeze=False, sharex=True)[:, 0])
+
+
+def _signals(record: Record, y_lti: Array, y_hat: Array, i: int) -> list[tuple[Array, str, str]]:
+    y = record.y[record.skip :, i]
+    return [
+        (y, "output", OUTPUT),
+        (y - y_lti[record.skip :, i], "LTI error", LTI),
+        (y - y_hat[record.skip :, i], "NL-LFR error", NL_LFR),
+    ]
+
+
+def _title(record: Record) -> str:
+    return f"{record.name} ({record.source})"
+
+
+def _decibel(signal: Array) -> Array:
+    """Amplitude of each line of a real signal in dB; a silent line shows as the rounding error."""
+    amplitude = np.abs(np.fft.rfft(signal)) * 2.0 / len(signal)
+    return 20.0 * np.log10(np.maximum(amplitude, np.finfo(float).tiny))

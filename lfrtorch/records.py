@@ -1,0 +1,211 @@
+"""Records of input and output signals, and the scaling between physical and normalised units.
+
+Axes, for the whole package (upper case: a length, lower case: a size of the model):
+
+====  =====================================================================
+R     records
+T     samples of a record
+nu    inputs ``u``
+ny    outputs ``y``
+nx    states ``x``
+nz    inputs ``z`` of the static nonlinearity
+nw    outputs ``w`` of the static nonlinearity
+nn    neurons
+P     parameters
+M     residuals (all records, scored samples and outputs together)
+====  =====================================================================
+
+A :class:`Record` is a numpy array in physical units; inside the engine signals are torch tensors
+in normalised units. A :class:`Scaler` stands at the two ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Start = Literal["zero", "periodic"]
+
+
+class Channel(NamedTuple):
+    """Name and unit of one signal."""
+
+    name: str
+    unit: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One measurement: input, output, and how it is to be simulated and scored.
+
+    Args:
+        u: input, physical units. A one-dimensional array is one channel.
+        y: output, physical units. A one-dimensional array is one channel.
+        fs: sampling frequency in Hz.
+        start: ``"zero"`` simulates from x = 0 (the equilibrium at the input's offset);
+            ``"periodic"`` says that the record is a whole number of periods in steady state.
+        skip: samples at the beginning that are left out of cost and score.
+        name: what tables and messages call it.
+        source: where it comes from: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
+        inputs, outputs: channel names and units, one a column of ``u`` and ``y``.
+
+    Shape:
+        u: (T, nu), y: (T, ny).
+
+    Raises:
+        ValueError: NaN or infinite samples, different lengths, wrong shapes, or a ``skip`` that
+            leaves no sample.
+    """
+
+    u: NDArray[np.float64]
+    y: NDArray[np.float64]
+    fs: float = 1.0
+    start: Start = "zero"
+    skip: int = 0
+    name: str = "record"
+    source: str = "file"
+    inputs: tuple[Channel, ...] = ()
+    outputs: tuple[Channel, ...] = ()
+
+    def __post_init__(self) -> None:
+        inputs = _channels(self.inputs, self.u, "u")
+        outputs = _channels(self.outputs, self.y, "y")
+        u = _signal(self.u, inputs, f"record '{self.name}': input")
+        y = _signal(self.y, outputs, f"record '{self.name}': output")
+        if len(u) != len(y):
+            raise ValueError(
+                f"record '{self.name}': the input has {len(u)} samples and the output {len(y)}; "
+                "both must be sampled at the same instants: cut or resample one of them."
+            )
+        if not (np.isfinite(self.fs) and self.fs > 0):
+            raise ValueError(
+                f"record '{self.name}': the sampling frequency is {self.fs} Hz; "
+                "give a positive number of samples per second."
+            )
+        if self.start not in ("zero", "periodic"):
+            raise ValueError(
+                f"record '{self.name}': start is {self.start!r}; use 'zero' or 'periodic'."
+            )
+        if not 0 <= self.skip < len(u):
+            raise ValueError(
+                f"record '{self.name}': skip={self.skip} leaves no sample of {len(u)}; "
+                "use a smaller skip or a longer record."
+            )
+        for field, value in (("u", u), ("y", y), ("inputs", inputs), ("outputs", outputs)):
+            object.__setattr__(self, field, value)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples T, the skipped ones included."""
+        return len(self.u)
+
+    def __getitem__(self, window: slice) -> Record:
+        """The part of the record in ``window``: a record from zero state with nothing skipped."""
+        return replace(self, u=self.u[window], y=self.y[window], start="zero", skip=0)
+
+
+def as_records(records: Record | Sequence[Record]) -> list[Record]:
+    """One record or several as a list, checked to share channels and sampling frequency.
+
+    Raises:
+        ValueError: no record, or records of different channel counts or sampling frequencies.
+    """
+    found = [records] if isinstance(records, Record) else list(records)
+    if not found:
+        raise ValueError("no record given; at least one is needed.")
+    first = found[0]
+    for record in found[1:]:
+        same = record.u.shape[1] == first.u.shape[1] and record.y.shape[1] == first.y.shape[1]
+        if not same:
+            raise ValueError(
+                f"records '{first.name}' and '{record.name}' differ in channels: "
+                f"{first.u.shape[1]} inputs and {first.y.shape[1]} outputs against "
+                f"{record.u.shape[1]} and {record.y.shape[1]}; give records of the same channels."
+            )
+        if not np.isclose(record.fs, first.fs):
+            raise ValueError(
+                f"records '{first.name}' and '{record.name}' are sampled at {first.fs} and "
+                f"{record.fs} Hz; resample them to one rate."
+            )
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Scaler:
+    """Offsets and scales between physical and normalised signals: (physical - offset) / scale.
+
+    Shape:
+        u_offset, u_scale: (nu,), y_offset, y_scale: (ny,); physical units.
+    """
+
+    u_offset: NDArray[np.float64]
+    u_scale: NDArray[np.float64]
+    y_offset: NDArray[np.float64]
+    y_scale: NDArray[np.float64]
+
+    def normalise_u(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Input (T, nu) from physical to normalised units."""
+        return (u - self.u_offset) / self.u_scale
+
+    def normalise_y(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Output (T, ny) from physical to normalised units."""
+        return (y - self.y_offset) / self.y_scale
+
+    def restore_y(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Output (T, ny) from normalised to physical units."""
+        return y * self.y_scale + self.y_offset
+
+
+def rms_scale(signals: Sequence[NDArray[np.float64]], offset: NDArray[np.float64]) -> NDArray:
+    """Root mean square (n,) of signals (T, n) about ``offset``; 1 where a channel is constant."""
+    scale = np.sqrt(np.mean((np.concatenate(signals) - offset) ** 2, axis=0))
+    return np.where(scale > 0, scale, 1.0)
+
+
+def _channels(given: tuple[Channel, ...], signal: ArrayLike, letter: str) -> tuple[Channel, ...]:
+    shape = np.shape(signal)
+    width = shape[1] if len(shape) == 2 else 1
+    if not given:
+        return tuple(Channel(letter if width == 1 else f"{letter}{i + 1}") for i in range(width))
+    if len(given) != width:
+        raise ValueError(
+            f"{letter} has {width} column(s) but {len(given)} channel name(s) were given; "
+            "name every column once."
+        )
+    return tuple(Channel(*c) for c in given)
+
+
+def _signal(x: ArrayLike, channels: tuple[Channel, ...], what: str) -> NDArray[np.float64]:
+    array = np.asarray(x)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{what} has type {array.dtype}; give real numbers.")
+    array = np.array(array, dtype=np.float64, order="C")  # a copy: it is frozen below
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2:
+        raise ValueError(
+            f"{what} has shape {array.shape}; give (T,) for one channel or (T, channels)."
+        )
+    if array.shape[0] < array.shape[1]:
+        raise ValueError(
+            f"{what} has shape {array.shape}: more channels than samples. "
+            "Time runs along the first axis; transpose the array."
+        )
+    if array.size == 0:
+        raise ValueError(f"{what} is empty (shape {array.shape}); give at least one sample.")
+    bad = ~np.isfinite(array)
+    if bad.any():
+        k, channel = np.argwhere(bad)[0]
+        raise ValueError(
+            f"{what} '{channels[channel].name}' has {bad.sum()} NaN or infinite sample(s), the "
+            f"first at index {k}; cut the record there or interpolate the gap."
+        )
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,89 @@
+"""The one sequential primitive: s(k+1) = F(k) s(k) + g(k), many columns at once.
+
+Sensitivities, adjoints, Newton steps over a trajectory and periodic boundaries are all this
+recurrence. ``loop`` says what it computes; ``compiled`` (numba) serves the CPU and ``scan`` (torch,
+parallel in time) any other device.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from numba import njit, prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+def linear_recurrence(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+    """All states of s(k+1) = F(k) s(k) + g(k), s(0) = s0.
+
+    Shape:
+        F: (R, T, n, n), g: (R, T, n, m), s0: (R, n, m) -> (R, T + 1, n, m).
+    """
+    return compiled(F, g, s0) if F.device.type == "cpu" else scan(F, g, s0)
+
+
+def loop(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+    """The recurrence written out: the oracle of the two others."""
+    states = [s0]
+    for k in range(F.shape[1]):
+        states.append(F[:, k] @ states[-1] + g[:, k])
+    return torch.stack(states, dim=1)
+
+
+def compiled(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+    """The recurrence in machine code, records in parallel; CPU tensors of one dtype."""
+    R, T, n, m = g.shape
+    s = g.new_empty(R, T + 1, n, m)
+    s[:, 0] = s0
+    _recur(to_numpy(F), to_numpy(g), s.detach().numpy())
+    return s
+
+
+def to_numpy(tensor: Tensor) -> NDArray:
+    """A CPU tensor as a contiguous array for compiled code."""
+    return tensor.detach().contiguous().numpy()
+
+
+@njit(cache=True, parallel=True)
+def _recur(F, g, s):
+    R, T, n, m = g.shape
+    for r in prange(R):
+        for k in range(T):
+            for i in range(n):
+                for c in range(m):
+                    s[r, k + 1, i, c] = g[r, k, i, c]
+                for j in range(n):
+                    f = F[r, k, i, j]
+                    for c in range(m):
+                        s[r, k + 1, i, c] += f * s[r, k, j, c]
+
+
+def scan(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+    """The recurrence in about 3 √T batched products: chunks of √T steps side by side.
+
+    Each chunk is run from a zero state together with its transition matrices, the chunks' end
+    states are linked, and the links are propagated back into the chunks.
+    """
+    R, T, n, m = g.shape
+    steps = max(1, math.isqrt(T))
+    chunks = -(-T // steps)
+    pad = chunks * steps - T
+    eye = torch.eye(n, dtype=F.dtype, device=F.device)
+    F = torch.cat([F, eye.expand(R, pad, n, n)], dim=1).reshape(R, chunks, steps, n, n)
+    g = torch.cat([g, g.new_zeros(R, pad, n, m)], dim=1).reshape(R, chunks, steps, n, m)
+
+    local = torch.cat([g.new_zeros(R, chunks, n, m), eye.expand(R, chunks, n, n)], dim=-1)
+    inside = []
+    for k in range(steps):
+        local = F[:, :, k] @ local
+        local[..., :m] += g[:, :, k]
+        inside.append(local)
+    particular, transition = torch.stack(inside, dim=2).split([m, n], dim=-1)
+
+    starts = [s0]
+    for c in range(chunks - 1):
+        starts.append(transition[:, c, -1] @ starts[-1] + particular[:, c, -1])
+    s = particular + transition @ torch.stack(starts, dim=1).unsqueeze(2)
+    return torch.cat([s0.unsqueeze(1), s.reshape(R, chunks * steps, n, m)[:, :T]], dim=1)

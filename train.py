@@ -1,0 +1,124 @@
+"""Identify an NL-LFR model: records -> BLA -> initialisation -> fit -> scores -> files.
+
+python train.py +bench=boucwen
+python train.py data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750 nx=3
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+
+import hydra
+import numba
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+import lfrtorch
+from lfrtorch import plots, report
+from lfrtorch.datasets import Dataset
+from lfrtorch.monitor import ProgressLine, TensorBoard
+
+
+def identify(cfg: DictConfig, folder: Path) -> float:
+    """One run, its files written into ``folder``; returns the validation RMSE."""
+    torch.set_num_threads(cfg.threads)
+    numba.set_num_threads(min(cfg.threads, numba.config.NUMBA_NUM_THREADS))
+    require(cfg)
+    dataset: Dataset = instantiate(cfg.data)
+    shown = dataset.validation[0] if dataset.validation else dataset.train[0]
+
+    bla: lfrtorch.LinearModel = instantiate(cfg.bla, dataset.train)
+    if cfg.init_from is None:
+        model: lfrtorch.Model = instantiate(cfg.init, bla, dataset.train)
+    else:
+        model = lfrtorch.load(cfg.init_from)
+    print(
+        f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples, "
+        f"{model.parameters} parameters ({model.parameters_net} without the gauge directions)"
+    )
+
+    line = ProgressLine()
+    board = TensorBoard(folder, shown, bla.simulate(shown))
+    result = lfrtorch.fit(
+        model,
+        dataset.train,
+        dataset.validation,
+        optimiser=instantiate(cfg.trainer),
+        monitors=[line, board],
+    )
+    line.close()
+    print(
+        f"{result.reason}; kept iteration {result.chosen_iteration} of {result.iterations}, "
+        f"{result.seconds:.1f} s, {1e3 * result.seconds_per_iteration:.0f} ms an iteration\n"
+    )
+
+    model.save(folder / "model")
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    metrics = report.metrics(
+        result, bla, dataset, seed=cfg.data.get("seed"), command=f"python {command}"
+    )
+    (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+    table = report.table(metrics, dataset.published)
+    print(table)
+    board.text("scores", table)
+    for name, figure in figures(result, bla, dataset).items():
+        figure.savefig(made(folder / "figures") / f"{name}.png", dpi=150)
+        board.figure(f"result/{name}", figure, result.iterations)
+    board.close()
+    print(f"\nRun in {folder}\nTensorBoard: tensorboard --logdir {folder.parent.parent}")
+    return metrics["validation"]["rmse"] or result.history[result.chosen_iteration].train
+
+
+def require(cfg: DictConfig) -> None:
+    """Say what is missing from the command line before anything is computed."""
+    if cfg.data is None:
+        raise ValueError(
+            "no data chosen: add +bench=boucwen, or data=file data.path=FILE "
+            "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER."
+        )
+    if cfg.nx is None:
+        raise ValueError("nx, the number of states, is not set: add nx=2, for example.")
+
+
+def figures(result: lfrtorch.FitResult, bla: lfrtorch.LinearModel, dataset: Dataset) -> dict:
+    """All figures of a run by file name: errors of each test, static map, convergence."""
+    model = result.model
+    drawn = {}
+    for record in dataset.tests:
+        y_lti, y_hat = bla.simulate(record), model.simulate(record)
+        draw = plots.spectrum if record.start == "periodic" else plots.response
+        drawn[record.name] = draw(record, y_lti, y_hat)
+    signals = model.signals(dataset.train[0])
+    drawn["static_map"] = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
+    unit = model.outputs[0].unit
+    drawn["convergence"] = plots.convergence(result.history, result.chosen_iteration, unit)
+    return drawn
+
+
+def made(folder: Path) -> Path:
+    """The folder, made where it is missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="config")
+def main(cfg: DictConfig) -> float:
+    """The command line: user errors end with one message and exit code 1, no traceback."""
+    try:
+        return identify(cfg, Path(HydraConfig.get().runtime.output_dir))
+    except InstantiationException as error:
+        print(f"error: {error.__cause__ or error}", file=sys.stderr)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+    sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
