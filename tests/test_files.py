@@ -64,7 +64,9 @@ def test_nothing_is_skipped_unless_told(tmp_path, signals):
 @pytest.mark.parametrize("samples", [51, 53, 97])
 def test_no_sample_is_lost_in_the_cut(tmp_path, signals, samples):
     path = write(tmp_path / "a.csv", signals[:samples])
-    assert np.array_equal(joined(files.load(path, **USE)), signals[:samples])
+    data = files.load(path, **USE)
+    assert np.array_equal(joined(data), signals[:samples])
+    assert data.validation[0].samples == data.tests[0].samples == round(samples / 5)
 
 
 @pytest.mark.parametrize(
@@ -106,14 +108,14 @@ def test_any_sequence_of_columns(tmp_path, signals):
 
 
 def test_other_columns_may_hold_text(tmp_path):
-    rows = "".join(f"12:00:{i:02d},{i},{2 * i}\r\n" for i in range(60))
+    rows = "".join(f"{i},12:00:{i:02d},{2 * i}\r\n" for i in range(60))
     path = tmp_path / "a.csv"
-    path.write_bytes(f"\ufefftime,u,y\r\n{rows}\r\n".encode())  # as Excel saves it
+    path.write_bytes(f"\ufeffu,time,y\r\n{rows}\r\n".encode())  # as Excel saves it
     data = files.load(path, inputs="u", outputs="y", fs=1.0)
     assert np.array_equal(joined(data), np.arange(60.0)[:, None] * [1, 2])
     bare = tmp_path / "b.csv"
     bare.write_text(rows)
-    assert np.array_equal(joined(files.load(bare, inputs=1, outputs=2, fs=1.0)), joined(data))
+    assert np.array_equal(joined(files.load(bare, inputs=0, outputs=2, fs=1.0)), joined(data))
 
 
 def test_as_numpy_writes_a_table(tmp_path, signals):

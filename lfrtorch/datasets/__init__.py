@@ -1,46 +1,7 @@
 """Benchmarks and users' files as records: one file a benchmark, ``files`` for one's own data."""
 
-from __future__ import annotations
+from lfrtorch.datasets.dataset import Dataset, Published  # first: the others import it from here
 
-from dataclasses import dataclass, field
+from lfrtorch.datasets import boucwen, files  # isort: skip
 
-from lfrtorch.records import Record
-
-
-@dataclass(frozen=True)
-class Published:
-    """Simulation RMSE of one published model on the test records, for the table beside ours.
-
-    Args:
-        label: column head, for example ``"NL-LFR (paper)"``.
-        scores: RMSE in the output's unit, by the name of the test record.
-        reference: where it was published.
-        sizes: (nz, nw) where the number belongs to one model size only.
-    """
-
-    label: str
-    scores: dict[str, float]
-    reference: str
-    sizes: tuple[int, int] | None = None
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """Records by use: fitted, chosen on, and scored.
-
-    Args:
-        name: the benchmark's name, or the file's stem.
-        train: records that are fitted.
-        validation: records that choose among iterates and starts; never fitted.
-        tests: records touched by evaluation alone.
-        noise_rms: rms of the measurement noise added to simulated estimation data, output unit;
-            ``None`` for measured data.
-        published: results of others on the same tests.
-    """
-
-    name: str
-    train: list[Record]
-    validation: list[Record]
-    tests: list[Record]
-    noise_rms: float | None = None
-    published: tuple[Published, ...] = field(default_factory=tuple)
+__all__ = ["Dataset", "Published", "boucwen", "files"]

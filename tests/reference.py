@@ -1,0 +1,203 @@
+"""Slow, obvious oracles for the fast code, and small random systems to try it on."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import scipy.signal
+import torch
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.func import functional_call, jacfwd
+
+from lfrtorch.cell import LFRCell
+from lfrtorch.lfr import LFR
+from lfrtorch.model import Model
+from lfrtorch.nonlinearity import Network
+from lfrtorch.records import Channel, Record, Scaler, Start
+from lfrtorch.simulate import Trajectory
+
+Array = NDArray[np.float64]
+Weights = dict[str, Tensor]
+
+SIGMA = {
+    "tanh": torch.tanh,
+    "sigmoid": lambda v: 1 / (1 + torch.exp(-v)),
+    "relu": lambda v: torch.where(v > 0, v, torch.zeros_like(v)),
+    "rbf": lambda v: torch.exp(-(v**2)),
+}
+
+# --- the NL-LFR equations -------------------------------------------------------------------
+
+
+def nl_lfr(cell: LFRCell, theta: Weights, u: Tensor, x0: Tensor) -> Trajectory:
+    """Equations (1) and (2) of the paper, one sample after another.
+
+    Shape:
+        u: (T, nu), x0: (nx,) -> x: (T + 1, nx), z: (T, nz), w: (T, nw), y: (T, ny).
+    """
+    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = (
+        theta[name] for name in ("A", "Bu", "Bw", "Cz", "Dzu", "Cy", "Dyu", "Dyw")
+    )
+    xs, zs, ws, ys = [x0], [], [], []
+    for u_k in u:
+        x = xs[-1]
+        z = Cz @ x + Dzu @ u_k
+        w = f(cell, theta, z)
+        zs.append(z)
+        ws.append(w)
+        ys.append(Cy @ x + Dyu @ u_k + Dyw @ w)
+        xs.append(A @ x + Bu @ u_k + Bw @ w)
+    return Trajectory(torch.stack(xs), torch.stack(zs), torch.stack(ws), torch.stack(ys))
+
+
+def f(cell: LFRCell, theta: Weights, z: Tensor) -> Tensor:
+    """w = Ww σ(Wz z + bz) + bw, or the user's own module."""
+    if cell.static is None:
+        return z
+    own = {k.removeprefix("static."): p for k, p in theta.items() if k.startswith("static.")}
+    if not isinstance(cell.static, Network):
+        return functional_call(cell.static, own, (z,))
+    sigma = SIGMA[cell.static.activation]
+    return own["Ww"] @ sigma(own["Wz"] @ z + own["bz"]) + own["bw"]
+
+
+def weights(cell: LFRCell) -> Weights:
+    return {name: p.detach() for name, p in cell.named_parameters()}
+
+
+def simulate(cell: LFRCell, u: Tensor, x0: Tensor, periods: int = 1) -> Trajectory:
+    """The last of many periods, for u (R, T, nu) and x0 (R, nx)."""
+    runs = []
+    for u_r, x_r in zip(u, x0, strict=True):
+        run = nl_lfr(cell, weights(cell), u_r.repeat(periods, 1), x_r)
+        T = len(u_r)
+        runs.append((run.x[-T - 1 :], run.z[-T:], run.w[-T:], run.y[-T:]))
+    return Trajectory(*(torch.stack(signal) for signal in zip(*runs, strict=True)))
+
+
+def output_jacobian(cell: LFRCell, u: Tensor, x0: Tensor, periods: int = 1) -> Tensor:
+    """dy/dθ (R, T, ny, P) in the last of many periods, by jacfwd through the loop."""
+    free = {name: p.detach() for name, p in cell.named_parameters() if p.requires_grad}
+    T = u.shape[1]
+
+    def last_period(theta: Weights, u_r: Tensor, x_r: Tensor) -> Tensor:
+        return nl_lfr(cell, weights(cell) | theta, u_r.repeat(periods, 1), x_r).y[-T:]
+
+    def one(u_r: Tensor, x_r: Tensor) -> Tensor:
+        by_name = jacfwd(last_period)(free, u_r, x_r)
+        return torch.cat([d.reshape(T, cell.ny, -1) for d in by_name.values()], dim=-1)
+
+    with warnings.catch_warnings():  # torch itself scripts code at its first forward derivative
+        warnings.filterwarnings("ignore", "`torch.jit.script`", DeprecationWarning)
+        return torch.stack([one(u_r, x_r) for u_r, x_r in zip(u, x0, strict=True)])
+
+
+# --- small random models --------------------------------------------------------------------
+
+SIZES = st.fixed_dictionaries(
+    {"nu": st.integers(1, 3), "ny": st.integers(1, 3), "nx": st.integers(1, 4)}
+    | {"nz": st.integers(1, 3), "nw": st.integers(1, 3), "nn": st.integers(1, 4)}
+    | {"seed": st.integers(0, 1000)}
+)
+
+
+def random_cell(
+    nu: int = 1,
+    ny: int = 1,
+    nx: int = 2,
+    nz: int = 1,
+    nw: int = 1,
+    nn: int = 3,
+    *,
+    seed: int = 0,
+    radius: float = 0.8,
+    feedback: float = 0.1,
+    activation: str = "tanh",
+    static: torch.nn.Module | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> LFRCell:
+    """Cell with normal weights that contracts: |A| = radius, |Bw| |Ww| |Wz| |Cz| = feedback.
+
+    The slopes of all σ are at most 1, so |∂x+/∂x| <= radius + feedback. Linear for nz = nw = 0.
+    """
+    if static is None and nw:
+        static = Network(nz, nw, nn, activation)
+    cell = LFRCell(nu, ny, nx, nz, nw, static).to(torch.float64)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for p in cell.parameters():
+            p.normal_(generator=generator)
+        cell.A.mul_(radius / torch.linalg.matrix_norm(cell.A, 2))
+        if nw:
+            loop = [cell.Bw, cell.Cz]
+            if isinstance(cell.static, Network):
+                loop += [cell.static.Ww, cell.static.Wz]
+            for p in loop:
+                p.div_(torch.linalg.matrix_norm(p, 2))
+            cell.Bw.mul_(feedback)
+    return cell.to(dtype)
+
+
+def normal(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
+
+
+def random_model(cell: LFRCell, *, seed: int = 0, fs: float = 100.0) -> Model:
+    """Model about the cell, with a scaling that is not the identity."""
+    generator = np.random.default_rng(seed)
+    scaler = Scaler(
+        generator.normal(size=cell.nu),
+        generator.uniform(0.5, 2.0, cell.nu),
+        generator.normal(size=cell.ny),
+        generator.uniform(0.5, 2.0, cell.ny),
+    )
+    inputs = tuple(Channel(f"u{i + 1}", "N") for i in range(cell.nu))
+    outputs = tuple(Channel(f"y{i + 1}", "mm") for i in range(cell.ny))
+    return Model(LFR(cell), scaler, fs, inputs, outputs)
+
+
+def measure(
+    model: Model, T: int, *, seed: int = 0, start: Start = "zero", skip: int = 0
+) -> Record:
+    """Noise-free record of a model under white noise about its input offset."""
+    scaler = model.scaler
+    u = normal(T, len(model.inputs), seed=seed).numpy() * scaler.u_scale + scaler.u_offset
+    return Record(
+        u, model.simulate(u, start=start), model.fs, start, skip,
+        inputs=model.inputs, outputs=model.outputs,
+    )  # fmt: skip
+
+
+# --- linear systems -------------------------------------------------------------------------
+
+System = tuple[Array, Array, Array, Array]  # A, B, C, D
+
+
+def random_system(nx: int, nu: int = 1, ny: int = 1, *, seed: int = 0) -> System:
+    """Stable system whose slowest pole has radius 0.9."""
+    generator = np.random.default_rng([nx, nu, ny, seed])
+    A = generator.normal(size=(nx, nx))
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    return (A, *(generator.normal(size=shape) for shape in ((nx, nu), (ny, nx), (ny, nu))))
+
+
+def dlsim(system: System, u: Array) -> Array:
+    """Response (T, ny) from zero state."""
+    return scipy.signal.dlsim((*system, 1.0), u)[1]
+
+
+def frf(system: System, omega: Array) -> NDArray[np.complex128]:
+    """C (zI - A)⁻¹ B + D at the angles omega (F,) -> (F, ny, nu)."""
+    A, B, C, D = system
+    return np.stack([C @ np.linalg.inv(np.exp(1j * w) * np.eye(len(A)) - A) @ B + D for w in omega])
+
+
+def periodic_response(system: System, u: Array) -> Array:
+    """Steady-state response (T, ny) to the periodic repetition of u (T, nu), in frequency."""
+    omega = 2 * np.pi * np.fft.rfftfreq(len(u))
+    Y = np.einsum("fyu,fu->fy", frf(system, omega), np.fft.rfft(u, axis=0))
+    return np.fft.irfft(Y, len(u), axis=0)

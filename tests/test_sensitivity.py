@@ -1,0 +1,170 @@
+"""The fast Jacobian against jacfwd through the plain loop, and its rank."""
+
+import pytest
+import reference
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import SIZES, normal, random_cell
+from torch import Tensor, nn
+from torch.testing import assert_close
+
+from lfrtorch.cell import LFRCell
+from lfrtorch.nonlinearity import ACTIVATIONS
+from lfrtorch.sensitivity import _rows_compiled, _rows_generic, _terms, output_jacobian
+from lfrtorch.simulate import simulate, steady_state
+
+# Sums of at most some hundred products along a contraction, in double precision: 1e-13 or so.
+TOLERANCE = 1e-9
+
+
+class Cubic(nn.Module):
+    """w = c z³ + d z, a user's map whose parameters have two shapes."""
+
+    def __init__(self, nz: int, nw: int):
+        super().__init__()
+        self.c = nn.Parameter(torch.zeros(nw, nz))
+        self.d = nn.Parameter(torch.zeros(()))
+
+    def forward(self, z: Tensor) -> Tensor:
+        return z.tanh() ** 3 @ self.c.mT + self.d * z.sum(-1, keepdim=True).tanh()
+
+
+class Square(nn.Module):
+    """A map without parameters."""
+
+    def forward(self, z: Tensor) -> Tensor:
+        return z.tanh() ** 2
+
+
+def assert_jacobian(J: Tensor, expected: Tensor, tolerance: float = TOLERANCE):
+    assert_close(J, expected, rtol=tolerance, atol=tolerance * float(expected.detach().abs().amax()))
+
+
+def check_zero_start(cell: LFRCell, R: int = 2, T: int = 6):
+    u, x0 = normal(R, T, cell.nu), normal(R, cell.nx, seed=1)
+    J = output_jacobian(cell, u, simulate(cell, u, x0))
+    assert_jacobian(J, reference.output_jacobian(cell, u, x0))
+
+
+def check_periodic(cell: LFRCell, R: int = 2, T: int = 5, periods: int = 12):
+    """Slopes within 0.6: the start is forgotten to 0.6^60 = 5e-14, its derivative to 60 times."""
+    u = normal(R, T, cell.nu)
+    J = output_jacobian(cell, u, steady_state(cell, u), periodic=True)
+    zero = u.new_zeros(R, cell.nx)
+    assert_jacobian(J, reference.output_jacobian(cell, u, zero, periods))
+
+
+# --- against the oracle ---------------------------------------------------------------------
+
+
+@given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 7))
+@settings(max_examples=20)
+def test_from_a_given_state(sizes: dict[str, int], R: int, T: int):
+    check_zero_start(random_cell(**sizes), R, T)
+
+
+@given(sizes=SIZES, R=st.integers(1, 2))
+@settings(max_examples=12)
+def test_in_periodic_steady_state(sizes: dict[str, int], R: int):
+    check_periodic(random_cell(**sizes, radius=0.5), R)
+
+
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
+def test_every_activation(activation: str):
+    check_zero_start(random_cell(2, 2, 2, 2, 2, 3, activation=activation))
+
+
+@pytest.mark.parametrize("check", [check_zero_start, check_periodic])
+def test_linear_cell(check):
+    check(random_cell(2, 2, 3, 0, 0, radius=0.5))
+
+
+@pytest.mark.parametrize("check", [check_zero_start, check_periodic])
+def test_own_module_as_static_map(check):
+    check(random_cell(1, 2, 2, 2, 2, static=Cubic(2, 2), radius=0.3, feedback=0.05))
+
+
+@pytest.mark.parametrize("check", [check_zero_start, check_periodic])
+def test_static_map_without_parameters(check):
+    check(random_cell(1, 2, 2, 2, 2, static=Square(), radius=0.3, feedback=0.05))
+
+
+@pytest.mark.parametrize(
+    "frozen",
+    [["A"], ["Bw", "Dyw"], ["Cz", "static.Wz"], ["static.bz", "static.bw"], ["Bu", "Cy", "Dyu"]],
+)
+@pytest.mark.parametrize("check", [check_zero_start, check_periodic])
+def test_frozen_parameters_get_no_column(check, frozen: list[str]):
+    cell = random_cell(2, 1, 2, 2, 2, 2, radius=0.5)
+    for name in frozen:
+        cell.get_parameter(name).requires_grad_(False)
+    check(cell)
+
+
+def test_all_parameters_frozen():
+    cell = random_cell().requires_grad_(False)
+    u = normal(1, 5, 1)
+    for periodic in (False, True):
+        assert output_jacobian(cell, u, steady_state(cell, u), periodic=periodic).shape[-1] == 0
+
+
+# --- the two ways ---------------------------------------------------------------------------
+
+
+@given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 30))
+@settings(max_examples=25)
+def test_compiled_is_generic(sizes: dict[str, int], R: int, T: int):
+    cell = random_cell(**sizes)
+    u = normal(R, T, cell.nu)
+    terms = _terms(cell, u, simulate(cell, u, normal(R, cell.nx, seed=1)))
+    for mine, other in zip(_rows_compiled(cell, terms), _rows_generic(cell, terms), strict=True):
+        assert_jacobian(mine, other)
+
+
+def test_single_precision():
+    double, single = random_cell(2, 1, 3), random_cell(2, 1, 3, dtype=torch.float32)
+    u = normal(2, 50, 2)
+    expected = output_jacobian(double, u, steady_state(double, u), periodic=True)
+    J = output_jacobian(single, u.float(), steady_state(single, u.float()), periodic=True)
+    assert J.dtype == torch.float32
+    # eps 1.2e-7 amplified by 1 / (1 - 0.9) in the states, and once more in their derivatives.
+    assert_jacobian(J.double(), expected, 5e-5)
+
+
+# --- rank -----------------------------------------------------------------------------------
+
+
+def vanishing(J: Tensor) -> int:
+    """Number of singular values below 1e-12 of the largest, columns at unit norm."""
+    J = J.flatten(0, -2)
+    s = torch.linalg.svdvals(J / J.norm(dim=0))
+    return int((s < 1e-12 * s[0]).sum())
+
+
+@pytest.mark.parametrize(
+    ("nu", "ny", "nx", "nz", "nw", "nn"),
+    [
+        (1, 1, 2, 1, 1, 3),
+        (1, 1, 3, 2, 1, 5),
+        (1, 1, 3, 1, 2, 4),
+        (2, 1, 2, 2, 2, 3),
+        (1, 2, 3, 2, 2, 4),
+        (1, 1, 4, 2, 3, 5),
+    ],
+)
+def test_rank_leaves_out_the_gauge_directions(nu, ny, nx, nz, nw, nn):
+    cell = random_cell(nu, ny, nx, nz, nw, nn)
+    u = normal(2, 400, nu)
+    gauge = nx**2 + nz**2 + nw**2
+    from_zero = simulate(cell, u, u.new_zeros(2, nx))
+    assert vanishing(output_jacobian(cell, u, from_zero)) == gauge
+    # A constant w can hide in the origin of the state where the start state is free to move.
+    periodic = output_jacobian(cell, u, steady_state(cell, u), periodic=True)
+    assert vanishing(periodic) == gauge + max(0, nw - ny)
+
+
+def test_linear_rank_leaves_out_the_state_coordinates():
+    cell = random_cell(2, 2, 3, 0, 0)
+    u = normal(1, 300, 2)
+    assert vanishing(output_jacobian(cell, u, steady_state(cell, u), periodic=True)) == 3**2

@@ -1,0 +1,210 @@
+"""Trajectories against the plain loop, and the periodic steady state."""
+
+import numpy as np
+import pytest
+import reference
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import SIZES, normal, random_cell
+from torch import Tensor
+from torch.testing import assert_close
+
+from lfrtorch.cell import LFRCell
+from lfrtorch.nonlinearity import ACTIVATIONS, Network
+from lfrtorch.simulate import (
+    PERIODIC_TOLERANCE,
+    Trajectory,
+    monodromy,
+    simulate,
+    slopes,
+    static_jacobians,
+    steady_state,
+)
+
+
+class SameNetwork(torch.nn.Module):
+    """The map of a Network in the user's own words: takes the generic path."""
+
+    def __init__(self, network: Network):
+        super().__init__()
+        self.W1, self.b1 = network.Wz, network.bz
+        self.W2, self.b2 = network.Ww, network.bw
+
+    def forward(self, z: Tensor) -> Tensor:
+        return torch.tanh(z @ self.W1.T + self.b1) @ self.W2.T + self.b2
+
+
+class Cube(torch.nn.Module):
+    """A static map without parameters."""
+
+    def forward(self, z: Tensor) -> Tensor:
+        return z**3
+
+
+def assert_same(trajectory: Trajectory, expected: Trajectory, tolerance: float):
+    for signal, wanted in zip(trajectory, expected, strict=True):
+        assert_close(signal, wanted, rtol=tolerance, atol=tolerance)
+
+
+# --- from a given state ---------------------------------------------------------------------
+
+
+@given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 12))
+@settings(max_examples=25)
+def test_simulation_is_the_plain_loop(sizes: dict[str, int], R: int, T: int):
+    cell = random_cell(**sizes)
+    u, x0 = normal(R, T, cell.nu), normal(R, cell.nx, seed=1)
+    assert_same(simulate(cell, u, x0), reference.simulate(cell, u, x0), 1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
+def test_compiled_is_the_plain_loop_for_every_activation(activation: str, dtype: torch.dtype):
+    cell = random_cell(2, 2, 3, 2, 2, 5, activation=activation, dtype=dtype)
+    u, x0 = normal(3, 40, 2, dtype=dtype), normal(3, 3, seed=1, dtype=dtype)
+    trajectory = simulate(cell, u, x0)
+    assert trajectory.y.dtype == dtype
+    eps = torch.finfo(dtype).eps  # errors of the steps before contract: some 100 eps in all
+    assert_same(trajectory, reference.simulate(cell, u, x0), 100 * eps)
+
+
+def test_linear_cell_is_the_plain_loop():
+    cell = random_cell(2, 2, 3, 0, 0)
+    u, x0 = normal(2, 30, 2), normal(2, 3, seed=1)
+    trajectory = simulate(cell, u, x0)
+    assert trajectory.z.shape == trajectory.w.shape == (2, 30, 0)
+    assert_same(trajectory, reference.simulate(cell, u, x0), 1e-12)
+
+
+def test_own_module_equals_the_compiled_network():
+    cell = random_cell(1, 1, 2, 2, 2, 4)
+    assert isinstance(cell.static, Network)
+    own = LFRCell(1, 1, 2, 2, 2, SameNetwork(cell.static)).double()
+    own.load_state_dict(cell.state_dict(), strict=False)
+    u, x0 = normal(2, 50, 1), normal(2, 2, seed=1)
+    assert_same(simulate(own, u, x0), simulate(cell, u, x0), 1e-12)
+    assert_same(steady_state(own, u), steady_state(cell, u), 1e-9)
+
+
+def test_records_of_a_batch_do_not_mix():
+    cell = random_cell(1, 1, 2)
+    u, x0 = normal(3, 20, 1), normal(3, 2, seed=1)
+    together = simulate(cell, u, x0)
+    for r in range(3):
+        alone = simulate(cell, u[r : r + 1], x0[r : r + 1])
+        assert torch.equal(together.x[r], alone.x[0])
+
+
+def test_unstable_model_is_not_an_exception():
+    cell = random_cell(radius=3.0)
+    trajectory = simulate(cell, normal(1, 2000, 1), torch.zeros(1, 2, dtype=torch.float64))
+    assert not trajectory.finite
+    assert not torch.isfinite(trajectory.y[0, -1]).any()
+    assert torch.isnan(steady_state(cell, normal(1, 2000, 1)).y).all()
+
+
+# --- periodic steady state ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
+def test_steady_state_is_the_last_of_very_many_periods(activation: str):
+    cell = random_cell(2, 1, 3, 2, 1, 4, activation=activation)
+    u = normal(2, 10, 2)
+    expected = reference.simulate(cell, u, u.new_zeros(2, 3), periods=50)  # 0.9^500 = 1e-23
+    # The gap of 1e-10 at the end of a period is 1e-10 / (1 - 0.9^10) from the solution.
+    assert_same(steady_state(cell, u), expected, 2e-9)
+
+
+def test_steady_state_of_a_linear_cell_is_the_response_in_frequency():
+    cell = random_cell(2, 2, 3, 0, 0)
+    system = [m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu)]
+    u = normal(1, 64, 2)
+    expected = reference.periodic_response((system[0], *system[1:]), u[0].numpy())
+    np.testing.assert_allclose(steady_state(cell, u).y[0].numpy(), expected, rtol=0, atol=1e-9)
+
+
+def lightly_damped(radius: float, nw: int, dtype: torch.dtype = torch.float64) -> LFRCell:
+    """Cell with poles at radius e^(±j) and hardly any feedback."""
+    cell = random_cell(1, 1, 2, nw, nw, 3, feedback=1e-5)
+    c, s = np.cos(1.0), np.sin(1.0)
+    with torch.no_grad():
+        cell.A.copy_(radius * torch.tensor([[c, s], [-s, c]]))
+    return cell.to(dtype)
+
+
+@pytest.mark.parametrize("nw", [0, 1])
+def test_lightly_damped_model_settles_by_newton(nw: int):
+    cell = lightly_damped(0.9999, nw)  # forward passes would take 2e5 samples
+    u = normal(2, 30, 1)
+    found = steady_state(cell, u)
+    scale = float(1 + found.x.abs().max())
+    assert (found.x[:, -1] - found.x[:, 0]).abs().max() <= PERIODIC_TOLERANCE * scale
+    assert_same(found, reference.simulate(cell, u, found.x[:, 0]), 1e-12 * scale)
+
+
+def test_good_guess_changes_nothing():
+    cell = random_cell()
+    u = normal(1, 20, 1)
+    cold = steady_state(cell, u)
+    assert_same(steady_state(cell, u, cold.x[:, 0]), cold, 1e-9)
+
+
+@pytest.mark.parametrize("radius", [0.5, 0.9, 0.99])
+def test_steady_state_in_single_precision(radius: float):
+    u = normal(1, 50, 1)
+    expected = steady_state(lightly_damped(radius, 1), u)
+    found = steady_state(lightly_damped(radius, 1, torch.float32), u.float())
+    # eps 1.2e-7 amplified by 1 / (1 - 0.99) = 100, times some rounding errors a step.
+    tolerance = 5e-5 * float(1 + expected.x.abs().max())
+    assert_close(found.y.double(), expected.y, rtol=0, atol=tolerance)
+
+
+def test_unstable_periodic_solution_counts_as_diverged():
+    cell = random_cell(1, 1, 2, 0, 0, radius=0.5)
+    with torch.no_grad():
+        cell.A[:] = torch.diag(torch.tensor([1.05, 0.5]))  # (I - Φ) is regular, x(T) = x(0) solvable
+    assert torch.isnan(steady_state(cell, normal(1, 10, 1)).y).all()
+
+
+# --- linearisation --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
+def test_static_jacobians_are_those_of_autograd(activation: str):
+    cell = random_cell(1, 1, 2, 2, 3, 4, activation=activation)
+    assert cell.static is not None
+    z = normal(2, 5, 2)
+    J, by_weight = static_jacobians(cell, z, parameters=True)
+    for r, k in np.ndindex(2, 5):
+        z_k = z[r, k].clone().requires_grad_()
+        for q, w_q in enumerate(cell.static(z_k)):
+            names, parameters = zip(*cell.static.named_parameters(), strict=True)
+            dz, *dp = torch.autograd.grad(w_q, (z_k, *parameters), retain_graph=True)
+            assert_close(J[r, k, q], dz, rtol=1e-12, atol=1e-14)
+            for name, d in zip(names, dp, strict=True):
+                assert_close(by_weight[name][r, k, q], d.flatten(), rtol=1e-12, atol=1e-14)
+
+
+def test_static_map_without_parameters():
+    cell = LFRCell(1, 1, 2, 2, 2, Cube())
+    z = normal(1, 4, 2)
+    J, by_weight = static_jacobians(cell, z, parameters=True)
+    assert_close(J, torch.diag_embed(3 * z**2), rtol=1e-14, atol=0)
+    assert by_weight == {}
+
+
+def test_slopes_are_the_derivatives_of_one_step():
+    cell = random_cell(2, 2, 3, 2, 2, 4)
+    u, x = normal(1, 1, 2), normal(1, 3, seed=1)
+    F, H = slopes(cell, static_jacobians(cell, simulate(cell, u, x).z)[0])
+    y_x, next_x = torch.autograd.functional.jacobian(lambda x_: cell(u[0, 0], x_), x[0])
+    assert_close(F[0, 0], next_x, rtol=1e-12, atol=1e-13)
+    assert_close(H[0, 0], y_x, rtol=1e-12, atol=1e-13)
+
+
+def test_monodromy_is_the_product_with_the_last_step_leftmost():
+    F = normal(2, 7, 3, 3)
+    for r in range(2):
+        expected = torch.linalg.multi_dot(list(F[r].flip(0)))
+        assert_close(monodromy(F)[r], expected, rtol=1e-12, atol=1e-12)
