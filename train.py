@@ -25,6 +25,9 @@ from lfrtorch.datasets import Dataset
 from lfrtorch.monitor import ProgressLine, TensorBoard
 
 
+CONF = Path(__file__).resolve().parent / "conf"
+
+
 def identify(cfg: DictConfig, folder: Path) -> float:
     """One run, its files written into ``folder``; returns the validation RMSE."""
     torch.set_num_threads(cfg.threads)
@@ -50,6 +53,7 @@ def identify(cfg: DictConfig, folder: Path) -> float:
         dataset.train,
         dataset.validation,
         optimiser=instantiate(cfg.trainer),
+        ridge=cfg.ridge,
         monitors=[line, board],
     )
     line.close()
@@ -78,7 +82,7 @@ def identify(cfg: DictConfig, folder: Path) -> float:
 
 def require(cfg: DictConfig) -> None:
     """Say what is missing from the command line before anything is computed."""
-    if cfg.data is None:
+    if cfg.get("data") is None:
         raise ValueError(
             "no data chosen: add +bench=boucwen, or data=file data.path=FILE "
             "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER."
@@ -108,7 +112,7 @@ def made(folder: Path) -> Path:
     return folder
 
 
-@hydra.main(version_base="1.3", config_path="conf", config_name="config")
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(cfg: DictConfig) -> float:
     """The command line: user errors end with one message and exit code 1, no traceback."""
     try:

@@ -32,7 +32,7 @@ def spectrum(record: Record, y_lti: Array, y_hat: Array) -> Figure:
     f = np.fft.rfftfreq(len(y), 1.0 / record.fs)
     for i, ax in enumerate(axes):
         for signal, label, colour in _signals(record, y_lti, y_hat, i):
-            ax.plot(f[1:], _decibel(signal)[1:], ".", ms=2, color=colour, label=label)
+            ax.plot(f[1:-1], _decibel(signal)[1:-1], ".", ms=2, color=colour, label=label)
         unit = record.outputs[i].unit or "1"
         ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {unit})", xlim=(0, f[-1]))
         ax.legend(loc="upper right", markerscale=5)
@@ -51,7 +51,7 @@ def response(record: Record, y_lti: Array, y_hat: Array) -> Figure:
     t = np.arange(record.skip, record.samples) / record.fs
     for i, ax in enumerate(axes):
         for signal, label, colour in _signals(record, y_lti, y_hat, i):
-            ax.plot(t, signal, lw=0.5, color=colour, label=label)
+            ax.plot(*_envelope(t, signal), lw=0.5, color=colour, label=label)
         ax.set(ylabel=str(record.outputs[i]), xlim=(t[0], t[-1]))
         legend = ax.legend(loc="upper right")
         for handle in legend.get_lines():
@@ -125,6 +125,16 @@ def _signals(record: Record, y_lti: Array, y_hat: Array, i: int) -> list[tuple[A
         (y - y_lti[record.skip :, i], "LTI error", LTI),
         (y - y_hat[record.skip :, i], "NL-LFR error", NL_LFR),
     ]
+
+
+def _envelope(t: Array, signal: Array) -> tuple[Array, Array]:
+    """A long signal as the smallest and largest sample of each of many short stretches."""
+    stretch = len(signal) // (MOST_POINTS // 2)
+    if stretch < 2:
+        return t, signal
+    pieces = signal[: len(signal) // stretch * stretch].reshape(-1, stretch)
+    ends = np.column_stack([pieces.min(axis=1), pieces.max(axis=1)])
+    return np.repeat(t[::stretch][: len(pieces)], 2), ends.ravel()
 
 
 def _title(record: Record) -> str:

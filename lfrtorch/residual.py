@@ -38,18 +38,26 @@ class Batch(NamedTuple):
 class SimulationError:
     """Residual, Jacobian and gradient of a model's mean squared simulation error.
 
-    r = y_hat - y in normalised units, over all scored samples of all records. θ is the vector of
-    all parameters of ``model.lfr`` that require a gradient; evaluating at θ writes it into the
-    module.
+    r = y_hat - y in normalised units, over all scored samples of all records, followed by
+    √ridge (θ - θ_start). θ is the vector of all parameters of ``model.lfr`` that require a
+    gradient; evaluating at θ writes it into the module.
 
     Args:
-        model: the model whose parameters are θ.
+        model: the model whose parameters are θ; θ_start is what they are now.
         records: the data, of the model's channels and rate.
+        ridge: weight of |θ - θ_start|² beside |y_hat - y|²: the noise variance over that of a
+            prior on each parameter, both normalised.
     """
 
-    def __init__(self, model: Model, records: Record | Sequence[Record]) -> None:
+    def __init__(
+        self, model: Model, records: Record | Sequence[Record], *, ridge: float = 0.0
+    ) -> None:
+        if not ridge >= 0:
+            raise ValueError(f"ridge is {ridge}; the penalty's weight cannot be negative.")
         self.model = model
         self.batches = _batches(model, as_records(records))
+        self.size = sum(int(b.scored.sum()) for b in self.batches) * len(model.outputs)
+        self._ridge, self._start = ridge, self.theta
         self._guesses: list[Tensor | None] = [None] * len(self.batches)
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
 
@@ -59,8 +67,8 @@ class SimulationError:
         return parameters_to_vector(self._parameters()).detach()
 
     def rmse(self, residual: Tensor) -> float:
-        """Root mean squared error over samples and outputs of a residual (M,), output unit."""
-        errors = residual.reshape(-1, len(self.model.outputs)).double().cpu().numpy()
+        """Root mean squared error over samples and outputs of a residual, output unit."""
+        errors = residual[: self.size].reshape(-1, len(self.model.outputs)).double().cpu().numpy()
         return float(np.sqrt(np.mean((errors * self.model.scaler.y_scale) ** 2)))
 
     def write(self, theta: Tensor) -> None:
@@ -70,28 +78,43 @@ class SimulationError:
     def residual(self, theta: Tensor) -> Tensor:
         """r (M,); infinite or NaN where the model diverges."""
         pairs = zip(self.batches, self.trajectories(theta), strict=True)
-        return torch.cat([b.select(t.y - b.y).flatten() for b, t in pairs])
+        errors = [batch.select(t.y - batch.y).flatten() for batch, t in pairs]
+        return torch.cat([*errors, *self._penalty(theta)])
 
     def jacobian(self, theta: Tensor) -> Tensor:
         """dr/dθ (M, P)."""
         trajectories = self.trajectories(theta)
+        self.write(theta)  # the module may hold a trial that came after the trajectories
         self._guesses = [t.x[:, 0] for t in trajectories]
-        cell, parts = self.model.lfr.cell, []
+        P = len(theta)
+        J = theta.new_zeros(self.size + (P if self._ridge else 0), P)
+        if self._ridge:
+            J[self.size :].fill_diagonal_(self._ridge**0.5)
+        first = 0
         for batch, trajectory in zip(self.batches, trajectories, strict=True):
-            rows = output_jacobian(cell, batch.u, trajectory, periodic=batch.start == "periodic")
-            parts.append(batch.select(rows).flatten(0, 1))
-        return parts[0] if len(parts) == 1 else torch.cat(parts)
+            rows = output_jacobian(
+                self.model.lfr.cell, batch.u, trajectory, periodic=batch.start == "periodic"
+            )
+            rows = batch.select(rows).flatten(0, 1)
+            J[first : first + len(rows)] = rows
+            first += len(rows)
+        return J
 
     def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """r (M,) and the gradient (P,) of its mean square, by the adjoint recurrence."""
+        """r (M,) and the gradient (P,) of |r|² / samples, by the adjoint recurrence."""
         self.write(theta)
         errors = []
         for i, batch in enumerate(self.batches):
             y_hat = self.model.lfr(batch.u, self._guesses[i], batch.start)
             errors.append(batch.select(y_hat - batch.y).flatten())
-        residual = torch.cat(errors)
-        gradients = torch.autograd.grad(residual.square().mean(), self._parameters())
-        return residual.detach(), parameters_to_vector(gradients)
+        r = torch.cat(errors)
+        gradients = torch.autograd.grad(r.square().sum() / self.size, self._parameters())
+        gradient = parameters_to_vector(gradients)
+        gradient = gradient + 2.0 * self._ridge / self.size * (theta - self._start)
+        return torch.cat([r.detach(), *self._penalty(theta)]), gradient
+
+    def _penalty(self, theta: Tensor) -> list[Tensor]:
+        return [self._ridge**0.5 * (theta - self._start)] if self._ridge else []
 
     def _parameters(self) -> list[torch.nn.Parameter]:
         return [p for p in self.model.lfr.parameters() if p.requires_grad]

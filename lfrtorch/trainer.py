@@ -128,6 +128,7 @@ def fit(
     validation: Record | Sequence[Record] = (),
     *,
     optimiser: Optimiser | None = None,
+    ridge: float = 0.0,
     monitors: Sequence[Monitor] = (),
 ) -> FitResult:
     """Minimise the simulation error of a model over records.
@@ -140,13 +141,14 @@ def fit(
         train: records that are fitted.
         validation: records that choose among the iterates.
         optimiser: Levenberg-Marquardt with its defaults where left out.
+        ridge: weight of |θ - θ_start|², see ``SimulationError``.
         monitors: called with the model and its progress after every iteration.
 
     Raises:
         ValueError: the model diverges on the training records at the start.
     """
     optimiser = LevenbergMarquardt() if optimiser is None else optimiser
-    problem = SimulationError(model, train)
+    problem = SimulationError(model, train, ridge=ridge)
     judge = SimulationError(model, validation) if validation else None
     begin = time.perf_counter()
     history: list[Progress] = []

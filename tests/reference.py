@@ -160,9 +160,7 @@ def random_model(cell: LFRCell, *, seed: int = 0, fs: float = 100.0) -> Model:
     return Model(LFR(cell), scaler, fs, inputs, outputs)
 
 
-def measure(
-    model: Model, T: int, *, seed: int = 0, start: Start = "zero", skip: int = 0
-) -> Record:
+def measure(model: Model, T: int, *, seed: int = 0, start: Start = "zero", skip: int = 0) -> Record:
     """Noise-free record of a model under white noise about its input offset."""
     scaler = model.scaler
     u = normal(T, len(model.inputs), seed=seed).numpy() * scaler.u_scale + scaler.u_offset

@@ -24,10 +24,10 @@ def write(path, table, header: str | None = "u1,u2,y", delimiter=","):
     return path
 
 
-def joined(dataset):
-    """The parts one after the other: (T, nu + ny)."""
-    records = [*dataset.train, *dataset.validation, *dataset.tests]
-    return np.hstack([np.concatenate([getattr(r, side) for r in records]) for side in "uy"])
+def joined(data):
+    """The file again: the training record, and the other two without their warm-up."""
+    records = [*data.train, *(record[record.skip :] for record in (*data.validation, *data.tests))]
+    return np.vstack([np.hstack([r.u, r.y]) for r in records])
 
 
 def refused(match, path, error: type[Exception] = ValueError, **options):
@@ -43,11 +43,11 @@ def test_parts_are_cut_in_time_order(tmp_path, signals):
     path = write(tmp_path / "motor.csv", signals)
     data = files.load(path, **USE, validation=0.25, test=0.1, skip=7)
     train, validation, test = *data.train, *data.validation, *data.tests
-    assert [r.samples for r in (train, validation, test)] == [130, 50, 20]
+    assert [r.samples for r in (train, validation, test)] == [130, 57, 27]
     assert [r.name for r in (train, validation, test)] == ["train", "validation", "test"]
     assert np.array_equal(train.u, signals[:130, :2])
-    assert np.array_equal(validation.y, signals[130:180, 2:])
-    assert np.array_equal(test.u, signals[180:, :2])
+    assert np.array_equal(validation.y, signals[123:180, 2:])  # 7 before the part
+    assert np.array_equal(test.u, signals[173:, :2])
     for record in (train, validation, test):
         assert (record.fs, record.start, record.skip, record.source) == (50.0, "zero", 7, "file")
         assert [c.name for c in record.inputs] == ["u1", "u2"]
@@ -55,18 +55,21 @@ def test_parts_are_cut_in_time_order(tmp_path, signals):
     assert (data.name, data.noise_rms, data.published) == ("motor", None, ())
 
 
-def test_nothing_is_skipped_unless_told(tmp_path, signals):
+def test_five_percent_warm_up_unless_told(tmp_path, signals):
     data = files.load(write(tmp_path / "a.csv", signals), **USE)
-    assert [r.samples for r in (*data.train, *data.validation, *data.tests)] == [120, 40, 40]
-    assert data.tests[0].skip == 0
+    assert [r.samples for r in (*data.train, *data.validation, *data.tests)] == [120, 50, 50]
+    assert data.train[0].skip == data.validation[0].skip == data.tests[0].skip == 10
 
 
 @pytest.mark.parametrize("samples", [51, 53, 97])
-def test_no_sample_is_lost_in_the_cut(tmp_path, signals, samples):
+@pytest.mark.parametrize("skip", [0, 3])
+def test_every_sample_after_the_first_warm_up_is_scored_once(tmp_path, signals, samples, skip):
     path = write(tmp_path / "a.csv", signals[:samples])
-    data = files.load(path, **USE)
-    assert np.array_equal(joined(data), signals[:samples])
-    assert data.validation[0].samples == data.tests[0].samples == round(samples / 5)
+    data = files.load(path, **USE, skip=skip)
+    records = [*data.train, *data.validation, *data.tests]
+    scored = np.concatenate([np.hstack([r.u, r.y])[r.skip :] for r in records])
+    assert np.array_equal(scored, signals[skip:samples])
+    assert len(data.validation[0].y) - skip == len(data.tests[0].y) - skip == round(samples / 5)
 
 
 @pytest.mark.parametrize(
@@ -169,11 +172,11 @@ def test_refused_fractions(tmp_path, signals, validation, test):
 
 def test_refused_short_parts(tmp_path, signals):
     path = write(tmp_path / "a.csv", signals)
-    refused("the test part has 8 of 200", path, test=0.04)
-    refused("the validation part has 8 of 200", path, validation=0.04)
-    refused("the train part has 4 of 200", path, validation=0.49, test=0.49)
-    refused("the validation part has 40 of 200 samples, less skip=31", path, skip=31)
-    files.load(path, **USE, skip=30)  # exactly the ten samples that are needed
+    refused("the test part has 8 scored samples of 200", path, test=0.04)
+    refused("the validation part has 8 scored", path, validation=0.04)
+    refused("the train part has 4 scored", path, validation=0.49, test=0.49, skip=0)
+    refused("the train part has 9 scored samples of 200, with skip=111", path, skip=111)
+    files.load(path, **USE, skip=110)  # exactly the ten samples that are needed
 
 
 def test_refused_paths(tmp_path):

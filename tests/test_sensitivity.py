@@ -38,7 +38,9 @@ class Square(nn.Module):
 
 
 def assert_jacobian(J: Tensor, expected: Tensor, tolerance: float = TOLERANCE):
-    assert_close(J, expected, rtol=tolerance, atol=tolerance * float(expected.detach().abs().amax()))
+    assert_close(
+        J, expected, rtol=tolerance, atol=tolerance * float(expected.detach().abs().amax())
+    )
 
 
 def check_zero_start(cell: LFRCell, R: int = 2, T: int = 6):

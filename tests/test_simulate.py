@@ -163,7 +163,9 @@ def test_steady_state_in_single_precision(radius: float):
 def test_unstable_periodic_solution_counts_as_diverged():
     cell = random_cell(1, 1, 2, 0, 0, radius=0.5)
     with torch.no_grad():
-        cell.A[:] = torch.diag(torch.tensor([1.05, 0.5]))  # (I - Φ) is regular, x(T) = x(0) solvable
+        cell.A[:] = torch.diag(
+            torch.tensor([1.05, 0.5])
+        )  # (I - Φ) is regular, x(T) = x(0) solvable
     assert torch.isnan(steady_state(cell, normal(1, 10, 1)).y).all()
 
 

@@ -19,6 +19,7 @@ __all__ = ["load"]
 _TEXT = (".csv", ".tsv", ".txt")
 _DELIMITERS = "\t;,"  # the first of these that the first line has
 _SHORTEST = 10  # scored samples of a part
+_WARM_UP = 0.05  # of the file: default of skip
 
 Columns = str | int | Sequence[str | int]
 Signal = tuple[str, NDArray[np.float64]]  # name, (T, channels)
@@ -32,7 +33,7 @@ def load(
     fs: float | None = None,
     validation: float = 0.2,
     test: float = 0.2,
-    skip: int = 0,
+    skip: int | None = None,
 ) -> Dataset:
     """One measurement, cut in time into a training, a validation and a test record.
 
@@ -41,8 +42,9 @@ def load(
     ``inputs`` and ``outputs`` are column numbers. In a .npz file every array has a name; one of
     shape (T, channels) is several channels.
 
-    Each part is simulated from zero state although the system was in motion where the part
-    begins: let ``skip`` cover that transient.
+    The system was in motion where a part begins, and the simulation starts from zero state: the
+    first ``skip`` samples of each record let that transient decay and are not scored. For
+    validation and test they are the samples before the part, so that nothing of it is lost.
 
     Args:
         path: the file.
@@ -51,7 +53,8 @@ def load(
         fs: sampling frequency in Hz.
         validation: fraction of the samples, those after the training part.
         test: fraction of the samples, those at the end.
-        skip: samples at the beginning of each part that are left out of cost and score.
+        skip: samples at the beginning of each record that are left out of cost and score; 5 % of
+            the file where left out.
 
     Shape:
         u, y of a part: (its samples, inputs), (its samples, outputs), in the file's units.
@@ -81,6 +84,7 @@ def load(
             "name every column once."
         )
     whole = _record(path, signals[: len(u_columns)], signals[len(u_columns) :], fs)
+    skip = round(_WARM_UP * whole.samples) if skip is None else skip
     parts = _split(path, whole.samples, validation, test, skip)
     train, chosen, scored = (
         [replace(whole[window], name=name, skip=skip)] for name, window in parts.items()
@@ -128,7 +132,7 @@ def _record(path: Path, u: list[Signal], y: list[Signal], fs: float) -> Record:
 
 
 def _split(path: Path, samples: int, validation: float, test: float, skip: int) -> dict[str, slice]:
-    """The samples of each part, by the name of its record."""
+    """The samples of each record by its name, the skipped ones included."""
     if not (0 < validation < 1 and 0 < test < 1 and validation + test < 1):
         raise ValueError(
             f"the fractions are validation={validation} and test={test}; both must be above 0 "
@@ -138,16 +142,17 @@ def _split(path: Path, samples: int, validation: float, test: float, skip: int) 
         raise ValueError(f"skip={skip}; give the number of samples to skip, 0 or more.")
     ends = [0, samples - round(samples * validation) - round(samples * test)]
     ends += [samples - round(samples * test), samples]
-    parts = {
-        name: slice(ends[i], ends[i + 1]) for i, name in enumerate(("train", "validation", "test"))
-    }
-    for name, window in parts.items():
-        length = window.stop - window.start
-        if length - skip < _SHORTEST:
+    parts = {}
+    for i, name in enumerate(("train", "validation", "test")):
+        first = max(0, ends[i] - skip)
+        scored = ends[i + 1] - first - skip
+        if scored < _SHORTEST:
             raise ValueError(
-                f"'{path}': the {name} part has {length} of {samples} samples, less skip={skip}; "
-                f"it needs {_SHORTEST}. Change the fractions or skip, or give a longer file."
+                f"'{path}': the {name} part has {scored} scored samples of {samples}, with "
+                f"skip={skip}; it needs {_SHORTEST}. Change the fractions or skip, or give a "
+                "longer file."
             )
+        parts[name] = slice(first, ends[i + 1])
     return parts
 
 

@@ -1,0 +1,234 @@
+"""The best linear approximation: exact on linear data, stable on any, and what it refuses."""
+
+import re
+
+import numpy as np
+import pytest
+import reference
+import scipy.linalg
+from reference import Array, System, random_system
+
+from lfrtorch.bla import LinearModel, data_scaler, estimate_bla
+from lfrtorch.records import Channel, Record, Start
+
+OMEGA = np.linspace(0.01, 3.1, 50)
+U0, Y0 = np.array([3.0, -1.0]), np.array([-7.0, 20.0])
+
+
+def record_of(system: System, start: Start, *, T: int = 400, offset: bool = False) -> Record:
+    """Noise-free record under white noise of zero mean, at rest at the offset before a zero start."""
+    nu, ny = system[3].shape[1], system[3].shape[0]
+    u = np.random.default_rng(0).normal(size=(T, nu))
+    u -= u.mean(axis=0)
+    y = reference.dlsim(system, u) if start == "zero" else reference.periodic_response(system, u)
+    if offset:
+        u, y = u + U0[:nu], y + Y0[:ny]
+    return Record(u, y, 10.0, start)
+
+
+def frf_error(model: LinearModel, system: System) -> float:
+    """Largest error over the frequencies, relative to the largest gain."""
+    G = reference.frf(system, OMEGA)
+    return float(np.abs(model.frf(OMEGA * model.fs / 2 / np.pi) - G).max() / np.abs(G).max())
+
+
+def normalised(model: LinearModel, record: Record) -> System:
+    """The model's matrices between signals of unit deviation."""
+    s = data_scaler([record], offset=True)
+    C, D = model.C / s.y_scale[:, None], model.D / s.y_scale[:, None] * s.u_scale
+    return model.A, model.B * s.u_scale, C, D
+
+
+# --- linear data ----------------------------------------------------------------------------
+
+# The fit is exact, so that what is left is rounding: 1e-14 times the gain of the slowest pole.
+EXACT = 1e-11
+
+
+@pytest.mark.parametrize("start", ["zero", "periodic"])
+@pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 2)])
+@pytest.mark.parametrize("nx", [1, 2, 3, 4, 5, 6])
+def test_linear_system_is_recovered(nx: int, nu: int, ny: int, start: Start):
+    system = random_system(nx, nu, ny)
+    model = estimate_bla(record_of(system, start), nx, offset=False)
+    assert frf_error(model, system) < EXACT
+    assert not model.u_offset.any()
+    assert not model.y_offset.any()
+
+
+@pytest.mark.parametrize("start", ["zero", "periodic"])
+@pytest.mark.parametrize(("nx", "nu", "ny"), [(1, 1, 1), (3, 1, 1), (2, 2, 2)])
+def test_linear_system_is_recovered_with_its_offsets(nx: int, nu: int, ny: int, start: Start):
+    system = random_system(nx, nu, ny)
+    model = estimate_bla(record_of(system, start, offset=True), nx)
+    np.testing.assert_allclose(model.u_offset, U0[:nu], rtol=1e-12)
+    np.testing.assert_allclose(model.y_offset, Y0[:ny], rtol=1e-6)
+    assert frf_error(model, system) < 1e-6
+
+
+def test_records_of_several_lengths_and_starts_are_fitted_together():
+    system = random_system(3)
+    records = [record_of(system, "zero", T=150), record_of(system, "periodic", T=100)]
+    assert frf_error(estimate_bla(records, 3, offset=False), system) < EXACT
+
+
+def test_small_and_large_units_change_nothing():
+    system = random_system(3)
+    record = record_of(system, "periodic", offset=True)
+    scaled = Record(1e6 * record.u, 1e-9 * record.y, record.fs, "periodic")
+    A, B, C, D = system
+    assert frf_error(estimate_bla(scaled, 3), (A, B, 1e-15 * C, 1e-15 * D)) < EXACT
+
+
+# --- any data -------------------------------------------------------------------------------
+
+T = 200
+NOISE = np.random.default_rng(1).normal(size=(2, T))
+TIME = np.arange(T)
+ANY_DATA = {
+    "noise": (NOISE[0], NOISE[1]),
+    "integrator": (NOISE[0], np.cumsum(NOISE[0])),
+    "unstable": (
+        NOISE[0],
+        reference.dlsim((*np.array([[[1.02]], [[1]], [[1]], [[0]]]),), NOISE[0]),
+    ),
+    "gain": (NOISE[0], 2 * NOISE[0]),
+    "delay": (NOISE[0], np.roll(NOISE[0], 3)),
+    "second order": (NOISE[0], reference.dlsim(random_system(2), NOISE[0])),
+    "sine": (np.sin(0.3 * TIME), np.cos(0.3 * TIME)),
+    "oscillator": (NOISE[0], np.sin(0.3 * TIME)),
+    "ramp": (TIME, TIME),
+    "step": (np.minimum(TIME, 1), 1 - 0.9**TIME),
+}
+
+
+@pytest.mark.parametrize("start", ["zero", "periodic"])
+@pytest.mark.parametrize("nx", [1, 2, 4, 6])
+@pytest.mark.parametrize("data", ANY_DATA)
+def test_model_of_any_data_is_stable(data: str, nx: int, start: Start):
+    model = estimate_bla(Record(*ANY_DATA[data], start=start), nx, max_iter=20)
+    assert np.abs(model.poles).max() < 1
+    record = Record(*ANY_DATA[data], start=start)
+    assert np.isfinite(model.simulate(record)).all()
+    # A model without dynamics is among the candidates of every order.
+    assert np.std(record.y - model.simulate(record)) < 1.01 * np.std(record.y)
+
+
+# --- coordinates ----------------------------------------------------------------------------
+
+
+def test_states_have_unit_deviation():
+    record = record_of(random_system(4, 2, 2), "periodic")
+    for coordinates in ("balanced", "given"):
+        model = estimate_bla(record, 4, coordinates=coordinates)
+        # y = x: the states as outputs
+        n = len(model.A)
+        states = reference.periodic_response(
+            (model.A, model.B, np.eye(n), np.zeros((n, 2))), record.u - model.u_offset
+        )
+        np.testing.assert_allclose(states.std(axis=0), np.ones(4), rtol=1e-9)
+
+
+def test_balanced_gramians_are_diagonal_and_alike():
+    record = record_of(random_system(5, 2, 2), "periodic")
+    A, B, C, _ = normalised(estimate_bla(record, 5), record)
+    P = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
+    Q = scipy.linalg.solve_discrete_lyapunov(A.T, C.T @ C)
+    for gramian in (P, Q):
+        correlation = gramian / np.sqrt(np.outer(np.diag(gramian), np.diag(gramian)))
+        np.testing.assert_allclose(correlation, np.eye(5), atol=1e-8)
+    hankel = np.sqrt(np.diag(P) * np.diag(Q))  # the scaling of the states cancels
+    assert np.all(np.diff(hankel) < 0)
+    np.testing.assert_allclose(hankel**2, np.sort(np.linalg.eigvals(P @ Q).real)[::-1], rtol=1e-8)
+
+
+def test_given_coordinates_have_the_same_response():
+    record = record_of(random_system(3), "periodic")
+    balanced, given = estimate_bla(record, 3), estimate_bla(record, 3, coordinates="given")
+    np.testing.assert_allclose(given.frf(OMEGA), balanced.frf(OMEGA), atol=1e-9)
+
+
+# --- the linear model -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def model() -> LinearModel:
+    channels = (Channel("u1"), Channel("u2")), (Channel("y1"), Channel("y2"))
+    return LinearModel(*random_system(3, 2, 2), 10.0, U0, Y0, *channels)
+
+
+def system_of(model: LinearModel) -> System:
+    return model.A, model.B, model.C, model.D
+
+
+def some_input(T: int = 300) -> Array:
+    return np.random.default_rng(5).normal(size=(T, 2))
+
+
+def test_simulation_from_zero_is_dlsim(model: LinearModel):
+    u = some_input()
+    record = Record(u + U0, u, 10.0)
+    expected = reference.dlsim(system_of(model), u) + Y0
+    np.testing.assert_allclose(model.simulate(record), expected, rtol=0, atol=1e-10)
+
+
+def test_periodic_simulation_is_the_response_in_frequency(model: LinearModel):
+    u = some_input()
+    record = Record(u + U0, u, 10.0, "periodic")
+    expected = reference.periodic_response(system_of(model), u) + Y0
+    np.testing.assert_allclose(model.simulate(record), expected, rtol=0, atol=1e-8)
+
+
+def test_frequency_response_is_its_formula(model: LinearModel):
+    G = model.frf(OMEGA * 10.0 / 2 / np.pi)
+    assert G.shape == (50, 2, 2)
+    np.testing.assert_allclose(G, reference.frf(system_of(model), OMEGA), rtol=0, atol=1e-12)
+
+
+def test_transformed_model_is_the_same_system(model: LinearModel):
+    T = np.random.default_rng(3).normal(size=(3, 3))
+    other = model.transformed(T)
+    np.testing.assert_allclose(other.A @ T, T @ model.A, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(other.frf(OMEGA), model.frf(OMEGA), rtol=0, atol=1e-9)
+
+
+def test_poles_are_the_eigenvalues(model: LinearModel):
+    np.testing.assert_allclose(np.poly(model.poles), np.poly(model.A), atol=1e-12)
+
+
+# --- refusals -------------------------------------------------------------------------------
+
+
+def refused(message: str, record: Record, nx: int = 2, **options):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        estimate_bla(record, nx, **options)
+
+
+def test_constant_signals_are_named():
+    u, y = some_input(100).T
+    channels = {"inputs": (Channel("force"), Channel("valve")), "outputs": (Channel("speed"),)}
+    refused("signal 'valve' is constant in all", Record(np.c_[u, 0 * u + 3], y, **channels))
+    refused("signal 'speed' is constant in all", Record(np.c_[u, y], 0 * y, **channels))
+
+
+def test_record_that_is_too_short():
+    u = some_input(35)[:, 0]  # 2 · 2 (nx + 1) (nu + ny + 1) = 36
+    refused(
+        "has 35 samples; order nx=2 with 1 input(s) and 1 output(s) needs at least 36", Record(u, u)
+    )
+    u = some_input(36)[:, 0]
+    assert np.abs(estimate_bla(Record(u, u), 2).poles).max() < 1
+
+
+@pytest.mark.parametrize("nx", [0, -1])
+def test_order(nx: int):
+    refused(f"nx is {nx}; a state-space model needs", record_of(random_system(1), "zero"), nx)
+
+
+def test_coordinates():
+    refused(
+        "coordinates is 'modal'; use 'balanced' or 'given'.",
+        record_of(random_system(1), "zero"),
+        1,
+        coordinates="modal",
+    )

@@ -1,0 +1,255 @@
+"""Saved and loaded to the same bits; everything else is refused with nothing lost."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from reference import random_cell, random_model
+from torch import Tensor, nn
+
+from lfrtorch import checkpoint
+from lfrtorch.model import Model, load
+from lfrtorch.nonlinearity import Network
+from lfrtorch.records import Channel
+
+U = np.random.default_rng(0).normal(size=(50, 2))
+
+
+class Cubic(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.c = nn.Parameter(torch.zeros(1, 2))
+
+    def forward(self, z: Tensor) -> Tensor:
+        return z.tanh() ** 3 @ self.c.mT
+
+
+class Halved(Network):
+    """A user's own class that begins with the package's."""
+
+    def forward(self, z: Tensor) -> Tensor:
+        return 0.5 * super().forward(z)
+
+
+def small(**options) -> Model:
+    return random_model(random_cell(2, 2, 3, 2, 1, 4, **options), fs=1 / 3)
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    return small().save(tmp_path / "saved")
+
+
+def edit(folder: Path, **changes):
+    """Change entries of the description; ``None`` takes one out."""
+    description = json.loads((folder / "model.json").read_text()) | changes
+    kept = {key: value for key, value in description.items() if value is not None}
+    (folder / "model.json").write_text(json.dumps(kept))
+
+
+def refused(folder: Path, message: str):
+    with pytest.raises(ValueError, match=re.escape(message)) as refusal:
+        load(folder)
+    assert folder.name in str(refusal.value)
+
+
+# --- there and back -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_the_same_bits_come_back(tmp_path: Path, activation: str, dtype: torch.dtype):
+    model = small(activation=activation, dtype=dtype)
+    back = load(model.save(tmp_path / "saved"))
+    mine, other = model.lfr.state_dict(), back.lfr.state_dict()
+    assert mine.keys() == other.keys()
+    assert all(torch.equal(mine[name], other[name]) for name in mine)
+    assert {p.dtype for p in back.lfr.parameters()} == {dtype}
+    for name in ("u_offset", "u_scale", "y_offset", "y_scale"):
+        assert np.array_equal(getattr(model.scaler, name), getattr(back.scaler, name))
+    assert (back.fs, back.inputs, back.outputs) == (model.fs, model.inputs, model.outputs)
+    assert isinstance(back.outputs[0], Channel)
+    for start in ("zero", "periodic"):
+        assert np.array_equal(model.simulate(U, start=start), back.simulate(U, start=start))
+
+
+def test_linear_model_comes_back(tmp_path: Path):
+    model = random_model(random_cell(2, 1, 3, 0, 0))
+    back = load(model.save(tmp_path / "saved"))
+    assert back.lfr.cell.static is None
+    assert np.array_equal(model.simulate(U), back.simulate(U))
+
+
+def test_the_folder_of_a_run_will_do(tmp_path: Path):
+    model = small()
+    model.save(tmp_path / "run" / "model")
+    assert np.array_equal(load(tmp_path / "run").simulate(U), model.simulate(U))
+
+
+def test_a_string_will_do(tmp_path: Path):
+    model = small()
+    model.save(str(tmp_path / "saved"))
+    assert np.array_equal(load(str(tmp_path / "saved")).simulate(U), model.simulate(U))
+
+
+# --- a user's own static map ----------------------------------------------------------------
+
+
+def test_own_map_is_filled_with_the_saved_weights(tmp_path: Path):
+    model = small(static=Cubic())
+    folder = model.save(tmp_path / "saved")
+    back = load(folder, static=Cubic().double())
+    assert np.array_equal(back.simulate(U), model.simulate(U))
+
+
+def test_own_map_is_asked_for(tmp_path: Path):
+    folder = small(static=Cubic()).save(tmp_path / "saved")
+    refused(folder, "class Cubic, which is not part of this package; pass an instance of it: load(")
+
+
+def test_own_map_that_does_not_fit(tmp_path: Path):
+    folder = small(static=Cubic()).save(tmp_path / "saved")
+    with pytest.raises(ValueError, match="its description and weights do not fit"):
+        load(folder, static=nn.Linear(2, 1))
+
+
+def test_own_map_keeps_its_double_precision(tmp_path: Path):
+    model = small(static=Cubic())
+    back = load(model.save(tmp_path / "saved"), static=Cubic())  # built in torch's single precision
+    assert np.array_equal(back.simulate(U), model.simulate(U))
+
+
+def test_own_class_derived_from_the_network_is_not_the_network(tmp_path: Path):
+    model = small(static=Halved(2, 1, 4))
+    folder = model.save(tmp_path / "saved")
+    refused(folder, "class Halved, which is not part of this package")
+    back = load(folder, static=Halved(2, 1, 4, dtype=torch.float64))
+    assert np.array_equal(back.simulate(U), model.simulate(U))
+
+
+def test_own_class_that_is_called_like_the_network(tmp_path: Path):
+    own = type("Network", (Cubic,), {})
+    model = small(static=own())
+    back = load(model.save(tmp_path / "saved"), static=own().double())
+    assert np.array_equal(back.simulate(U), model.simulate(U))
+
+
+# --- refusals of load -----------------------------------------------------------------------
+
+
+def test_no_checkpoint(tmp_path: Path):
+    refused(tmp_path / "nowhere", "is not a checkpoint: no model.json")
+    refused(tmp_path, "is not a checkpoint")
+
+
+@pytest.mark.parametrize("text", [b"", b'{"format": "lfrt', b"\xff\xfe\x00", b"{]"])
+def test_damaged_description(saved: Path, text: bytes):
+    (saved / "model.json").write_bytes(text)
+    refused(saved, "is damaged")
+
+
+@pytest.mark.parametrize("text", ["[]", "null", "{}", '{"format": "other", "version": 1}'])
+def test_description_of_another_program(saved: Path, text: str):
+    (saved / "model.json").write_text(text)
+    refused(saved, "was not written by lfrtorch")
+
+
+def test_newer_version(saved: Path):
+    edit(saved, version=checkpoint.VERSION + 1)
+    refused(saved, f"has checkpoint version {checkpoint.VERSION + 1} and this program reads up to")
+
+
+def test_version_that_is_missing(saved: Path):
+    edit(saved, version=None)
+    refused(saved, "has checkpoint version None")
+
+
+@pytest.mark.parametrize("entry", ["sizes", "static", "dtype", "fs", "inputs", "outputs"])
+def test_description_that_lacks_an_entry(saved: Path, entry: str):
+    edit(saved, **{entry: None})
+    refused(saved, "is damaged")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sizes": {"nu": 2, "ny": 2, "nx": 4, "nz": 2, "nw": 1}},
+        {"sizes": {"nu": 2, "ny": 2, "nx": "3", "nz": 2, "nw": 1}},
+        {"sizes": {"nu": 2}},
+        {"static": {"type": "Network", "nn": 5, "activation": "tanh"}},
+        {"static": {"type": "Network"}},
+        {"dtype": "float65"},
+        {"fs": []},
+        {"inputs": [{"label": "u"}]},
+    ],
+)
+def test_description_that_does_not_fit_the_weights(saved: Path, change: dict):
+    edit(saved, **change)
+    refused(saved, "its description and weights do not fit")
+
+
+@pytest.mark.parametrize("kept", [0, 4, 0.5, 0.99])
+def test_truncated_weights(saved: Path, kept: float):
+    file = saved / "weights.safetensors"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(kept if kept > 1 else kept * len(whole))])
+    refused(saved, "is damaged or missing")
+
+
+def test_missing_weights(saved: Path):
+    (saved / "weights.safetensors").unlink()
+    refused(saved, "is damaged or missing")
+
+
+# --- refusals of save -----------------------------------------------------------------------
+
+
+def test_foreign_folder_is_left_alone(tmp_path: Path):
+    (tmp_path / "thesis.txt").write_text("three years")
+    with pytest.raises(ValueError, match="exists and is not a checkpoint; choose another folder"):
+        small().save(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+    assert (tmp_path / "thesis.txt").read_text() == "three years"
+
+
+def test_file_is_left_alone(tmp_path: Path):
+    (tmp_path / "saved").write_text("three years")
+    with pytest.raises(ValueError, match="exists and is not a checkpoint"):
+        small().save(tmp_path / "saved")
+    assert (tmp_path / "saved").read_text() == "three years"
+
+
+def test_empty_folder_is_taken(tmp_path: Path):
+    (tmp_path / "saved").mkdir()
+    assert np.array_equal(load(small().save(tmp_path / "saved")).simulate(U), small().simulate(U))
+
+
+def test_old_checkpoint_is_replaced(saved: Path):
+    newer = small(seed=1)
+    newer.save(saved)
+    assert np.array_equal(load(saved).simulate(U), newer.simulate(U))
+    assert [p.name for p in saved.parent.iterdir()] == ["saved"]
+    assert sorted(p.name for p in saved.iterdir()) == ["model.json", "weights.safetensors"]
+
+
+def test_link_to_a_checkpoint_is_replaced(saved: Path):
+    link = saved.with_name("latest")
+    link.symlink_to(saved)
+    newer = small(seed=1)
+    newer.save(link)
+    assert np.array_equal(load(link).simulate(U), newer.simulate(U))
+    assert sorted(p.name for p in saved.parent.iterdir()) == ["latest", "saved"]
+
+
+def test_save_that_fails_keeps_the_old_checkpoint(saved: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(*_):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(checkpoint, "save_file", full)
+    with pytest.raises(OSError, match="no space left"):
+        small(seed=1).save(saved)
+    assert np.array_equal(load(saved).simulate(U), small().simulate(U))
+    assert [p.name for p in saved.parent.iterdir()] == ["saved"]

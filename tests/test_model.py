@@ -1,0 +1,170 @@
+"""The identified model: gauge invariance, parameter counts, and what simulate refuses."""
+
+import re
+
+import numpy as np
+import pytest
+import reference
+import torch
+from reference import measure, normal, random_cell, random_model
+from torch import Tensor
+from torch.testing import assert_close
+
+from lfrtorch.cell import LFRCell
+from lfrtorch.model import Model
+from lfrtorch.nonlinearity import Network
+from lfrtorch.records import Record
+from lfrtorch.sensitivity import output_jacobian
+from lfrtorch.simulate import simulate, steady_state
+
+# --- coordinates that do not matter ---------------------------------------------------------
+
+
+def state(cell: LFRCell, T: Tensor) -> dict[str, Tensor]:
+    """x -> T x."""
+    inverse = torch.linalg.inv(T)
+    return {
+        "A": T @ cell.A @ inverse, "Bu": T @ cell.Bu, "Bw": T @ cell.Bw,
+        "Cz": cell.Cz @ inverse, "Cy": cell.Cy @ inverse,
+    }  # fmt: skip
+
+
+def input_of_the_map(cell: LFRCell, T: Tensor) -> dict[str, Tensor]:
+    """z -> T z."""
+    assert isinstance(cell.static, Network)
+    Wz = cell.static.Wz @ torch.linalg.inv(T)
+    return {"Cz": T @ cell.Cz, "Dzu": T @ cell.Dzu, "static.Wz": Wz}
+
+
+def output_of_the_map(cell: LFRCell, T: Tensor) -> dict[str, Tensor]:
+    """w -> T w."""
+    assert isinstance(cell.static, Network)
+    inverse, static = torch.linalg.inv(T), cell.static
+    return {
+        "Bw": cell.Bw @ inverse, "Dyw": cell.Dyw @ inverse,
+        "static.Ww": T @ static.Ww, "static.bw": T @ static.bw,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("transform", [state, input_of_the_map, output_of_the_map])
+def test_output_does_not_depend_on_coordinates(transform):
+    cell = random_cell(2, 2, 3, 3, 3, 4)
+    u, zero = normal(1, 100, 2), torch.zeros(1, 3, dtype=torch.float64)
+    before = simulate(cell, u, zero).y, steady_state(cell, u).y
+    T = normal(3, 3, seed=5)
+    with torch.no_grad():
+        for name, value in transform(cell, T).items():
+            cell.get_parameter(name).copy_(value)
+    # eps κ(T)² is about 1e-14; the steady state is known to 1e-10 / (1 - 0.9^100).
+    assert_close(simulate(cell, u, zero).y, before[0], rtol=1e-9, atol=1e-9)
+    assert_close(steady_state(cell, u).y, before[1], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("nu", "ny", "nx", "nz", "nw", "nn"),
+    [(1, 1, 3, 2, 1, 5), (1, 1, 2, 1, 2, 4), (1, 1, 2, 2, 3, 4), (2, 2, 2, 1, 1, 3)],
+)
+def test_net_parameters_are_the_rank_of_the_periodic_jacobian(nu, ny, nx, nz, nw, nn):
+    cell = random_cell(nu, ny, nx, nz, nw, nn)
+    model = random_model(cell)
+    linear = nx * (nx + nu + nw) + nz * (nx + nu) + ny * (nx + nu + nw)
+    assert model.parameters == linear + nn * (nz + 1 + nw) + nw
+    u = normal(1, 500, nu)
+    J = output_jacobian(cell, u, steady_state(cell, u), periodic=True).flatten(0, 2)
+    s = torch.linalg.svdvals(J / J.norm(dim=0))
+    assert model.parameters_net == int((s > 1e-12 * s[0]).sum())
+
+
+def test_net_parameters_of_a_linear_model():
+    model = random_model(random_cell(2, 1, 3, 0, 0))
+    assert model.parameters == 3 * 3 + 3 * 2 + 3 + 2
+    assert model.parameters_net == 3 * 2 + 3 + 2
+    assert model.sizes == {"nx": 3, "nz": 0, "nw": 0, "nn": 0}
+
+
+# --- simulation in physical units -----------------------------------------------------------
+
+
+@pytest.fixture
+def model() -> Model:
+    return random_model(random_cell(2, 2, 3, 2, 1, 4))
+
+
+def test_scaling_stands_at_the_two_ends(model: Model):
+    u = np.random.default_rng(0).normal(size=(30, 2))
+    s = model.scaler
+    cell, zero = model.lfr.cell, torch.zeros(1, 3, dtype=torch.float64)
+    inside = reference.simulate(cell, torch.tensor((u - s.u_offset) / s.u_scale)[None], zero)
+    expected = inside.y[0].numpy() * s.y_scale + s.y_offset
+    np.testing.assert_allclose(model.simulate(u), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_record_is_simulated_from_its_own_start(model: Model):
+    for start in ("zero", "periodic"):
+        record = measure(model, 40, start=start)
+        assert np.array_equal(model.simulate(record), model.simulate(record.u, start=start))
+    periodic = measure(model, 40, start="periodic")
+    assert not np.allclose(model.simulate(periodic), model.simulate(periodic, start="zero"))
+
+
+def test_start_state_is_carried(model: Model):
+    u = np.random.default_rng(0).normal(size=(30, 2))
+    normalised = torch.tensor(model.scaler.normalise_u(u))[None]
+    middle = model.lfr.trajectory(normalised).x[0, 20]
+    second = model.simulate(u[20:], x0=middle.numpy())
+    np.testing.assert_allclose(second, model.simulate(u)[20:], rtol=0, atol=1e-13)
+
+
+def test_one_input_may_be_one_dimensional():
+    model = random_model(random_cell())
+    u = np.sin(np.arange(20))
+    assert np.array_equal(model.simulate(u), model.simulate(u[:, None]))
+
+
+def test_a_single_sample_is_enough(model: Model):
+    assert model.simulate(np.ones((2, 2)))[:1] == pytest.approx(model.simulate(np.ones((1, 2))))
+
+
+def test_single_precision_model_gives_double_precision_output():
+    model = random_model(random_cell(dtype=torch.float32))
+    y = model.simulate(np.sin(np.arange(20)))
+    assert y.dtype == np.float64
+    double = random_model(random_cell()).simulate(np.sin(np.arange(20)))
+    np.testing.assert_allclose(y, double, rtol=0, atol=1e-5)  # some eps of single precision
+
+
+# --- refusals -------------------------------------------------------------------------------
+
+
+def refused(model: Model, message: str, *data, **options):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        model.simulate(*data, **options)
+
+
+def test_number_of_inputs(model: Model):
+    refused(model, "has 1 input(s) and the model 2 (u1, u2); give a column for each", np.ones(9))
+    record = Record(np.ones((9, 3)), np.ones(9), model.fs, name="lab")
+    refused(model, "record 'lab' has 3 input(s)", record)
+
+
+def test_sampling_frequency(model: Model):
+    record = Record(np.ones((9, 2)), np.ones((9, 2)), 50.0, name="lab")
+    refused(model, "record 'lab' is sampled at 50.0 Hz and the model at 100.0 Hz; resam", record)
+
+
+def test_size_of_the_start_state(model: Model):
+    refused(model, "x0 has 2 entries; the model has 3.", np.ones((9, 2)), x0=np.zeros(2))
+
+
+def test_input_that_is_not_finite(model: Model):
+    u = np.ones((9, 2))
+    u[3, 1] = np.nan
+    refused(model, "input 'u2' has 1 NaN or infinite sample(s), the first at index 3", u)
+
+
+def test_unknown_start(model: Model):
+    refused(model, "start is 'steady'", np.ones((9, 2)), start="steady")
+
+
+def test_input_without_a_time_axis(model: Model):
+    refused(model, "shape ()", 3.0)

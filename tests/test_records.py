@@ -1,0 +1,169 @@
+"""What a record takes, what it refuses, and the scaling of its signals."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from lfrtorch.records import Channel, Record, Scaler, as_records, rms_scale
+
+U, Y = np.linspace(-1, 1, 20).reshape(10, 2), np.linspace(3, 4, 10)
+
+
+def refused(message: str, **given):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Record(**{"u": U, "y": Y, "name": "lab"} | given)
+
+
+# --- what it takes --------------------------------------------------------------------------
+
+
+def test_one_dimensional_array_is_one_channel():
+    record = Record([1, 2, 3], (4, 5, 6))
+    assert record.u.shape == record.y.shape == (3, 1)
+    assert record.u.dtype == np.float64
+    assert record.samples == 3
+
+
+def test_defaults():
+    record = Record(U, Y)
+    assert (record.fs, record.start, record.skip, record.source) == (1.0, "zero", 0, "file")
+    assert record.inputs == (Channel("u1"), Channel("u2"))
+    assert record.outputs == (Channel("y"),)
+
+
+def test_channels_are_named_with_their_units():
+    record = Record(U, Y, inputs=(Channel("force", "N"), Channel("valve")))
+    assert [str(c) for c in record.inputs] == ["force (N)", "valve"]
+
+
+def test_arrays_are_frozen_copies():
+    u, y = U.copy(), Y.copy()
+    record = Record(u, y)
+    u[0], y[0] = 99.0, 99.0  # the caller's arrays stay writable
+    assert np.array_equal(record.u, U)
+    assert np.array_equal(record.y[:, 0], Y)
+    for signal in (record.u, record.y):
+        with pytest.raises(ValueError, match="read-only"):
+            signal[0] = 1.0
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        record.fs = 2.0  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize("dtype", [bool, np.int16, np.uint8, np.float32])
+def test_any_real_type_becomes_float64(dtype):
+    record = Record(np.ones(4, dtype), np.ones(4, dtype))
+    assert record.u.dtype == np.float64
+    assert np.array_equal(record.u, np.ones((4, 1)))
+
+
+def test_slice_is_a_record_from_zero_with_nothing_skipped():
+    inputs = (Channel("a", "V"), Channel("b", "V"))
+    record = Record(U, Y, 50.0, "periodic", 3, "lab", "official", inputs)
+    part = record[2:7]
+    assert np.array_equal(part.u, U[2:7])
+    assert np.array_equal(part.y[:, 0], Y[2:7])
+    assert (part.start, part.skip) == ("zero", 0)
+    kept = (part.fs, part.name, part.source, part.inputs, part.outputs)
+    assert kept == (50.0, "lab", "official", inputs, record.outputs)
+
+
+# --- what it refuses ------------------------------------------------------------------------
+
+
+def test_different_lengths():
+    refused("record 'lab': the input has 10 samples and the output 9;", y=Y[:9])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_samples_that_are_not_finite(bad: float):
+    u = U.copy()
+    u[4:6, 1] = bad
+    refused("input 'u2' has 2 NaN or infinite sample(s), the first at index 4;", u=u)
+    y = Y.copy()
+    y[7] = bad
+    refused("output 'force' has 1 NaN", y=y, outputs=(Channel("force"),))
+
+
+@pytest.mark.parametrize("fs", [0.0, -1.0, np.nan, np.inf])
+def test_sampling_frequency(fs: float):
+    refused("record 'lab': the sampling frequency is", fs=fs)
+
+
+def test_unknown_start():
+    refused("record 'lab': start is 'steady'; use 'zero' or 'periodic'.", start="steady")
+
+
+@pytest.mark.parametrize("skip", [-1, 10, 11])
+def test_skip_that_leaves_nothing(skip: int):
+    refused(f"record 'lab': skip={skip} leaves no sample of 10;", skip=skip)
+
+
+def test_rows_and_columns_exchanged():
+    refused("record 'lab': input has shape (2, 10): more channels than samples.", u=U.T)
+
+
+@pytest.mark.parametrize("shape", [(), (10, 1, 1)])
+def test_number_of_axes(shape: tuple[int, ...]):
+    refused(f"record 'lab': input has shape {shape};", u=np.ones(shape))
+
+
+@pytest.mark.parametrize("empty", [[], np.ones((0, 1)), np.ones((10, 0))])
+def test_nothing_at_all(empty):
+    refused("record 'lab': input is empty", u=empty)
+
+
+def test_empty_slice():
+    with pytest.raises(ValueError, match="is empty"):
+        Record(U, Y)[5:5]
+
+
+@pytest.mark.parametrize("dtype", [complex, object, str])
+def test_numbers_that_are_not_real(dtype):
+    refused("record 'lab': input has type", u=U.astype(dtype))
+
+
+def test_channel_names_that_do_not_fit():
+    refused("u has 2 column(s) but 1 channel name(s) were given;", inputs=(Channel("force"),))
+
+
+# --- several records ------------------------------------------------------------------------
+
+
+def test_one_record_is_a_list_of_one():
+    record = Record(U, Y)
+    assert as_records(record) == [record]
+    assert as_records((record, record)) == [record, record]
+
+
+def test_no_record():
+    with pytest.raises(ValueError, match="no record given"):
+        as_records([])
+
+
+def test_records_of_different_channels():
+    others = Record(Y, Y, name="a"), Record(U, U, name="b")
+    for other in others:
+        with pytest.raises(ValueError, match=f"records 'lab' and '{other.name}' differ in chan"):
+            as_records([Record(U, Y, name="lab"), other])
+
+
+def test_records_of_different_rates():
+    with pytest.raises(ValueError, match=r"'a' and 'b' are sampled at 1\.0 and 2\.0 Hz; resample"):
+        as_records([Record(U, Y, name="a"), Record(U, Y, 2.0, name="b")])
+
+
+# --- scaling --------------------------------------------------------------------------------
+
+
+def test_scaler_maps_to_offset_and_scale_and_back():
+    scaler = Scaler(np.array([1.0, 2.0]), np.array([2.0, 4.0]), np.array([-1.0]), np.array([0.5]))
+    assert np.array_equal(scaler.normalise_u(np.array([[3.0, 2.0]])), [[1.0, 0.0]])
+    assert np.array_equal(scaler.normalise_y(np.array([[0.0]])), [[2.0]])
+    assert np.array_equal(scaler.restore_y(np.array([[2.0]])), [[0.0]])
+
+
+def test_rms_scale_is_about_the_offset_and_1_for_a_constant_channel():
+    signals = [np.array([[4.0, 7.0], [-2.0, 7.0]]), np.array([[1.0, 7.0]])]
+    assert np.allclose(rms_scale(signals, np.array([1.0, 7.0])), [np.sqrt(6.0), 1.0])

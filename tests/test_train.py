@@ -1,0 +1,182 @@
+"""The command line: every configuration runs, and user errors are messages without a traceback."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_object, instantiate
+
+import lfrtorch
+import train
+
+ROOT = Path(__file__).resolve().parents[1]
+CONF = ROOT / "conf"
+BENCHES = sorted(path.stem for path in (CONF / "bench").glob("*.yaml"))
+
+
+def configuration(*overrides: str):
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        return compose("config", list(overrides))
+
+
+def command(*overrides: str, folder: Path) -> list[str]:
+    return [sys.executable, str(ROOT / "train.py"), f"hydra.run.dir='{folder}'", *overrides]
+
+
+def run(*overrides: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(*overrides, folder=folder), capture_output=True, text=True, check=False, cwd=folder
+    )
+
+
+@pytest.fixture(scope="module")
+def csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short record of a saturating first-order system with offsets."""
+    rng = np.random.default_rng(0)
+    u = 2.0 + rng.standard_normal(600)
+    x, y = 0.0, []
+    for u_k in u:
+        y.append(5.0 + np.tanh(x))
+        x = 0.7 * x + 0.4 * (u_k - 2.0)
+    path = tmp_path_factory.mktemp("csv") / "x.csv"
+    rows = "\n".join(f"{a:.17g},{b:.17g}" for a, b in zip(u, y, strict=True))
+    path.write_text(f"u,y\n{rows}\n")
+    return path
+
+
+def file_overrides(csv: Path) -> list[str]:
+    return ["data=file", f"data.path={csv}", "data.inputs=[u]", "data.outputs=[y]", "data.fs=10"]
+
+
+@pytest.mark.parametrize("bench", BENCHES)
+@pytest.mark.parametrize(
+    "choice", ["init=zero_output trainer.max_iter=2", "init=paper trainer=adam trainer.epochs=2"]
+)
+def test_every_bench_runs_two_iterations(bench: str, choice: str, tmp_path: Path):
+    cfg = configuration(f"+bench={bench}", *choice.split())
+    train.identify(cfg, tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["fit"]["iterations"] == 2
+    for score in metrics["scores"].values():
+        assert 0 < score["rmse"] < np.inf
+        assert score["source"] in ("official", "simulated")
+
+
+@pytest.mark.parametrize("group", ["bla", "data", "init", "trainer"])
+def test_every_option_of_a_group_is_an_argument_of_its_target(group: str):
+    for path in (CONF / group).glob("*.yaml"):
+        node = configuration("+bench=boucwen", f"{group}={path.stem}")[group]
+        parameters = inspect.signature(get_object(node["_target_"])).parameters
+        assert set(node) - {"_target_"} <= set(parameters)
+
+
+def test_the_paper_cases_are_one_override():
+    for nz, nw in ((1, 1), (2, 1), (2, 2)):
+        cfg = configuration("+bench=boucwen", f"nz={nz}", f"nw={nw}")
+        assert (cfg.init.nz, cfg.init.nw, cfg.init.nn) == (nz, nw, 15)
+
+
+def test_run_writes_its_folder_and_the_checkpoint_simulates(csv: Path, tmp_path: Path):
+    done = run(*file_overrides(csv), "nx=1", "trainer.max_iter=20", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for name in ("metrics.json", "config.yaml", "model/model.json", "figures/test.png"):
+        assert (tmp_path / name).is_file()
+    assert list(tmp_path.glob("events.out.tfevents.*"))
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    score = metrics["scores"]["test"]
+    assert score["source"] == "file"
+    assert score["rmse"] < 0.2 * score["lti_rmse"]  # the saturation is found
+
+    cfg = configuration(*file_overrides(csv), "nx=1")
+    test = instantiate(cfg.data).tests[0]
+    model = lfrtorch.load(tmp_path)
+    assert lfrtorch.rmse(test, model.simulate(test)) == pytest.approx(score["rmse"], rel=1e-12)
+    assert [c.name for c in model.inputs + model.outputs] == ["u", "y"]
+
+
+def test_init_from_continues_where_the_run_ended(csv: Path, tmp_path: Path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+    arguments = [*file_overrides(csv), "nx=1"]
+    train.identify(configuration(*arguments, "trainer.max_iter=5"), first)
+    validation = train.identify(
+        configuration(*arguments, f"init_from={first}", "trainer.max_iter=0"), second
+    )
+    before = json.loads((first / "metrics.json").read_text())["validation"]["rmse"]
+    assert validation == pytest.approx(before, rel=1e-12)
+
+
+def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
+    with subprocess.Popen(
+        command(
+            "+bench=boucwen", "trainer.max_iter=100000", "trainer.patience=100000", folder=tmp_path
+        ),
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.lstrip().startswith("10/"):
+                break
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        rest = process.stdout.read()
+        assert process.wait(timeout=60) == 0
+    assert "interrupted" in rest
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["fit"]["reason"] == "interrupted"
+    assert metrics["scores"]["sweep"]["rmse"] < metrics["scores"]["sweep"]["lti_rmse"]
+    assert lfrtorch.load(tmp_path).sizes["nx"] == 3
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([], "no data chosen"),
+        (["+bench=nonsense"], "nonsense"),
+        (["+bench=boucwen", "nz=0"], "nz is 0"),
+        (["+bench=boucwen", "init.method=magic"], "init method is 'magic'"),
+        (["+bench=boucwen", "activation=softsign"], "activation is 'softsign'"),
+        (["+bench=boucwen", "trainer.speed=3"], "speed"),
+        (["+bench=boucwen", "trainer.damping=-1"], "damping is -1"),
+        (["+bench=boucwen", "bla.coordinates=polar"], "coordinates is 'polar'"),
+        (["+bench=boucwen", "data.root=/nowhere"], "/nowhere"),
+        (["+bench=boucwen", "data.samples=ten"], "samples"),
+        (["+bench=boucwen", "init_from=/nowhere"], "'/nowhere' is not a checkpoint"),
+        (["+bench=boucwen", "ridge=-1"], "ridge is -1"),
+        (["data=file", "data.path=/nowhere.csv", "nx=1"], "data.inputs"),
+    ],
+)
+def test_user_errors_are_one_message(
+    overrides: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.setattr(sys, "argv", ["train.py", f"hydra.run.dir='{tmp_path}'", *overrides])
+    with pytest.raises(SystemExit) as stop:
+        train.main()
+    printed = capsys.readouterr()
+    assert stop.value.code == 1
+    assert message in printed.err
+    assert "Traceback" not in printed.err + printed.out
+
+
+def test_missing_order_is_one_message_and_exit_code_1(csv: Path, tmp_path: Path):
+    done = run(*file_overrides(csv), folder=tmp_path)
+    assert done.returncode == 1
+    assert "nx, the number of states, is not set" in done.stderr
+    assert "Traceback" not in done.stderr + done.stdout
