@@ -24,7 +24,6 @@ from lfrtorch import plots, report
 from lfrtorch.datasets import Dataset
 from lfrtorch.monitor import ProgressLine, TensorBoard
 
-
 CONF = Path(__file__).resolve().parent / "conf"
 
 

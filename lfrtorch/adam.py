@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -66,7 +67,7 @@ class Adam:
         parameter = torch.nn.Parameter(state.theta.clone())
         optimiser = torch.optim.Adam([parameter], lr=self.learning_rate)
         if state.moments:
-            optimiser.load_state_dict(state.moments)
+            optimiser.load_state_dict(copy.deepcopy(state.moments))
         parameter.grad = state.gradient
         optimiser.step()
         theta = parameter.detach()

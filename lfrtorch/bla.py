@@ -24,8 +24,11 @@ Array = NDArray[np.float64]
 HORIZONS = (2, 3, 5, 10)
 """Block rows of the subspace start in multiples of nx + 1; the best in simulation is kept."""
 
-STABLE_RADIUS = 0.999
-"""Radius that a pole on the unit circle is moved to."""
+LARGEST_POLE = 1.0 - 1e-6
+"""Radius that no pole reaches: the margin keeps a model stable when its coordinates change."""
+
+MOVED_POLE = 0.999
+"""Largest radius that an unstable pole of the subspace start is moved to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +130,8 @@ def estimate_bla(
     scaler = data_scaler(data, offset=offset)
 
     starts = [
-        _with_input_matrices(A, C, data, scaler) for A, C in _subspace_estimates(data, scaler, nx)
+        _with_input_matrices(A, C, data, scaler, offset=offset)
+        for A, C in _subspace_estimates(data, scaler, nx)
     ]
     cost, cell = min(starts, key=lambda start: start[0])
     if not np.isfinite(cost):
@@ -136,7 +140,7 @@ def estimate_bla(
             "try a lower nx or a longer record."
         )
     _to_unit_variance(cell, data, scaler, balanced=True)
-    _refine(cell, data, scaler, max_iter)
+    _refine(cell, data, scaler, max_iter, offset=offset)
     _to_unit_variance(cell, data, scaler, balanced=coordinates == "balanced")
 
     A, B, C, D = (m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu))
@@ -153,7 +157,7 @@ def estimate_bla(
     )
     if not offset:
         return model
-    # What is left of the mean once the transients are modelled belongs to the operating point.
+    # The constant that the fit took off.
     errors = [(r.y - model.simulate(r))[r.skip :] for r in data]
     return replace(model, y_offset=model.y_offset + np.concatenate(errors).mean(axis=0))
 
@@ -232,15 +236,14 @@ def _hankel(signal: Array, rows: int) -> Array:
 
 
 def _stabilised(A: Array) -> Array:
-    """A with eigenvalues outside the unit circle reflected into it, those on it moved inside."""
+    """A with its unstable eigenvalues reflected into the unit circle, at most to MOVED_POLE."""
     values, vectors = np.linalg.eig(A)
     radius = np.abs(values)
-    if radius.max() < 1.0:
+    unstable = radius > LARGEST_POLE
+    if not unstable.any():
         return A
-    inside = np.where(
-        radius >= 1.0, np.minimum(1.0 / np.maximum(radius, 1.0), STABLE_RADIUS), radius
-    )
-    values = values * inside / np.where(radius > 0, radius, 1.0)
+    factor = np.where(unstable, np.minimum(1.0 / np.maximum(radius, 1.0), MOVED_POLE), radius)
+    values = values * np.where(unstable, factor / np.maximum(radius, 1e-300), 1.0)
     return np.real(vectors * values @ np.linalg.pinv(vectors))
 
 
@@ -257,24 +260,43 @@ def _model(cell: LFRCell, records: list[Record], scaler: Scaler) -> Model:
     return Model(LFR(cell), scaler, first.fs, first.inputs, first.outputs)
 
 
-class _StableSimulationError(SimulationError):
-    """Simulation error of a linear model, undefined where the model is unstable."""
+class _LinearProblem(SimulationError):
+    """Simulation error of a linear model, undefined where a pole passes LARGEST_POLE.
+
+    With ``offset`` the best constant output is taken off in closed form: each output's residual has
+    zero mean, and so have its derivatives (variable projection).
+    """
+
+    def __init__(
+        self, cell: LFRCell, records: list[Record], scaler: Scaler, *, offset: bool
+    ) -> None:
+        super().__init__(_model(cell, records, scaler), records)
+        self.offset = offset
 
     def residual(self, theta: Tensor) -> Tensor:
         r = super().residual(theta)
-        stable = torch.linalg.eigvals(self.model.lfr.cell.A.detach()).abs().amax() < 1.0
-        return r if stable else torch.full_like(r, torch.inf)
+        radius = torch.linalg.eigvals(self.model.lfr.cell.A.detach()).abs().amax()
+        return self._centred(r) if radius < LARGEST_POLE else torch.full_like(r, torch.inf)
+
+    def jacobian(self, theta: Tensor) -> Tensor:
+        return self._centred(super().jacobian(theta))
+
+    def _centred(self, rows: Tensor) -> Tensor:
+        if not self.offset:
+            return rows
+        by_output = rows.reshape(-1, len(self.model.outputs), *rows.shape[1:])
+        return (by_output - by_output.mean(dim=0)).reshape(rows.shape)
 
 
 def _with_input_matrices(
-    A: Array, C: Array, records: list[Record], scaler: Scaler
+    A: Array, C: Array, records: list[Record], scaler: Scaler, *, offset: bool
 ) -> tuple[float, LFRCell]:
     """Mean square error and cell with the best B and D for A and C: y is linear in them."""
     nu, ny = len(scaler.u_scale), len(scaler.y_scale)
     cell = _cell(A, np.zeros((len(A), nu)), C, np.zeros((ny, nu)))
     for fixed in (cell.A, cell.Cy):
         fixed.requires_grad_(False)
-    problem = _StableSimulationError(_model(cell, records, scaler), records)
+    problem = _LinearProblem(cell, records, scaler, offset=offset)
     theta = problem.theta
     J, r = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
     if np.isfinite(J).all():
@@ -285,9 +307,11 @@ def _with_input_matrices(
     return (cost if np.isfinite(cost) else np.inf), cell
 
 
-def _refine(cell: LFRCell, records: list[Record], scaler: Scaler, max_iter: int) -> None:
+def _refine(
+    cell: LFRCell, records: list[Record], scaler: Scaler, max_iter: int, *, offset: bool
+) -> None:
     """Levenberg-Marquardt on A, Bu, Cy, Dyu until the cost no longer falls."""
-    problem = _StableSimulationError(_model(cell, records, scaler), records)
+    problem = _LinearProblem(cell, records, scaler, offset=offset)
     optimiser = LevenbergMarquardt(max_iter=max_iter, acceleration=False, tolerance=1e-9)
     state = optimiser.init(problem, problem.theta)
     while not state.reason and state.iteration < max_iter:
@@ -319,12 +343,24 @@ def _transform(cell: LFRCell, T: Array, T_inverse: Array) -> None:
 
 def _balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     """T and T⁻¹ to balanced coordinates by the square-root method (Laub et al. 1987)."""
-    Lp = _square_root(scipy.linalg.solve_discrete_lyapunov(A, B @ B.T))
-    Lq = _square_root(scipy.linalg.solve_discrete_lyapunov(A.T, C.T @ C))
+    Lp, Lq = _square_root(_gramian(A, B @ B.T)), _square_root(_gramian(A.T, C.T @ C))
     U, s, Vh = np.linalg.svd(Lq.T @ Lp)
     # A state that is all but uncontrollable or unobservable would be scaled by its rounding error.
     root = np.sqrt(np.maximum(s, s[0] * np.finfo(float).eps))
     return (U / root).T @ Lq.T, Lp @ (Vh.T / root)
+
+
+def _gramian(A: Array, Q: Array) -> Array:
+    """P = A P Aᵀ + Q by Smith's doubling.
+
+    scipy's solver forms I - A ⊗ A, which is singular to rounding where two poles are close to the
+    unit circle; the sum of A^k Q A^kᵀ stays positive semidefinite there.
+    """
+    P = Q
+    while np.abs(A).max() > np.finfo(float).eps:
+        P = P + A @ P @ A.T
+        A = A @ A
+    return P
 
 
 def _square_root(gramian: Array) -> Array:

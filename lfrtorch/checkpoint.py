@@ -24,7 +24,7 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
     Raises:
         ValueError: ``folder`` exists and is not a checkpoint.
     """
-    folder = Path(folder)
+    folder = Path(folder).resolve()  # a link's target is replaced, not the link
     if folder.exists() and not (folder / DESCRIPTION).is_file() and any_inside(folder):
         raise ValueError(
             f"'{folder}' exists and is not a checkpoint; choose another folder to save to."

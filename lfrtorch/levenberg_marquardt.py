@@ -88,6 +88,7 @@ class LevenbergMarquardt:
         damping: first λ relative to the largest squared singular value of the Jacobian.
         tolerance: relative decrease of the cost that counts as no progress ...
         patience: ... and the number of such steps in a row that ends the search.
+        floor: root mean square of the residual that counts as zero.
         truncation: singular values below this part of the largest are gauge and left out.
         finite_step: h of the directional second derivative (Transtrum et al. use 0.1).
         acceleration_limit: largest 2|a| / |δ| at which the acceleration is trusted.
@@ -99,6 +100,7 @@ class LevenbergMarquardt:
     damping: float = 1e-2
     tolerance: float = 1e-7
     patience: int = 5
+    floor: float = 1e-13
     truncation: float = 1e-12
     finite_step: float = 0.1
     acceleration_limit: float = 0.75
@@ -108,7 +110,7 @@ class LevenbergMarquardt:
         for name in ("damping", "truncation", "finite_step", "acceleration_limit", "max_damping"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; give a positive number.")
-        for name in ("max_iter", "tolerance", "patience"):
+        for name in ("max_iter", "tolerance", "patience", "floor"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it cannot be negative.")
 
@@ -126,7 +128,7 @@ class LevenbergMarquardt:
         residual = problem.residual(theta)
         if not torch.isfinite(residual).all():
             raise ValueError(
-                "the model diverges at the start of the search; start from a stable model."
+                "the residual is not finite at the start of the search; start from a stable model."
             )
         return LMState(theta, residual)
 
@@ -134,9 +136,10 @@ class LevenbergMarquardt:
         """One iteration: linearise, then raise the damping until a step lowers the cost."""
         jacobian = problem.jacobian(state.theta)
         # Only R is formed: gradients Jᵀr then cost one product each, half the time of forming Q.
-        _, s, Vh = torch.linalg.svd(torch.linalg.qr(jacobian, mode="r").R)
-        if len(s) == 0 or not s[0] > 0:
+        R = torch.linalg.qr(jacobian, mode="r").R
+        if not torch.isfinite(R).all() or not R.any():
             return replace(state, reason="the Jacobian vanishes or is not finite")
+        _, s, Vh = torch.linalg.svd(R, full_matrices=False)
         kept = s > self.truncation * s[0]
         s, Vh = s[kept], Vh[kept]
         scale = float(s[0]) ** 2
@@ -174,6 +177,8 @@ class LevenbergMarquardt:
                     rank=len(s),
                     quiet=quiet,
                 )
+                if accepted.cost <= self.floor**2 * len(residual):
+                    return replace(accepted, reason="converged: the residual vanishes")
                 if quiet >= self.patience:
                     return replace(accepted, reason="converged: the cost no longer falls")
                 if accepted.iteration >= self.max_iter:

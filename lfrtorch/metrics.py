@@ -9,7 +9,16 @@ from lfrtorch.records import Record
 
 
 def rmse(record: Record, y_hat: NDArray[np.float64]) -> float:
-    """Root mean squared simulation error over scored samples and outputs, in the output's unit."""
+    """Root mean squared simulation error over scored samples and outputs, in the output's unit.
+
+    Raises:
+        ValueError: ``y_hat`` is not of the shape (T, ny) of the record's output.
+    """
+    if np.shape(y_hat) != record.y.shape:
+        raise ValueError(
+            f"record '{record.name}' has an output of shape {record.y.shape} and the simulation "
+            f"{np.shape(y_hat)}; simulate this record."
+        )
     error = record.y[record.skip :] - y_hat[record.skip :]
     return float(np.sqrt(np.mean(error**2)))
 

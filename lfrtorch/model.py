@@ -15,7 +15,7 @@ from lfrtorch import checkpoint
 from lfrtorch.cell import LFRCell
 from lfrtorch.lfr import LFR
 from lfrtorch.nonlinearity import Network
-from lfrtorch.records import Channel, Record, Scaler, Start
+from lfrtorch.records import Channel, Record, Scaler, Start, as_signal, check_start
 from lfrtorch.simulate import Trajectory
 
 
@@ -84,37 +84,47 @@ class Model:
         self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None
     ) -> Trajectory:
         """All signals x, z, w, y of the same simulation, normalised, on the CPU, with R = 1."""
-        if not isinstance(data, Record):
-            u = np.asarray(data)
-            data = Record(u, np.zeros((len(u), len(self.outputs))), self.fs, name="input")
-        if data.u.shape[1] != len(self.inputs):
-            names = ", ".join(c.name for c in self.inputs)
-            raise ValueError(
-                f"record '{data.name}' has {data.u.shape[1]} input(s) and the model "
-                f"{len(self.inputs)} ({names}); give a column for each."
-            )
-        if not np.isclose(data.fs, self.fs):
-            raise ValueError(
-                f"record '{data.name}' is sampled at {data.fs} Hz and the model at {self.fs} Hz; "
-                "resample the record."
-            )
+        if isinstance(data, Record):
+            self.check(data)
+            u, start = data.u, start or data.start
+        else:
+            u, start = as_signal(data, self.inputs, "input"), start or "zero"
+        check_start(start, "simulation")
         like = self.lfr.cell.A
-        u = torch.as_tensor(self.scaler.normalise_u(data.u)).to(like).unsqueeze(0)
+        v = torch.as_tensor(self.scaler.normalise_u(u)).to(like).unsqueeze(0)
         state = None if x0 is None else torch.as_tensor(np.asarray(x0)).to(like).reshape(1, -1)
         if state is not None and state.shape[1] != self.lfr.cell.nx:
             raise ValueError(f"x0 has {state.shape[1]} entries; the model has {self.lfr.cell.nx}.")
-        trajectory = self.lfr.trajectory(u, state, start or data.start)
+        trajectory = self.lfr.trajectory(v, state, start)
         return Trajectory(*(signal.cpu() for signal in trajectory))
+
+    def check(self, record: Record) -> None:
+        """Refuse a record of other channels or another sampling frequency with a ValueError."""
+        for side, signal, channels in (
+            ("input", record.u, self.inputs),
+            ("output", record.y, self.outputs),
+        ):
+            if signal.shape[1] != len(channels):
+                names = ", ".join(channel.name for channel in channels)
+                raise ValueError(
+                    f"record '{record.name}' has {signal.shape[1]} {side}(s) and the model "
+                    f"{len(channels)} ({names}); give a column for each."
+                )
+        if not np.isclose(record.fs, self.fs):
+            raise ValueError(
+                f"record '{record.name}' is sampled at {record.fs} Hz and the model at {self.fs} "
+                "Hz; resample the record."
+            )
 
     def save(self, folder: str | Path) -> Path:
         """Write the checkpoint folder; ``lfrtorch.load`` reads it back to the same bits."""
         cell, s = self.lfr.cell, self.scaler
         static: dict[str, Any] | None = None
-        if isinstance(cell.static, Network):
+        if type(cell.static) is Network:
             static = {"type": "Network", "nn": len(cell.static.bz)}
             static["activation"] = cell.static.activation
         elif cell.static is not None:
-            static = {"type": type(cell.static).__name__}
+            static = {"type": "own", "class": type(cell.static).__qualname__}
         description = {
             "sizes": {"nu": cell.nu, "ny": cell.ny, "nx": cell.nx, "nz": cell.nz, "nw": cell.nw},
             "static": static,
@@ -154,10 +164,10 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             static = Network(sizes["nz"], sizes["nw"], made["nn"], made["activation"], dtype=dtype)
         elif made is not None and static is None:
             raise ValueError(
-                f"'{folder}' holds a static nonlinearity of class {made['type']}, which is not "
+                f"'{folder}' holds a static nonlinearity of class {made['class']}, which is not "
                 "part of this package; pass an instance of it: load(folder, static=...)."
             )
-        cell = LFRCell(**sizes, static=static, dtype=dtype)
+        cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         cell.load_state_dict(weights)
         channels = [
             tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")

@@ -30,6 +30,9 @@ from numpy.typing import ArrayLike, NDArray
 
 Start = Literal["zero", "periodic"]
 
+_MANY_CHANNELS = 16
+"""An array of more channels than this and fewer samples is taken for a transposed one."""
+
 
 class Channel(NamedTuple):
     """Name and unit of one signal."""
@@ -77,8 +80,8 @@ class Record:
     def __post_init__(self) -> None:
         inputs = _channels(self.inputs, self.u, "u")
         outputs = _channels(self.outputs, self.y, "y")
-        u = _signal(self.u, inputs, f"record '{self.name}': input")
-        y = _signal(self.y, outputs, f"record '{self.name}': output")
+        u = as_signal(self.u, inputs, f"record '{self.name}': input")
+        y = as_signal(self.y, outputs, f"record '{self.name}': output")
         if len(u) != len(y):
             raise ValueError(
                 f"record '{self.name}': the input has {len(u)} samples and the output {len(y)}; "
@@ -89,10 +92,7 @@ class Record:
                 f"record '{self.name}': the sampling frequency is {self.fs} Hz; "
                 "give a positive number of samples per second."
             )
-        if self.start not in ("zero", "periodic"):
-            raise ValueError(
-                f"record '{self.name}': start is {self.start!r}; use 'zero' or 'periodic'."
-            )
+        check_start(self.start, f"record '{self.name}'")
         if not 0 <= self.skip < len(u):
             raise ValueError(
                 f"record '{self.name}': skip={self.skip} leaves no sample of {len(u)}; "
@@ -163,6 +163,12 @@ class Scaler:
         return y * self.y_scale + self.y_offset
 
 
+def check_start(start: str, what: str) -> None:
+    """Refuse a start that is neither ``"zero"`` nor ``"periodic"`` with a ValueError."""
+    if start not in ("zero", "periodic"):
+        raise ValueError(f"{what}: start is {start!r}; use 'zero' or 'periodic'.")
+
+
 def rms_scale(signals: Sequence[NDArray[np.float64]], offset: NDArray[np.float64]) -> NDArray:
     """Root mean square (n,) of signals (T, n) about ``offset``; 1 where a channel is constant."""
     scale = np.sqrt(np.mean((np.concatenate(signals) - offset) ** 2, axis=0))
@@ -182,7 +188,17 @@ def _channels(given: tuple[Channel, ...], signal: ArrayLike, letter: str) -> tup
     return tuple(Channel(*c) for c in given)
 
 
-def _signal(x: ArrayLike, channels: tuple[Channel, ...], what: str) -> NDArray[np.float64]:
+def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str) -> NDArray[np.float64]:
+    """A signal (T, channels) of finite real numbers from (T, channels) or (T,), not writeable.
+
+    Args:
+        x: the samples.
+        channels: their names.
+        what: what an error message calls the signal.
+
+    Raises:
+        ValueError: another type or shape, no sample, NaN or infinite samples.
+    """
     array = np.asarray(x)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{what} has type {array.dtype}; give real numbers.")
@@ -193,13 +209,19 @@ def _signal(x: ArrayLike, channels: tuple[Channel, ...], what: str) -> NDArray[n
         raise ValueError(
             f"{what} has shape {array.shape}; give (T,) for one channel or (T, channels)."
         )
-    if array.shape[0] < array.shape[1]:
+    if array.size == 0:
+        raise ValueError(f"{what} is empty (shape {array.shape}); give at least one sample.")
+    if array.shape[0] < array.shape[1] and array.shape[1] > _MANY_CHANNELS:
         raise ValueError(
             f"{what} has shape {array.shape}: more channels than samples. "
             "Time runs along the first axis; transpose the array."
         )
-    if array.size == 0:
-        raise ValueError(f"{what} is empty (shape {array.shape}); give at least one sample.")
+    if array.shape[1] != len(channels):
+        names = ", ".join(channel.name for channel in channels)
+        raise ValueError(
+            f"{what} has {array.shape[1]} column(s) and {len(channels)} channel(s) are expected "
+            f"({names}); give a column for each."
+        )
     bad = ~np.isfinite(array)
     if bad.any():
         k, channel = np.argwhere(bad)[0]

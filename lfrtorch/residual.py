@@ -55,7 +55,10 @@ class SimulationError:
         if not ridge >= 0:
             raise ValueError(f"ridge is {ridge}; the penalty's weight cannot be negative.")
         self.model = model
-        self.batches = _batches(model, as_records(records))
+        data = as_records(records)
+        for record in data:
+            model.check(record)
+        self.batches = _batches(model, data)
         self.size = sum(int(b.scored.sum()) for b in self.batches) * len(model.outputs)
         self._ridge, self._start = ridge, self.theta
         self._guesses: list[Tensor | None] = [None] * len(self.batches)
@@ -69,7 +72,8 @@ class SimulationError:
     def rmse(self, residual: Tensor) -> float:
         """Root mean squared error over samples and outputs of a residual, output unit."""
         errors = residual[: self.size].reshape(-1, len(self.model.outputs)).double().cpu().numpy()
-        return float(np.sqrt(np.mean((errors * self.model.scaler.y_scale) ** 2)))
+        with np.errstate(over="ignore", invalid="ignore"):  # a diverging model scores inf or NaN
+            return float(np.sqrt(np.mean((errors * self.model.scaler.y_scale) ** 2)))
 
     def write(self, theta: Tensor) -> None:
         """Put θ (P,) into the module."""

@@ -18,6 +18,9 @@ from lfrtorch.recurrence import linear_recurrence, to_numpy
 PERIODIC_TOLERANCE = 1e-10
 """Largest |x(T) - x(0)| relative to 1 + max |x| that counts as periodic (states have unit rms)."""
 
+PERIODIC_ROUNDING = 100.0
+"""The same in multiples of the rounding error, for dtypes that cannot reach the tolerance."""
+
 SETTLING_PERIODS = 3
 """Periods simulated forward before Newton's method takes over; a well damped model needs one."""
 
@@ -81,13 +84,14 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
     """
     x0 = u.new_zeros(len(u), cell.nx) if guess is None else guess
     identity = torch.eye(cell.nx, dtype=u.dtype, device=u.device)
+    tolerance = max(PERIODIC_TOLERANCE, PERIODIC_ROUNDING * torch.finfo(u.dtype).eps)
     trajectory = simulate(cell, u, x0)
     for passes in range(MAX_PERIODS):
         if not trajectory.finite:
             break
         end = trajectory.x[:, -1]
         scale = 1.0 + trajectory.x.abs().amax()
-        if (end - x0).abs().amax() <= PERIODIC_TOLERANCE * scale:
+        if (end - x0).abs().amax() <= tolerance * scale:
             return trajectory
         if passes < SETTLING_PERIODS:
             x0 = end

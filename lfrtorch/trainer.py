@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
@@ -150,6 +151,10 @@ def fit(
     optimiser = LevenbergMarquardt() if optimiser is None else optimiser
     problem = SimulationError(model, train, ridge=ridge)
     judge = SimulationError(model, validation) if validation else None
+    if not torch.isfinite(problem.residual(problem.theta)).all():
+        raise ValueError(
+            "the model diverges on the training records at the start; start from a stable model."
+        )
     begin = time.perf_counter()
     history: list[Progress] = []
     durations: list[float] = []

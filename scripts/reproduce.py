@@ -31,7 +31,7 @@ def main() -> int:
     parser.add_argument("--init", nargs="+", default=["zero_output", "paper"])
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "reproduce")
     parser.add_argument("overrides", nargs="*", help="settings for train.py, name=value")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     if options.seeds < 1:
         parser.error(f"--seeds is {options.seeds}; at least one run is needed")
 

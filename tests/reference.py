@@ -180,7 +180,8 @@ def random_system(nx: int, nu: int = 1, ny: int = 1, *, seed: int = 0) -> System
     generator = np.random.default_rng([nx, nu, ny, seed])
     A = generator.normal(size=(nx, nx))
     A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
-    return (A, *(generator.normal(size=shape) for shape in ((nx, nu), (ny, nx), (ny, nu))))
+    B, C, D = (generator.normal(size=shape) for shape in ((nx, nu), (ny, nx), (ny, nu)))
+    return A, B, C, D
 
 
 def dlsim(system: System, u: Array) -> Array:
@@ -196,6 +197,6 @@ def frf(system: System, omega: Array) -> NDArray[np.complex128]:
 
 def periodic_response(system: System, u: Array) -> Array:
     """Steady-state response (T, ny) to the periodic repetition of u (T, nu), in frequency."""
-    omega = 2 * np.pi * np.fft.rfftfreq(len(u))
+    omega = np.asarray(2 * np.pi * np.fft.rfftfreq(len(u)), dtype=np.float64)
     Y = np.einsum("fyu,fu->fy", frf(system, omega), np.fft.rfft(u, axis=0))
     return np.fft.irfft(Y, len(u), axis=0)

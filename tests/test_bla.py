@@ -16,7 +16,7 @@ U0, Y0 = np.array([3.0, -1.0]), np.array([-7.0, 20.0])
 
 
 def record_of(system: System, start: Start, *, T: int = 400, offset: bool = False) -> Record:
-    """Noise-free record under white noise of zero mean, at rest at the offset before a zero start."""
+    """Noise-free record under white noise of zero mean, at the operating point before it."""
     nu, ny = system[3].shape[1], system[3].shape[0]
     u = np.random.default_rng(0).normal(size=(T, nu))
     u -= u.mean(axis=0)
@@ -62,14 +62,28 @@ def test_linear_system_is_recovered_with_its_offsets(nx: int, nu: int, ny: int, 
     system = random_system(nx, nu, ny)
     model = estimate_bla(record_of(system, start, offset=True), nx)
     np.testing.assert_allclose(model.u_offset, U0[:nu], rtol=1e-12)
-    np.testing.assert_allclose(model.y_offset, Y0[:ny], rtol=1e-6)
-    assert frf_error(model, system) < 1e-6
+    np.testing.assert_allclose(model.y_offset, Y0[:ny], rtol=EXACT)
+    assert frf_error(model, system) < EXACT
 
 
 def test_records_of_several_lengths_and_starts_are_fitted_together():
     system = random_system(3)
     records = [record_of(system, "zero", T=150), record_of(system, "periodic", T=100)]
     assert frf_error(estimate_bla(records, 3, offset=False), system) < EXACT
+
+
+def test_unknown_start_state_is_left_to_the_skipped_samples():
+    system = random_system(3)
+    u = np.random.default_rng(0).normal(size=(900, 1))
+    record = Record(u[200:], reference.dlsim(system, u)[200:], 10.0, skip=250)
+    # The start state is forgotten to 0.9^250 = 4e-12.
+    assert frf_error(estimate_bla(record, 3), system) < 1e-9
+
+
+def test_all_poles_at_the_origin():
+    A, B, C = np.eye(3, k=-1), np.eye(3, 1), np.array([[0.0, 0.5, 1.0]])
+    system = A, B, C, np.zeros((1, 1))
+    assert frf_error(estimate_bla(record_of(system, "zero"), 3), system) < EXACT
 
 
 def test_small_and_large_units_change_nothing():
@@ -103,14 +117,14 @@ ANY_DATA = {
 
 
 @pytest.mark.parametrize("start", ["zero", "periodic"])
-@pytest.mark.parametrize("nx", [1, 2, 4, 6])
+@pytest.mark.parametrize("nx", [2, 6])
 @pytest.mark.parametrize("data", ANY_DATA)
 def test_model_of_any_data_is_stable(data: str, nx: int, start: Start):
     model = estimate_bla(Record(*ANY_DATA[data], start=start), nx, max_iter=20)
     assert np.abs(model.poles).max() < 1
     record = Record(*ANY_DATA[data], start=start)
     assert np.isfinite(model.simulate(record)).all()
-    # A model without dynamics is among the candidates of every order.
+    # B = D = 0 is among the candidates.
     assert np.std(record.y - model.simulate(record)) < 1.01 * np.std(record.y)
 
 

@@ -20,7 +20,7 @@ def refused(message: str, **given):
 
 
 def test_one_dimensional_array_is_one_channel():
-    record = Record([1, 2, 3], (4, 5, 6))
+    record = Record(np.array([1, 2, 3]), np.array([4, 5, 6]))
     assert record.u.shape == record.y.shape == (3, 1)
     assert record.u.dtype == np.float64
     assert record.samples == 3
@@ -101,7 +101,13 @@ def test_skip_that_leaves_nothing(skip: int):
 
 
 def test_rows_and_columns_exchanged():
-    refused("record 'lab': input has shape (2, 10): more channels than samples.", u=U.T)
+    message = "record 'lab': {} has shape (2, 30): more channels than samples."
+    refused(message.format("input"), u=np.ones((2, 30)))
+    refused(message.format("output"), y=np.ones((2, 30)))
+
+
+def test_one_sample_of_several_channels_is_a_record():
+    assert Record(np.ones((1, 3)), np.ones(1)).samples == 1
 
 
 @pytest.mark.parametrize("shape", [(), (10, 1, 1)])

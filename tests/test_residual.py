@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.records import Record, Start
 from lfrtorch.residual import SimulationError
 
 
@@ -21,7 +21,10 @@ def some_records(model: Model) -> list[Record]:
     """Three groups: (30, zero) twice with other windows, (30, periodic), (20, zero)."""
     noise = np.random.default_rng(0)
     records = []
-    for T, start, skip in ((30, "zero", 0), (30, "periodic", 4), (30, "zero", 7), (20, "zero", 1)):
+    groups: list[tuple[int, Start, int]] = [
+        (30, "zero", 0), (30, "periodic", 4), (30, "zero", 7), (20, "zero", 1)
+    ]  # fmt: skip
+    for T, start, skip in groups:
         exact = measure(model, T, seed=len(records), start=start, skip=skip)
         y = exact.y + noise.normal(size=exact.y.shape)
         records.append(Record(exact.u, y, exact.fs, start, skip, name=f"{start} {T} {skip}"))
@@ -98,12 +101,23 @@ def test_frozen_parameters_are_no_part_of_theta(model: Model):
 
 
 def test_divergence_is_a_residual_that_is_not_finite(model: Model):
-    problem = SimulationError(model, [measure(model, 2000)])
-    assert not torch.isfinite(problem.residual(problem.theta + 3.0)).all()
-    assert torch.isfinite(problem.residual(problem.theta)).all()
+    problem = SimulationError(model, measure(model, 2000))
+    theta = problem.theta
+    assert not torch.isfinite(problem.residual(theta + 3.0)).all()
+    assert torch.isfinite(problem.residual(theta)).all()
 
 
 @pytest.mark.parametrize("ridge", [-1.0, float("nan")])
 def test_negative_ridge(model: Model, ridge: float):
     with pytest.raises(ValueError, match="cannot be negative"):
         SimulationError(model, some_records(model), ridge=ridge)
+
+
+@pytest.mark.parametrize(
+    ("nu", "ny", "fs", "message"),
+    [(1, 2, 100.0, "input"), (2, 1, 100.0, "output"), (2, 2, 50.0, "50")],
+)
+def test_records_that_are_not_the_model_s(model: Model, nu: int, ny: int, fs: float, message: str):
+    record = Record(np.ones((20, nu)), np.ones((20, ny)), fs, name="lab")
+    with pytest.raises(ValueError, match=f"(?s)lab.*{message}"):
+        SimulationError(model, record)

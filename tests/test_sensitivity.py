@@ -1,5 +1,7 @@
 """The fast Jacobian against jacfwd through the plain loop, and its rank."""
 
+from typing import Any
+
 import pytest
 import reference
 import torch
@@ -9,6 +11,7 @@ from reference import SIZES, normal, random_cell
 from torch import Tensor, nn
 from torch.testing import assert_close
 
+from lfrtorch import sensitivity
 from lfrtorch.cell import LFRCell
 from lfrtorch.nonlinearity import ACTIVATIONS
 from lfrtorch.sensitivity import _rows_compiled, _rows_generic, _terms, output_jacobian
@@ -62,13 +65,13 @@ def check_periodic(cell: LFRCell, R: int = 2, T: int = 5, periods: int = 12):
 
 @given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 7))
 @settings(max_examples=20)
-def test_from_a_given_state(sizes: dict[str, int], R: int, T: int):
+def test_from_a_given_state(sizes: dict[str, Any], R: int, T: int):
     check_zero_start(random_cell(**sizes), R, T)
 
 
 @given(sizes=SIZES, R=st.integers(1, 2))
 @settings(max_examples=12)
-def test_in_periodic_steady_state(sizes: dict[str, int], R: int):
+def test_in_periodic_steady_state(sizes: dict[str, Any], R: int):
     check_periodic(random_cell(**sizes, radius=0.5), R)
 
 
@@ -116,11 +119,21 @@ def test_all_parameters_frozen():
 
 @given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 30))
 @settings(max_examples=25)
-def test_compiled_is_generic(sizes: dict[str, int], R: int, T: int):
+def test_compiled_is_generic(sizes: dict[str, Any], R: int, T: int):
     cell = random_cell(**sizes)
     u = normal(R, T, cell.nu)
     terms = _terms(cell, u, simulate(cell, u, normal(R, cell.nx, seed=1)))
     for mine, other in zip(_rows_compiled(cell, terms), _rows_generic(cell, terms), strict=True):
+        assert_jacobian(mine, other)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 7, 100])
+def test_columns_are_shared_among_any_number_of_threads(threads: int, monkeypatch):
+    cell = random_cell(2, 2, 3, 2, 2, 3)
+    terms = _terms(cell, u := normal(2, 20, 2), simulate(cell, u, normal(2, 3, seed=1)))
+    expected = _rows_generic(cell, terms)
+    monkeypatch.setattr(sensitivity.numba, "get_num_threads", lambda: threads)
+    for mine, other in zip(_rows_compiled(cell, terms), expected, strict=True):
         assert_jacobian(mine, other)
 
 

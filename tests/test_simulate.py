@@ -1,5 +1,7 @@
 """Trajectories against the plain loop, and the periodic steady state."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import reference
@@ -52,7 +54,7 @@ def assert_same(trajectory: Trajectory, expected: Trajectory, tolerance: float):
 
 @given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 12))
 @settings(max_examples=25)
-def test_simulation_is_the_plain_loop(sizes: dict[str, int], R: int, T: int):
+def test_simulation_is_the_plain_loop(sizes: dict[str, Any], R: int, T: int):
     cell = random_cell(**sizes)
     u, x0 = normal(R, T, cell.nu), normal(R, cell.nx, seed=1)
     assert_same(simulate(cell, u, x0), reference.simulate(cell, u, x0), 1e-12)
@@ -118,9 +120,9 @@ def test_steady_state_is_the_last_of_very_many_periods(activation: str):
 
 def test_steady_state_of_a_linear_cell_is_the_response_in_frequency():
     cell = random_cell(2, 2, 3, 0, 0)
-    system = [m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu)]
+    A, B, C, D = (m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu))
     u = normal(1, 64, 2)
-    expected = reference.periodic_response((system[0], *system[1:]), u[0].numpy())
+    expected = reference.periodic_response((A, B, C, D), u[0].numpy())
     np.testing.assert_allclose(steady_state(cell, u).y[0].numpy(), expected, rtol=0, atol=1e-9)
 
 
