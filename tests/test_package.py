@@ -6,7 +6,10 @@ import tomllib
 from pathlib import Path
 from zipfile import ZipFile
 
+import numpy as np
 import pytest
+
+import lfrtorch
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -62,3 +65,15 @@ def test_version_is_the_same_everywhere():
     ]
     assert first(r"^version: (\S+)$", "CITATION.cff") == version
     assert first(r"^## \[(\d.*)\]", "CHANGELOG.md") == version
+
+
+def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The eight lines of the README, as they stand."""
+    text = (ROOT / "README.md").read_text()
+    code = text.split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(code, names)
+    record, y_hat = names["data"].tests[0], names["y_hat"]
+    assert lfrtorch.rmse(record, y_hat) < 1e-5  # m; the linear model has 1.5e-4
+    assert np.array_equal(names["again"].simulate(record), y_hat)

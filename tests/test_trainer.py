@@ -22,8 +22,8 @@ from lfrtorch.trainer import INTERRUPTED, Progress, fit
 class Sine(torch.nn.Linear):
     """w = sin(W z + b), a user's own map."""
 
-    def forward(self, z: Tensor) -> Tensor:
-        return torch.sin(super().forward(z))
+    def forward(self, input: Tensor) -> Tensor:
+        return torch.sin(super().forward(input))
 
 
 def theta(model: Model) -> Tensor:
