@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 
 import hydra
-import numba
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
@@ -29,8 +28,8 @@ CONF = Path(__file__).resolve().parent / "conf"
 
 def identify(cfg: DictConfig, folder: Path) -> float:
     """One run, its files written into ``folder``; returns the validation RMSE."""
-    torch.set_num_threads(cfg.threads)
-    numba.set_num_threads(min(cfg.threads, numba.config.NUMBA_NUM_THREADS))
+    if cfg.threads is not None:
+        torch.set_num_threads(cfg.threads)
     require(cfg)
     dataset: Dataset = instantiate(cfg.data)
     shown = dataset.validation[0] if dataset.validation else dataset.train[0]

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numba
 import numpy as np
 import torch
 
@@ -32,7 +31,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="write the result as JSON")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    numba.set_num_threads(options.threads)
 
     data = lfrtorch.datasets.boucwen.load()
     bla = lfrtorch.estimate_bla(data.train, 3, offset=False)

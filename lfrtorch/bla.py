@@ -71,10 +71,8 @@ class LinearModel:
         """
         z = np.exp(2j * np.pi * np.asarray(frequencies) / self.fs)
         shifted = z[:, None, None] * np.eye(len(self.A)) - self.A
-        return (
-            self.C @ np.linalg.solve(shifted, np.broadcast_to(self.B, (len(z), *self.B.shape)))
-            + self.D
-        )
+        states = np.linalg.solve(shifted, np.broadcast_to(self.B, (len(z), *self.B.shape)))
+        return np.asarray(self.C @ states + self.D, dtype=np.complex128)
 
     def simulate(self, record: Record) -> Array:
         """Simulated output (T, ny) in physical units, from the record's own start."""

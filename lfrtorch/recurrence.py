@@ -10,9 +10,11 @@ from __future__ import annotations
 import math
 
 import torch
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
+
+from lfrtorch.threads import spread
 
 
 def linear_recurrence(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
@@ -37,7 +39,7 @@ def compiled(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
     R, T, n, m = g.shape
     s = g.new_empty(R, T + 1, n, m)
     s[:, 0] = s0
-    _recur(to_numpy(F), to_numpy(g), s.detach().numpy())
+    spread(_recur, R, to_numpy(F), to_numpy(g), s.detach().numpy())
     return s
 
 
@@ -46,18 +48,17 @@ def to_numpy(tensor: Tensor) -> NDArray:
     return tensor.detach().contiguous().numpy()
 
 
-@njit(cache=True, parallel=True)
-def _recur(F, g, s):
-    R, T, n, m = g.shape
-    for r in prange(R):
-        for k in range(T):
-            for i in range(n):
+@njit(cache=True, nogil=True)
+def _recur(r, F, g, s):
+    _, T, n, m = g.shape
+    for k in range(T):
+        for i in range(n):
+            for c in range(m):
+                s[r, k + 1, i, c] = g[r, k, i, c]
+            for j in range(n):
+                f = F[r, k, i, j]
                 for c in range(m):
-                    s[r, k + 1, i, c] = g[r, k, i, c]
-                for j in range(n):
-                    f = F[r, k, i, j]
-                    for c in range(m):
-                        s[r, k + 1, i, c] += f * s[r, k, j, c]
+                    s[r, k + 1, i, c] += f * s[r, k, j, c]
 
 
 def scan(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:

@@ -18,15 +18,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.recurrence import linear_recurrence, to_numpy
 from lfrtorch.simulate import Slopes, Trajectory, slopes, static_jacobians
+from lfrtorch.threads import spread
 
 
 @torch.no_grad()
@@ -142,61 +142,61 @@ def _rows_compiled(cell: LFRCell, t: _Terms) -> tuple[Tensor, Tensor]:
     end = _start(rows[:, 0], cell.nx)
     tensors = (t.slopes.F, t.slopes.H, t.v, t.J, t.d_static, cell.Bw, cell.Dyw)
     lists = (*t.x, *t.y, *t.z, t.static_columns)
-    chunks = max(1, numba.get_num_threads() // R)
+    chunks = max(1, torch.get_num_threads() // R)
     indices = (np.asarray(entries, dtype=np.int64) for entries in lists)
     arguments = [*map(to_numpy, tensors), *indices, chunks, rows.numpy(), end.numpy()]
-    _emit(*arguments)
+    spread(_emit, R * chunks, *arguments)
     return rows, end
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _emit(
+    job,
     F, H, v, J, d_static, Bw, Dyw,
     x_column, x_row, x_regressor, y_column, y_row, y_regressor, z_column, z_row, z_regressor,
     static_column, chunks, rows, end,
 ):  # fmt: skip
-    R, T, ny, C = rows.shape
+    _, T, ny, C = rows.shape
     nx, nw = Bw.shape
-    for job in prange(R * chunks):
-        r, chunk = job // chunks, job % chunks
-        c0, c1 = C * chunk // chunks, C * (chunk + 1) // chunks
-        # Entries of each list that fall into this job's columns (the lists are ascending).
-        x0, x1 = np.searchsorted(x_column, c0), np.searchsorted(x_column, c1)
-        y0, y1 = np.searchsorted(y_column, c0), np.searchsorted(y_column, c1)
-        z0, z1 = np.searchsorted(z_column, c0), np.searchsorted(z_column, c1)
-        s0, s1 = np.searchsorted(static_column, c0), np.searchsorted(static_column, c1)
-        S = end[r, :, c0:c1].copy()
-        S_next = np.empty_like(S)
-        for k in range(T):
-            for i in range(ny):
-                row = rows[r, k, i, c0:c1]
-                row[:] = 0
-                for j in range(nx):
-                    h = H[r, k, i, j]
-                    for c in range(c1 - c0):
-                        row[c] += h * S[j, c]
-            for n in range(y0, y1):
-                rows[r, k, y_row[n], y_column[n]] += v[r, k, y_regressor[n]]
-            for i in range(nx):
-                S_next[i, :] = 0
-                for j in range(nx):
-                    f = F[r, k, i, j]
-                    for c in range(c1 - c0):
-                        S_next[i, c] += f * S[j, c]
-            for n in range(x0, x1):
-                S_next[x_row[n], x_column[n] - c0] += v[r, k, x_regressor[n]]
-            for q in range(nw):
-                for n in range(z0, z1):
-                    dw = J[r, k, q, z_row[n]] * v[r, k, z_regressor[n]]
-                    for i in range(nx):
-                        S_next[i, z_column[n] - c0] += Bw[i, q] * dw
-                    for i in range(ny):
-                        rows[r, k, i, z_column[n]] += Dyw[i, q] * dw
-                for n in range(s0, s1):
-                    dw = d_static[r, k, q, n]
-                    for i in range(nx):
-                        S_next[i, static_column[n] - c0] += Bw[i, q] * dw
-                    for i in range(ny):
-                        rows[r, k, i, static_column[n]] += Dyw[i, q] * dw
-            S, S_next = S_next, S
-        end[r, :, c0:c1] = S
+    r, chunk = job // chunks, job % chunks
+    c0, c1 = C * chunk // chunks, C * (chunk + 1) // chunks
+    # Entries of each list that fall into this job's columns (the lists are ascending).
+    x0, x1 = np.searchsorted(x_column, c0), np.searchsorted(x_column, c1)
+    y0, y1 = np.searchsorted(y_column, c0), np.searchsorted(y_column, c1)
+    z0, z1 = np.searchsorted(z_column, c0), np.searchsorted(z_column, c1)
+    s0, s1 = np.searchsorted(static_column, c0), np.searchsorted(static_column, c1)
+    S = end[r, :, c0:c1].copy()
+    S_next = np.empty_like(S)
+    for k in range(T):
+        for i in range(ny):
+            row = rows[r, k, i, c0:c1]
+            row[:] = 0
+            for j in range(nx):
+                h = H[r, k, i, j]
+                for c in range(c1 - c0):
+                    row[c] += h * S[j, c]
+        for n in range(y0, y1):
+            rows[r, k, y_row[n], y_column[n]] += v[r, k, y_regressor[n]]
+        for i in range(nx):
+            S_next[i, :] = 0
+            for j in range(nx):
+                f = F[r, k, i, j]
+                for c in range(c1 - c0):
+                    S_next[i, c] += f * S[j, c]
+        for n in range(x0, x1):
+            S_next[x_row[n], x_column[n] - c0] += v[r, k, x_regressor[n]]
+        for q in range(nw):
+            for n in range(z0, z1):
+                dw = J[r, k, q, z_row[n]] * v[r, k, z_regressor[n]]
+                for i in range(nx):
+                    S_next[i, z_column[n] - c0] += Bw[i, q] * dw
+                for i in range(ny):
+                    rows[r, k, i, z_column[n]] += Dyw[i, q] * dw
+            for n in range(s0, s1):
+                dw = d_static[r, k, q, n]
+                for i in range(nx):
+                    S_next[i, static_column[n] - c0] += Bw[i, q] * dw
+                for i in range(ny):
+                    rows[r, k, i, static_column[n]] += Dyw[i, q] * dw
+        S, S_next = S_next, S
+    end[r, :, c0:c1] = S

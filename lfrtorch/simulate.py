@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
 from torch.func import functional_call, jacrev, vmap
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.nonlinearity import Network
 from lfrtorch.recurrence import linear_recurrence, to_numpy
+from lfrtorch.threads import spread
 
 PERIODIC_TOLERANCE = 1e-10
 """Largest |x(T) - x(0)| relative to 1 + max |x| that counts as periodic (states have unit rms)."""
@@ -169,50 +170,49 @@ def _states_compiled(cell: LFRCell, u: Tensor, x0: Tensor) -> Tensor:
         activation = cell.static.activation
     matrices = (u, cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, *weights)
     arguments = [*map(to_numpy, matrices), _ACTIVATION_CODES[activation], x.numpy()]
-    _run(*arguments)
+    spread(_run, len(u), *arguments)
     return x
 
 
 _ACTIVATION_CODES = {"tanh": 0, "sigmoid": 1, "relu": 2, "rbf": 3}
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _run(u, A, Bu, Bw, Cz, Dzu, Wz, bz, Ww, bw, activation, x):
-    R, T, nu = u.shape
+@njit(cache=True, nogil=True, error_model="numpy")
+def _run(r, u, A, Bu, Bw, Cz, Dzu, Wz, bz, Ww, bw, activation, x):
+    _, T, nu = u.shape
     nx, (nn, nz), nw = A.shape[0], Wz.shape, bw.shape[0]
-    for r in prange(R):
-        z, w, h = np.empty(nz, u.dtype), np.empty(nw, u.dtype), np.empty(nn, u.dtype)
-        for k in range(T):
-            for i in range(nz):
-                a = u.dtype.type(0)
-                for j in range(nx):
-                    a += Cz[i, j] * x[r, k, j]
-                for j in range(nu):
-                    a += Dzu[i, j] * u[r, k, j]
-                z[i] = a
+    z, w, h = np.empty(nz, u.dtype), np.empty(nw, u.dtype), np.empty(nn, u.dtype)
+    for k in range(T):
+        for i in range(nz):
+            a = u.dtype.type(0)
+            for j in range(nx):
+                a += Cz[i, j] * x[r, k, j]
+            for j in range(nu):
+                a += Dzu[i, j] * u[r, k, j]
+            z[i] = a
+        for n in range(nn):
+            a = bz[n]
+            for j in range(nz):
+                a += Wz[n, j] * z[j]
+            if activation == 0:
+                h[n] = math.tanh(a)
+            elif activation == 1:
+                h[n] = 1.0 / (1.0 + math.exp(-a))
+            elif activation == 2:
+                h[n] = max(a, 0.0)
+            else:
+                h[n] = math.exp(-a * a)
+        for i in range(nw):
+            a = bw[i]
             for n in range(nn):
-                a = bz[n]
-                for j in range(nz):
-                    a += Wz[n, j] * z[j]
-                if activation == 0:
-                    h[n] = math.tanh(a)
-                elif activation == 1:
-                    h[n] = 1.0 / (1.0 + math.exp(-a))
-                elif activation == 2:
-                    h[n] = max(a, 0.0)
-                else:
-                    h[n] = math.exp(-a * a)
-            for i in range(nw):
-                a = bw[i]
-                for n in range(nn):
-                    a += Ww[i, n] * h[n]
-                w[i] = a
-            for i in range(nx):
-                a = u.dtype.type(0)
-                for j in range(nx):
-                    a += A[i, j] * x[r, k, j]
-                for j in range(nu):
-                    a += Bu[i, j] * u[r, k, j]
-                for j in range(nw):
-                    a += Bw[i, j] * w[j]
-                x[r, k + 1, i] = a
+                a += Ww[i, n] * h[n]
+            w[i] = a
+        for i in range(nx):
+            a = u.dtype.type(0)
+            for j in range(nx):
+                a += A[i, j] * x[r, k, j]
+            for j in range(nu):
+                a += Bu[i, j] * u[r, k, j]
+            for j in range(nw):
+                a += Bw[i, j] * w[j]
+            x[r, k + 1, i] = a

@@ -15,15 +15,18 @@ OMEGA = np.linspace(0.01, 3.1, 50)
 U0, Y0 = np.array([3.0, -1.0]), np.array([-7.0, 20.0])
 
 
-def record_of(system: System, start: Start, *, T: int = 400, offset: bool = False) -> Record:
-    """Noise-free record under white noise of zero mean, at the operating point before it."""
+def record_of(
+    system: System, start: Start, *, T: int = 400, offset: bool = False, noise: float = 0.0
+) -> Record:
+    """Record under white noise of zero mean, at the operating point before it."""
     nu, ny = system[3].shape[1], system[3].shape[0]
     u = np.random.default_rng(0).normal(size=(T, nu))
     u -= u.mean(axis=0)
+    e = noise * np.random.default_rng(1).normal(size=(T, ny))
     y = reference.dlsim(system, u) if start == "zero" else reference.periodic_response(system, u)
     if offset:
         u, y = u + U0[:nu], y + Y0[:ny]
-    return Record(u, y, 10.0, start)
+    return Record(u, y + e, 10.0, start)
 
 
 def frf_error(model: LinearModel, system: System) -> float:
@@ -132,7 +135,7 @@ def test_model_of_any_data_is_stable(data: str, nx: int, start: Start):
 
 
 def test_states_have_unit_deviation():
-    record = record_of(random_system(4, 2, 2), "periodic")
+    record = record_of(random_system(4, 2, 2), "periodic", noise=0.1)  # the refinement moves it
     for coordinates in ("balanced", "given"):
         model = estimate_bla(record, 4, coordinates=coordinates)
         # y = x: the states as outputs
@@ -144,7 +147,7 @@ def test_states_have_unit_deviation():
 
 
 def test_balanced_gramians_are_diagonal_and_alike():
-    record = record_of(random_system(5, 2, 2), "periodic")
+    record = record_of(random_system(5, 2, 2), "periodic", noise=0.1)
     A, B, C, _ = normalised(estimate_bla(record, 5), record)
     P = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
     Q = scipy.linalg.solve_discrete_lyapunov(A.T, C.T @ C)

@@ -37,6 +37,13 @@ class SameNetwork(torch.nn.Module):
         return torch.tanh(z @ self.W1.T + self.b1) @ self.W2.T + self.b2
 
 
+class Halved(Network):
+    """A user's own class that begins with the package's."""
+
+    def forward(self, z: Tensor) -> Tensor:
+        return 0.5 * super().forward(z)
+
+
 class Cube(torch.nn.Module):
     """A static map without parameters."""
 
@@ -87,6 +94,17 @@ def test_own_module_equals_the_compiled_network():
     u, x0 = normal(2, 50, 1), normal(2, 2, seed=1)
     assert_same(simulate(own, u, x0), simulate(cell, u, x0), 1e-12)
     assert_same(steady_state(own, u), steady_state(cell, u), 1e-9)
+
+
+def test_own_class_derived_from_the_network_is_followed():
+    own = random_cell(static=Halved(1, 1, 3))
+    halved = random_cell(static=Network(1, 1, 3))
+    halved.load_state_dict(own.state_dict())
+    with torch.no_grad():
+        for name in ("static.Ww", "static.bw"):
+            halved.get_parameter(name).mul_(0.5)
+    u, x0 = normal(2, 20, 1), normal(2, 2, seed=1)
+    assert_same(simulate(own, u, x0), simulate(halved, u, x0), 1e-12)
 
 
 def test_records_of_a_batch_do_not_mix():

@@ -281,6 +281,20 @@ def test_monitors_see_every_iteration_with_its_weights():
     assert 0 < result.seconds_per_iteration < result.seconds
 
 
+def test_monitors_never_see_a_trial():
+    class Wandering(LevenbergMarquardt):
+        def step(self, problem, state):
+            state = super().step(problem, state)
+            problem.residual(state.theta + 1.0)
+            return state
+
+    def watch(model: Model, progress: Progress):
+        assert rmse(train[0], model.simulate(train[0])) == pytest.approx(progress.train, rel=1e-9)
+
+    model, train, _ = planted(T=100)
+    assert fit(model, train[0], optimiser=Wandering(3), monitors=[watch]).iterations == 3
+
+
 @pytest.mark.parametrize("optimiser", [LevenbergMarquardt(max_iter=5), Adam(epochs=5)])
 def test_same_start_same_bits(optimiser):
     runs = []

@@ -1,0 +1,58 @@
+"""Jobs spread over threads: each one done once, and errors are not lost."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from lfrtorch.threads import spread
+
+
+@pytest.mark.parametrize("threads", [1, 2, 7])
+@pytest.mark.parametrize("jobs", [1, 2, 5, 20])
+def test_every_job_is_done_once(jobs: int, threads: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    done = torch.zeros(jobs)
+
+    def kernel(job: int, add: int):
+        done[job] += add
+
+    spread(kernel, jobs, 3)
+    assert done.tolist() == [3] * jobs
+
+
+@pytest.mark.parametrize("bad", [0, 1])
+def test_error_of_any_thread_is_raised(bad: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+
+    def kernel(job: int):
+        if job == bad:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        spread(kernel, 2)
+
+
+FORK = """
+import os, torch
+from lfrtorch.threads import spread
+torch.set_num_threads(2)
+spread(lambda job: None, 2)  # the pool has threads, which a forked process does not inherit
+child = os.fork()
+spread(lambda job: None, 2)
+if child == 0:
+    os._exit(7)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no fork")
+def test_forked_process_does_not_wait_for_threads_of_its_parent():
+    with subprocess.Popen([sys.executable, "-c", FORK], stdout=subprocess.PIPE) as run:
+        try:
+            out, _ = run.communicate(timeout=30)
+        except subprocess.TimeoutExpired:
+            run.kill()
+            pytest.fail("the forked process hangs")
+    assert out.split() == [b"7"]
