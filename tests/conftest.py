@@ -7,7 +7,7 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parents[1]
 
-torch.set_num_threads(2)  # small matrices: more threads cost more than they give
+torch.set_num_threads(1)  # small matrices: more threads cost more than they give
 
 # Same examples in every run, none kept on disk; compilation may take its time.
 settings.register_profile("lfrtorch", deadline=None, derandomize=True, database=None)

@@ -101,14 +101,11 @@ def test_small_and_large_units_change_nothing():
 
 T = 200
 NOISE = np.random.default_rng(1).normal(size=(2, T))
-TIME = np.arange(T)
+TIME, ONE = np.arange(T), np.ones((1, 1))
 ANY_DATA = {
     "noise": (NOISE[0], NOISE[1]),
     "integrator": (NOISE[0], np.cumsum(NOISE[0])),
-    "unstable": (
-        NOISE[0],
-        reference.dlsim((*np.array([[[1.02]], [[1]], [[1]], [[0]]]),), NOISE[0]),
-    ),
+    "unstable": (NOISE[0], reference.dlsim((1.02 * ONE, ONE, ONE, 0 * ONE), NOISE[0])),
     "gain": (NOISE[0], 2 * NOISE[0]),
     "delay": (NOISE[0], np.roll(NOISE[0], 3)),
     "second order": (NOISE[0], reference.dlsim(random_system(2), NOISE[0])),
