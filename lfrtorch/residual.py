@@ -90,18 +90,24 @@ class SimulationError:
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
         self._guesses = [t.x[:, 0] for t in trajectories]
-        P = len(theta)
-        J = theta.new_zeros(self.size + (P if self._ridge else 0), P)
-        if self._ridge:
-            J[self.size :].fill_diagonal_(self._ridge**0.5)
+        P, penalty = len(theta), self._penalty(theta)
+        J = theta.new_empty(self.size + sum(map(len, penalty)), P)
+        if penalty:
+            J[self.size :] = self._ridge**0.5 * torch.eye(P, dtype=J.dtype, device=J.device)
         first = 0
         for batch, trajectory in zip(self.batches, trajectories, strict=True):
+            part = J[first : first + int(batch.scored.sum()) * len(self.model.outputs)]
+            first += len(part)
+            whole = part.numel() == batch.y.numel() * P  # nothing skipped: no copy
             rows = output_jacobian(
-                self.model.lfr.cell, batch.u, trajectory, periodic=batch.start == "periodic"
+                self.model.lfr.cell,
+                batch.u,
+                trajectory,
+                periodic=batch.start == "periodic",
+                out=part.view(*batch.y.shape, P) if whole else None,
             )
-            rows = batch.select(rows).flatten(0, 1)
-            J[first : first + len(rows)] = rows
-            first += len(rows)
+            if not whole:
+                part[:] = batch.select(rows).flatten(0, 1)
         return J
 
     def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,6 +22,9 @@ PERIODIC_TOLERANCE = 1e-10
 PERIODIC_ROUNDING = 100.0
 """The same in multiples of the rounding error, for dtypes that cannot reach the tolerance."""
 
+MET_ROUNDING = 4.0
+"""Distance of two states, in rounding errors, at which their trajectories are taken as one."""
+
 SETTLING_PERIODS = 3
 """Periods simulated forward before Newton's method takes over; a well damped model needs one."""
 
@@ -59,14 +62,26 @@ class Slopes(NamedTuple):
 
 
 @torch.no_grad()
-def simulate(cell: LFRCell, u: Tensor, x0: Tensor) -> Trajectory:
+def simulate(
+    cell: LFRCell, u: Tensor, x0: Tensor, *, other: Trajectory | None = None
+) -> Trajectory:
     """Trajectory from the state ``x0``. A model that diverges gives infinite or NaN samples.
+
+    Args:
+        cell: the model.
+        u: input.
+        x0: start state.
+        other: trajectory of the same model and input from another start; once the two have met to
+            rounding, the rest is taken from it. Its states are overwritten.
 
     Shape:
         u: (R, T, nu), x0: (R, nx).
     """
     fast = u.device.type == "cpu" and (cell.static is None or type(cell.static) is Network)
-    x = _states_compiled(cell, u, x0) if fast else _states_loop(cell, u, x0)
+    if fast:
+        x = _states_compiled(cell, u, x0, None if other is None else other.x)
+    else:
+        x = _states_loop(cell, u, x0)
     z, w = cell.internal(u, x[:, :-1])
     y = x[:, :-1] @ cell.Cy.mT + u @ cell.Dyu.mT + w @ cell.Dyw.mT
     return Trajectory(x, z, w, y)
@@ -90,7 +105,7 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
     for passes in range(MAX_PERIODS):
         if not trajectory.finite:
             break
-        end = trajectory.x[:, -1]
+        end = trajectory.x[:, -1].clone()
         scale = 1.0 + trajectory.x.abs().amax()
         if (end - x0).abs().amax() <= tolerance * scale:
             return trajectory
@@ -102,7 +117,7 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
                 break
             gap = (end - x0).unsqueeze(-1)
             x0 = x0 + torch.linalg.solve(identity - transition, gap).squeeze(-1)
-        trajectory = simulate(cell, u, x0)
+        trajectory = simulate(cell, u, x0, other=trajectory)
     return Trajectory(*(torch.full_like(signal, torch.nan) for signal in trajectory))
 
 
@@ -157,9 +172,9 @@ def _states_loop(cell: LFRCell, u: Tensor, x0: Tensor) -> Tensor:
     return torch.stack(states, dim=1)
 
 
-def _states_compiled(cell: LFRCell, u: Tensor, x0: Tensor) -> Tensor:
+def _states_compiled(cell: LFRCell, u: Tensor, x0: Tensor, other: Tensor | None = None) -> Tensor:
     """The same in machine code, for a linear cell or one hidden layer, on the CPU."""
-    x = u.new_empty(u.shape[0], u.shape[1] + 1, cell.nx)
+    x = u.new_full((u.shape[0], u.shape[1] + 1, cell.nx), torch.nan) if other is None else other
     x[:, 0] = x0
     if cell.static is None:
         weights = [u.new_zeros(0, 0), u.new_zeros(0), u.new_zeros(0, 0), u.new_zeros(0)]
@@ -169,7 +184,8 @@ def _states_compiled(cell: LFRCell, u: Tensor, x0: Tensor) -> Tensor:
         weights = [cell.static.Wz, cell.static.bz, cell.static.Ww, cell.static.bw]
         activation = cell.static.activation
     matrices = (u, cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, *weights)
-    arguments = [*map(to_numpy, matrices), _ACTIVATION_CODES[activation], x.numpy()]
+    met_within = MET_ROUNDING * torch.finfo(u.dtype).eps
+    arguments = [*map(to_numpy, matrices), _ACTIVATION_CODES[activation], met_within, x.numpy()]
     spread(_run, len(u), *arguments)
     return x
 
@@ -178,7 +194,7 @@ _ACTIVATION_CODES = {"tanh": 0, "sigmoid": 1, "relu": 2, "rbf": 3}
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _run(r, u, A, Bu, Bw, Cz, Dzu, Wz, bz, Ww, bw, activation, x):
+def _run(r, u, A, Bu, Bw, Cz, Dzu, Wz, bz, Ww, bw, activation, met_within, x):
     _, T, nu = u.shape
     nx, (nn, nz), nw = A.shape[0], Wz.shape, bw.shape[0]
     z, w, h = np.empty(nz, u.dtype), np.empty(nw, u.dtype), np.empty(nn, u.dtype)
@@ -207,6 +223,7 @@ def _run(r, u, A, Bu, Bw, Cz, Dzu, Wz, bz, Ww, bw, activation, x):
             for n in range(nn):
                 a += Ww[i, n] * h[n]
             w[i] = a
+        met = True
         for i in range(nx):
             a = u.dtype.type(0)
             for j in range(nx):
@@ -215,4 +232,8 @@ def _run(r, u, A, Bu, Bw, Cz, Dzu, Wz, bz, Ww, bw, activation, x):
                 a += Bu[i, j] * u[r, k, j]
             for j in range(nw):
                 a += Bw[i, j] * w[j]
+            # What stood there is the other trajectory, or NaN, which nothing meets.
+            met = met and abs(a - x[r, k + 1, i]) <= met_within * (1.0 + abs(a))
             x[r, k + 1, i] = a
+        if met:
+            return
