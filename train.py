@@ -74,7 +74,7 @@ def identify(cfg: DictConfig, folder: Path) -> float:
         figure.savefig(made(folder / "figures") / f"{name}.png", dpi=150)
         board.figure(f"result/{name}", figure, result.iterations)
     board.close()
-    print(f"\nRun in {folder}\nTensorBoard: tensorboard --logdir {folder.parent.parent}")
+    print(f"\nRun in {folder}\nTensorBoard: tensorboard --logdir {folder}")
     return metrics["validation"]["rmse"] or result.history[result.chosen_iteration].train
 
 
