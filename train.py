@@ -7,6 +7,7 @@ python train.py data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import sys
 from pathlib import Path
@@ -20,17 +21,18 @@ from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
 from lfrtorch import plots, report
+from lfrtorch.checks import integer
 from lfrtorch.datasets import Dataset
 from lfrtorch.monitor import ProgressLine, TensorBoard
 
 CONF = Path(__file__).resolve().parent / "conf"
 
 
-def identify(cfg: DictConfig, folder: Path) -> float:
+def identify(cfg: DictConfig, folder: Path, command: str = "") -> float:
     """One run, its files written into ``folder``; returns the validation RMSE."""
+    require(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    require(cfg)
     dataset: Dataset = instantiate(cfg.data)
     shown = dataset.validation[0] if dataset.validation else dataset.train[0]
 
@@ -38,7 +40,7 @@ def identify(cfg: DictConfig, folder: Path) -> float:
     if cfg.init_from is None:
         model: lfrtorch.Model = instantiate(cfg.init, bla, dataset.train)
     else:
-        model = lfrtorch.load(cfg.init_from)
+        model = continued(cfg, dataset)
     print(
         f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples, "
         f"{model.parameters} parameters ({model.parameters_net} without the gauge directions)"
@@ -61,11 +63,9 @@ def identify(cfg: DictConfig, folder: Path) -> float:
     )
 
     model.save(folder / "model")
-    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    metrics = report.metrics(
-        result, bla, dataset, seed=cfg.data.get("seed"), command=f"python {command}"
-    )
-    (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    metrics = report.metrics(result, bla, dataset, seed=cfg.data.get("seed"), command=command)
+    text = json.dumps(metrics, indent=2, allow_nan=False)
+    (folder / "metrics.json").write_text(text + "\n")
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
     table = report.table(metrics, dataset.published)
     print(table)
@@ -75,7 +75,8 @@ def identify(cfg: DictConfig, folder: Path) -> float:
         board.figure(f"result/{name}", figure, result.iterations)
     board.close()
     print(f"\nRun in {folder}\nTensorBoard: tensorboard --logdir {folder}")
-    return metrics["validation"]["rmse"] or result.history[result.chosen_iteration].train
+    kept = result.history[result.chosen_iteration]
+    return kept.train if math.isnan(kept.validation) else kept.validation
 
 
 def require(cfg: DictConfig) -> None:
@@ -86,7 +87,32 @@ def require(cfg: DictConfig) -> None:
             "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER."
         )
     if cfg.nx is None:
-        raise ValueError("nx, the number of states, is not set: add nx=2, for example.")
+        raise ValueError(
+            "nx, the number of states, is not set: add nx=2, for example "
+            "(+bench=boucwen sets it and all else for that benchmark)."
+        )
+    if cfg.threads is not None:
+        integer("threads", cfg.threads, 1)
+
+
+def continued(cfg: DictConfig, dataset: Dataset) -> lfrtorch.Model:
+    """The model of ``init_from``; its sizes replace those of the configuration."""
+    model = lfrtorch.load(cfg.init_from)
+    record = dataset.train[0]
+    for side, channels, found in (
+        ("inputs", model.inputs, record.inputs),
+        ("outputs", model.outputs, record.outputs),
+    ):
+        if channels != found:
+            raise ValueError(
+                f"the model in '{cfg.init_from}' has the {side} {', '.join(map(str, channels))} "
+                f"and the data {', '.join(map(str, found))}; continue on data of the same channels."
+            )
+    for name, size in model.sizes.items():
+        if cfg[name] != size:
+            print(f"{name} is {size}, that of the model in '{cfg.init_from}', not {cfg[name]}")
+            cfg[name] = size
+    return model
 
 
 def figures(result: lfrtorch.FitResult, bla: lfrtorch.LinearModel, dataset: Dataset) -> dict:
@@ -113,12 +139,17 @@ def made(folder: Path) -> Path:
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(cfg: DictConfig) -> float:
     """The command line: user errors end with one message and exit code 1, no traceback."""
+    run = HydraConfig.get()
+    command = shlex.join(["python", "train.py", *run.overrides.task])
     try:
-        return identify(cfg, Path(HydraConfig.get().runtime.output_dir))
+        return identify(cfg, Path(run.runtime.output_dir), command)
     except InstantiationException as error:
         print(f"error: {error.__cause__ or error}", file=sys.stderr)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
+    except KeyboardInterrupt:
+        print("interrupted outside the fit: nothing to keep", file=sys.stderr)
+        sys.exit(130)
     sys.exit(1)
 
 

@@ -9,6 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from lfrtorch.checks import integer, number
+
 
 class Differentiable(Protocol):
     """A residual with the gradient of its mean square."""
@@ -48,10 +50,8 @@ class Adam:
     learning_rate: float = 1e-3
 
     def __post_init__(self) -> None:
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate is {self.learning_rate}; give a positive number.")
-        if self.epochs < 0:
-            raise ValueError(f"epochs is {self.epochs}; it cannot be negative.")
+        number("learning_rate", self.learning_rate, positive=True)
+        integer("epochs", self.epochs, 0)
 
     @property
     def limit(self) -> int:

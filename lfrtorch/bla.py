@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lfrtorch.cell import LFRCell
+from lfrtorch.checks import integer
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.lfr import LFR
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler, as_records, rms_scale
 from lfrtorch.residual import SimulationError
+from lfrtorch.simulate import spectral_radius
 
 Array = NDArray[np.float64]
 
@@ -106,7 +108,7 @@ def estimate_bla(
         records: data; periodic ones are fitted in exact steady state.
         nx: order.
         offset: whether the means of input and output are removed and stored as operating point.
-        coordinates: ``"balanced"`` states, or ``"given"`` as the refinement leaves them.
+        coordinates: ``"balanced"`` states, or ``"given"`` by the subspace estimate.
         max_iter: iterations of the refinement.
 
     Returns:
@@ -120,8 +122,8 @@ def estimate_bla(
         innovations form from input-output data", Automatica 30, 1994 (PO-MOESP).
     """
     data = as_records(records)
-    if nx < 1:
-        raise ValueError(f"nx is {nx}; a state-space model needs an order of at least 1.")
+    integer("nx", nx, 1)
+    integer("max_iter", max_iter, 0)
     if coordinates not in ("balanced", "given"):
         raise ValueError(f"coordinates is {coordinates!r}; use 'balanced' or 'given'.")
     _check_excitation(data, nx)
@@ -137,7 +139,7 @@ def estimate_bla(
             f"no stable linear model of order {nx} could be started from these data; "
             "try a lower nx or a longer record."
         )
-    _to_unit_variance(cell, data, scaler, balanced=True)
+    _to_unit_variance(cell, data, scaler, balanced=coordinates == "balanced")
     _refine(cell, data, scaler, max_iter, offset=offset)
     _to_unit_variance(cell, data, scaler, balanced=coordinates == "balanced")
 
@@ -161,7 +163,7 @@ def estimate_bla(
 
 
 def data_scaler(records: list[Record], *, offset: bool) -> Scaler:
-    """Means (or zeros) and standard deviations of the records' signals."""
+    """Means (or zeros) of the records' signals, and their rms about them."""
     us, ys = [r.u for r in records], [r.y for r in records]
 
     def centre(signals: list[Array]) -> Array:
@@ -273,8 +275,9 @@ class _LinearProblem(SimulationError):
 
     def residual(self, theta: Tensor) -> Tensor:
         r = super().residual(theta)
-        radius = torch.linalg.eigvals(self.model.lfr.cell.A.detach()).abs().amax()
-        return self._centred(r) if radius < LARGEST_POLE else torch.full_like(r, torch.inf)
+        self.write(theta)
+        stable = spectral_radius(self.model.lfr.cell.A.detach()) < LARGEST_POLE
+        return self._centred(r) if stable else torch.full_like(r, torch.inf)
 
     def jacobian(self, theta: Tensor) -> Tensor:
         return self._centred(super().jacobian(theta))

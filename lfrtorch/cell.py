@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from lfrtorch.checks import integer
+
 
 class LFRCell(nn.Module):
     """One time step (u, x) -> (y, x+) of the NL-LFR state-space model::
@@ -48,6 +50,8 @@ class LFRCell(nn.Module):
                 f"nz={nz}, nw={nw} with static={static}: a static nonlinearity needs nz >= 1 and "
                 "nw >= 1, and a linear model has neither."
             )
+        for name, size in (("nu", nu), ("ny", ny), ("nx", nx)):
+            integer(name, size, 1)
         self.nu, self.ny, self.nx, self.nz, self.nw = nu, ny, nx, nz, nw
 
         def matrix(rows: int, columns: int) -> nn.Parameter:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lfrtorch.bla import LinearModel
 from lfrtorch.cell import LFRCell
+from lfrtorch.checks import integer
 from lfrtorch.lfr import LFR
 from lfrtorch.model import Model
 from lfrtorch.nonlinearity import Network
@@ -59,8 +60,8 @@ def initialise(
         Schoukens, "Improved initialization of state-space artificial neural networks", ECC 2021.
     """
     for name, size in (("nz", nz), ("nw", nw), ("nn", nn)):
-        if size < 1:
-            raise ValueError(f"{name} is {size}; the static nonlinearity needs at least 1.")
+        integer(name, size, 1)
+    integer("seed", seed, 0)
     if method not in ("zero_output", "paper"):
         raise ValueError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
     data = as_records(records)
@@ -91,7 +92,7 @@ def initialise(
         cell.Cy.mul_(std)
         uniform(cell.Cz)
         uniform(cell.Dzu)
-        z = (x / std) @ cell.Cz.mT + u @ cell.Dzu.mT  # u has unit deviation already
+        z = (x / std) @ cell.Cz.mT + u @ cell.Dzu.mT
         spread = _deviation(z)[:, None]
         cell.Cz.div_(spread)
         cell.Dzu.div_(spread)

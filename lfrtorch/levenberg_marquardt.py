@@ -21,6 +21,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from lfrtorch.checks import integer, number
+
+FASTEST_DECREASE = 0.2
+"""Smallest factor on λ after a good step; Nielsen has 1/3."""
+
 
 class LeastSquares(Protocol):
     """A residual and its Jacobian; where the residual is undefined it is infinite or NaN."""
@@ -70,8 +75,10 @@ class LMState:
     @property
     def report(self) -> dict[str, float]:
         """What the monitors show of a step."""
+        if self.damping is None:
+            return {}
         return {
-            "damping": self.damping or 0.0,
+            "damping": self.damping,
             "gain_ratio": self.gain_ratio,
             "trials": self.trials,
             "rank": self.rank,
@@ -89,7 +96,8 @@ class LevenbergMarquardt:
         tolerance: relative decrease of the cost that counts as no progress ...
         patience: ... and the number of such steps in a row that ends the search.
         floor: root mean square of the residual that counts as zero.
-        truncation: singular values below this part of the largest are gauge and left out.
+        truncation: singular values below this part of the largest are gauge and left out. (Those
+            below about 1e-8 count only as far as the damping lets them: the steps come from Jᵀr.)
         finite_step: h of the directional second derivative (Transtrum et al. use 0.1).
         acceleration_limit: largest 2|a| / |δ| at which the acceleration is trusted.
         max_damping: λ relative to the largest squared singular value that ends the search.
@@ -108,11 +116,11 @@ class LevenbergMarquardt:
 
     def __post_init__(self) -> None:
         for name in ("damping", "truncation", "finite_step", "acceleration_limit", "max_damping"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; give a positive number.")
-        for name in ("max_iter", "tolerance", "patience", "floor"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it cannot be negative.")
+            number(name, getattr(self, name), positive=True)
+        for name in ("tolerance", "floor"):
+            number(name, getattr(self, name))
+        integer("max_iter", self.max_iter, 0)
+        integer("patience", self.patience, 1)
 
     @property
     def limit(self) -> int:
@@ -163,7 +171,7 @@ class LevenbergMarquardt:
             actual = cost - float(residual.square().sum())
             gain_ratio = actual / predicted if predicted > 0 else float("nan")
             if actual > 0:  # False for NaN: a diverging trial is a rejected step
-                damping *= max(0.2, 1.0 - (2.0 * gain_ratio - 1.0) ** 3)
+                damping *= max(FASTEST_DECREASE, 1.0 - (2.0 * gain_ratio - 1.0) ** 3)
                 quiet = state.quiet + 1 if actual <= self.tolerance * cost else 0
                 accepted = replace(
                     state,

@@ -24,5 +24,9 @@ def rmse(record: Record, y_hat: NDArray[np.float64]) -> float:
 
 
 def nrmse(record: Record, y_hat: NDArray[np.float64]) -> float:
-    """RMSE over the standard deviation of the measured output, both over the scored samples."""
-    return rmse(record, y_hat) / float(np.sqrt(np.mean(np.var(record.y[record.skip :], axis=0))))
+    """RMSE over the standard deviation of the measured output, both over the scored samples.
+
+    NaN for an output that is constant there.
+    """
+    deviation = float(np.sqrt(np.mean(np.var(record.y[record.skip :], axis=0))))
+    return rmse(record, y_hat) / deviation if deviation > 0 else float("nan")

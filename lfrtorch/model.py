@@ -68,8 +68,9 @@ class Model:
 
         Args:
             data: a record, or an input in physical units.
-            start: ``"zero"`` (x = 0, the equilibrium at the input's offset) or ``"periodic"``;
-                where left out, the record's own, and ``"zero"`` for a bare input.
+            start: ``"zero"`` (x = 0: at rest at the input's offset, exactly so for the linear model
+                and the start of a fit, later up to the network's bias) or ``"periodic"``; where
+                left out, the record's own, and ``"zero"`` for a bare input.
             x0: start state in the model's coordinates, for ``start="zero"``.
 
         Shape:
@@ -151,8 +152,14 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         ValueError: no checkpoint, a damaged one, or one of another program or a newer version.
     """
     description, weights = checkpoint.read(folder)
+    made = description.get("static")
+    if isinstance(made, dict) and made.get("type") != "Network" and static is None:
+        raise ValueError(
+            f"'{folder}' holds a static nonlinearity of class {made.get('class')}, which is not "
+            "part of this package; pass an instance of it: load(folder, static=...)."
+        )
     try:
-        sizes, made = description["sizes"], description["static"]
+        sizes = description["sizes"]
         dtype = getattr(torch, description["dtype"])
         scaler = Scaler(
             *(
@@ -162,18 +169,13 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         )
         if made is not None and made["type"] == "Network":
             static = Network(sizes["nz"], sizes["nw"], made["nn"], made["activation"], dtype=dtype)
-        elif made is not None and static is None:
-            raise ValueError(
-                f"'{folder}' holds a static nonlinearity of class {made['class']}, which is not "
-                "part of this package; pass an instance of it: load(folder, static=...)."
-            )
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         cell.load_state_dict(weights)
         channels = [
             tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")
         ]
         return Model(LFR(cell), scaler, float(description["fs"]), *channels)
-    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise ValueError(
             f"'{folder}' is damaged: its description and weights do not fit ({error})."
         ) from None

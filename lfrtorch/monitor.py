@@ -7,13 +7,13 @@ import sys
 from pathlib import Path
 from typing import TextIO
 
-import torch
 from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
 from lfrtorch import plots
 from lfrtorch.model import Model
 from lfrtorch.records import Record
+from lfrtorch.simulate import spectral_radius
 from lfrtorch.trainer import Progress
 
 
@@ -28,20 +28,21 @@ class ProgressLine:
     def __init__(self, every: int = 10, stream: TextIO | None = None) -> None:
         self.every = every
         self.stream = sys.stdout if stream is None else stream
+        self._unseen = ""
 
     def __call__(self, model: Model, progress: Progress) -> None:
         """Show the progress."""
         live = self.stream.isatty()
-        last = progress.iteration == progress.limit
-        if live or last or progress.iteration % self.every == 0:
-            text = progress_text(progress, model.outputs[0].unit)
+        text = progress_text(progress, model.outputs[0].unit)
+        shown = live or progress.iteration % self.every == 0
+        self._unseen = "" if shown else text + "\n"
+        if shown:
             self.stream.write(f"\r{text}\033[K" if live else text + "\n")
             self.stream.flush()
 
     def close(self) -> None:
-        """End the live line."""
-        if self.stream.isatty():
-            self.stream.write("\n")
+        """End the live line; elsewhere show the last iteration."""
+        self.stream.write("\n" if self.stream.isatty() else self._unseen)
 
 
 def progress_text(progress: Progress, unit: str) -> str:
@@ -86,11 +87,13 @@ class TensorBoard:
             self.writer.add_scalar("rmse/validation", progress.validation, step)
         for name, value in progress.report.items():
             self.writer.add_scalar(f"optimiser/{name}", value, step)
-        radius = torch.linalg.eigvals(model.lfr.cell.A.detach()).abs().max()
+        radius = spectral_radius(model.lfr.cell.A.detach())
         self.writer.add_scalar("model/spectral_radius_A", radius, step)
         if step % self.every == 0:
-            y_hat = model.simulate(self.record)
+            y_hat, signals = model.simulate(self.record), model.signals(self.record)
             self.figure("validation/spectrum", plots.spectrum(self.record, self.y_lti, y_hat), step)
+            drawn = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
+            self.figure("validation/static_map", drawn, step)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """Add a figure."""

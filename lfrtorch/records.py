@@ -23,10 +23,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from lfrtorch.checks import integer
 
 Start = Literal["zero", "periodic"]
 
@@ -52,7 +55,7 @@ class Record:
         u: input, physical units. A one-dimensional array is one channel.
         y: output, physical units. A one-dimensional array is one channel.
         fs: sampling frequency in Hz.
-        start: ``"zero"`` simulates from x = 0 (the equilibrium at the input's offset);
+        start: ``"zero"`` simulates from x = 0 (at rest at the input's offset);
             ``"periodic"`` says that the record is a whole number of periods in steady state.
         skip: samples at the beginning that are left out of cost and score.
         name: what tables and messages call it.
@@ -87,13 +90,14 @@ class Record:
                 f"record '{self.name}': the input has {len(u)} samples and the output {len(y)}; "
                 "both must be sampled at the same instants: cut or resample one of them."
             )
-        if not (np.isfinite(self.fs) and self.fs > 0):
+        if not (isinstance(self.fs, Real) and np.isfinite(self.fs) and self.fs > 0):
             raise ValueError(
                 f"record '{self.name}': the sampling frequency is {self.fs} Hz; "
                 "give a positive number of samples per second."
             )
         check_start(self.start, f"record '{self.name}'")
-        if not 0 <= self.skip < len(u):
+        integer(f"record '{self.name}': skip", self.skip, 0)
+        if self.skip >= len(u):
             raise ValueError(
                 f"record '{self.name}': skip={self.skip} leaves no sample of {len(u)}; "
                 "use a smaller skip or a longer record."
@@ -107,7 +111,13 @@ class Record:
         return len(self.u)
 
     def __getitem__(self, window: slice) -> Record:
-        """The part of the record in ``window``: a record from zero state with nothing skipped."""
+        """The part of the record in ``window``: a record from zero state with nothing skipped.
+
+        Raises:
+            ValueError: not a slice, or one with a step (it would change the rate).
+        """
+        if not isinstance(window, slice) or window.step not in (None, 1):
+            raise ValueError(f"a record is cut by record[first:last], not by {window!r}.")
         return replace(self, u=self.u[window], y=self.y[window], start="zero", skip=0)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
+from typing import Any
 
 from lfrtorch.bla import LinearModel
 from lfrtorch.datasets import Dataset, Published
@@ -53,10 +55,10 @@ def score(model: Model, bla: LinearModel, record: Record) -> Score:
 def metrics(
     result: FitResult, bla: LinearModel, dataset: Dataset, *, seed: int | None, command: str
 ) -> dict:
-    """What ``metrics.json`` holds; scores are by test record."""
+    """What ``metrics.json`` holds, scores by test record; None where a number is not finite."""
     model = result.model
     validation = [score(model, bla, record) for record in dataset.validation]
-    return {
+    entries = {
         "bench": dataset.name,
         "sizes": model.sizes,
         "parameters": model.parameters,
@@ -85,6 +87,7 @@ def metrics(
             **{name: version(name) for name in ("lfrtorch", "torch", "numpy", "scipy", "numba")},
         },
     }
+    return _finite(entries)
 
 
 def table(result: dict, published: Sequence[Published]) -> str:
@@ -100,7 +103,7 @@ def table(result: dict, published: Sequence[Published]) -> str:
         for name, s in result["scores"].items()
     ]
     v = result["validation"]
-    if v["rmse"] is not None:
+    if v["rmse"] is not None or v["lti_rmse"] is not None:
         chosen = ["validation", "not fitted", "", "", _number(v["lti_rmse"]), _number(v["rmse"])]
         rows.append(chosen + [_number(None)] * len(others))
     widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
@@ -127,6 +130,13 @@ def _pooled(values: list[float], scores: list[Score]) -> float | None:
     counts = [s.samples - s.skip for s in scores]
     squares = sum(n * v**2 for n, v in zip(counts, values, strict=True))
     return (squares / sum(counts)) ** 0.5
+
+
+def _finite(entry: Any) -> Any:
+    """The same nested entries with None for every number that JSON cannot hold."""
+    if isinstance(entry, dict):
+        return {key: _finite(value) for key, value in entry.items()}
+    return None if isinstance(entry, float) and not math.isfinite(entry) else entry
 
 
 def _number(value: float | None) -> str:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from lfrtorch.checks import number
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start, as_records
 from lfrtorch.sensitivity import output_jacobian
@@ -52,8 +53,7 @@ class SimulationError:
     def __init__(
         self, model: Model, records: Record | Sequence[Record], *, ridge: float = 0.0
     ) -> None:
-        if not ridge >= 0:
-            raise ValueError(f"ridge is {ridge}; the penalty's weight cannot be negative.")
+        number("ridge", ridge)
         self.model = model
         data = as_records(records)
         for record in data:

@@ -67,7 +67,7 @@ def _close(slope: Slopes, rows: Tensor, end: Tensor) -> None:
     states = linear_recurrence(slope.F, torch.zeros_like(slope.F), identity)
     start = torch.linalg.solve(identity - states[:, -1], end)
     free = slope.H @ states[:, :-1]  # (R, T, ny, nx)
-    reach = torch.nonzero(free.abs().amax(dim=(0, 2, 3)) > CLOSED)
+    reach = torch.nonzero(~(free.abs().amax(dim=(0, 2, 3)) <= CLOSED))  # NaN reaches, too
     length = int(reach[-1]) + 1 if len(reach) else 0
     rows[:, :length] += free[:, :length] @ start.unsqueeze(1)
 

@@ -62,26 +62,21 @@ class Slopes(NamedTuple):
 
 
 @torch.no_grad()
-def simulate(
-    cell: LFRCell, u: Tensor, x0: Tensor, *, other: Trajectory | None = None
-) -> Trajectory:
+def simulate(cell: LFRCell, u: Tensor, x0: Tensor, *, near: Tensor | None = None) -> Trajectory:
     """Trajectory from the state ``x0``. A model that diverges gives infinite or NaN samples.
 
     Args:
         cell: the model.
         u: input.
         x0: start state.
-        other: trajectory of the same model and input from another start; once the two have met to
-            rounding, the rest is taken from it. Its states are overwritten.
+        near: states of the same model and input from another start; once the two have met to
+            rounding, the rest is taken from there. They are overwritten.
 
     Shape:
-        u: (R, T, nu), x0: (R, nx).
+        u: (R, T, nu), x0: (R, nx), near: (R, T + 1, nx).
     """
     fast = u.device.type == "cpu" and (cell.static is None or type(cell.static) is Network)
-    if fast:
-        x = _states_compiled(cell, u, x0, None if other is None else other.x)
-    else:
-        x = _states_loop(cell, u, x0)
+    x = _states_compiled(cell, u, x0, near) if fast else _states_loop(cell, u, x0)
     z, w = cell.internal(u, x[:, :-1])
     y = x[:, :-1] @ cell.Cy.mT + u @ cell.Dyu.mT + w @ cell.Dyw.mT
     return Trajectory(x, z, w, y)
@@ -113,11 +108,11 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
             x0 = end
         else:
             transition = monodromy(slopes(cell, static_jacobians(cell, trajectory.z)[0]).F)
-            if torch.linalg.eigvals(transition).abs().amax() >= 1.0:
+            if not spectral_radius(transition) < 1.0:
                 break
             gap = (end - x0).unsqueeze(-1)
             x0 = x0 + torch.linalg.solve(identity - transition, gap).squeeze(-1)
-        trajectory = simulate(cell, u, x0, other=trajectory)
+        trajectory = simulate(cell, u, x0, near=trajectory.x)
     return Trajectory(*(torch.full_like(signal, torch.nan) for signal in trajectory))
 
 
@@ -154,6 +149,16 @@ def static_jacobians(
     }
 
 
+def spectral_radius(matrices: Tensor) -> float:
+    """Largest magnitude of an eigenvalue of (..., n, n); NaN where an entry is not finite.
+
+    LAPACK is not asked then: some builds crash the process.
+    """
+    if not torch.isfinite(matrices).all():
+        return float("nan")
+    return float(torch.linalg.eigvals(matrices).abs().amax())
+
+
 def monodromy(F: Tensor) -> Tensor:
     """Transition matrix over the whole record: the product of all F(k), last one leftmost.
 
@@ -172,9 +177,9 @@ def _states_loop(cell: LFRCell, u: Tensor, x0: Tensor) -> Tensor:
     return torch.stack(states, dim=1)
 
 
-def _states_compiled(cell: LFRCell, u: Tensor, x0: Tensor, other: Tensor | None = None) -> Tensor:
+def _states_compiled(cell: LFRCell, u: Tensor, x0: Tensor, near: Tensor | None = None) -> Tensor:
     """The same in machine code, for a linear cell or one hidden layer, on the CPU."""
-    x = u.new_full((u.shape[0], u.shape[1] + 1, cell.nx), torch.nan) if other is None else other
+    x = u.new_full((u.shape[0], u.shape[1] + 1, cell.nx), torch.nan) if near is None else near
     x[:, 0] = x0
     if cell.static is None:
         weights = [u.new_zeros(0, 0), u.new_zeros(0), u.new_zeros(0, 0), u.new_zeros(0)]

@@ -162,9 +162,12 @@ def fit(
 
     def record(state: OptimiserState) -> None:
         nonlocal theta_best, best, chosen
-        train_rmse = problem.rmse(state.residual)
-        validation_rmse = judge.rmse(judge.residual(state.theta)) if judge else float("nan")
-        score = validation_rmse if judge else train_rmse
+        train_rmse, validation_rmse = problem.rmse(state.residual), float("nan")
+        judged = state.residual
+        if judge is not None:
+            judged = judge.residual(state.theta)
+            validation_rmse = judge.rmse(judged)
+        score = float(judged.square().mean())  # normalised: every output counts alike
         better = score < best  # False for the NaN of a model that diverges on validation
         if better:
             theta_best, best, chosen = state.theta, score, state.iteration
@@ -182,9 +185,10 @@ def fit(
         state = optimiser.init(problem, problem.theta)
         record(state)
         while state.iteration < optimiser.limit:
-            clock = time.perf_counter()
+            before, clock = state.theta, time.perf_counter()
             state = optimiser.step(problem, state)
-            durations.append(time.perf_counter() - clock)
+            if state.theta is not before:
+                durations.append(time.perf_counter() - clock)
             record(state)
             reason = state.reason
             if reason:

@@ -1,9 +1,10 @@
 """The paper's Bouc-Wen table as medians over seeds, from runs of train.py.
 
     python scripts/reproduce.py data.root=DIR
-    python scripts/reproduce.py --seeds 2 --init paper trainer.max_iter=100
+    python scripts/reproduce.py --seeds 2 --init paper -- trainer.max_iter=100
 
-Each run has a folder of its own below --out and is not repeated where its metrics.json is there.
+Each run has a folder of its own below --out and is not repeated where a run of the same command
+came to its end there (remove the folder after a change of the package).
 Words with an equals sign are passed on to train.py.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -36,10 +38,11 @@ def main() -> int:
         parser.error(f"--seeds is {options.seeds}; at least one run is needed")
 
     print(f"{'init':12} nz nw  {'record':10} {'source':10} {'median':>9} {'best':>9} {'worst':>9}")
+    out = options.out.resolve()
     for init in options.init:
         for nz, nw in CASES:
             runs = [
-                run(options.out, seed, [f"init={init}", f"nz={nz}", f"nw={nw}", *options.overrides])
+                run(out, seed, [f"init={init}", f"nz={nz}", f"nw={nw}", *options.overrides])
                 for seed in range(options.seeds)
             ]
             for name in runs[0]["scores"]:
@@ -55,15 +58,19 @@ def main() -> int:
 
 def run(out: Path, seed: int, settings: list[str]) -> dict:
     """metrics.json of one run of train.py, which is started where it is missing."""
-    name = "_".join(word.replace("/", "-") for word in settings if not word.startswith("data.root"))
-    folder = out / name / f"seed={seed}"
-    if not (folder / "metrics.json").is_file():
-        command = [sys.executable, str(ROOT / "train.py"), "+bench=boucwen", *settings]
-        command += [f"seed={seed}", f"data.seed={seed}", f"hydra.run.dir='{folder}'"]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        if done.returncode:
-            sys.exit(f"failed: {' '.join(command)}\n{done.stderr}")
-    return json.loads((folder / "metrics.json").read_text())
+    words = ["+bench=boucwen", *settings, f"seed={seed}", f"data.seed={seed}"]
+    folder = out / "_".join(settings[:3]) / f"seed={seed}"
+    file = folder / "metrics.json"
+    if file.is_file():
+        found = json.loads(file.read_text())
+        same = found["command"] == shlex.join(["python", "train.py", *words])
+        if same and found["fit"]["reason"] != "interrupted":
+            return found
+    command = [sys.executable, str(ROOT / "train.py"), *words, f"hydra.run.dir='{folder}'"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"failed: {shlex.join(command)}\n{done.stderr}")
+    return json.loads(file.read_text())
 
 
 def show(label: str, record: str, scores: list[dict], key: str) -> None:

@@ -67,5 +67,5 @@ def test_learning_rate_must_be_positive(rate: float):
 
 
 def test_epochs_cannot_be_negative():
-    with pytest.raises(ValueError, match="epochs is -1; it cannot be negative"):
+    with pytest.raises(ValueError, match="epochs is -1; give a whole number of at least 0"):
         Adam(epochs=-1)

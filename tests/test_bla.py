@@ -236,7 +236,9 @@ def test_record_that_is_too_short():
 
 @pytest.mark.parametrize("nx", [0, -1])
 def test_order(nx: int):
-    refused(f"nx is {nx}; a state-space model needs", record_of(random_system(1), "zero"), nx)
+    refused(
+        f"nx is {nx}; give a whole number of at least 1", record_of(random_system(1), "zero"), nx
+    )
 
 
 def test_coordinates():

@@ -159,7 +159,7 @@ def test_refused_arguments(tmp_path, signals):
     refused("no column 'v'.*'u1', 'u2', 'y'", path, inputs="v")
     refused("no column number 3.*3 columns.*'u1', 'u2', 'y'", path, inputs=3)
     refused("no column number -1", path, inputs=-1)
-    refused("skip=-1", path, skip=-1)
+    refused("data.skip is -1", path, skip=-1)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,12 @@ def test_refused_arguments(tmp_path, signals):
 )
 def test_refused_fractions(tmp_path, signals, validation, test):
     path = write(tmp_path / "a.csv", signals)
-    refused("fractions are validation=", path, validation=validation, test=test)
+    refused(
+        "fractions are validation=|is (-0.1|nan); give a number",
+        path,
+        validation=validation,
+        test=test,
+    )
 
 
 def test_refused_short_parts(tmp_path, signals):

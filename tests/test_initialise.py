@@ -131,7 +131,7 @@ def test_options_reach_the_model(bla: LinearModel):
 @pytest.mark.parametrize("size", ["nz", "nw", "nn"])
 def test_size_below_one(bla: LinearModel, size: str):
     options: dict[str, Any] = SIZES | {size: 0}
-    with pytest.raises(ValueError, match=f"{size} is 0; the static nonlinearity needs at least 1"):
+    with pytest.raises(ValueError, match=f"{size} is 0; give a whole number of at least 1"):
         initialise(bla, RECORDS, **options)
 
 

@@ -95,7 +95,11 @@ def test_unknown_start():
     refused("record 'lab': start is 'steady'; use 'zero' or 'periodic'.", start="steady")
 
 
-@pytest.mark.parametrize("skip", [-1, 10, 11])
+def test_negative_skip():
+    refused("record 'lab': skip is -1; give a whole number of at least 0", skip=-1)
+
+
+@pytest.mark.parametrize("skip", [10, 11])
 def test_skip_that_leaves_nothing(skip: int):
     refused(f"record 'lab': skip={skip} leaves no sample of 10;", skip=skip)
 

@@ -109,7 +109,7 @@ def test_divergence_is_a_residual_that_is_not_finite(model: Model):
 
 @pytest.mark.parametrize("ridge", [-1.0, float("nan")])
 def test_negative_ridge(model: Model, ridge: float):
-    with pytest.raises(ValueError, match="cannot be negative"):
+    with pytest.raises(ValueError, match=r"ridge is .*; give a number of at least 0"):
         SimulationError(model, some_records(model), ridge=ridge)
 
 

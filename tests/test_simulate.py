@@ -1,5 +1,6 @@
 """Trajectories against the plain loop, and the periodic steady state."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from lfrtorch.simulate import (
     monodromy,
     simulate,
     slopes,
+    spectral_radius,
     static_jacobians,
     steady_state,
 )
@@ -230,3 +232,33 @@ def test_monodromy_is_the_product_with_the_last_step_leftmost():
     for r in range(2):
         expected = torch.linalg.multi_dot(list(F[r].flip(0)))
         assert_close(monodromy(F)[r], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_expanding_but_bounded_trajectory_counts_as_diverged():
+    """Its monodromy overflows, and the eigenvalues of infinities crash some builds of LAPACK."""
+    # The chaotic Gauss map x+ = exp(-6.2 x²) - 0.5.
+    static = Network(1, 1, 1, "rbf", dtype=torch.float64)
+    cell = LFRCell(1, 1, 1, 1, 1, static, dtype=torch.float64)
+    with torch.no_grad():
+        for weight, value in (
+            (cell.Bw, 1.0),
+            (cell.Cz, 1.0),
+            (static.Wz, 6.2**0.5),
+            (static.bz, 0.0),
+            (static.Ww, 1.0),
+            (static.bw, -0.5),
+        ):
+            weight.fill_(value)
+    u = torch.zeros(1, 8192, 1, dtype=torch.float64)
+    start = u.new_full((1, 1), 0.1)
+    trajectory = simulate(cell, u, start)
+    J, _ = static_jacobians(cell, trajectory.z)
+    assert trajectory.finite
+    assert not torch.isfinite(monodromy(slopes(cell, J).F)).all()
+    assert not steady_state(cell, u, start).finite
+
+
+def test_spectral_radius():
+    matrices = torch.tensor([[[0.0, 2.0], [-2.0, 0.0]], [[0.5, 0.0], [0.0, 0.1]]])
+    assert spectral_radius(matrices) == pytest.approx(2.0)
+    assert math.isnan(spectral_radius(matrices * torch.inf))

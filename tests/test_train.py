@@ -117,6 +117,36 @@ def test_init_from_continues_where_the_run_ended(csv: Path, tmp_path: Path):
     assert validation == pytest.approx(before, rel=1e-12)
 
 
+def test_init_from_says_which_sizes_it_takes(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+    arguments = [*file_overrides(csv), "nx=1", "trainer.max_iter=1"]
+    train.identify(configuration(*arguments, "nz=1", "nn=4"), first)
+    cfg = configuration(*arguments, f"init_from={first}")
+    train.identify(cfg, second)
+    assert (cfg.nz, cfg.nn) == (1, 4)
+    assert "nz is 1, that of the model in" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"has the inputs u and the data u \(N\)"):
+        train.identify(configuration("+bench=boucwen", f"init_from={first}"), second)
+
+
+def test_a_resting_test_part_gives_a_score_that_is_null(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    u = np.concatenate([rng.standard_normal(400), np.zeros(200)])
+    y = np.convolve(u, [0.5, 0.3, 0.1])[: len(u)]
+    y[-200:] = 0.0
+    np.savez(tmp_path / "rest.npz", u=u, y=y)
+    overrides = ["data=file", f"data.path={tmp_path / 'rest.npz'}", "data.inputs=[u]"]
+    overrides += ["data.outputs=[y]", "data.fs=1", "data.test=0.1", "nx=1", "trainer.max_iter=1"]
+    train.identify(configuration(*overrides), tmp_path)
+    score = json.loads((tmp_path / "metrics.json").read_text())["scores"]["test"]
+    assert score["nrmse"] is None
+    assert score["rmse"] >= 0
+
+
 def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
     with subprocess.Popen(
         command(
@@ -158,6 +188,13 @@ def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
         (["+bench=boucwen", "data.samples=ten"], "samples"),
         (["+bench=boucwen", "init_from=/nowhere"], "'/nowhere' is not a checkpoint"),
         (["+bench=boucwen", "ridge=-1"], "ridge is -1"),
+        (["+bench=boucwen", "ridge=abc"], "ridge is abc"),
+        (["+bench=boucwen", "threads=0"], "threads is 0"),
+        (["+bench=boucwen", "nx=2.5"], "nx is 2.5"),
+        (["+bench=boucwen", "nn=x"], "nn is x"),
+        (["+bench=boucwen", "seed=a"], "seed is a"),
+        (["+bench=boucwen", "data.seed=x"], "data.seed is x"),
+        (["data=boucwen"], "+bench=boucwen"),
         (["data=file", "data.path=/nowhere.csv", "nx=1"], "data.inputs"),
     ],
 )

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.io import loadmat
 from scipy.signal import firwin, resample
 
+from lfrtorch.checks import integer, number
 from lfrtorch.datasets import Dataset, Published
 from lfrtorch.records import Channel, Record
 
@@ -102,11 +103,10 @@ def load(
         ValueError: an argument out of range, or a test file that cannot be used.
         FileNotFoundError: ``root`` holds no test file, or one of a pair is missing.
     """
-    if seed < 0 or seed + validation_seed_offset < 0:
-        raise ValueError(
-            f"seed={seed} with validation_seed_offset={validation_seed_offset}: both seed and "
-            "seed + validation_seed_offset must be 0 or more."
-        )
+    integer("data.seed", seed, 0)
+    integer("data.validation_seed_offset", validation_seed_offset, -seed)
+    number("data.rms", rms, positive=True)
+    number("data.noise_rms", noise_rms)
     if validation_seed_offset in (0, _TEST_OFFSET):
         raise ValueError(
             f"validation_seed_offset={validation_seed_offset} makes the validation record the "

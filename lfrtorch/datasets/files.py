@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lfrtorch.checks import integer, number
 from lfrtorch.datasets import Dataset
 from lfrtorch.records import Channel, Record
 
@@ -133,13 +134,14 @@ def _record(path: Path, u: list[Signal], y: list[Signal], fs: float) -> Record:
 
 def _split(path: Path, samples: int, validation: float, test: float, skip: int) -> dict[str, slice]:
     """The samples of each record by its name, the skipped ones included."""
+    number("data.validation", validation)
+    number("data.test", test)
     if not (0 < validation < 1 and 0 < test < 1 and validation + test < 1):
         raise ValueError(
             f"the fractions are validation={validation} and test={test}; both must be above 0 "
             "and leave something for training, for example 0.2 and 0.2."
         )
-    if skip < 0:
-        raise ValueError(f"skip={skip}; give the number of samples to skip, 0 or more.")
+    integer("data.skip", skip, 0)
     ends = [0, samples - round(samples * validation) - round(samples * test)]
     ends += [samples - round(samples * test), samples]
     parts = {}

@@ -1,0 +1,35 @@
+"""Checks at the door: what passes, and the message that names what does not."""
+
+import math
+
+import numpy as np
+import pytest
+
+from lfrtorch.checks import integer, number
+
+
+@pytest.mark.parametrize("value", [3, np.int64(3), 4])
+def test_whole_numbers_pass(value):
+    integer("nx", value, 3)
+
+
+@pytest.mark.parametrize("value", [2, 3.0, 2.5, "3", None, True, math.nan])
+def test_anything_else_is_named(value):
+    with pytest.raises(ValueError, match=f"nx is {value}; give a whole number of at least 3"):
+        integer("nx", value, 3)
+
+
+@pytest.mark.parametrize("value", [0, 0.5, np.float64(2), 7])
+def test_numbers_pass(value):
+    number("ridge", value)
+
+
+@pytest.mark.parametrize("value", [-1, "1", None, True, math.nan])
+def test_other_than_numbers_are_named(value):
+    with pytest.raises(ValueError, match=f"ridge is {value}; give a number of at least 0"):
+        number("ridge", value)
+
+
+def test_zero_is_not_positive():
+    with pytest.raises(ValueError, match="damping is 0; give a positive number"):
+        number("damping", 0, positive=True)
