@@ -1,0 +1,68 @@
+"""Figures show the signals they are given."""
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+
+from lfrtorch import plots
+from lfrtorch.records import Channel, Record
+from lfrtorch.trainer import Progress
+
+T = np.arange(400) / 100.0
+Y = np.column_stack([np.sin(2 * np.pi * 10 * T), 3 * np.cos(2 * np.pi * 20 * T)])
+RECORD = Record(T, Y, 100.0, skip=0, name="lab", outputs=(Channel("a", "m"), Channel("b")))
+
+
+def drawn(ax: Axes, label: str) -> np.ndarray:
+    """(x, y) of the line with a label."""
+    (line,) = [line for line in ax.get_lines() if line.get_label() == label]
+    return np.column_stack([line.get_xdata(), line.get_ydata()])
+
+
+def test_spectrum_shows_amplitudes_in_decibel():
+    figure = plots.spectrum(RECORD, 0.9 * Y, Y - 1e-3 * Y)
+    first, second = figure.axes
+    for ax, frequency, amplitude in ((first, 10.0, 1.0), (second, 20.0, 3.0)):
+        for label, scale in (("output", 1.0), ("LTI error", 0.1), ("NL-LFR error", 1e-3)):
+            line = drawn(ax, label)
+            peak = line[np.argmax(line[:, 1])]
+            assert peak == pytest.approx([frequency, 20 * np.log10(scale * amplitude)], abs=1e-6)
+    assert "dB, re 1 m" in first.get_ylabel()
+    assert first.get_title() == "lab (file)"
+
+
+def test_response_shows_the_scored_samples():
+    record = Record(T, Y, 100.0, skip=100, name="lab")
+    ax = plots.response(record, 0.5 * Y, Y).axes[0]
+    assert drawn(ax, "output")[0] == pytest.approx([1.0, Y[100, 0]])
+    assert len(drawn(ax, "output")) == 300
+    assert np.allclose(drawn(ax, "LTI error")[:, 1], 0.5 * Y[100:, 0])
+    assert not drawn(ax, "NL-LFR error")[:, 1].any()
+
+
+def test_long_signals_keep_their_extremes():
+    y = np.sin(np.arange(100_000))
+    y[77_777] = 5.0
+    ax = plots.response(Record(y, y), 0 * y[:, None], y[:, None]).axes[0]
+    line = drawn(ax, "output")
+    assert len(line) <= plots.MOST_POINTS + 2
+    assert line[:, 1].max() == 5.0
+    assert abs(line[np.argmax(line[:, 1]), 0] - 77_777) <= 10
+
+
+@pytest.mark.parametrize(("nz", "panels"), [(1, 1), (2, 1), (3, 3)])
+def test_static_map_has_a_panel_for_each_output(nz: int, panels: int):
+    rng = np.random.default_rng(0)
+    z, w = rng.normal(size=(500, nz)), rng.normal(size=(500, 2))
+    figure = plots.static_map(z, w)
+    labels = [ax.get_ylabel() for ax in figure.axes]
+    assert sum(label in ("w1", "w2") for label in labels) == 2 * panels
+
+
+def test_convergence_marks_the_kept_iterate():
+    history = [Progress(i, 3, 1.0 / (i + 1), 2.0 / (i + 1), 0.0, True, {}) for i in range(4)]
+    ax = plots.convergence(history, 2, "m").axes[0]
+    assert np.allclose(drawn(ax, "training")[:, 1], [1, 1 / 2, 1 / 3, 1 / 4])
+    assert drawn(ax, "kept: iteration 2")[0, 0] == 2
+    assert "(m)" in ax.get_ylabel()
+    assert len(plots.convergence(history[:1], 0).axes[0].get_lines()) == 3
