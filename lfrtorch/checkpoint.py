@@ -25,7 +25,7 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
         ValueError: ``folder`` exists and is not a checkpoint.
     """
     folder = Path(folder).resolve()  # a link's target is replaced, not the link
-    if folder.exists() and not (folder / DESCRIPTION).is_file() and any_inside(folder):
+    if folder.exists() and not (folder / DESCRIPTION).is_file() and _occupied(folder):
         raise ValueError(
             f"'{folder}' exists and is not a checkpoint; choose another folder to save to."
         )
@@ -82,7 +82,7 @@ def read(folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return description, weights
 
 
-def any_inside(folder: Path) -> bool:
+def _occupied(folder: Path) -> bool:
     """Whether ``folder`` is a file or a folder that is not empty."""
     return not folder.is_dir() or any(folder.iterdir())
 
