@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
+STARTS = ["zero_output", "paper"]
 CASES = ((1, 1), (2, 1), (2, 2))
 """(nz, nw) of the paper's three columns."""
 
@@ -30,7 +31,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seeds", type=int, default=5, help="seed = data.seed = 0 .. SEEDS - 1")
-    parser.add_argument("--init", nargs="+", default=["zero_output", "paper"])
+    parser.add_argument("--init", nargs="+", choices=STARTS, default=STARTS)
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "reproduce")
     parser.add_argument("overrides", nargs="*", help="settings for train.py, name=value")
     options = parser.parse_intermixed_args()

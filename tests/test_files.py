@@ -25,9 +25,9 @@ def write(path, table, header: str | None = "u1,u2,y", delimiter=","):
 
 
 def joined(data):
-    """The file again: the training record, and the other two without their warm-up."""
-    records = [*data.train, *(record[record.skip :] for record in (*data.validation, *data.tests))]
-    return np.vstack([np.hstack([r.u, r.y]) for r in records])
+    """The file again: the test record begins where it begins and ends where it ends."""
+    (record,) = data.tests
+    return np.hstack([record.u, record.y])
 
 
 def refused(match, path, error: type[Exception] = ValueError, **options):
@@ -43,13 +43,14 @@ def test_parts_are_cut_in_time_order(tmp_path, signals):
     path = write(tmp_path / "motor.csv", signals)
     data = files.load(path, **USE, validation=0.25, test=0.1, skip=7)
     train, validation, test = *data.train, *data.validation, *data.tests
-    assert [r.samples for r in (train, validation, test)] == [130, 57, 27]
+    assert [r.samples for r in (train, validation, test)] == [130, 180, 200]
     assert [r.name for r in (train, validation, test)] == ["train", "validation", "test"]
     assert np.array_equal(train.u, signals[:130, :2])
-    assert np.array_equal(validation.y, signals[123:180, 2:])  # 7 before the part
-    assert np.array_equal(test.u, signals[173:, :2])
+    assert [r.skip for r in (train, validation, test)] == [7, 130, 180]
+    assert np.array_equal(validation.y, signals[:180, 2:])
+    assert np.array_equal(test.u, signals[:, :2])
     for record in (train, validation, test):
-        assert (record.fs, record.start, record.skip, record.source) == (50.0, "zero", 7, "file")
+        assert (record.fs, record.start, record.source) == (50.0, "zero", "file")
         assert [c.name for c in record.inputs] == ["u1", "u2"]
         assert [c.name for c in record.outputs] == ["y"]
     assert (data.name, data.noise_rms, data.published) == ("motor", None, ())
@@ -57,8 +58,8 @@ def test_parts_are_cut_in_time_order(tmp_path, signals):
 
 def test_five_percent_warm_up_unless_told(tmp_path, signals):
     data = files.load(write(tmp_path / "a.csv", signals), **USE)
-    assert [r.samples for r in (*data.train, *data.validation, *data.tests)] == [120, 50, 50]
-    assert data.train[0].skip == data.validation[0].skip == data.tests[0].skip == 10
+    records = (*data.train, *data.validation, *data.tests)
+    assert [(r.skip, r.samples) for r in records] == [(10, 120), (120, 160), (160, 200)]
 
 
 @pytest.mark.parametrize("samples", [51, 53, 97])
@@ -69,7 +70,7 @@ def test_every_sample_after_the_first_warm_up_is_scored_once(tmp_path, signals, 
     records = [*data.train, *data.validation, *data.tests]
     scored = np.concatenate([np.hstack([r.u, r.y])[r.skip :] for r in records])
     assert np.array_equal(scored, signals[skip:samples])
-    assert len(data.validation[0].y) - skip == len(data.tests[0].y) - skip == round(samples / 5)
+    assert [len(r.y) - r.skip for r in records[1:]] == [round(samples / 5)] * 2
 
 
 @pytest.mark.parametrize(

@@ -43,9 +43,8 @@ def load(
     ``inputs`` and ``outputs`` are column numbers. In a .npz file every array has a name; one of
     shape (T, channels) is several channels.
 
-    The system was in motion where a part begins, and the simulation starts from zero state: the
-    first ``skip`` samples of each record let that transient decay and are not scored. For
-    validation and test they are the samples before the part, so that nothing of it is lost.
+    Every record begins where the file begins and is simulated from there, from zero state: only its
+    own part is scored, so that the transient of the start reaches neither validation nor test.
 
     Args:
         path: the file.
@@ -54,8 +53,8 @@ def load(
         fs: sampling frequency in Hz.
         validation: fraction of the samples, those after the training part.
         test: fraction of the samples, those at the end.
-        skip: samples at the beginning of each record that are left out of cost and score; 5 % of
-            the file where left out.
+        skip: samples at the beginning of the file that are left out of the cost, for the transient
+            of the start; 5 % of the file where left out.
 
     Shape:
         u, y of a part: (its samples, inputs), (its samples, outputs), in the file's units.
@@ -87,10 +86,11 @@ def load(
     whole = _record(path, signals[: len(u_columns)], signals[len(u_columns) :], fs)
     skip = round(_WARM_UP * whole.samples) if skip is None else skip
     parts = _split(path, whole.samples, validation, test, skip)
-    train, chosen, scored = (
-        [replace(whole[window], name=name, skip=skip)] for name, window in parts.items()
+    train, chosen, tests = (
+        [replace(whole[: scored.stop], name=name, skip=scored.start)]
+        for name, scored in parts.items()
     )
-    return Dataset(path.stem, train, chosen, scored)
+    return Dataset(path.stem, train, chosen, tests)
 
 
 def _listed(columns: Columns | None, what: str) -> list[str | int]:
@@ -133,7 +133,7 @@ def _record(path: Path, u: list[Signal], y: list[Signal], fs: float) -> Record:
 
 
 def _split(path: Path, samples: int, validation: float, test: float, skip: int) -> dict[str, slice]:
-    """The samples of each record by its name, the skipped ones included."""
+    """The scored samples of each record by its name."""
     number("data.validation", validation)
     number("data.test", test)
     if not (0 < validation < 1 and 0 < test < 1 and validation + test < 1):
@@ -146,8 +146,8 @@ def _split(path: Path, samples: int, validation: float, test: float, skip: int) 
     ends += [samples - round(samples * test), samples]
     parts = {}
     for i, name in enumerate(("train", "validation", "test")):
-        first = max(0, ends[i] - skip)
-        scored = ends[i + 1] - first - skip
+        first = max(ends[i], skip)
+        scored = ends[i + 1] - first
         if scored < _SHORTEST:
             raise ValueError(
                 f"'{path}': the {name} part has {scored} scored samples of {samples}, with "
