@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.checks import integer
-from lfrtorch.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
 from lfrtorch.lfr import LFR
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler, as_records, rms_scale
@@ -263,8 +263,8 @@ def _model(cell: LFRCell, records: list[Record], scaler: Scaler) -> Model:
 class _LinearProblem(SimulationError):
     """Simulation error of a linear model, undefined where a pole passes LARGEST_POLE.
 
-    With ``offset`` the best constant output is taken off in closed form: each output's residual has
-    zero mean, and so have its derivatives (variable projection).
+    With ``offset`` the best constant output is taken off in closed form: residual and derivatives
+    are orthogonal to what a constant makes (variable projection).
     """
 
     def __init__(
@@ -272,6 +272,12 @@ class _LinearProblem(SimulationError):
     ) -> None:
         super().__init__(_model(cell, records, scaler), records)
         self.offset = offset
+        # The residuals (M, ny) that a constant in each output makes, at unit length.
+        each = torch.eye(len(self.model.outputs), dtype=torch.float64)
+        constants = torch.cat(
+            [b.weigh(each.expand(*b.y.shape, -1)).flatten(0, 2) for b in self.batches]
+        )
+        self._constants = constants / constants.norm(dim=0)
 
     def residual(self, theta: Tensor) -> Tensor:
         r = super().residual(theta)
@@ -282,11 +288,15 @@ class _LinearProblem(SimulationError):
     def jacobian(self, theta: Tensor) -> Tensor:
         return self._centred(super().jacobian(theta))
 
+    def linearise(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, theta: Tensor
+    ) -> DenseJacobian:
+        return DenseJacobian(self.jacobian(theta), self.residual(theta))
+
     def _centred(self, rows: Tensor) -> Tensor:
         if not self.offset:
             return rows
-        by_output = rows.reshape(-1, len(self.model.outputs), *rows.shape[1:])
-        return (by_output - by_output.mean(dim=0)).reshape(rows.shape)
+        return rows - self._constants @ (self._constants.mT @ rows)
 
 
 def _with_input_matrices(

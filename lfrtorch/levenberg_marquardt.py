@@ -14,7 +14,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -22,21 +22,68 @@ import torch
 from torch import Tensor
 
 from lfrtorch.checks import integer, number
+from lfrtorch.factors import Orthogonal, System
 
 FASTEST_DECREASE = 0.2
 """Smallest factor on λ after a good step; Nielsen has 1/3."""
 
 
+class Jacobian(Protocol):
+    """The Jacobian J (M, P) of a residual as far as the search needs it: never the whole of it."""
+
+    def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
+        """The system (JᵀJ + λI) δ = -gradient, and the gradient Jᵀr (P,) where J was taken.
+
+        Args:
+            damping: that of the next trial relative to the largest eigenvalue of JᵀJ, as far as it
+                is known: the system may have errors that are small against it.
+            truncation: relative size of singular values that are left out.
+        """
+        ...
+
+    def tangent(self, d_theta: Tensor) -> Tensor:
+        """J d_theta (M,)."""
+        ...
+
+    def adjoint(self, residual: Tensor) -> Tensor:
+        """Jᵀ residual (P,)."""
+        ...
+
+
 class LeastSquares(Protocol):
-    """A residual and its Jacobian; where the residual is undefined it is infinite or NaN."""
+    """A residual and its slope; where the residual is undefined it is infinite or NaN."""
 
     def residual(self, theta: Tensor) -> Tensor:
         """r (M,) at θ (P,)."""
         ...
 
-    def jacobian(self, theta: Tensor) -> Tensor:
-        """dr/dθ (M, P) at θ (P,)."""
+    def linearise(self, theta: Tensor) -> Jacobian:
+        """dr/dθ at θ (P,)."""
         ...
+
+    def cost(self, residual: Tensor) -> float:
+        """|r|²: of all parts of r, where processes share it."""
+        ...
+
+
+class DenseJacobian:
+    """A Jacobian (M, P) that is held whole, and the residual (M,) there."""
+
+    def __init__(self, jacobian: Tensor, residual: Tensor) -> None:
+        self.jacobian, self.residual = jacobian, residual
+
+    def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
+        """The system and the gradient."""
+        R = torch.linalg.qr(self.jacobian, mode="r").R
+        return Orthogonal(R, truncation), self.jacobian.mT @ self.residual
+
+    def tangent(self, d_theta: Tensor) -> Tensor:
+        """J d_theta (M,)."""
+        return self.jacobian @ d_theta
+
+    def adjoint(self, residual: Tensor) -> Tensor:
+        """Jᵀ residual (P,)."""
+        return self.jacobian.mT @ residual
 
 
 @dataclass(frozen=True)
@@ -46,7 +93,9 @@ class LMState:
     Args:
         theta: parameters (P,).
         residual: r(θ), (M,).
+        cost: |r|².
         damping: λ of the next trial; ``None`` before the first step.
+        scale: largest squared singular value of the Jacobian in the last step.
         growth: factor of λ on the next rejection.
         iteration: accepted and refused steps so far.
         gain_ratio: actual over predicted decrease of the last trial.
@@ -58,7 +107,9 @@ class LMState:
 
     theta: Tensor
     residual: Tensor
+    cost: float
     damping: float | None = None
+    scale: float = 1.0
     growth: float = 2.0
     iteration: int = 0
     gain_ratio: float = float("nan")
@@ -66,11 +117,6 @@ class LMState:
     rank: int = 0
     quiet: int = 0
     reason: str = ""
-
-    @property
-    def cost(self) -> float:
-        """|r|²."""
-        return float(self.residual.square().sum())
 
     @property
     def report(self) -> dict[str, float]:
@@ -134,41 +180,35 @@ class LevenbergMarquardt:
             ValueError: the residual at the start is not finite.
         """
         residual = problem.residual(theta)
-        if not torch.isfinite(residual).all():
+        cost = problem.cost(residual)
+        if not math.isfinite(cost):
             raise ValueError(
                 "the residual is not finite at the start of the search; start from a stable model."
             )
-        return LMState(theta, residual)
+        return LMState(theta, residual, cost)
 
     def step(self, problem: LeastSquares, state: LMState) -> LMState:
         """One iteration: linearise, then raise the damping until a step lowers the cost."""
-        jacobian = problem.jacobian(state.theta)
-        # Only R is formed: gradients Jᵀr then cost one product each, half the time of forming Q.
-        R = torch.linalg.qr(jacobian, mode="r").R
-        if not torch.isfinite(R).all() or not R.any():
+        jacobian = problem.linearise(state.theta)
+        relative = self.damping if state.damping is None else state.damping / state.scale
+        system, gradient = jacobian.system(relative, self.truncation)
+        scale = system.scale
+        if not scale > 0:
             return replace(state, reason="the Jacobian vanishes or is not finite")
-        _, s, Vh = torch.linalg.svd(R, full_matrices=False)
-        kept = s > self.truncation * s[0]
-        s, Vh = s[kept], Vh[kept]
-        scale = float(s[0]) ** 2
         damping = self.damping * scale if state.damping is None else state.damping
-        growth, cost, r = state.growth, state.cost, state.residual
-
-        def solve(right: Tensor) -> Tensor:
-            """argmin |J δ + right|² + λ|δ|²."""
-            return -Vh.mT @ ((Vh @ (jacobian.mT @ right)) / (s.square() + damping))
+        growth, cost = state.growth, state.cost
 
         trials, gain_ratio = 0, float("nan")
         while damping <= self.max_damping * scale:
             trials += 1
-            delta = solve(r)
-            slope = jacobian @ delta
-            predicted = float(slope.square().sum() + 2.0 * damping * delta.square().sum())
+            delta = system.solve(gradient, damping)
+            predicted = float(damping * delta.square().sum() - gradient @ delta)
             theta = state.theta + delta
             if self.acceleration:
-                theta = theta + self._acceleration(problem, state, slope, delta, solve)
+                theta = theta + self._acceleration(problem, state, delta, jacobian, system, damping)
             residual = problem.residual(theta)
-            actual = cost - float(residual.square().sum())
+            new_cost = problem.cost(residual)
+            actual = cost - new_cost
             gain_ratio = actual / predicted if predicted > 0 else float("nan")
             if actual > 0:  # False for NaN: a diverging trial is a rejected step
                 damping *= max(FASTEST_DECREASE, 1.0 - (2.0 * gain_ratio - 1.0) ** 3)
@@ -177,15 +217,17 @@ class LevenbergMarquardt:
                     state,
                     theta=theta,
                     residual=residual,
+                    cost=new_cost,
                     damping=damping,
+                    scale=scale,
                     growth=2.0,
                     iteration=state.iteration + 1,
                     gain_ratio=gain_ratio,
                     trials=trials,
-                    rank=len(s),
+                    rank=system.rank,
                     quiet=quiet,
                 )
-                if accepted.cost <= self.floor**2 * len(residual):
+                if accepted.cost <= self.floor**2 * problem.cost(torch.ones_like(residual)):
                     return replace(accepted, reason="converged: the residual vanishes")
                 if quiet >= self.patience:
                     return replace(accepted, reason="converged: the cost no longer falls")
@@ -199,7 +241,7 @@ class LevenbergMarquardt:
             iteration=state.iteration + 1,
             gain_ratio=gain_ratio,
             trials=trials,
-            rank=len(s),
+            rank=system.rank,
             reason="converged: no step lowers the cost",
         )
 
@@ -207,14 +249,17 @@ class LevenbergMarquardt:
         self,
         problem: LeastSquares,
         state: LMState,
-        slope: Tensor,
         delta: Tensor,
-        solve: Callable[[Tensor], Tensor],
+        jacobian: Jacobian,
+        system: System,
+        damping: float,
     ) -> Tensor:
         """Second-order correction a = ½ argmin |J a + r''|² + λ|a|², or 0 where it is too long."""
         h = self.finite_step
         ahead = problem.residual(state.theta + h * delta)
-        second = 2.0 / h * ((ahead - state.residual) / h - slope)
-        a = 0.5 * solve(second)
+        if not math.isfinite(problem.cost(ahead)):
+            return torch.zeros_like(delta)
+        second = 2.0 / h * ((ahead - state.residual) / h - jacobian.tangent(delta))
+        a = 0.5 * system.solve(jacobian.adjoint(second), damping)
         trusted = 2.0 * a.norm() <= self.acceleration_limit * delta.norm()  # False for NaN
         return a if trusted else torch.zeros_like(delta)

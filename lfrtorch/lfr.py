@@ -10,15 +10,8 @@ from torch.autograd.function import once_differentiable
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.records import Start
-from lfrtorch.recurrence import linear_recurrence
-from lfrtorch.simulate import (
-    Trajectory,
-    monodromy,
-    simulate,
-    slopes,
-    static_jacobians,
-    steady_state,
-)
+from lfrtorch.sensitivity import Linearisation
+from lfrtorch.simulate import Trajectory, simulate, steady_state
 
 
 class LFR(nn.Module):
@@ -49,34 +42,23 @@ class LFR(nn.Module):
 
     def forward(self, u: Tensor, x0: Tensor | None = None, start: Start = "zero") -> Tensor:
         """Simulated output; ``backward`` costs one adjoint recurrence (no second derivatives)."""
-        trajectory = self.trajectory(u.detach(), None if x0 is None else x0.detach(), start)
-        if not torch.is_grad_enabled():
-            return trajectory.y
-        # All steps in one batch with the states held fixed; what flows through the states is the
-        # adjoint recurrence of _ThroughStates.
-        y, x_next = self.cell(u, trajectory.x[:, :-1])
-        F, H = slopes(self.cell, static_jacobians(self.cell, trajectory.z)[0])
-        if x0 is None or start == "periodic":
-            x0 = trajectory.x[:, 0]
-        return _ThroughStates.apply(y, x_next, x0, F, H, start == "periodic")
+        weights = list(self.cell.parameters())
+        if x0 is None:
+            x0 = u.new_zeros(len(u), self.cell.nx)
+        return _Simulation.apply(self, start, u, x0, *weights)
 
 
-class _ThroughStates(torch.autograd.Function):
-    """Identity on y whose backward pass is λ(k) = F(k)ᵀ λ(k+1) + H(k)ᵀ dV/dy(k)."""
+class _Simulation(torch.autograd.Function):
+    """The simulation with the adjoint recurrence as its derivative."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        y: Tensor,
-        x_next: Tensor,
-        x0: Tensor,
-        F: Tensor,
-        H: Tensor,
-        periodic: bool,
+        ctx: Any, lfr: LFR, start: Start, u: Tensor, x0: Tensor, *weights: Tensor
     ) -> Tensor:
-        ctx.save_for_backward(F, H)
-        ctx.periodic = periodic
-        return y.clone()
+        trajectory = lfr.trajectory(u, x0, start)
+        ctx.save_for_backward(u, x0, *weights)
+        ctx.lfr, ctx.start, ctx.trajectory = lfr, start, trajectory
+        return trajectory.y.clone()
 
     @staticmethod
     @once_differentiable
@@ -84,15 +66,14 @@ class _ThroughStates(torch.autograd.Function):
         ctx: Any, *grad_outputs: Tensor
     ) -> tuple[Tensor | None, ...]:
         (grad_y,) = grad_outputs
-        F, H = ctx.saved_tensors
-        # Backwards in time: index 0 of the recurrence is the end of the record.
-        F = F.mT.flip(1)
-        g = (H.mT @ grad_y.unsqueeze(-1)).flip(1)
-        end = g.new_zeros(g.shape[0], *g.shape[2:])
-        adjoint = linear_recurrence(F, g, end)
-        if ctx.periodic:
-            identity = torch.eye(F.shape[-1], dtype=F.dtype, device=F.device)
-            end = torch.linalg.solve(identity - monodromy(F), adjoint[:, -1])
-            adjoint = linear_recurrence(F, g, end)
-        adjoint = adjoint.squeeze(-1).flip(1)
-        return grad_y, adjoint[:, 1:], adjoint[:, 0], None, None, None
+        u, _, *weights = ctx.saved_tensors
+        periodic = ctx.start == "periodic"
+        cell = ctx.lfr.cell
+        linearisation = Linearisation(cell, u, ctx.trajectory, periodic=periodic, weights=weights)
+        adjoint = linearisation.adjoint(grad_y)
+        sizes = [p.numel() for p in weights]
+        gradients = [
+            part.reshape(p.shape)
+            for part, p in zip(adjoint.theta.sum(0).split(sizes), weights, strict=True)
+        ]
+        return None, None, adjoint.u, None if periodic else adjoint.x0, *gradients

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.nn import Module, Parameter
+from torch.func import functional_call, vmap
+from torch.nn import Module, Parameter, ParameterList
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "tanh": torch.tanh,
@@ -68,3 +69,30 @@ class Network(Module):
         """Sizes and activation, for ``print(module)``."""
         (nn, nz), nw = self.Wz.shape, len(self.Ww)
         return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}"
+
+
+class Stacked(Module):
+    """One map with its own weights for every record: (R, T, nz) -> (R, T, nw).
+
+    Args:
+        base: the map; its own weights are not used.
+        weights: by the names of its parameters, each with a leading axis of length R.
+    """
+
+    def __init__(self, base: Module, weights: dict[str, Tensor]) -> None:
+        super().__init__()
+        self._base, self.names = [base], list(weights)  # a list hides the module's own weights
+        self.weights = ParameterList(weights.values())
+
+    @property
+    def base(self) -> Module:
+        """The map."""
+        return self._base[0]
+
+    def forward(self, z: Tensor) -> Tensor:
+        """w (R, T, nw) of z (R, T, nz)."""
+
+        def one(weights: dict[str, Tensor], z: Tensor) -> Tensor:
+            return functional_call(self.base, weights, (z,))
+
+        return vmap(one)(dict(zip(self.names, self.weights, strict=True)), z)

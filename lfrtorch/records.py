@@ -24,14 +24,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch.checks import integer
 
-Start = Literal["zero", "periodic"]
+Start = Literal["zero", "given", "estimated", "periodic"]
 
 _MANY_CHANNELS = 16
 """An array of more channels than this and fewer samples is taken for a transposed one."""
@@ -55,19 +55,26 @@ class Record:
         u: input, physical units. A one-dimensional array is one channel.
         y: output, physical units. A one-dimensional array is one channel.
         fs: sampling frequency in Hz.
-        start: ``"zero"`` simulates from x = 0 (at rest at the input's offset);
-            ``"periodic"`` says that the record is a whole number of periods in steady state.
+        start: ``"zero"`` simulates from x = 0 (at rest at the input's offset), ``"given"`` from
+            ``x0``; ``"estimated"`` fits the start state to the record, too; ``"periodic"`` says
+            that the record is a whole number of periods in steady state.
         skip: samples at the beginning that are left out of cost and score.
+        x0: the given start state, in the coordinates of the model.
+        weight: of the squared normalised errors in a fit, one number or one for each output.
+        line_weight: of the squared errors in a fit by spectral line, for whole periods without
+            ``skip``: line f is that of ``numpy.fft.rfft``. 1 for all lines is plain least squares;
+            1 / noise variance is maximum likelihood (Pintelon and Schoukens, 2012, chapter 9).
         name: what tables and messages call it.
         source: where it comes from: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
         inputs, outputs: channel names and units, one a column of ``u`` and ``y``.
 
     Shape:
-        u: (T, nu), y: (T, ny).
+        u: (T, nu), y: (T, ny), x0: (nx,), weight: () or (ny,),
+        line_weight: (T // 2 + 1,) or (T // 2 + 1, ny).
 
     Raises:
-        ValueError: NaN or infinite samples, different lengths, wrong shapes, or a ``skip`` that
-            leaves no sample.
+        ValueError: NaN or infinite samples, different lengths, wrong shapes, negative weights, or a
+            ``skip`` that leaves no sample.
     """
 
     u: NDArray[np.float64]
@@ -79,6 +86,9 @@ class Record:
     source: str = "file"
     inputs: tuple[Channel, ...] = ()
     outputs: tuple[Channel, ...] = ()
+    x0: NDArray[np.float64] | None = None
+    weight: float | NDArray[np.float64] = 1.0
+    line_weight: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         inputs = _channels(self.inputs, self.u, "u")
@@ -102,8 +112,48 @@ class Record:
                 f"record '{self.name}': skip={self.skip} leaves no sample of {len(u)}; "
                 "use a smaller skip or a longer record."
             )
+        if (self.start == "given") != (self.x0 is not None):
+            raise ValueError(
+                f"record '{self.name}': start is {self.start!r} and x0 is {self.x0}; "
+                "a start state goes with start='given', and only with it."
+            )
+        if self.x0 is not None:
+            object.__setattr__(self, "x0", np.array(self.x0, dtype=np.float64).reshape(-1))
+        self._check_weights(len(u), y.shape[1])
         for field, value in (("u", u), ("y", y), ("inputs", inputs), ("outputs", outputs)):
             object.__setattr__(self, field, value)
+
+    def _check_weights(self, T: int, ny: int) -> None:
+        weight = np.array(self.weight, dtype=np.float64)
+        if weight.shape not in ((), (1,), (ny,)):
+            raise ValueError(
+                f"record '{self.name}': weight has shape {weight.shape}; give one number, or one "
+                f"for each of the {ny} output(s)."
+            )
+        lines = self.line_weight
+        if lines is not None:
+            given = np.array(lines, dtype=np.float64)
+            lines = given[:, None] if given.ndim == 1 else given
+            F = T // 2 + 1
+            if lines.shape not in ((F, 1), (F, ny)):
+                raise ValueError(
+                    f"record '{self.name}': line_weight has shape {given.shape}; "
+                    f"{T} samples have {F} lines from 0 to fs / 2: give ({F},) or ({F}, {ny})."
+                )
+            if self.start != "periodic" or self.skip:
+                raise ValueError(
+                    f"record '{self.name}': line_weight needs start='periodic' and skip=0, not "
+                    f"start={self.start!r} and skip={self.skip}."
+                )
+            lines = np.broadcast_to(lines, (F, ny))
+        for name, values in (("weight", weight), ("line_weight", lines)):
+            if values is None:
+                continue
+            if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
+                raise ValueError(
+                    f"record '{self.name}': {name} must be finite, at least 0 and not all 0."
+                )
+            object.__setattr__(self, name, values)
 
     @property
     def samples(self) -> int:
@@ -118,7 +168,10 @@ class Record:
         """
         if not isinstance(window, slice) or window.step not in (None, 1):
             raise ValueError(f"a record is cut by record[first:last], not by {window!r}.")
-        return replace(self, u=self.u[window], y=self.y[window], start="zero", skip=0)
+        return replace(
+            self, u=self.u[window], y=self.y[window], start="zero", skip=0, x0=None,
+            line_weight=None,
+        )  # fmt: skip
 
 
 def as_records(records: Record | Sequence[Record]) -> list[Record]:
@@ -174,9 +227,11 @@ class Scaler:
 
 
 def check_start(start: str, what: str) -> None:
-    """Refuse a start that is neither ``"zero"`` nor ``"periodic"`` with a ValueError."""
-    if start not in ("zero", "periodic"):
-        raise ValueError(f"{what}: start is {start!r}; use 'zero' or 'periodic'.")
+    """Refuse an unknown kind of start with a ValueError."""
+    if start not in get_args(Start):
+        raise ValueError(
+            f"{what}: start is {start!r}; use 'zero', 'given', 'estimated' or 'periodic'."
+        )
 
 
 def rms_scale(signals: Sequence[NDArray[np.float64]], offset: NDArray[np.float64]) -> NDArray:

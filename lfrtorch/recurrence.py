@@ -26,6 +26,17 @@ def linear_recurrence(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
     return compiled(F, g, s0) if F.device.type == "cpu" else scan(F, g, s0)
 
 
+def adjoint_recurrence(F: Tensor, g: Tensor, end: Tensor) -> Tensor:
+    """All states of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end: the same back in time.
+
+    Shape:
+        F: (R, T, n, n), g: (R, T, n, m), end: (R, n, m) -> (R, T + 1, n, m).
+    """
+    if F.device.type == "cpu":
+        return compiled(F, g, end, backwards=True)
+    return scan(F.mT.flip(1), g.flip(1), end).flip(1)
+
+
 def loop(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
     """The recurrence written out: the oracle of the two others."""
     states = [s0]
@@ -34,12 +45,12 @@ def loop(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
     return torch.stack(states, dim=1)
 
 
-def compiled(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
-    """The recurrence in machine code, records in parallel; CPU tensors of one dtype."""
+def compiled(F: Tensor, g: Tensor, s0: Tensor, *, backwards: bool = False) -> Tensor:
+    """Either recurrence in machine code, records in parallel; CPU tensors of one dtype."""
     R, T, n, m = g.shape
     s = g.new_empty(R, T + 1, n, m)
-    s[:, 0] = s0
-    spread(_recur, R, to_numpy(F), to_numpy(g), s.detach().numpy())
+    s[:, T if backwards else 0] = s0
+    spread(_recur_back if backwards else _recur, R, to_numpy(F), to_numpy(g), s.detach().numpy())
     return s
 
 
@@ -48,17 +59,28 @@ def to_numpy(tensor: Tensor) -> NDArray:
     return tensor.detach().contiguous().numpy()
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def _recur(r, F, g, s):
     _, T, n, m = g.shape
     for k in range(T):
         for i in range(n):
             for c in range(m):
-                s[r, k + 1, i, c] = g[r, k, i, c]
-            for j in range(n):
-                f = F[r, k, i, j]
-                for c in range(m):
-                    s[r, k + 1, i, c] += f * s[r, k, j, c]
+                a = g[r, k, i, c]
+                for j in range(n):
+                    a += F[r, k, i, j] * s[r, k, j, c]
+                s[r, k + 1, i, c] = a
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _recur_back(r, F, g, s):
+    _, T, n, m = g.shape
+    for k in range(T - 1, -1, -1):
+        for i in range(n):
+            for c in range(m):
+                a = g[r, k, i, c]
+                for j in range(n):
+                    a += F[r, k, j, i] * s[r, k + 1, j, c]
+                s[r, k, i, c] = a
 
 
 def scan(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:

@@ -2,155 +2,178 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from lfrtorch.batch import batches_of
 from lfrtorch.checks import number
+from lfrtorch.gauge import reduction
+from lfrtorch.jacobian import Jacobian, Part
 from lfrtorch.model import Model
-from lfrtorch.records import Record, Start, as_records
-from lfrtorch.sensitivity import output_jacobian
-from lfrtorch.simulate import Trajectory
+from lfrtorch.records import Record, as_records
+from lfrtorch.sensitivity import Linearisation
+from lfrtorch.simulate import Trajectory, estimated_start
 
-
-class Batch(NamedTuple):
-    """Records of one length and start, normalised.
-
-    Shape:
-        u: (R, T, nu), y: (R, T, ny), scored: (R, T), True where a sample counts.
-    """
-
-    u: Tensor
-    y: Tensor
-    scored: Tensor
-    start: Start
-
-    def select(self, signal: Tensor) -> Tensor:
-        """The scored samples of a signal (R, T, ...), records one after another."""
-        whole = signal.flatten(0, 1)
-        return whole if bool(self.scored.all()) else whole[self.scored.flatten()]
+Ridge = float | Mapping[str, float]
 
 
 class SimulationError:
-    """Residual, Jacobian and gradient of a model's mean squared simulation error.
+    """Residual, slope and gradient of a model's mean squared simulation error.
 
-    r = y_hat - y in normalised units, over all scored samples of all records, followed by
-    √ridge (θ - θ_start). θ is the vector of all parameters of ``model.lfr`` that require a
-    gradient; evaluating at θ writes it into the module.
+    r = weighted y_hat - y in normalised units, over all samples of all records (0 where a sample
+    does not count), followed by √ridge (θ - θ_start). θ is the vector of all parameters of
+    ``model.lfr`` that require a gradient, then the start state of each record whose start is
+    ``"estimated"``; evaluating at θ writes it into the module.
 
     Args:
         model: the model whose parameters are θ; θ_start is what they are now.
         records: the data, of the model's channels and rate.
         ridge: weight of |θ - θ_start|² beside |y_hat - y|²: the noise variance over that of a
-            prior on each parameter, both normalised.
+            prior on each parameter, both normalised. One number, or one for each group of
+            parameters by the beginning of their names: ``{"static": 1e-3, "A": 1e-2, "x0": 0}``;
+            those without get none.
+        solved_starts: estimated start states are no part of θ, but solved for at every θ.
+
+    Raises:
+        ValueError: records that are not the model's, a negative ridge or an unknown group.
     """
 
     def __init__(
-        self, model: Model, records: Record | Sequence[Record], *, ridge: float = 0.0
+        self,
+        model: Model,
+        records: Record | Sequence[Record],
+        *,
+        ridge: Ridge = 0.0,
+        solved_starts: bool = False,
     ) -> None:
-        number("ridge", ridge)
         self.model = model
+        self._parameters = [p for p in model.lfr.parameters() if p.requires_grad]
         data = as_records(records)
         for record in data:
             model.check(record)
-        self.batches = _batches(model, data)
-        self.size = sum(int(b.scored.sum()) for b in self.batches) * len(model.outputs)
-        self._ridge, self._start = ridge, self.theta
+        self.batches = batches_of(model, data)
+        self.size = sum(record.samples - record.skip for record in data) * len(model.outputs)
+        self._solved = solved_starts
+        self._starts = self._first_starts()
+        self._start = self.theta
+        self._ridge = self._ridge_of(ridge)
         self._guesses: list[Tensor | None] = [None] * len(self.batches)
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
 
     @property
     def theta(self) -> Tensor:
-        """Parameters (P,) as they stand in the module."""
-        return parameters_to_vector(self._parameters()).detach()
+        """Parameters (P,) as they stand in the module, then the estimated start states."""
+        starts = [x0.flatten() for x0 in self._starts.values()]
+        return torch.cat([parameters_to_vector(self._parameters).detach(), *starts])
 
-    def rmse(self, residual: Tensor) -> float:
-        """Root mean squared error over samples and outputs of a residual, output unit."""
-        errors = residual[: self.size].reshape(-1, len(self.model.outputs)).double().cpu().numpy()
-        with np.errstate(over="ignore", invalid="ignore"):  # a diverging model scores inf or NaN
-            return float(np.sqrt(np.mean((errors * self.model.scaler.y_scale) ** 2)))
+    def rmse(self, theta: Tensor) -> float:
+        """Root mean squared error at θ over scored samples and outputs, output unit, unweighted."""
+        total, scale = 0.0, torch.as_tensor(self.model.scaler.y_scale).to(self._start)
+        for batch, trajectory in zip(self.batches, self.trajectories(theta), strict=True):
+            errors = (trajectory.y - batch.y) * scale
+            if not batch.spectral:
+                errors = errors * (batch.weight != 0)
+            total += float(errors.double().square().sum())
+        return float(np.sqrt(total / self.size))
 
     def write(self, theta: Tensor) -> None:
         """Put θ (P,) into the module."""
-        vector_to_parameters(theta, self._parameters())
+        sizes = [x0.numel() for x0 in self._starts.values()]
+        own, *starts = theta.split([len(theta) - sum(sizes), *sizes])
+        vector_to_parameters(own, self._parameters)
+        for (i, x0), start in zip(self._starts.items(), starts, strict=True):
+            self._starts[i] = start.reshape(x0.shape)
+
+    def cost(self, residual: Tensor) -> float:
+        """|r|²."""
+        return float(residual.square().sum())
 
     def residual(self, theta: Tensor) -> Tensor:
         """r (M,); infinite or NaN where the model diverges."""
         pairs = zip(self.batches, self.trajectories(theta), strict=True)
-        errors = [batch.select(t.y - batch.y).flatten() for batch, t in pairs]
+        errors = [batch.weigh(t.y - batch.y).flatten() for batch, t in pairs]
         return torch.cat([*errors, *self._penalty(theta)])
 
-    def jacobian(self, theta: Tensor) -> Tensor:
-        """dr/dθ (M, P)."""
+    def linearise(self, theta: Tensor) -> Jacobian:
+        """dr/dθ at θ, held as a whole only where it is small."""
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
         self._guesses = [t.x[:, 0] for t in trajectories]
-        P, penalty = len(theta), self._penalty(theta)
-        J = theta.new_empty(self.size + sum(map(len, penalty)), P)
-        if penalty:
-            J[self.size :] = self._ridge**0.5 * torch.eye(P, dtype=J.dtype, device=J.device)
-        first = 0
-        for batch, trajectory in zip(self.batches, trajectories, strict=True):
-            part = J[first : first + int(batch.scored.sum()) * len(self.model.outputs)]
-            first += len(part)
-            whole = part.numel() == batch.y.numel() * P  # nothing skipped: no copy
-            rows = output_jacobian(
-                self.model.lfr.cell,
-                batch.u,
-                trajectory,
-                periodic=batch.start == "periodic",
-                out=part.view(*batch.y.shape, P) if whole else None,
-            )
-            if not whole:
-                part[:] = batch.select(rows).flatten(0, 1)
-        return J
+        cell = self.model.lfr.cell
+        parts, first = [], sum(p.numel() for p in self._parameters)
+        for i, (batch, trajectory) in enumerate(zip(self.batches, trajectories, strict=True)):
+            x0 = slice(first, first + self._starts[i].numel()) if i in self._starts else None
+            first = first if x0 is None else x0.stop
+            periodic = batch.start == "periodic"
+            linearisation = Linearisation(cell, batch.u, trajectory, periodic=periodic)
+            parts.append(Part(batch, linearisation, x0))
+        start = torch.cat([cell.A.new_zeros(0, cell.nx), *self._starts.values()])
+        held = any(batch.x0 is not None for batch in self.batches)
+        reduced = reduction(cell, start, coordinates=not held)
+        return Jacobian(parts, reduced, self._ridge.sqrt(), *self._penalty(theta))
+
+    def jacobian(self, theta: Tensor) -> Tensor:
+        """dr/dθ (M, P) as a whole: for a look at it, and for small problems."""
+        return SimulationError.linearise(self, theta).whole()
 
     def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """r (M,) and the gradient (P,) of |r|² / samples, by the adjoint recurrence."""
-        self.write(theta)
-        errors = []
-        for i, batch in enumerate(self.batches):
-            y_hat = self.model.lfr(batch.u, self._guesses[i], batch.start)
-            errors.append(batch.select(y_hat - batch.y).flatten())
-        r = torch.cat(errors)
-        gradients = torch.autograd.grad(r.square().sum() / self.size, self._parameters())
-        gradient = parameters_to_vector(gradients)
-        gradient = gradient + 2.0 * self._ridge / self.size * (theta - self._start)
-        return torch.cat([r.detach(), *self._penalty(theta)]), gradient
-
-    def _penalty(self, theta: Tensor) -> list[Tensor]:
-        return [self._ridge**0.5 * (theta - self._start)] if self._ridge else []
-
-    def _parameters(self) -> list[torch.nn.Parameter]:
-        return [p for p in self.model.lfr.parameters() if p.requires_grad]
+        r = self.residual(theta)
+        return r, 2.0 / self.size * self.linearise(theta).adjoint(r)
 
     def trajectories(self, theta: Tensor) -> list[Trajectory]:
         """Trajectories at θ, those of the latest θ kept; periodic ones start from a good guess."""
         if self._latest is None or self._latest[0] is not theta:
             self.write(theta)
-            trajectories = [
-                self.model.lfr.trajectory(batch.u, guess, batch.start)
-                for batch, guess in zip(self.batches, self._guesses, strict=True)
-            ]
-            self._latest = theta, trajectories
+            self._latest = theta, [self._trajectory(i) for i in range(len(self.batches))]
         return self._latest[1]
 
+    def _trajectory(self, i: int) -> Trajectory:
+        batch, cell = self.batches[i], self.model.lfr.cell
+        if batch.start == "periodic":
+            return self.model.lfr.trajectory(batch.u, self._guesses[i], "periodic")
+        if batch.start == "estimated" and self._solved:
+            return estimated_start(cell, batch.u, batch.y, batch.weight)
+        return self.model.lfr.trajectory(batch.u, self._starts.get(i, batch.x0))
 
-def _batches(model: Model, records: list[Record]) -> list[Batch]:
-    like = model.lfr.cell.A
-    groups: dict[tuple[int, Start], list[Record]] = defaultdict(list)
-    for record in records:
-        groups[record.samples, record.start].append(record)
-    batches = []
-    for (T, start), group in groups.items():
-        u = np.stack([model.scaler.normalise_u(record.u) for record in group])
-        y = np.stack([model.scaler.normalise_y(record.y) for record in group])
-        skip = torch.tensor([record.skip for record in group], device=like.device)
-        scored = torch.arange(T, device=like.device) >= skip.unsqueeze(1)
-        batches.append(Batch(torch.tensor(u).to(like), torch.tensor(y).to(like), scored, start))
-    return batches
+    def _first_starts(self) -> dict[int, Tensor]:
+        """Start states by the number of their batch, where they are parameters."""
+        if self._solved:
+            return {}
+        cell = self.model.lfr.cell
+        return {
+            i: estimated_start(cell, batch.u, batch.y, batch.weight).x[:, 0].clone()
+            for i, batch in enumerate(self.batches)
+            if batch.start == "estimated"
+        }
+
+    def _penalty(self, theta: Tensor) -> list[Tensor]:
+        return [self._ridge.sqrt() * (theta - self._start)] if self._ridge.any() else []
+
+    def _ridge_of(self, ridge: Ridge) -> Tensor:
+        """The weight of every entry of θ."""
+        groups = ridge if isinstance(ridge, Mapping) else {"": ridge}
+        names = [n for n, p in self.model.lfr.cell.named_parameters() if p.requires_grad]
+        sizes = [p.numel() for p in self._parameters]
+        names += ["x0"] * len(self._starts)
+        sizes += [x0.numel() for x0 in self._starts.values()]
+        weights = [0.0] * len(names)
+        for group, value in groups.items():
+            number(f"ridge of '{group}'" if group else "ridge", value)
+            own = [i for i, name in enumerate(names) if _belongs(name, group)]
+            if not own:
+                raise ValueError(
+                    f"ridge has a group '{group}', and no parameter's name begins so; "
+                    f"the parameters are {', '.join(dict.fromkeys(names))}."
+                )
+            for i in own:
+                weights[i] = float(value)
+        return torch.tensor(weights).to(self._start).repeat_interleave(torch.tensor(sizes))
+
+
+def _belongs(name: str, group: str) -> bool:
+    return not group or name == group or name.startswith(f"{group}.")

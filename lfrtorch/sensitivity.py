@@ -1,18 +1,24 @@
-"""Jacobian of the simulated output with respect to every parameter of the cell.
+"""Derivatives of the simulated output with respect to every parameter of the cell.
 
 With v = [x; u; w] the model is linear in its matrices::
 
     x+ = [A Bu Bw] v      z = [Cz Dzu 0] v      y = [Cy Dyu Dyw] v      w = f(z; φ)
 
-so the direct terms of a parameter are entries of v, but for those of the static map, which come
-from ``torch.func``. The indirect ones, through the state, are one linear recurrence for all
-parameters at once::
+so the direct terms of a parameter are entries of v, but for those of the static map. The indirect
+ones, through the state, are one linear recurrence::
 
     S(k+1) = F(k) S(k) + G(k),    dy(k)/dθ = H(k) S(k) + E(k)
+
+in three ways: for all parameters at once (``rows``), for one direction dθ (``tangent``) and, back
+in time, for one combination of outputs (``adjoint``). Time is passed in blocks, so that memory
+does not grow with the length of a record.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -21,91 +27,28 @@ from numba import njit
 from torch import Tensor
 
 from lfrtorch.cell import LFRCell
-from lfrtorch.recurrence import linear_recurrence, to_numpy
-from lfrtorch.simulate import Slopes, Trajectory, slopes, static_jacobians
+from lfrtorch.recurrence import adjoint_recurrence, linear_recurrence, to_numpy
+from lfrtorch.simulate import PASS, Slopes, Trajectory, of_static, slopes_at
+from lfrtorch.static_slopes import NetworkSlopes, StaticSlopes, static_slopes
 from lfrtorch.threads import spread
 
-CLOSED = 1e-18
-"""What the start state still moves of an output, relative to the start, that counts as nothing."""
+BLOCK = 8192
+"""Samples of all records together in a block of rows on the CPU."""
 
 
-@torch.no_grad()
-def output_jacobian(
-    cell: LFRCell,
-    u: Tensor,
-    trajectory: Trajectory,
-    *,
-    periodic: bool = False,
-    out: Tensor | None = None,
-) -> Tensor:
-    """dy/dθ along a trajectory, columns in the order of ``cell.named_parameters()``.
-
-    Args:
-        cell: the model; parameters with ``requires_grad=False`` get no column.
-        u: input of the trajectory.
-        trajectory: from a start state that does not depend on θ, or in periodic steady state.
-        periodic: the start state is the end state, whatever the parameters.
-        out: where to write the result, contiguous.
+class Adjoint(NamedTuple):
+    """Derivatives of Σ e(k) · y(k).
 
     Shape:
-        u: (R, T, nu) -> (R, T, ny, P).
-    """
-    terms = _terms(cell, u, trajectory)
-    rows = u.new_empty(*u.shape[:2], cell.ny, terms.parameters) if out is None else out
-    end = (_rows_compiled if u.device.type == "cpu" else _rows_generic)(cell, terms, rows)
-    if periodic:
-        _close(terms.slopes, rows, end)
-    return rows
-
-
-def _close(slope: Slopes, rows: Tensor, end: Tensor) -> None:
-    """Add what the start state contributes when it moves with θ so that S(0) = S(T).
-
-    S(T) = end + Φ S(0); the rows of the start state fade, and are added as far as they reach.
-    """
-    identity = torch.eye(end.shape[1], dtype=end.dtype, device=end.device).expand_as(slope.F[:, 0])
-    states = linear_recurrence(slope.F, torch.zeros_like(slope.F), identity)
-    start = torch.linalg.solve(identity - states[:, -1], end)
-    free = slope.H @ states[:, :-1]  # (R, T, ny, nx)
-    reach = torch.nonzero(~(free.abs().amax(dim=(0, 2, 3)) <= CLOSED))  # NaN reaches, too
-    length = int(reach[-1]) + 1 if len(reach) else 0
-    rows[:, :length] += free[:, :length] @ start.unsqueeze(1)
-
-
-class _Entries(NamedTuple):
-    """Direct terms of neighbouring columns, from ``first`` on.
-
-    Column first + c is that of a parameter that multiplies ``v[regressor[c]]`` in row ``row[c]``.
+        theta: (R, P), each record's own; u: (R, T, nu); x0: (R, nx).
     """
 
-    first: int
-    row: list[int]
-    regressor: list[int]
-
-    @property
-    def columns(self) -> slice:
-        """The columns."""
-        return slice(self.first, self.first + len(self.row))
+    theta: Tensor
+    u: Tensor
+    x0: Tensor
 
 
-class _Terms(NamedTuple):
-    """All that the recurrence needs at every sample; columns of x, z, y and static map in turn.
-
-    Shape:
-        v: (R, T, nx + nu + nw), J: (R, T, nw, nz), d_static: (R, T, nw, columns of the static map).
-    """
-
-    slopes: Slopes
-    v: Tensor
-    J: Tensor
-    d_static: Tensor
-    x: _Entries
-    z: _Entries
-    y: _Entries
-    parameters: int
-
-
-_MATRICES = {
+_EQUATIONS = {
     "x": {"A": "x", "Bu": "u", "Bw": "w"},
     "z": {"Cz": "x", "Dzu": "u"},
     "y": {"Cy": "x", "Dyu": "u", "Dyw": "w"},
@@ -113,112 +56,513 @@ _MATRICES = {
 """What each matrix multiplies, by the equation it stands in, in the order of the parameters."""
 
 
-def _terms(cell: LFRCell, u: Tensor, trajectory: Trajectory) -> _Terms:
-    v = torch.cat([trajectory.x[:, :-1], u, trajectory.w], dim=-1)
-    offset = {"x": 0, "u": cell.nx, "w": cell.nx + cell.nu}
-    entries, P = {}, 0
-    for left, matrices in _MATRICES.items():
-        row, regressor = [], []
-        for name, right in matrices.items():
-            matrix: Tensor = getattr(cell, name)
-            if matrix.requires_grad:
-                rows, width = matrix.shape
-                row += [i for i in range(rows) for _ in range(width)]
-                regressor += list(range(offset[right], offset[right] + width)) * rows
-        entries[left] = _Entries(P, row, regressor)
-        P += len(row)
-    J, by_weight = static_jacobians(cell, trajectory.z, parameters=True)
-    static = [by_weight[name] for name, p in _static_parameters(cell) if p.requires_grad]
-    d_static = torch.cat([J.new_zeros(*J.shape[:3], 0), *static], dim=-1)
-    return _Terms(slopes(cell, J), v, J, d_static, **entries, parameters=P + d_static.shape[-1])
+class Columns(NamedTuple):
+    """Direct terms of some columns.
+
+    Each row (column, row, regressor) of ``x``, ``z``, ``y`` says that the column's parameter
+    multiplies ``v[regressor]`` in that row of the equation. Those of the static map begin at the
+    column ``first``.
+
+    Shape:
+        x, z, y: (entries, 3), static: (kept,), positions among all weights of the map.
+    """
+
+    x: Tensor
+    z: Tensor
+    y: Tensor
+    static: Tensor
+    first: int
 
 
-def _static_parameters(cell: LFRCell) -> list[tuple[str, Tensor]]:
-    return [] if cell.static is None else list(cell.static.named_parameters())
+def layout(cell: LFRCell, *, every: bool = False) -> Layout:
+    """Layout of the free parameters, or of all: the same object for cells that are alike."""
+    models = cell.A.numel() // cell.nx**2
+    parameters = tuple(
+        (name, p.numel() // models, every or p.requires_grad) for name, p in cell.named_parameters()
+    )
+    return _layout(cell.nx, cell.nu, cell.ny, cell.nz, cell.nw, parameters)
 
 
-def _rows_generic(cell: LFRCell, t: _Terms, rows: Tensor) -> Tensor:
-    """Write the rows (R, T, ny, P) by the recurrence primitive, any device; S(T) (R, nx, P)."""
-    R, T = t.v.shape[:2]
-    dw = t.v.new_zeros(R, T, cell.nw, t.parameters)
-    dw[..., t.z.columns] = t.J[..., t.z.row] * t.v[..., t.z.regressor].unsqueeze(2)
-    dw[..., t.parameters - t.d_static.shape[-1] :] = t.d_static
-    G, E = cell.Bw @ dw, cell.Dyw @ dw
-    for target, entries in ((G, t.x), (E, t.y)):
-        columns = torch.arange(entries.first, entries.columns.stop)
-        target[..., entries.row, columns] += t.v[..., entries.regressor]
-    S = linear_recurrence(t.slopes.F, G, torch.zeros_like(G[:, 0]))
-    torch.add(t.slopes.H @ S[:, :-1], E, out=rows)
-    return S[:, -1]
+class Layout:
+    """Where parameters (name, size, whether free) stand: in θ (the free), and in the equations."""
+
+    def __init__(
+        self,
+        nx: int,
+        nu: int,
+        ny: int,
+        nz: int,
+        nw: int,
+        parameters: tuple[tuple[str, int, bool], ...],
+    ) -> None:
+        self.rows = {"x": nx, "z": nz, "y": ny}
+        self.width = nx + nu + nw
+        start, size = {"x": 0, "u": nx, "w": nx + nu}, {"x": nx, "u": nu, "w": nw}
+        places = {
+            name: (e, self.rows[left], start[right], size[right])
+            for e, (left, matrices) in enumerate(_EQUATIONS.items())
+            for name, right in matrices.items()
+        }
+        # For every element of θ: equation (3: static map), row (its position), regressor.
+        table = []
+        self.weights = 0
+        for name, count, free in parameters:
+            if name in places:
+                e, n, first, m = places[name]
+                row = torch.arange(n).repeat_interleave(m)
+                entries = torch.stack(
+                    [torch.full_like(row, e), row, first + torch.arange(m).repeat(n)]
+                )
+            else:
+                position = self.weights + torch.arange(count)
+                entries = torch.stack([torch.full_like(position, 3), position, position])
+                self.weights += count
+            if free:
+                table.append(entries)
+        self.table = torch.cat([torch.zeros(3, 0, dtype=torch.int64), *table], dim=1)
+
+    def columns(self, kept: Tensor) -> Columns:
+        """The direct terms of the kept parameters (K,), positions in θ, ascending."""
+        equation, row, regressor = self.table[:, kept.cpu()]
+        column = torch.arange(len(equation))
+        entries = torch.stack([column, row, regressor], dim=1)
+        x, z, y = (entries[equation == e] for e in range(3))
+        static = row[equation == 3]
+        return Columns(x, z, y, static, len(column) - len(static))
+
+    def matrices(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Changes of [A Bu Bw], [Cz Dzu 0], [Cy Dyu Dyw] and the static map for θ (..., P)."""
+        equation, row, regressor = self.table.to(theta.device)
+        parts = []
+        for e, rows in enumerate(self.rows.values()):
+            own = equation == e
+            matrix = theta.new_zeros(*theta.shape[:-1], rows, self.width)
+            matrix[..., row[own], regressor[own]] = theta[..., own]
+            parts.append(matrix)
+        static = theta.new_zeros(*theta.shape[:-1], self.weights)
+        static[..., row[equation == 3]] = theta[..., equation == 3]
+        return *parts, static
+
+    def vector(self, x: Tensor, z: Tensor, y: Tensor, static: Tensor) -> Tensor:
+        """The entries of such matrices (R, rows, width) that belong to θ: (R, P)."""
+        equation, row, regressor = self.table.to(x.device)
+        theta = x.new_empty(len(x), len(equation))
+        for e, matrix in enumerate((x, z, y)):
+            own = equation == e
+            theta[:, own] = matrix[:, row[own], regressor[own]]
+        theta[:, equation == 3] = static[:, row[equation == 3]]
+        return theta
 
 
-def _rows_compiled(cell: LFRCell, t: _Terms, rows: Tensor) -> Tensor:
-    """The same in machine code, without ever storing S over time."""
-    R = len(rows)
-    end = rows.new_empty(R, cell.nx, t.parameters)
-    tensors = (t.slopes.F, t.slopes.H, t.v, t.J, t.d_static, cell.Bw, cell.Dyw)
-    entries = []
-    for group in (t.x, t.z, t.y):
-        entries += [group.first, *(np.array(e, dtype=np.int64) for e in group[1:])]
-    chunks = max(1, torch.get_num_threads() // R)
-    arguments = [*map(to_numpy, tensors), *entries, chunks, rows.numpy(), end.numpy()]
-    spread(_emit, R * chunks, *arguments)
-    return end
+class _Block:
+    """The model linearised at neighbouring samples of some records.
+
+    Shape:
+        v: (R, B, nx + nu + nw).
+    """
+
+    def __init__(
+        self, time: slice, v: Tensor, static: StaticSlopes, weights: dict[str, Tensor]
+    ) -> None:
+        self.time, self.v, self.static, self.weights = time, v, static, weights
+
+    @cached_property
+    def slopes(self) -> Slopes:
+        """x+ = F x, y = H x."""
+        return slopes_at(self.weights, self.static.J)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+_layout = lru_cache(maxsize=64)(Layout)
+
+
+class Linearisation:
+    """The model linearised along a trajectory.
+
+    Args:
+        cell: the model; parameters with ``requires_grad=False`` are no part of θ. Its weights are
+            copied. They may have a leading axis of length R: one model a record.
+        u: input of the trajectory.
+        trajectory: of this cell.
+        periodic: the start state is the end state, whatever the parameters. Otherwise it does not
+            depend on them.
+        weights: of the cell in the order of its parameters where they are not those that it holds
+            now; all of them are θ then.
+
+    Shape:
+        u: (R, T, nu).
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        cell: LFRCell,
+        u: Tensor,
+        trajectory: Trajectory,
+        *,
+        periodic: bool = False,
+        weights: Sequence[Tensor] | None = None,
+    ) -> None:
+        self.u, self.trajectory, self.periodic = u, trajectory, periodic
+        self.static = cell.static
+        own = cell.parameters() if weights is None else weights
+        names = [name for name, _ in cell.named_parameters()]
+        self.weights = {n: p.detach().clone() for n, p in zip(names, own, strict=True)}
+        self.layout = layout(cell, every=weights is not None)
+        self.state = cell.A.new_zeros(len(u), cell.nx)
+        self._ny = cell.ny
+        self._transition: Tensor | None = None
+        self._whole: _Block | None = None
+        if u.shape[:2].numel() <= PASS:
+            self._whole = self._block(slice(0, len(u)), slice(0, u.shape[1]))
+
+    @property
+    def parameters(self) -> int:
+        """P."""
+        return self.layout.table.shape[1]
+
+    @property
+    def transition(self) -> Tensor:
+        """Φ (R, nx, nx): how the start state moves the end state."""
+        if self._transition is None:
+            Phi = torch.eye(self.state.shape[1]).to(self.state).expand(len(self.state), -1, -1)
+            for block in self._blocks():
+                Phi = linear_recurrence(block.slopes.F, torch.zeros_like(block.slopes.F), Phi)[
+                    :, -1
+                ]
+            self._transition = Phi
+        return self._transition
+
+    @torch.no_grad()
+    def rows(
+        self,
+        kept: Tensor,
+        visit: Callable[[slice, slice, Tensor], None],
+        *,
+        start: bool,
+        spare: int = 0,
+        out: Tensor | None = None,
+    ) -> Tensor:
+        """Rows of dy/dθ, from a start state that is held, block by block.
+
+        Args:
+            kept: which parameters get a column, ascending.
+            visit: called with the records, the samples and the rows of every block.
+            start: whether the columns of the start state follow those of the parameters.
+            spare: columns without a value at the end of the rows, for the visitor to fill.
+            out: all rows (R, T, ny, K [+ nx] [+ spare]), where they are to be kept.
+
+        Returns:
+            Derivatives of the end state.
+
+        Shape:
+            kept: (K,), rows: (records, samples, ny, K [+ nx] [+ spare]) -> (R, nx, K [+ nx]).
+        """
+        columns = self.layout.columns(kept)
+        R, nx = self.state.shape
+        cpu = self.u.device.type == "cpu"
+        samples = BLOCK if cpu else PASS
+        ends = []
+        for records in _slices(R, max(1, samples // self.u.shape[1])):
+            S = self.state.new_zeros(len(self.u[records]), nx, len(kept) + (nx if start else 0))
+            if start:
+                S[:, :, len(kept) :] = torch.eye(nx).to(S)
+            for time in _slices(self.u.shape[1], max(1, samples // len(S))):
+                block = self._block(records, time)
+                if out is None:
+                    rows = S.new_empty(*block.v.shape[:2], self._ny, S.shape[-1] + spare)
+                else:
+                    rows = out[records, time]
+                emit = self._rows_compiled if cpu else self._rows_generic
+                S = emit(block, columns, S, rows)
+                visit(records, time, rows)
+            ends.append(S)
+        end = torch.cat(ends)
+        if start:
+            self._transition = end[:, :, len(kept) :]
+        return end
+
+    @torch.no_grad()
+    def tangent(self, d_theta: Tensor, d_x0: Tensor | None = None) -> Tensor:
+        """dy (R, T, ny) of a change d_theta (P,) or (R, P) and of the start state, (R, nx)."""
+        d_x, d_z, d_y, d_static = self.layout.matrices(d_theta)
+        Bw, Dyw = self.weights["Bw"], self.weights["Dyw"]
+        start = self.state if d_x0 is None else d_x0
+
+        def direct(block: _Block) -> tuple[Tensor, Tensor]:
+            d_w = _apply(block.static.J, block.v @ d_z.mT) + block.static.tangent(d_static)
+            return block.v @ d_x.mT + d_w @ Bw.mT, block.v @ d_y.mT + d_w @ Dyw.mT
+
+        def states(block: _Block, g: Tensor, s: Tensor) -> Tensor:
+            return linear_recurrence(block.slopes.F, g.unsqueeze(-1), s.unsqueeze(-1)).squeeze(-1)
+
+        whole = None if self._whole is None else direct(self._whole)
+        if self.periodic:
+            for block in self._blocks():
+                start = states(block, (whole or direct(block))[0], start)[:, -1]
+            start = closed(self.transition, start.unsqueeze(-1)).squeeze(-1)
+        outputs = []
+        for block in self._blocks():
+            g, d_out = whole or direct(block)
+            s = states(block, g, start)
+            start = s[:, -1]
+            outputs.append(_apply(block.slopes.H, s[:, :-1]) + d_out)
+        return torch.cat(outputs, dim=1)
+
+    @torch.no_grad()
+    def adjoint(self, e: Tensor) -> Adjoint:
+        """Derivatives of Σ e(k) · y(k), for e (R, T, ny)."""
+        W = self.weights
+        end = self.state
+        if self.periodic:
+            for block in self._blocks(backwards=True):
+                end = self._costates(block, e, end)[:, 0]
+            end = closed(self.transition.mT, end.unsqueeze(-1)).squeeze(-1)
+        parts, by_u = [], []
+        for block in self._blocks(backwards=True):
+            e_block = e[:, block.time]
+            costates = self._costates(block, e, end)
+            ahead, end = costates[:, 1:], costates[:, 0]
+            d_w = ahead @ W["Bw"] + e_block @ W["Dyw"]
+            d_z = _apply(block.static.J.mT, d_w)
+            linear = (signal.mT @ block.v for signal in (ahead, d_z, e_block))
+            by_x, by_z, by_y = linear
+            parts.append(self.layout.vector(by_x, by_z, by_y, block.static.adjoint(d_w)))
+            by_u.append(ahead @ W["Bu"] + e_block @ W["Dyu"] + d_z @ W["Dzu"])
+        return Adjoint(torch.stack(parts).sum(0), torch.cat(by_u[::-1], dim=1), end)
+
+    def _costates(self, block: _Block, e: Tensor, end: Tensor) -> Tensor:
+        """λ(k) = F(k)ᵀ λ(k+1) + H(k)ᵀ e(k) (R, B + 1, nx) from λ behind the block."""
+        Dyw, Cz = self.weights["Dyw"], self.weights["Cz"]
+        e = e[:, block.time]
+        g = e @ self.weights["Cy"] + _apply(block.static.J.mT, e @ Dyw) @ Cz  # Hᵀ e
+        return adjoint_recurrence(block.slopes.F, g.unsqueeze(-1), end.unsqueeze(-1)).squeeze(-1)
+
+    def _blocks(self, *, backwards: bool = False) -> Iterator[_Block]:
+        """All records, at once where that is kept, else block by block in time."""
+        everything = slice(0, len(self.u))
+        T = self.u.shape[1]
+        times = list(_slices(T, T if self._whole else max(1, PASS // len(self.u))))
+        for time in reversed(times) if backwards else times:
+            yield self._whole or self._block(everything, time)
+
+    def _block(self, records: slice, time: slice) -> _Block:
+        if self._whole is not None:
+            v, static = self._whole.v[records, time], self._whole.static.part(records, time)
+        else:
+            t = self.trajectory
+            z, w, x, u = (signal[records, time] for signal in (t.z, t.w, t.x, self.u))
+            static = static_slopes(self.static, z, of_static(self._of(records)))
+            v = torch.cat([x, u, w], dim=-1)
+        return _Block(time, v, static, self._of(records))
+
+    def _of(self, records: slice) -> dict[str, Tensor]:
+        """The weights of some of the records."""
+        one = self.weights["A"].ndim == 2
+        return self.weights if one else {name: p[records] for name, p in self.weights.items()}
+
+    def _by_weight(self, block: _Block, columns: Columns) -> Tensor:
+        by_weight = block.static.by_weight()
+        if len(columns.static) == self.layout.weights:
+            return by_weight
+        return by_weight[..., columns.static.to(by_weight.device)]
+
+    def _rows_generic(self, block: _Block, columns: Columns, S: Tensor, rows: Tensor) -> Tensor:
+        """Write the rows of a block; the next S. By the recurrence primitive, any device."""
+        J, v, by_weight = block.static.J, block.v, self._by_weight(block, columns)
+        C = S.shape[-1]
+        d_w = v.new_zeros(*v.shape[:2], J.shape[2], C)
+        x, z, y = (entries.to(v.device) for entries in columns[:3])
+        d_w[..., z[:, 0]] = J[..., z[:, 1]] * v[..., z[:, 2]].unsqueeze(2)
+        d_w[..., columns.first : columns.first + by_weight.shape[-1]] = by_weight
+        G = block.weights["Bw"].unsqueeze(-3) @ d_w
+        E = block.weights["Dyw"].unsqueeze(-3) @ d_w
+        G[..., x[:, 1], x[:, 0]] += v[..., x[:, 2]]
+        E[..., y[:, 1], y[:, 0]] += v[..., y[:, 2]]
+        states = linear_recurrence(block.slopes.F, G, S)
+        rows[..., :C] = block.slopes.H @ states[:, :-1] + E
+        return states[:, -1]
+
+    def _rows_compiled(self, block: _Block, columns: Columns, S: Tensor, rows: Tensor) -> Tensor:
+        """The same in machine code, without ever storing S over time."""
+        R = len(S)
+        W = [block.weights[name] for name in ("A", "Bw", "Cz", "Cy", "Dyw")]
+        W = [m if m.ndim == 3 else m.unsqueeze(0) for m in W]
+        threads = torch.get_num_threads()
+        chunks = 1 if R % threads == 0 else threads
+        static, none = block.static, S.new_zeros(R, len(block.v[0]), 0)
+        if isinstance(static, NetworkSlopes) and len(columns.static) == self.layout.weights:
+            network = (static.Ww if static.Ww.ndim == 3 else static.Ww.unsqueeze(0), static.z)
+            by_weight = (none.unsqueeze(2), static.slope, static.h, *network)
+        else:
+            by_weight = (self._by_weight(block, columns), none, none, none[:1], none)
+        tensors = (*W, static.J, block.v, *by_weight, *columns[:3])
+        arguments = (*map(to_numpy, tensors), columns.first, chunks, S.numpy(), rows.numpy())
+        spread(_emit, R * chunks, *arguments)
+        return S
+
+
+def output_jacobian(linearisation: Linearisation) -> Tensor:
+    """dy/dθ (R, T, ny, P) as a whole; from a start state that is held, its nx columns follow."""
+    everything = torch.arange(linearisation.parameters)
+    groups: dict[int, list[Tensor]] = defaultdict(list)
+    end = linearisation.rows(
+        everything, lambda records, _, rows: groups[records.start].append(rows), start=True
+    )
+    rows = torch.cat([torch.cat(blocks, dim=1) for blocks in groups.values()])
+    if not linearisation.periodic:
+        return rows
+    P = len(everything)
+    start = closed(end[:, :, P:], end[:, :, :P])
+    return rows[..., :P] + rows[..., P:] @ start.unsqueeze(1)
+
+
+def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """(R, T, n, m) times (R, T, m): (R, T, n)."""
+    return (matrices * vectors.unsqueeze(-2)).sum(-1)
+
+
+def _slices(length: int, size: int) -> Iterator[slice]:
+    return (slice(first, min(first + size, length)) for first in range(0, length, size))
+
+
+def closed(transition: Tensor, end: Tensor) -> Tensor:
+    """The start S (R, nx, m) that returns to itself: S = Φ S + end."""
+    identity = torch.eye(end.shape[1]).to(end)
+    return torch.linalg.solve(identity - transition, end)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _emit(
-    job, F, H, v, J, d_static, Bw, Dyw,
-    x_first, x_row, x_regressor, z_first, z_row, z_regressor, y_first, y_row, y_regressor,
-    chunks, rows, end,
+    job, A, Bw, Cz, Cy, Dyw, J, v, by_weight, slope, h, Ww, z, x_entries, z_entries, y_entries,
+    first, chunks, S, rows,
 ):  # fmt: skip
-    _, T, ny, P = rows.shape
-    nx, nw = Bw.shape
+    B, ny, C = rows.shape[1], rows.shape[2], S.shape[2]
+    nx, nw = Bw.shape[1:]
+    network, nn, nz = h.shape[2] > 0, h.shape[2], z.shape[2]
+    n_weights = nn * (nz + 1 + nw) + nw if network else by_weight.shape[3]
     r, chunk = job // chunks, job % chunks
-    c0, c1 = P * chunk // chunks, P * (chunk + 1) // chunks
-    width = c1 - c0
-    # The entries of each group that fall into this job's columns c0 .. c1.
-    x0, x1 = max(c0 - x_first, 0), min(c1 - x_first, len(x_row))
-    z0, z1 = max(c0 - z_first, 0), min(c1 - z_first, len(z_row))
-    y0, y1 = max(c0 - y_first, 0), min(c1 - y_first, len(y_row))
-    s_first = P - d_static.shape[3]
-    s0 = max(c0 - s_first, 0)
-    s1 = max(c1 - s_first, s0)
-    s_first += s0 - c0
-    z_column, x_column, y_column = z_first - c0, x_first - c0, y_first
-    S = np.zeros((nx, width), rows.dtype)
-    S_next = np.empty_like(S)
-    for k in range(T):
+    m = min(r, len(A) - 1)  # which model
+    c0, c1 = C * chunk // chunks, C * (chunk + 1) // chunks
+    x_own, z_own, y_own = (
+        _between(x_entries, c0, c1), _between(z_entries, c0, c1), _between(y_entries, c0, c1)
+    )  # fmt: skip
+    s0 = min(max(first, c0), c1)
+    s1 = max(min(first + n_weights, c1), s0)
+    # S(k+1) = M(k) X(k) and dy(k) = N(k) X(k) with X = [S; direct terms of w], M = [F Bw] and
+    # N = [H Dyw], padded with zeros to whole tiles.
+    rows_of_X = _TILE * (-(-(nx + nw) // _TILE))
+    M = np.zeros((_TILE * (-(-nx // _TILE)), rows_of_X), rows.dtype)
+    N = np.zeros((ny, rows_of_X), rows.dtype)
+    M[:nx, nx : nx + nw] = Bw[m]
+    N[:, nx : nx + nw] = Dyw[m]
+    X, X_next = (
+        np.zeros((rows_of_X, c1 - c0), rows.dtype),
+        np.zeros((rows_of_X, c1 - c0), rows.dtype),
+    )
+    X[:nx] = S[r, :, c0:c1]
+    d_w = np.zeros((nw, n_weights), rows.dtype)
+    for q in range(nw if network else 0):
+        d_w[q, n_weights - nw + q] = 1.0
+    for k in range(B):
+        _slope(A[m], M, J[r, k], Cz[m])
+        _slope(Cy[m], N, J[r, k], Cz[m])
+        for q in range(nw):
+            for n in range(len(z_own)):
+                X[nx + q, z_own[n, 0]] = J[r, k, q, z_own[n, 1]] * v[r, k, z_own[n, 2]]
+            if network:
+                _by_weight(Ww[m, q], slope[r, k], h[r, k], z[r, k], q, d_w[q])
+            else:
+                d_w[q] = by_weight[r, k, q]
+            for c in range(s0, s1):
+                X[nx + q, c - c0] = d_w[q, c - first]
+        _state_rows(M, X, X_next)
         for i in range(ny):
-            for c in range(width):
-                rows[r, k, i, c0 + c] = H[r, k, i, 0] * S[0, c]
-            for j in range(1, nx):
-                h = H[r, k, i, j]
-                for c in range(width):
-                    rows[r, k, i, c0 + c] += h * S[j, c]
-            for q in range(nw):
-                d = Dyw[i, q]
-                for n in range(z0, z1):
-                    rows[r, k, i, z_first + n] += d * J[r, k, q, z_row[n]] * v[r, k, z_regressor[n]]
-                for n in range(s1 - s0):
-                    rows[r, k, i, c0 + s_first + n] += d * d_static[r, k, q, s0 + n]
-        for n in range(y0, y1):
-            rows[r, k, y_row[n], y_column + n] += v[r, k, y_regressor[n]]
-        for i in range(nx):
-            f = F[r, k, i, 0]
-            for c in range(width):
-                S_next[i, c] = f * S[0, c]
-            for j in range(1, nx):
-                f = F[r, k, i, j]
-                for c in range(width):
-                    S_next[i, c] += f * S[j, c]
-            for q in range(nw):
-                b = Bw[i, q]
-                for n in range(z0, z1):
-                    S_next[i, z_column + n] += b * J[r, k, q, z_row[n]] * v[r, k, z_regressor[n]]
-                for n in range(s1 - s0):
-                    S_next[i, s_first + n] += b * d_static[r, k, q, s0 + n]
-        for n in range(x0, x1):
-            S_next[x_row[n], x_column + n] += v[r, k, x_regressor[n]]
-        S, S_next = S_next, S
-    end[r, :, c0:c1] = S
+            _output_row(N[i], X, rows[r, k, i, c0:c1])
+        for n in range(len(x_own)):
+            X_next[x_own[n, 1], x_own[n, 0]] += v[r, k, x_own[n, 2]]
+        for n in range(len(y_own)):
+            rows[r, k, y_own[n, 1], c0 + y_own[n, 0]] += v[r, k, y_own[n, 2]]
+        X, X_next = X_next, X
+    for i in range(nx):
+        for c in range(c1 - c0):
+            # A fading state would reach denormal numbers, a hundred times slower, and stay there.
+            S[r, i, c0 + c] = X[i, c] if abs(X[i, c]) > _FADED else 0.0
+
+
+_TILE, _FADED = 4, 1e-30
+
+
+@njit(nogil=True)
+def _by_weight(Ww, slope, h, z, q, d_w):
+    """Row q of what ``NetworkSlopes.by_weight`` computes, at one sample."""
+    nn, nz = len(h), len(z)
+    for n in range(nn):
+        a = Ww[n] * slope[n]
+        for j in range(nz):
+            d_w[n * nz + j] = a * z[j]
+        d_w[nn * nz + n] = a
+        d_w[nn * (nz + 1 + q) + n] = h[n]
+
+
+@njit(nogil=True, fastmath={"contract"})
+def _slope(constant, M, J, Cz):
+    """M[:, :nx] = constant + M[:, nx:] J Cz."""
+    n, nx = constant.shape
+    for i in range(n):
+        for c in range(nx):
+            M[i, c] = constant[i, c]
+        for j in range(len(Cz)):
+            slope = M.dtype.type(0)
+            for q in range(len(J)):
+                slope += M[i, nx + q] * J[q, j]
+            for c in range(nx):
+                M[i, c] += slope * Cz[j, c]
+
+
+@njit(nogil=True)
+def _between(entries, c0, c1):
+    """The entries whose column lies between c0 and c1, counted from c0."""
+    own = entries[(entries[:, 0] >= c0) & (entries[:, 0] < c1)].copy()
+    own[:, 0] -= c0
+    return own
+
+
+@njit(nogil=True, fastmath={"contract"})
+def _state_rows(M, X, out):
+    """out[:len(M)] = M @ X, tile by tile: 16 coefficients stay in registers."""
+    for i in range(0, len(M), 4):
+        ya, yb, yc, yd = out[i], out[i + 1], out[i + 2], out[i + 3]
+        for j in range(0, M.shape[1], 4):
+            a0, a1, a2, a3 = M[i, j], M[i, j + 1], M[i, j + 2], M[i, j + 3]
+            b0, b1, b2, b3 = M[i + 1, j], M[i + 1, j + 1], M[i + 1, j + 2], M[i + 1, j + 3]
+            c0, c1, c2, c3 = M[i + 2, j], M[i + 2, j + 1], M[i + 2, j + 2], M[i + 2, j + 3]
+            d0, d1, d2, d3 = M[i + 3, j], M[i + 3, j + 1], M[i + 3, j + 2], M[i + 3, j + 3]
+            x0, x1, x2, x3 = X[j], X[j + 1], X[j + 2], X[j + 3]
+            if j == 0:
+                for t in range(X.shape[1]):
+                    p, q, r, s = x0[t], x1[t], x2[t], x3[t]
+                    ya[t] = a0 * p + a1 * q + a2 * r + a3 * s
+                    yb[t] = b0 * p + b1 * q + b2 * r + b3 * s
+                    yc[t] = c0 * p + c1 * q + c2 * r + c3 * s
+                    yd[t] = d0 * p + d1 * q + d2 * r + d3 * s
+            else:
+                for t in range(X.shape[1]):
+                    p, q, r, s = x0[t], x1[t], x2[t], x3[t]
+                    ya[t] += a0 * p + a1 * q + a2 * r + a3 * s
+                    yb[t] += b0 * p + b1 * q + b2 * r + b3 * s
+                    yc[t] += c0 * p + c1 * q + c2 * r + c3 * s
+                    yd[t] += d0 * p + d1 * q + d2 * r + d3 * s
+
+
+@njit(nogil=True, fastmath={"contract"})
+def _output_row(a, X, out):
+    """out = a @ X."""
+    for j in range(0, len(a), 4):
+        a0, a1, a2, a3 = a[j], a[j + 1], a[j + 2], a[j + 3]
+        x0, x1, x2, x3 = X[j], X[j + 1], X[j + 2], X[j + 3]
+        if j == 0:
+            for t in range(len(out)):
+                out[t] = a0 * x0[t] + a1 * x1[t] + a2 * x2[t] + a3 * x3[t]
+        else:
+            for t in range(len(out)):
+                out[t] += a0 * x0[t] + a1 * x1[t] + a2 * x2[t] + a3 * x3[t]

@@ -10,6 +10,11 @@ from functools import cache
 import torch
 
 
+def workers() -> int:
+    """Threads that kernels are spread over."""
+    return torch.get_num_threads()
+
+
 def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
     """Call ``kernel(job, *arguments)`` for every job, on ``torch.get_num_threads()`` threads.
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
 from lfrtorch.records import Record
-from lfrtorch.residual import SimulationError
+from lfrtorch.residual import Ridge, SimulationError
 
 INTERRUPTED = "interrupted"
 
@@ -129,7 +129,7 @@ def fit(
     validation: Record | Sequence[Record] = (),
     *,
     optimiser: Optimiser | None = None,
-    ridge: float = 0.0,
+    ridge: Ridge = 0.0,
     monitors: Sequence[Monitor] = (),
 ) -> FitResult:
     """Minimise the simulation error of a model over records.
@@ -150,7 +150,7 @@ def fit(
     """
     optimiser = LevenbergMarquardt() if optimiser is None else optimiser
     problem = SimulationError(model, train, ridge=ridge)
-    judge = SimulationError(model, validation) if validation else None
+    judge = SimulationError(model, validation, solved_starts=True) if validation else None
     if not torch.isfinite(problem.residual(problem.theta)).all():
         raise ValueError(
             "the model diverges on the training records at the start; start from a stable model."
@@ -162,12 +162,13 @@ def fit(
 
     def record(state: OptimiserState) -> None:
         nonlocal theta_best, best, chosen
-        train_rmse, validation_rmse = problem.rmse(state.residual), float("nan")
-        judged = state.residual
+        train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")
+        score = problem.cost(state.residual)
         if judge is not None:
-            judged = judge.residual(state.theta)
-            validation_rmse = judge.rmse(judged)
-        score = float(judged.square().mean())  # normalised: every output counts alike
+            problem.write(state.theta)
+            theta = judge.theta
+            score = judge.cost(judge.residual(theta))  # normalised: every output counts alike
+            validation_rmse = judge.rmse(theta)
         better = score < best  # False for the NaN of a model that diverges on validation
         if better:
             theta_best, best, chosen = state.theta, score, state.iteration

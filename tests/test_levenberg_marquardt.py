@@ -11,7 +11,7 @@ from reference import normal
 from torch import Tensor
 from torch.func import jacrev
 
-from lfrtorch.levenberg_marquardt import LevenbergMarquardt, LMState
+from lfrtorch.levenberg_marquardt import DenseJacobian, LevenbergMarquardt, LMState
 
 BOTH = pytest.mark.parametrize("acceleration", [True, False])
 
@@ -33,6 +33,12 @@ class Problem:
 
     def jacobian(self, theta: Tensor) -> Tensor:
         return torch.atleast_2d(jacrev(self.f)(theta))
+
+    def linearise(self, theta: Tensor) -> DenseJacobian:
+        return DenseJacobian(self.jacobian(theta), torch.atleast_1d(self.f(theta)))
+
+    def cost(self, residual: Tensor) -> float:
+        return float(residual.square().sum())
 
 
 def search(problem: Problem, theta: Tensor, optimiser: LevenbergMarquardt) -> list[LMState]:

@@ -14,7 +14,7 @@ from lfrtorch.cell import LFRCell
 from lfrtorch.model import Model
 from lfrtorch.nonlinearity import Network
 from lfrtorch.records import Record
-from lfrtorch.sensitivity import output_jacobian
+from lfrtorch.sensitivity import Linearisation, output_jacobian
 from lfrtorch.simulate import simulate, steady_state
 
 # --- coordinates that do not matter ---------------------------------------------------------
@@ -70,7 +70,8 @@ def test_net_parameters_are_the_rank_of_the_periodic_jacobian(nu, ny, nx, nz, nw
     linear = nx * (nx + nu + nw) + nz * (nx + nu) + ny * (nx + nu + nw)
     assert model.parameters == linear + nn * (nz + 1 + nw) + nw
     u = normal(1, 500, nu)
-    J = output_jacobian(cell, u, steady_state(cell, u), periodic=True).flatten(0, 2)
+    linearisation = Linearisation(cell, u, steady_state(cell, u), periodic=True)
+    J = output_jacobian(linearisation).flatten(0, 2)
     s = torch.linalg.svdvals(J / J.norm(dim=0))
     assert model.parameters_net == int((s > 1e-12 * s[0]).sum())
 

@@ -92,7 +92,7 @@ def test_sampling_frequency(fs: float):
 
 
 def test_unknown_start():
-    refused("record 'lab': start is 'steady'; use 'zero' or 'periodic'.", start="steady")
+    refused("record 'lab': start is 'steady'; use 'zero', 'given', 'estimated' or", start="steady")
 
 
 def test_negative_skip():

@@ -11,9 +11,10 @@ from reference import SIZES, normal, random_cell
 from torch import Tensor, nn
 from torch.testing import assert_close
 
+from lfrtorch import sensitivity
 from lfrtorch.cell import LFRCell
 from lfrtorch.nonlinearity import ACTIVATIONS
-from lfrtorch.sensitivity import _rows_compiled, _rows_generic, _terms, output_jacobian
+from lfrtorch.sensitivity import Linearisation, output_jacobian
 from lfrtorch.simulate import simulate, steady_state
 
 # Sums of at most some hundred products along a contraction, in double precision: 1e-13 or so.
@@ -45,18 +46,35 @@ def assert_jacobian(J: Tensor, expected: Tensor, tolerance: float = TOLERANCE):
     )
 
 
+def periodic(cell: LFRCell, u: Tensor) -> Linearisation:
+    return Linearisation(cell, u, steady_state(cell, u), periodic=True)
+
+
+def assert_all(linearisation: Linearisation, expected: Tensor):
+    """Rows, product with a direction and product with output errors are those of one matrix."""
+    P = linearisation.parameters
+    assert_jacobian(output_jacobian(linearisation)[..., :P], expected)
+    if not P:
+        return
+    direction = normal(P, seed=5)
+    assert_jacobian(linearisation.tangent(direction), expected @ direction)
+    e = normal(*expected.shape[:3], seed=6)
+    adjoint = (expected * e.unsqueeze(-1)).sum(dim=(1, 2))
+    assert_jacobian(linearisation.adjoint(e).theta, adjoint)
+
+
 def check_zero_start(cell: LFRCell, R: int = 2, T: int = 6):
     u, x0 = normal(R, T, cell.nu), normal(R, cell.nx, seed=1)
-    J = output_jacobian(cell, u, simulate(cell, u, x0))
-    assert_jacobian(J, reference.output_jacobian(cell, u, x0))
+    assert_all(
+        Linearisation(cell, u, simulate(cell, u, x0)), reference.output_jacobian(cell, u, x0)
+    )
 
 
 def check_periodic(cell: LFRCell, R: int = 2, T: int = 5, periods: int = 12):
     """Slopes within 0.6: the start is forgotten to 0.6^60 = 5e-14, its derivative to 60 times."""
     u = normal(R, T, cell.nu)
-    J = output_jacobian(cell, u, steady_state(cell, u), periodic=True)
     zero = u.new_zeros(R, cell.nx)
-    assert_jacobian(J, reference.output_jacobian(cell, u, zero, periods))
+    assert_all(periodic(cell, u), reference.output_jacobian(cell, u, zero, periods))
 
 
 # --- against the oracle ---------------------------------------------------------------------
@@ -109,48 +127,84 @@ def test_frozen_parameters_get_no_column(check, frozen: list[str]):
 def test_all_parameters_frozen():
     cell = random_cell().requires_grad_(False)
     u = normal(1, 5, 1)
-    for periodic in (False, True):
-        assert output_jacobian(cell, u, steady_state(cell, u), periodic=periodic).shape[-1] == 0
+    assert output_jacobian(periodic(cell, u)).shape[-1] == 0
 
 
 # --- the two ways ---------------------------------------------------------------------------
 
 
-@torch.no_grad()
-def both(backend: Any, cell: LFRCell, terms: Any) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rows and end sensitivities."""
-    rows = terms.v.new_full((*terms.v.shape[:2], cell.ny, terms.parameters), torch.nan)
-    end = backend(cell, terms, rows)
-    return rows, end
+def rows_and_end(linearisation: Linearisation, kept: Tensor) -> list[Tensor]:
+    blocks: list[Tensor] = []
+    end = linearisation.rows(kept, lambda r, t, rows: blocks.append(rows.clone()), start=True)
+    R, T = linearisation.u.shape[:2]
+    return [torch.cat([b.flatten(0, 1) for b in blocks]).reshape(R, T, *blocks[0].shape[2:]), end]
 
 
-@given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 30))
+def generic(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Linearisation, "_rows_compiled", Linearisation._rows_generic)
+
+
+@given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 30), block=st.integers(1, 40))
 @settings(max_examples=25)
-def test_compiled_is_generic(sizes: dict[str, Any], R: int, T: int):
+def test_compiled_is_generic_in_whatever_blocks_and_columns(
+    sizes: dict[str, Any], R: int, T: int, block: int
+):
     cell = random_cell(**sizes)
     u = normal(R, T, cell.nu)
-    terms = _terms(cell, u, simulate(cell, u, normal(R, cell.nx, seed=1)))
-    for mine, other in zip(
-        both(_rows_compiled, cell, terms), both(_rows_generic, cell, terms), strict=True
-    ):
-        assert_jacobian(mine, other)
+    linearisation = Linearisation(cell, u, simulate(cell, u, normal(R, cell.nx, seed=1)))
+    P = linearisation.parameters
+    kept = torch.arange(P)[torch.rand(P, generator=torch.Generator().manual_seed(T)) < 0.7]
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        generic(monkeypatch)
+        expected = rows_and_end(linearisation, kept)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(sensitivity, "BLOCK", block)
+        monkeypatch.setattr(sensitivity, "PASS", block)
+        blocked = Linearisation(cell, u, linearisation.trajectory)
+        for mine, other in zip(rows_and_end(blocked, kept), expected, strict=True):
+            assert_jacobian(mine, other)
+
+
+@pytest.mark.parametrize("start_is_periodic", [False, True])
+@pytest.mark.parametrize("static", ["network", "own"])
+def test_products_in_blocks_are_those_in_one_piece(
+    static: str, start_is_periodic: bool, monkeypatch
+):
+    own = Cubic(2, 2) if static == "own" else None
+    cell = random_cell(2, 2, 3, 2, 2, 3, static=own, radius=0.5, feedback=0.05)
+    u, e, direction = normal(2, 50, 2), normal(2, 50, 2, seed=1), normal(200, seed=2)
+
+    def products() -> list[Tensor]:
+        if start_is_periodic:
+            linearisation = periodic(cell, u)
+        else:
+            linearisation = Linearisation(cell, u, simulate(cell, u, normal(2, 3, seed=3)))
+        d_y = linearisation.tangent(direction[: linearisation.parameters])
+        return [d_y, *linearisation.adjoint(e)]
+
+    whole = products()
+    monkeypatch.setattr(sensitivity, "PASS", 14)
+    for mine, other in zip(products(), whole, strict=True):
+        assert_close(mine, other, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7, 100])
 def test_columns_are_shared_among_any_number_of_threads(threads: int, monkeypatch):
     cell = random_cell(2, 2, 3, 2, 2, 3)
-    terms = _terms(cell, u := normal(2, 20, 2), simulate(cell, u, normal(2, 3, seed=1)))
-    expected = both(_rows_generic, cell, terms)
+    u = normal(2, 20, 2)
+    linearisation = Linearisation(cell, u, simulate(cell, u, normal(2, 3, seed=1)))
+    everything = torch.arange(linearisation.parameters)
+    expected = rows_and_end(linearisation, everything)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    for mine, other in zip(both(_rows_compiled, cell, terms), expected, strict=True):
+    for mine, other in zip(rows_and_end(linearisation, everything), expected, strict=True):
         assert_jacobian(mine, other)
 
 
 def test_single_precision():
     double, single = random_cell(2, 1, 3), random_cell(2, 1, 3, dtype=torch.float32)
     u = normal(2, 50, 2)
-    expected = output_jacobian(double, u, steady_state(double, u), periodic=True)
-    J = output_jacobian(single, u.float(), steady_state(single, u.float()), periodic=True)
+    expected = output_jacobian(periodic(double, u))
+    J = output_jacobian(periodic(single, u.float()))
     assert J.dtype == torch.float32
     # eps 1.2e-7 amplified by 1 / (1 - 0.9) in the states, and once more in their derivatives.
     assert_jacobian(J.double(), expected, 5e-5)
@@ -181,14 +235,13 @@ def test_rank_leaves_out_the_gauge_directions(nu, ny, nx, nz, nw, nn):
     cell = random_cell(nu, ny, nx, nz, nw, nn)
     u = normal(2, 400, nu)
     gauge = nx**2 + nz**2 + nw**2
-    from_zero = simulate(cell, u, u.new_zeros(2, nx))
-    assert vanishing(output_jacobian(cell, u, from_zero)) == gauge
+    from_zero = Linearisation(cell, u, simulate(cell, u, u.new_zeros(2, nx)))
+    assert vanishing(output_jacobian(from_zero)[..., : from_zero.parameters]) == gauge
     # A constant w can hide in the origin of the state where the start state is free to move.
-    periodic = output_jacobian(cell, u, steady_state(cell, u), periodic=True)
-    assert vanishing(periodic) == gauge + max(0, nw - ny)
+    assert vanishing(output_jacobian(periodic(cell, u))) == gauge + max(0, nw - ny)
 
 
 def test_linear_rank_leaves_out_the_state_coordinates():
     cell = random_cell(2, 2, 3, 0, 0)
     u = normal(1, 300, 2)
-    assert vanishing(output_jacobian(cell, u, steady_state(cell, u), periodic=True)) == 3**2
+    assert vanishing(output_jacobian(periodic(cell, u))) == 3**2

@@ -18,11 +18,11 @@ from lfrtorch.nonlinearity import ACTIVATIONS, Network
 from lfrtorch.simulate import (
     PERIODIC_TOLERANCE,
     Trajectory,
+    estimated_start,
     monodromy,
     simulate,
     slopes,
     spectral_radius,
-    static_jacobians,
     steady_state,
 )
 
@@ -194,44 +194,23 @@ def test_unstable_periodic_solution_counts_as_diverged():
 # --- linearisation --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
-def test_static_jacobians_are_those_of_autograd(activation: str):
-    cell = random_cell(1, 1, 2, 2, 3, 4, activation=activation)
-    assert cell.static is not None
-    z = normal(2, 5, 2)
-    J, by_weight = static_jacobians(cell, z, parameters=True)
-    for r, k in np.ndindex(2, 5):
-        z_k = z[r, k].clone().requires_grad_()
-        for q, w_q in enumerate(cell.static(z_k)):
-            names, parameters = zip(*cell.static.named_parameters(), strict=True)
-            dz, *dp = torch.autograd.grad(w_q, (z_k, *parameters), retain_graph=True)
-            assert_close(J[r, k, q], dz, rtol=1e-12, atol=1e-14)
-            for name, d in zip(names, dp, strict=True):
-                assert_close(by_weight[name][r, k, q], d.flatten(), rtol=1e-12, atol=1e-14)
-
-
-def test_static_map_without_parameters():
-    cell = LFRCell(1, 1, 2, 2, 2, Cube())
-    z = normal(1, 4, 2)
-    J, by_weight = static_jacobians(cell, z, parameters=True)
-    assert_close(J, torch.diag_embed(3 * z**2), rtol=1e-14, atol=0)
-    assert by_weight == {}
-
-
 def test_slopes_are_the_derivatives_of_one_step():
     cell = random_cell(2, 2, 3, 2, 2, 4)
     u, x = normal(1, 1, 2), normal(1, 3, seed=1)
-    F, H = slopes(cell, static_jacobians(cell, simulate(cell, u, x).z)[0])
+    F, H = slopes(cell, simulate(cell, u, x).z)
     y_x, next_x = torch.autograd.functional.jacobian(lambda x_: cell(u[0, 0], x_), x[0])
     assert_close(F[0, 0], next_x, rtol=1e-12, atol=1e-13)
     assert_close(H[0, 0], y_x, rtol=1e-12, atol=1e-13)
 
 
-def test_monodromy_is_the_product_with_the_last_step_leftmost():
-    F = normal(2, 7, 3, 3)
+@pytest.mark.parametrize("samples", [1 << 14, 3])
+def test_monodromy_is_the_product_with_the_last_step_leftmost(samples: int, monkeypatch):
+    monkeypatch.setattr("lfrtorch.simulate.PASS", samples)
+    cell, z = random_cell(1, 1, 3, 2, 2), normal(2, 7, 2)
+    F = slopes(cell, z).F
     for r in range(2):
         expected = torch.linalg.multi_dot(list(F[r].flip(0)))
-        assert_close(monodromy(F)[r], expected, rtol=1e-12, atol=1e-12)
+        assert_close(monodromy(cell, z)[r], expected, rtol=1e-12, atol=1e-12)
 
 
 def test_expanding_but_bounded_trajectory_counts_as_diverged():
@@ -252,9 +231,8 @@ def test_expanding_but_bounded_trajectory_counts_as_diverged():
     u = torch.zeros(1, 8192, 1, dtype=torch.float64)
     start = u.new_full((1, 1), 0.1)
     trajectory = simulate(cell, u, start)
-    J, _ = static_jacobians(cell, trajectory.z)
     assert trajectory.finite
-    assert not torch.isfinite(monodromy(slopes(cell, J).F)).all()
+    assert not torch.isfinite(monodromy(cell, trajectory.z)).all()
     assert not steady_state(cell, u, start).finite
 
 
@@ -262,3 +240,40 @@ def test_spectral_radius():
     matrices = torch.tensor([[[0.0, 2.0], [-2.0, 0.0]], [[0.5, 0.0], [0.0, 0.1]]])
     assert spectral_radius(matrices) == pytest.approx(2.0)
     assert math.isnan(spectral_radius(matrices * torch.inf))
+
+
+# --- estimated start states -----------------------------------------------------------------
+
+
+def test_estimated_start_is_the_one_that_made_the_output():
+    cell, u, x0 = random_cell(2, 2, 3, 2, 2, 4), normal(3, 60, 2), normal(3, 3, seed=1)
+    made = simulate(cell, u, x0)
+    found = estimated_start(cell, u, made.y, torch.ones_like(made.y))
+    assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
+    assert_close(found.y, made.y, rtol=0, atol=1e-9)
+
+
+def test_estimated_start_counts_what_is_weighted_only():
+    cell, u, x0 = random_cell(1, 1, 2), normal(2, 60, 1), normal(2, 2, seed=1)
+    y = simulate(cell, u, x0).y
+    weight = torch.ones_like(y)
+    y[:, 3:6] += 10.0
+    weight[:, 3:6] = 0.0
+    found = estimated_start(cell, u, y, weight)
+    assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
+
+
+def test_estimated_start_of_a_state_that_no_output_shows_stays():
+    cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 30, 1)
+    with torch.no_grad():
+        cell.A.copy_(torch.diag(torch.tensor([0.5, 0.4])))
+        cell.Cy[0, 1] = 0.0
+    made = simulate(cell, u, u.new_tensor([[2.0, 3.0]]))
+    found = estimated_start(cell, u, made.y, torch.ones_like(made.y))
+    assert_close(found.x[:, 0], u.new_tensor([[2.0, 0.0]]), rtol=0, atol=1e-9)
+
+
+def test_estimated_start_of_a_diverging_model_is_not_finite():
+    cell, u = random_cell(1, 1, 2, 0, 0, radius=3.0), normal(1, 2000, 1)
+    y = torch.zeros_like(u)
+    assert not estimated_start(cell, u, y, torch.ones_like(y)).finite

@@ -1,0 +1,145 @@
+"""Damped least-squares systems (JᵀJ + λI) δ = -gradient from rows of J that come in blocks.
+
+A ``Triangle`` or a ``Gram`` matrix takes in the rows; either is the same whatever the blocks and
+their order, which is how blocks of time, threads and processes share the work. The systems
+``Orthogonal`` and ``Normal`` are solved with them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from lfrtorch.threads import spread, workers
+
+MERGED = 16
+"""Triangles that wait before they are made one."""
+
+
+class System(Protocol):
+    """JᵀJ decomposed, for several dampings."""
+
+    @property
+    def scale(self) -> float:
+        """Largest eigenvalue of JᵀJ; NaN where an entry is not finite."""
+        ...
+
+    @property
+    def rank(self) -> int:
+        """Directions that J sees."""
+        ...
+
+    def solve(self, gradient: Tensor, damping: float) -> Tensor:
+        """-(JᵀJ + λI)⁻¹ gradient (P,)."""
+        ...
+
+
+class Orthogonal:
+    """From R (K, P) with RᵀR = JᵀJ, by singular values: exact for any damping.
+
+    Args:
+        R: the factor.
+        truncation: singular values below this part of the largest are left out.
+    """
+
+    def __init__(self, R: Tensor, truncation: float) -> None:
+        self.scale, self.rank = float("nan"), 0
+        if torch.isfinite(R).all():
+            _, s, Vh = torch.linalg.svd(R, full_matrices=False)
+            kept = s > truncation * s[0]
+            self._squares, self._Vh = s[kept].square(), Vh[kept]
+            self.scale, self.rank = float(s[0]) ** 2, len(self._squares)
+
+    def solve(self, gradient: Tensor, damping: float) -> Tensor:
+        """-(JᵀJ + λI)⁻¹ gradient (P,), its part along the directions that are left out 0."""
+        return -self._Vh.mT @ ((self._Vh @ gradient) / (self._squares + damping))
+
+
+class Normal:
+    """From G = JᵀJ (P, P), by Cholesky: three times faster, for λ well above G's rounding error.
+
+    Args:
+        G: the matrix.
+        rank: its rank, as far as it is known.
+    """
+
+    def __init__(self, G: Tensor, rank: int) -> None:
+        finite = bool(torch.isfinite(G).all())
+        self._G, self.rank = G, rank
+        self.scale = float(torch.linalg.eigvalsh(G)[-1]) if finite else float("nan")
+
+    def solve(self, gradient: Tensor, damping: float) -> Tensor:
+        """-(JᵀJ + λI)⁻¹ gradient (P,); NaN where rounding errors make that no minimum."""
+        damped = self._G + damping * torch.eye(len(self._G)).to(self._G)
+        L, failed = torch.linalg.cholesky_ex(damped)
+        delta = -torch.cholesky_solve(gradient.unsqueeze(-1), L).squeeze(-1)
+        return torch.full_like(delta, torch.nan) if failed else delta
+
+
+class Triangle:
+    """R factor of the rows (M, n) seen so far, by orthogonal transformations."""
+
+    def __init__(self) -> None:
+        self._parts: list[Tensor] = []
+
+    def fold(self, rows: Tensor) -> None:
+        """Add rows (m, n)."""
+        pieces = _pieces(rows)
+        parts: list[Tensor] = [rows[:0]] * len(pieces)
+        spread(_triangularise, len(pieces), pieces, parts)
+        self._parts += parts
+        if sum(map(len, self._parts)) > MERGED * rows.shape[1]:
+            self._parts = [self.R]
+
+    def absorb(self, other: Any, mix: Tensor) -> None:
+        """Add the rows of another, their columns mixed by (its n, n)."""
+        self.fold(other.R @ mix)
+
+    @property
+    def R(self) -> Tensor:
+        """R (min(M, n), n) with RᵀR = AᵀA, up to the signs of its rows."""
+        if len(self._parts) == 1:
+            return self._parts[0]
+        return torch.linalg.qr(torch.cat(self._parts), mode="r").R
+
+
+class Gram:
+    """AᵀA (n, n) of the rows (M, n) seen so far: three times faster, and half the digits."""
+
+    def __init__(self) -> None:
+        self._parts: list[Tensor] = []
+
+    def fold(self, rows: Tensor) -> None:
+        """Add rows (m, n)."""
+        pieces = _pieces(rows)
+        parts: list[Tensor] = [rows[:0]] * len(pieces)
+        spread(_square, len(pieces), pieces, parts)
+        self._add(*parts)
+
+    def absorb(self, other: Any, mix: Tensor) -> None:
+        """Add the rows of another, their columns mixed by (its n, n)."""
+        self._add(mix.mT @ other.G @ mix)
+
+    @property
+    def G(self) -> Tensor:
+        """The matrix."""
+        return self._parts[0]
+
+    def _add(self, *parts: Tensor) -> None:
+        self._parts = [torch.stack([*self._parts, *parts]).sum(0)]
+
+
+def _pieces(rows: Tensor) -> tuple[Tensor, ...]:
+    """The rows in as many pieces as there are threads for them."""
+    threads = workers() if rows.device.type == "cpu" else 1
+    return rows.tensor_split(max(1, min(threads, len(rows) // rows.shape[1])))
+
+
+def _triangularise(job: int, pieces: tuple[Tensor, ...], parts: list[Tensor]) -> None:
+    parts[job] = torch.linalg.qr(pieces[job], mode="r").R
+
+
+def _square(job: int, pieces: tuple[Tensor, ...], parts: list[Tensor]) -> None:
+    parts[job] = pieces[job].mT @ pieces[job]

@@ -1,0 +1,93 @@
+"""Gauge directions: changes of the parameters that leave the simulated output as it is.
+
+The coordinates of x, and those of z and w where the static map is a network that can absorb them,
+are free. A Jacobian therefore has columns that are combinations of others; they need not be
+computed: with the columns ``kept``, J = J[:, kept] @ expand, exactly.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import torch
+from torch import Tensor
+
+from lfrtorch.cell import LFRCell
+from lfrtorch.nonlinearity import Network
+
+DEPENDENT = 1e-3
+"""Smallest pivot, relative to the largest, of a column that is left out; the rest is computed."""
+
+
+class Reduction(NamedTuple):
+    """Columns of a Jacobian that are computed and what the whole one is made of.
+
+    Shape:
+        kept: (K,), expand: (K, P).
+    """
+
+    kept: Tensor
+    expand: Tensor
+
+
+@torch.no_grad()
+def reduction(cell: LFRCell, start: Tensor, *, coordinates: bool = True) -> Reduction:
+    """Which columns of the Jacobian of the free parameters to compute.
+
+    Args:
+        cell: the model.
+        start: start states (S, nx) that are parameters, too; their columns come last and are kept.
+        coordinates: whether those of x are free: no start state is given in them.
+    """
+    G = _directions(cell, start)[:, 0 if coordinates else cell.nx**2 :]
+    free, lti = [], 0
+    for name, p in cell.named_parameters():
+        free += [p.requires_grad] * p.numel()
+        lti += 0 if name.startswith("static.") or not p.requires_grad else p.numel()
+    free = torch.tensor([*free, *[True] * start.numel()], device=G.device)
+    G, fixed = G[free].double().cpu().numpy(), G[~free].double().cpu().numpy()
+    if len(fixed) and G.shape[1]:  # directions that move no fixed parameter
+        G = G @ scipy.linalg.null_space(fixed)
+    # Columns of the linear part only: those of the static map are computed together.
+    Q, R, pivots = scipy.linalg.qr(G[:lti].T, mode="economic", pivoting=True)
+    diagonal = np.abs(np.diag(R))
+    rank = int((diagonal > DEPENDENT * diagonal.max(initial=0.0)).sum())
+    left_out, G = pivots[:rank], G @ Q[:, :rank]
+    kept = np.delete(np.arange(len(G)), left_out)
+    expand = np.zeros((len(kept), len(G)))
+    expand[np.arange(len(kept)), kept] = 1.0
+    # J G = 0, so that J[:, left_out] = -J[:, kept] G[kept] G[left_out]⁻¹.
+    expand[:, left_out] = -np.linalg.solve(G[left_out].T, G[kept].T).T
+    return Reduction(torch.as_tensor(kept).to(cell.A.device), torch.as_tensor(expand).to(cell.A))
+
+
+def _directions(cell: LFRCell, start: Tensor) -> Tensor:
+    """Gauge directions (all parameters and start states, number of directions)."""
+    A, Bu, Bw, Cz, Dzu = cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu
+    T = _units(cell.nx, A)  # x -> (I + εT) x
+    changes = {"A": T @ A - A @ T, "Bu": T @ Bu, "Bw": T @ Bw, "Cz": -Cz @ T, "Cy": -cell.Cy @ T}
+    groups: list[tuple[dict[str, Tensor], Tensor | None]] = [(changes, start @ T.mT)]
+    if isinstance(cell.static, Network):
+        Wz, Ww, bw = cell.static.Wz, cell.static.Ww, cell.static.bw
+        T = _units(cell.nz, A)
+        groups.append(({"Cz": T @ Cz, "Dzu": T @ Dzu, "static.Wz": -Wz @ T}, None))
+        T = _units(cell.nw, A)
+        changes = {"Bw": -Bw @ T, "Dyw": -cell.Dyw @ T, "static.Ww": T @ Ww, "static.bw": T @ bw}
+        groups.append((changes, None))
+    columns = []
+    for changes, states in groups:
+        count = len(next(iter(changes.values())))
+        parts = [
+            changes[name].flatten(1) if name in changes else A.new_zeros(count, p.numel())
+            for name, p in cell.named_parameters()
+        ]
+        parts.append(A.new_zeros(count, start.numel()) if states is None else states.flatten(1))
+        columns.append(torch.cat(parts, dim=1))
+    return torch.cat(columns).mT
+
+
+def _units(n: int, like: Tensor) -> Tensor:
+    """The n² matrices (n, n) with one entry 1."""
+    return torch.eye(n * n, dtype=like.dtype, device=like.device).reshape(n * n, n, n)

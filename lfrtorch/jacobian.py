@@ -1,0 +1,183 @@
+"""Jacobian of the residual: its least-squares system and its products with vectors.
+
+With the columns of gauge directions left out (``gauge``), rows come in blocks and are folded into
+a running factor. Where they are few they are kept, and products with vectors are products with
+them; where they are not, memory does not grow with the records, and such a product is a recurrence.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lfrtorch.batch import EVERY, Batch
+from lfrtorch.factors import Gram, Normal, Orthogonal, System, Triangle
+from lfrtorch.gauge import Reduction
+from lfrtorch.sensitivity import Linearisation, closed, output_jacobian
+
+NORMAL = 1e4
+"""Relative damping, in rounding errors, above which the normal equations are as good as QR."""
+
+KEPT_BYTES = 1 << 27
+"""Rows of a batch up to this size are kept."""
+
+
+class Jacobian:
+    """J (M, P) of a residual at one θ.
+
+    Args:
+        parts: of each batch.
+        reduced: the columns that are computed.
+        ridge: factors (P,) of θ - θ_start in the residual, which follow the batches ...
+        penalty: ... and that part of the residual; left out where there is none.
+    """
+
+    def __init__(
+        self, parts: list[Part], reduced: Reduction, ridge: Tensor, *penalty: Tensor
+    ) -> None:
+        self._parts, self._reduced, self._ridge, self._penalty = parts, reduced, ridge, penalty
+
+    def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
+        """The least-squares system of J and its gradient Jᵀr (P,).
+
+        Args:
+            damping: that of the next trial relative to the largest eigenvalue of JᵀJ.
+            truncation: relative size of singular values that are left out.
+        """
+        kept, expand = self._reduced
+        penalty = (
+            torch.diag(self._ridge) if self._penalty else self._ridge.new_zeros(0, len(expand.mT))
+        )
+        precise = damping <= NORMAL * torch.finfo(expand.dtype).eps
+        factor = Triangle() if precise else Gram()
+        for part in self._parts:
+            part.fold(kept, factor)  # [J r] in the kept columns
+        if isinstance(factor, Triangle):
+            R, r = factor.R[:, :-1] @ expand, factor.R[:, -1]
+            gradient = R.mT @ r
+            system = Orthogonal(torch.cat([R, penalty]), truncation)
+        else:
+            gradient = expand.mT @ factor.G[:-1, -1]
+            G = expand.mT @ factor.G[:-1, :-1] @ expand
+            system = Normal(G + penalty.mT @ penalty, len(kept))
+        for own in self._penalty:
+            gradient = gradient + self._ridge * own
+        return system, gradient
+
+    def tangent(self, d_theta: Tensor) -> Tensor:
+        """J d_theta (M,)."""
+        reduced = self._reduced.expand @ d_theta
+        parts = [part.tangent(d_theta, reduced).flatten() for part in self._parts]
+        return torch.cat([*parts, *(self._ridge * d_theta for _ in self._penalty)])
+
+    def adjoint(self, residual: Tensor) -> Tensor:
+        """Jᵀ residual (P,)."""
+        gradient = torch.zeros_like(self._ridge)
+        reduced = gradient.new_zeros(len(self._reduced.kept))
+        first = 0
+        for part in self._parts:
+            shape = part.batch.residual_shape
+            own = residual[first : first + shape.numel()].reshape(shape)
+            first += own.numel()
+            part.adjoint(own, gradient, reduced)
+        gradient = gradient + self._reduced.expand.mT @ reduced
+        return gradient + self._ridge * residual[first:] if self._penalty else gradient
+
+    def whole(self) -> Tensor:
+        """J (M, P): for a look at it, and for small problems."""
+        parts = [part.whole(len(self._ridge)).flatten(0, 2) for part in self._parts]
+        return torch.cat([*parts, *(torch.diag(self._ridge) for _ in self._penalty)])
+
+
+class Part:
+    """The rows of one batch.
+
+    Args:
+        batch: the records.
+        linearisation: the model along them.
+        x0: where their start states stand in θ, if they are parameters.
+    """
+
+    def __init__(self, batch: Batch, linearisation: Linearisation, x0: slice | None) -> None:
+        self.batch, self.linearisation, self.x0 = batch, linearisation, x0
+        self._kept: tuple[Tensor, Tensor] | None = None
+
+    def fold(self, kept: Tensor, total: Triangle | Gram) -> None:
+        """Add the rows [J r], in the kept columns (K,), to the factor."""
+        batch, linearisation = self.batch, self.linearisation
+        own = kept[kept < linearisation.parameters]
+        K, nx = len(own), linearisation.state.shape[1]
+        start = linearisation.periodic or self.x0 is not None
+        errors = linearisation.trajectory.y - batch.y
+        R, T, ny = errors.shape
+        columns = K + nx * start + 1
+        whole = R * T * ny * columns * errors.element_size() <= KEPT_BYTES
+        rows = errors.new_empty(R, T, ny, columns) if whole or batch.spectral else None
+        # The start state's columns become others in each record's own way.
+        factors = [type(total)() for _ in batch.u] if start else [type(total)()]
+
+        def visit(records: slice, time: slice, block: Tensor) -> None:
+            block[..., -1] = errors[records, time]
+            if batch.spectral:
+                if time.stop < T:
+                    return
+                assert rows is not None
+                block, time = rows[records], EVERY
+            weighted = batch.weigh(block, records, time)
+            if rows is not None and not batch.plain and not batch.spectral:
+                block.copy_(weighted)
+            if start:
+                for factor, of_record in zip(factors[records], weighted, strict=True):
+                    factor.fold(of_record.flatten(0, 1))
+            else:
+                factors[0].fold(weighted.flatten(0, 2))
+
+        end = linearisation.rows(own, visit, start=start, spare=1, out=rows)
+        # What the columns are made of: (R, columns, kept and the residual).
+        mix = end.new_zeros(R, columns, len(kept) + 1)
+        mix[:, :K, :K] = torch.eye(K).to(end)
+        mix[:, -1, -1] = 1.0
+        if linearisation.periodic:
+            mix[:, K:-1, :K] = closed(end[:, :, K:], end[:, :, :K])
+        elif self.x0 is not None:
+            first = K + self.x0.start - linearisation.parameters
+            for r in range(R):
+                mix[r, K:-1, first + r * nx : first + (r + 1) * nx] = torch.eye(nx).to(end)
+        for factor, of_record in zip(factors, mix, strict=start):
+            total.absorb(factor, of_record)
+        if whole and rows is not None and not batch.spectral:
+            self._kept = rows[..., :-1].flatten(1, 2), mix[:, :-1, :-1]
+
+    def tangent(self, d_theta: Tensor, reduced: Tensor) -> Tensor:
+        """Weighted changes (R, m, ny) of the outputs with θ (P,), or its kept columns (K,)."""
+        if self._kept is not None:
+            rows, mix = self._kept
+            return (rows @ (mix @ reduced).unsqueeze(-1)).reshape(self.batch.residual_shape)
+        linearisation = self.linearisation
+        d_x0 = None if self.x0 is None else d_theta[self.x0].reshape(linearisation.state.shape)
+        d_y = linearisation.tangent(d_theta[: linearisation.parameters], d_x0)
+        return self.batch.weigh(d_y)
+
+    def adjoint(self, residual: Tensor, gradient: Tensor, reduced: Tensor) -> None:
+        """Add Jᵀ residual (R, m, ny) to the one by θ (P,), or by its kept columns (K,)."""
+        if self._kept is not None:
+            rows, mix = self._kept
+            by_column = rows.mT @ residual.reshape(len(rows), -1, 1)
+            reduced += (mix.mT @ by_column).sum(0).squeeze(-1)
+            return
+        adjoint = self.linearisation.adjoint(self.batch.unweigh(residual))
+        gradient[: self.linearisation.parameters] += adjoint.theta.sum(0)
+        if self.x0 is not None:
+            gradient[self.x0] += adjoint.x0.flatten()
+
+    def whole(self, parameters: int) -> Tensor:
+        """All weighted rows (R, m, ny, P)."""
+        rows, P = output_jacobian(self.linearisation), self.linearisation.parameters
+        J = rows.new_zeros(*rows.shape[:3], parameters)
+        J[..., :P] = rows[..., :P]
+        if self.x0 is not None:
+            nx = self.linearisation.state.shape[1]
+            for r in range(len(J)):
+                first = self.x0.start + r * nx
+                J[r, ..., first : first + nx] = rows[r, ..., P:]
+        return self.batch.weigh(J)
