@@ -14,7 +14,7 @@ from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.lfr import LFR
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
-from lfrtorch.nonlinearity import Network
+from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Channel, Record, Scaler
 from lfrtorch.trainer import FitResult, fit
 
@@ -30,6 +30,7 @@ __all__ = [
     "LinearModel",
     "Model",
     "Network",
+    "Polynomial",
     "Record",
     "Scaler",
     "datasets",

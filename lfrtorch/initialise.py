@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import Module
 
 from lfrtorch.bla import LinearModel
 from lfrtorch.cell import LFRCell
 from lfrtorch.checks import integer
 from lfrtorch.lfr import LFR
 from lfrtorch.model import Model
-from lfrtorch.nonlinearity import Network
+from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Record, Scaler, as_records, rms_scale
 
 OUTPUT_RANGE = 0.3
 """Bw, Dyw ~ U(-0.3, 0.3) of the ``"zero_output"`` start."""
+
+OUTPUT_WEIGHTS: dict[type[Module], tuple[str, ...]] = {Network: ("Ww", "bw"), Polynomial: ("C",)}
+"""The weights of a static map that make its output vanish."""
 
 
 def initialise(
@@ -27,39 +32,44 @@ def initialise(
     *,
     nz: int,
     nw: int,
-    nn: int,
+    nn: int | None = None,
     activation: str = "tanh",
+    static: Module | None = None,
     method: Literal["zero_output", "paper"] = "zero_output",
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> Model:
-    """NL-LFR model with one hidden layer whose output is that of the linear model.
+    """NL-LFR model whose output is that of the linear model.
 
     Signals and states are scaled to unit standard deviation over the records, and so is every z:
-    C*, D* ~ U(-1, 1), then Cz, Dzu = C*, D* over the standard deviation of C* x + D* u. Wz and bz
-    ~ U(-1, 1), bw = 0. The two methods differ in what keeps w out of the start:
+    C*, D* ~ U(-1, 1), then Cz, Dzu = C*, D* over the standard deviation of C* x + D* u. The static
+    map is one hidden layer, Wz and bz ~ U(-1, 1), bw = 0, or a module of the caller's own with its
+    weights as they are. The two methods differ in what keeps w out of the start:
 
     - ``"paper"``: Bw = Dyw = 0 and Ww ~ U(-1, 1) (Schoukens and Tóth 2020);
-    - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021). The more reliable
-      one.
+    - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021), for a polynomial
+      C = 0. The more reliable one. A module of another class starts as with ``"paper"``, as nothing
+      is known of what makes its output vanish.
 
     Args:
         bla: stable linear model, best in balanced coordinates.
         records: the data that are to be fitted.
-        nz, nw, nn: inputs, outputs and neurons of the static nonlinearity.
-        activation: of the hidden layer.
+        nz, nw: inputs and outputs of the static nonlinearity.
+        nn, activation: neurons of the hidden layer and their function.
+        static: the map z -> w in the layer's place, copied: a ``Network``, a ``Polynomial`` or any
+            module from (..., nz) to (..., nw); nn and activation are then of no use.
         method: which of the two starts.
         seed: of the random weights.
         dtype: of the weights.
 
     Raises:
-        ValueError: sizes below 1 or an unknown method.
+        ValueError: sizes below 1, an unknown method or a static map of other sizes.
 
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
         Schoukens, "Improved initialization of state-space artificial neural networks", ECC 2021.
     """
-    for name, size in (("nz", nz), ("nw", nw), ("nn", nn)):
+    for name, size in (("nz", nz), ("nw", nw)):
         integer(name, size, 1)
     integer("seed", seed, 0)
     if method not in ("zero_output", "paper"):
@@ -71,20 +81,28 @@ def initialise(
         bla.y_offset,
         rms_scale([r.y for r in data], bla.y_offset),
     )
-    static = Network(nz, nw, nn, activation, dtype=dtype)
-    cell = LFRCell(len(bla.inputs), len(bla.outputs), len(bla.A), nz, nw, static, dtype=dtype)
-    model = Model(LFR(cell), scaler, bla.fs, bla.inputs, bla.outputs)
     generator = torch.Generator().manual_seed(seed)
+    if static is None:
+        integer("nn", nn, 1)
+        assert nn is not None
+        static = Network(nz, nw, nn, activation, dtype=dtype)
+        static.reset_parameters(generator)
+    else:
+        static = deepcopy(static).to(dtype)
+        _check_sizes(static, nz, nw, dtype)
+    sizes = len(bla.inputs), len(bla.outputs), len(bla.A)
+    linear, cell = LFRCell(*sizes, dtype=dtype), LFRCell(*sizes, nz, nw, static, dtype=dtype)
+    for target in (linear, cell):
+        write_bla(target, bla, scaler)
+    response, model = (
+        Model(LFR(c), scaler, bla.fs, bla.inputs, bla.outputs) for c in (linear, cell)
+    )
 
     def uniform(parameter: Tensor, limit: float = 1.0) -> None:
         parameter.uniform_(-limit, limit, generator=generator)
 
     with torch.no_grad():
-        write_bla(cell, bla, scaler)
-        static.reset_parameters(generator)
-        for weight in (cell.Bw, cell.Dyw):
-            weight.zero_()
-        x = torch.cat([model.signals(record).x[0, :-1] for record in data])
+        x = torch.cat([response.signals(record).x[0, :-1] for record in data])
         u = torch.cat([torch.as_tensor(scaler.normalise_u(r.u)).to(x) for r in data])
         std = _deviation(x)
         cell.A.copy_(cell.A * std / std[:, None])
@@ -96,8 +114,9 @@ def initialise(
         spread = _deviation(z)[:, None]
         cell.Cz.div_(spread)
         cell.Dzu.div_(spread)
-        if method == "zero_output":
-            static.Ww.zero_()
+        if method == "zero_output" and type(static) in OUTPUT_WEIGHTS:
+            for name in OUTPUT_WEIGHTS[type(static)]:
+                static.get_parameter(name).zero_()
             uniform(cell.Bw, OUTPUT_RANGE)
             uniform(cell.Dyw, OUTPUT_RANGE)
     return model
@@ -113,6 +132,20 @@ def write_bla(cell: LFRCell, bla: LinearModel, scaler: Scaler) -> None:
             (cell.Dyu, bla.D * scaler.u_scale / scaler.y_scale[:, None]),
         ):
             weight.copy_(torch.as_tensor(np.ascontiguousarray(value)))
+
+
+def _check_sizes(static: Module, nz: int, nw: int, dtype: torch.dtype) -> None:
+    """Refuse a static map that does not take nz to nw signals with a ValueError."""
+    try:
+        with torch.no_grad():
+            found: object = tuple(static(torch.zeros(1, 2, nz, dtype=dtype)).shape)
+    except (RuntimeError, IndexError) as error:
+        found = error
+    if found != (1, 2, nw):
+        raise ValueError(
+            f"static gives {found} for z of shape (1, 2, {nz}); with nz={nz} and nw={nw} it must "
+            f"give w of shape (1, 2, {nw})."
+        )
 
 
 def _deviation(signal: Tensor) -> Tensor:

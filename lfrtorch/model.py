@@ -14,7 +14,7 @@ from torch.nn import Module
 from lfrtorch import checkpoint
 from lfrtorch.cell import LFRCell
 from lfrtorch.lfr import LFR
-from lfrtorch.nonlinearity import Network
+from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Channel, Record, Scaler, Start, as_signal, check_start
 from lfrtorch.simulate import Trajectory
 
@@ -38,10 +38,12 @@ class Model:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """nx, nz, nw and the number of neurons nn (0 for a map that is not a network)."""
+        """nx, nz, nw, and the degree of a polynomial or else the neurons nn (0 for an own map)."""
         cell = self.lfr.cell
-        nn = len(cell.static.bz) if isinstance(cell.static, Network) else 0
-        return {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw, "nn": nn}
+        sizes = {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw}
+        if isinstance(cell.static, Polynomial):
+            return sizes | {"degree": cell.static.degree}
+        return sizes | {"nn": len(cell.static.bz) if isinstance(cell.static, Network) else 0}
 
     @property
     def parameters(self) -> int:
@@ -52,13 +54,16 @@ class Model:
     def parameters_net(self) -> int:
         """P less the gauge directions, which change the parameters and not the output.
 
-        nx² for the coordinates of x, nz² and nw² for those of z and w (a network absorbs them),
-        and max(0, nw - ny) for a constant w that hides in the origin of the state.
+        nx² for the coordinates of x, nz² and nw² for those of z and w (a network and a polynomial
+        absorb them), max(0, nw - ny) for a constant w that hides in the origin of the state, and
+        nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu hold as well.
         """
         cell = self.lfr.cell
         gauge = cell.nx**2
-        if isinstance(cell.static, Network):
+        if isinstance(cell.static, Network | Polynomial):
             gauge += cell.nz**2 + cell.nw**2 + max(0, cell.nw - cell.ny)
+        if isinstance(cell.static, Polynomial):
+            gauge += cell.nz * cell.nw
         return self.parameters - gauge
 
     def simulate(
@@ -124,6 +129,8 @@ class Model:
         if type(cell.static) is Network:
             static = {"type": "Network", "nn": len(cell.static.bz)}
             static["activation"] = cell.static.activation
+        elif type(cell.static) is Polynomial:
+            static = {"type": "Polynomial", "degree": cell.static.degree}
         elif cell.static is not None:
             static = {"type": "own", "class": type(cell.static).__qualname__}
         description = {
@@ -153,7 +160,8 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
     """
     description, weights = checkpoint.read(folder)
     made = description.get("static")
-    if isinstance(made, dict) and made.get("type") != "Network" and static is None:
+    built_in = ("Network", "Polynomial")
+    if isinstance(made, dict) and made.get("type") not in built_in and static is None:
         raise ValueError(
             f"'{folder}' holds a static nonlinearity of class {made.get('class')}, which is not "
             "part of this package; pass an instance of it: load(folder, static=...)."
@@ -167,8 +175,11 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
                 for name in ("u_offset", "u_scale", "y_offset", "y_scale")
             )
         )
-        if made is not None and made["type"] == "Network":
-            static = Network(sizes["nz"], sizes["nw"], made["nn"], made["activation"], dtype=dtype)
+        match made:
+            case {"type": "Network", "nn": nn, "activation": activation}:
+                static = Network(sizes["nz"], sizes["nw"], nn, activation, dtype=dtype)
+            case {"type": "Polynomial", "degree": degree}:
+                static = Polynomial(sizes["nz"], sizes["nw"], degree, dtype=dtype)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         cell.load_state_dict(weights)
         channels = [

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
+from itertools import combinations_with_replacement
+from operator import mul
 
 import torch
 from torch import Tensor
 from torch.func import functional_call, vmap
 from torch.nn import Module, Parameter, ParameterList
+from torch.nn.functional import pad
+
+from lfrtorch.checks import integer
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "tanh": torch.tanh,
@@ -69,6 +75,61 @@ class Network(Module):
         """Sizes and activation, for ``print(module)``."""
         (nn, nz), nw = self.Wz.shape, len(self.Ww)
         return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}"
+
+
+class Polynomial(Module):
+    """All monomials up to a total degree: w = C m(z), m(z) = (1, z1, z2, .., z1², z1 z2, ..).
+
+    Affine maps of z and of w change nothing but C.
+
+    Args:
+        nz: inputs.
+        nw: outputs.
+        degree: highest total degree.
+        device, dtype: as everywhere in torch.
+
+    Shape:
+        C: (nw, monomials), (nz + degree)! / (nz! degree!) of them by rising degree, the constant in
+        column 0; z: (..., nz) -> w: (..., nw).
+
+    Raises:
+        ValueError: a degree below 1.
+    """
+
+    _factors: Tensor
+
+    def __init__(
+        self,
+        nz: int,
+        nw: int,
+        degree: int,
+        *,
+        device: torch.device | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        integer("degree", degree, 1)
+        self.nz, self.degree = nz, degree
+        # Each product of that many factors out of (1, z1, z2, ..) once; the ones lower its degree.
+        factors = list(combinations_with_replacement(range(nz + 1), degree))
+        self.register_buffer("_factors", torch.tensor(factors, device=device), persistent=False)
+        self.C = Parameter(torch.empty(nw, len(factors), device=device, dtype=dtype))
+        self.reset_parameters()
+
+    def reset_parameters(self, generator: torch.Generator | None = None) -> None:
+        """C ~ U(-1, 1) / monomials, so that |w| <= 1 where all |z| <= 1, and the constant 0."""
+        with torch.no_grad():
+            self.C.uniform_(-1.0, 1.0, generator=generator).div_(self.C.shape[-1])
+            self.C[:, 0] = 0.0
+
+    def forward(self, z: Tensor) -> Tensor:
+        """w (..., nw) of z (..., nz)."""
+        factors = pad(z, (1, 0), value=1.0)[..., self._factors]  # (..., monomials, degree)
+        return reduce(mul, factors.unbind(-1)) @ self.C.mT
+
+    def extra_repr(self) -> str:
+        """Sizes, for ``print(module)``."""
+        return f"nz={self.nz}, nw={len(self.C)}, degree={self.degree}"
 
 
 class Stacked(Module):

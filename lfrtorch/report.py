@@ -117,7 +117,8 @@ def table(result: dict, published: Sequence[Published]) -> str:
 
     units = {s["unit"] for s in result["scores"].values()} - {""}
     title = f"Simulation RMSE{f' ({next(iter(units))})' if len(units) == 1 else ''}"
-    title += f", nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {sizes['nn']} neurons"
+    static = f"degree {sizes['degree']}" if "degree" in sizes else f"{sizes['nn']} neurons"
+    title += f", nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
     references = [f"{p.label}: {p.reference}" for p in others]
     rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
     return "\n".join([title, rule, line(head), rule, *map(line, rows), rule, *references])

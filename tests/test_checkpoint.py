@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lfrtorch import checkpoint
 from lfrtorch.model import Model, load
-from lfrtorch.nonlinearity import Network
+from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Channel
 
 U = np.random.default_rng(0).normal(size=(50, 2))
@@ -81,6 +81,17 @@ def test_linear_model_comes_back(tmp_path: Path):
     back = load(model.save(tmp_path / "saved"))
     assert back.lfr.cell.static is None
     assert np.array_equal(model.simulate(U), back.simulate(U))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_polynomial_comes_back(tmp_path: Path, dtype: torch.dtype):
+    model = small(static=Polynomial(2, 1, 3), dtype=dtype)
+    model.lfr.cell.get_parameter("static.C").detach().mul_(0.1)
+    back = load(model.save(tmp_path / "saved"))
+    assert repr(back.lfr) == repr(model.lfr)
+    assert {p.dtype for p in back.lfr.parameters()} == {dtype}
+    assert np.array_equal(model.simulate(U), back.simulate(U))
+    assert np.isfinite(model.simulate(U)).all()
 
 
 def test_the_folder_of_a_run_will_do(tmp_path: Path):
@@ -181,6 +192,9 @@ def test_description_that_lacks_an_entry(saved: Path, entry: str):
         {"sizes": {"nu": 2}},
         {"static": {"type": "Network", "nn": 5, "activation": "tanh"}},
         {"static": {"type": "Network"}},
+        {"static": {"type": "Polynomial"}},
+        {"static": {"type": "Polynomial", "degree": 3}},
+        {"static": {"type": "Polynomial", "degree": 0}},
         {"dtype": "float65"},
         {"fs": []},
         {"inputs": [{"label": "u"}]},

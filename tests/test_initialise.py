@@ -7,11 +7,12 @@ import pytest
 import reference
 import torch
 from reference import random_system
+from torch import Tensor, nn
 
 from lfrtorch.bla import LinearModel, estimate_bla
 from lfrtorch.initialise import OUTPUT_RANGE, initialise
 from lfrtorch.model import Model
-from lfrtorch.nonlinearity import Network
+from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Record
 from lfrtorch.residual import SimulationError
 
@@ -32,6 +33,25 @@ def some_records() -> list[Record]:
 
 
 RECORDS = some_records()
+
+
+class Shifted(nn.Module):
+    """A user's own map from 2 to 3 signals, which does not vanish at zero."""
+
+    def __init__(self):
+        super().__init__()
+        self.c = nn.Parameter(torch.ones(3, 2))
+
+    def forward(self, z: Tensor) -> Tensor:
+        return torch.cos(z) @ self.c.mT
+
+
+def static_maps() -> dict[str, nn.Module]:
+    network, polynomial = Network(2, 3, 5, "relu"), Polynomial(2, 3, 2)
+    with torch.no_grad():
+        for weight in (network.bw, polynomial.C):
+            weight.fill_(0.7)
+    return {"network": network, "polynomial": polynomial, "own": Shifted()}
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +158,53 @@ def test_size_below_one(bla: LinearModel, size: str):
 def test_unknown_method(bla: LinearModel):
     with pytest.raises(ValueError, match="method is 'random'; use 'zero_output' or 'paper'"):
         initialise(bla, RECORDS, **SIZES, method="random")  # pyright: ignore[reportArgumentType]
+
+
+# --- a static map of the caller's -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["network", "polynomial", "own"])
+def test_start_with_a_given_map_is_the_linear_model(bla: LinearModel, name: str, method):
+    static = static_maps()[name]
+    given = {key: weight.clone() for key, weight in static.state_dict().items()}
+    model = initialise(bla, RECORDS, nz=2, nw=3, static=static, method=method)
+    cell = model.lfr.cell
+    assert type(cell.static) is type(static)
+    assert {p.dtype for p in model.lfr.parameters()} == {torch.float64}
+    for record in RECORDS:
+        expected = bla.simulate(record)
+        tolerance = 1e-12 if record.start == "zero" else 1e-9
+        np.testing.assert_allclose(
+            model.simulate(record), expected, rtol=0, atol=tolerance * np.abs(expected).max()
+        )
+    # What makes w vanish may move: the map's own output weights, or else Bw and Dyw.
+    cleared = {"network": {"Ww", "bw"}, "polynomial": {"C"}, "own": set()}[name]
+    cleared = cleared if method == "zero_output" else set()
+    for weight in (cell.Bw, cell.Dyw):
+        assert bool(weight.all()) == bool(weight.any()) == bool(cleared)
+        assert weight.abs().max() <= OUTPUT_RANGE
+    assert cell.static is not None
+    for key, weight in cell.static.state_dict().items():
+        expected = torch.zeros_like(weight) if key in cleared else given[key].double()
+        assert torch.equal(weight, expected)
+    for key, weight in static.state_dict().items():  # the caller's module is left alone
+        assert torch.equal(weight, given[key])
+
+
+def test_given_map_changes_nothing_else(bla: LinearModel):
+    network = initialise(bla, RECORDS, **SIZES).lfr.state_dict()
+    own = initialise(bla, RECORDS, nz=2, nw=3, static=Shifted()).lfr.state_dict()
+    for name in ("cell.A", "cell.Bu", "cell.Cy", "cell.Dyu"):
+        assert torch.equal(network[name], own[name])
+
+
+@pytest.mark.parametrize("static", [Polynomial(3, 3, 2), Polynomial(2, 1, 2), nn.Linear(3, 3)])
+def test_given_map_of_other_sizes(bla: LinearModel, static: nn.Module):
+    with pytest.raises(ValueError, match=r"with nz=2 and nw=3 it must give w of shape \(1, 2, 3\)"):
+        initialise(bla, RECORDS, nz=2, nw=3, static=static)
+
+
+def test_neither_neurons_nor_a_map(bla: LinearModel):
+    with pytest.raises(ValueError, match="nn is None; give a whole number of at least 1"):
+        initialise(bla, RECORDS, nz=2, nw=3)

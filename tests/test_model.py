@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.model import Model
-from lfrtorch.nonlinearity import Network
+from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Record
 from lfrtorch.sensitivity import Linearisation, output_jacobian
 from lfrtorch.simulate import simulate, steady_state
@@ -72,6 +72,21 @@ def test_net_parameters_are_the_rank_of_the_periodic_jacobian(nu, ny, nx, nz, nw
     u = normal(1, 500, nu)
     linearisation = Linearisation(cell, u, steady_state(cell, u), periodic=True)
     J = output_jacobian(linearisation).flatten(0, 2)
+    s = torch.linalg.svdvals(J / J.norm(dim=0))
+    assert model.parameters_net == int((s > 1e-12 * s[0]).sum())
+
+
+@pytest.mark.parametrize(
+    ("nu", "ny", "nx", "nz", "nw", "degree"),
+    [(1, 1, 3, 2, 1, 3), (1, 1, 2, 1, 2, 3), (1, 1, 2, 2, 3, 2), (2, 2, 2, 1, 1, 4)],
+)
+def test_net_parameters_of_a_polynomial_are_the_rank_as_well(nu, ny, nx, nz, nw, degree):
+    cell = random_cell(nu, ny, nx, nz, nw, static=Polynomial(nz, nw, degree))
+    cell.get_parameter("static.C").detach().mul_(0.3)
+    model = random_model(cell)
+    assert model.sizes == {"nx": nx, "nz": nz, "nw": nw, "degree": degree}
+    u = 0.5 * normal(1, 200, nu)
+    J = output_jacobian(cell, u, steady_state(cell, u), periodic=True).flatten(0, 2)
     s = torch.linalg.svdvals(J / J.norm(dim=0))
     assert model.parameters_net == int((s > 1e-12 * s[0]).sum())
 

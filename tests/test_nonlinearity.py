@@ -1,11 +1,17 @@
-"""The one-hidden-layer map."""
+"""The one-hidden-layer map and the polynomial."""
+
+from itertools import product
+from math import comb, prod
 
 import pytest
 import torch
 from reference import SIGMA, normal
+from torch.func import functional_call, jacrev, vmap
 from torch.testing import assert_close
 
-from lfrtorch.nonlinearity import ACTIVATIONS, Network
+from lfrtorch.nonlinearity import ACTIVATIONS, Network, Polynomial
+
+# --- one hidden layer -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
@@ -48,3 +54,83 @@ def test_unknown_activation():
 
 def test_sizes_are_printed():
     assert repr(Network(2, 1, 3, "rbf")) == "Network(nz=2, nw=1, nn=3, activation='rbf')"
+
+
+# --- polynomial -----------------------------------------------------------------------------
+
+
+def monomials(z: tuple[float, ...], degree: int) -> list[float]:
+    """Every one, by its exponents."""
+    exponents = [e for e in product(range(degree + 1), repeat=len(z)) if sum(e) <= degree]
+    return [prod(z_j**e_j for z_j, e_j in zip(z, e, strict=True)) for e in exponents]
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 5])
+@pytest.mark.parametrize("nz", [1, 2, 3])
+def test_polynomial_has_every_monomial_once(nz: int, degree: int):
+    polynomial = Polynomial(nz, comb(nz + degree, degree), degree, dtype=torch.float64)
+    with torch.no_grad():
+        polynomial.C.copy_(torch.eye(len(polynomial.C)))
+    z = (2.0, 3.0, 5.0)[:nz]  # primes: no two monomials are equal
+    values = polynomial(torch.tensor(z, dtype=torch.float64)).tolist()
+    assert sorted(values) == sorted(monomials(z, degree))
+    assert values[: nz + 1] == [1.0, *z]
+
+
+def test_polynomial_of_one_variable_is_that_of_horner():
+    polynomial = Polynomial(1, 2, 3, dtype=torch.float64)
+    with torch.no_grad():
+        polynomial.C.copy_(normal(2, 4))
+    z = normal(5, 7, 1)
+    w = polynomial(z)
+    assert w.shape == (5, 7, 2)
+    for i, (c0, c1, c2, c3) in enumerate(polynomial.C):
+        expected = c0 + z[..., 0] * (c1 + z[..., 0] * (c2 + z[..., 0] * c3))
+        assert_close(w[..., i], expected, rtol=1e-13, atol=1e-13)
+
+
+def test_slopes_of_a_polynomial_by_torch_func():
+    polynomial = Polynomial(2, 1, 2, dtype=torch.float64)
+    with torch.no_grad():
+        polynomial.C.copy_(normal(1, 6))
+    c = polynomial.C[0].detach()  # 1, z1, z2, z1², z1 z2, z2²
+    z = torch.cat([normal(4, 2), torch.zeros(1, 2, dtype=torch.float64)])
+
+    def w(z_k, C):
+        return functional_call(polynomial, {"C": C}, (z_k,))
+
+    by_z, by_c = vmap(jacrev(w, argnums=(0, 1)), in_dims=(0, None))(z, polynomial.C.detach())
+    z1, z2 = z.unbind(-1)
+    slopes = torch.stack([c[1] + 2 * c[3] * z1 + c[4] * z2, c[2] + c[4] * z1 + 2 * c[5] * z2], -1)
+    assert_close(by_z[:, 0], slopes, rtol=1e-13, atol=1e-13)
+    m = torch.stack([torch.ones_like(z1), z1, z2, z1**2, z1 * z2, z2**2], -1)
+    assert_close(by_c[:, 0, 0], m, rtol=1e-13, atol=1e-13)
+
+
+def test_a_polynomial_has_one_parameter_and_stores_nothing_else():
+    polynomial = Polynomial(2, 3, 4)
+    assert [name for name, _ in polynomial.named_parameters()] == ["C"]
+    assert list(polynomial.state_dict()) == ["C"]
+    assert polynomial.C.shape == (3, 15)
+    assert polynomial.double()(normal(2)).dtype == torch.float64
+
+
+def test_draw_of_a_polynomial():
+    drawn = [Polynomial(3, 50, 4) for _ in range(2)]
+    for polynomial in drawn:
+        polynomial.reset_parameters(torch.Generator().manual_seed(0))
+    C = drawn[0].C.detach()
+    assert torch.equal(C, drawn[1].C)
+    assert not C[:, 0].any()
+    assert C[:, 1:].abs().max() * C.shape[1] == pytest.approx(1, abs=0.01)
+    assert drawn[0](torch.rand(1000, 3) * 2 - 1).abs().max() <= 1
+
+
+@pytest.mark.parametrize("degree", [0, -1, 1.5, True])
+def test_degree_that_is_none(degree):
+    with pytest.raises(ValueError, match=f"degree is {degree}; give a whole number of at least 1"):
+        Polynomial(1, 1, degree)
+
+
+def test_sizes_of_a_polynomial_are_printed():
+    assert repr(Polynomial(2, 1, 3)) == "Polynomial(nz=2, nw=1, degree=3)"

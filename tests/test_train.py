@@ -117,6 +117,22 @@ def test_init_from_continues_where_the_run_ended(csv: Path, tmp_path: Path):
     assert validation == pytest.approx(before, rel=1e-12)
 
 
+def test_polynomial_is_chosen_and_continued(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+    arguments = [*file_overrides(csv), "nx=1", "nz=1", "trainer.max_iter=2"]
+    train.identify(configuration(*arguments, "init=polynomial", "degree=2"), first)
+    cfg = configuration(*arguments, f"init_from={first}")
+    train.identify(cfg, second)
+    assert cfg.degree == 2
+    sizes = json.loads((second / "metrics.json").read_text())["sizes"]
+    assert sizes == {"nx": 1, "nz": 1, "nw": 1, "degree": 2}
+    assert "nx 1, nz 1, nw 1, degree 2" in capsys.readouterr().out
+
+
 def test_init_from_says_which_sizes_it_takes(
     csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -180,6 +196,7 @@ def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
         (["+bench=nonsense"], "nonsense"),
         (["+bench=boucwen", "nz=0"], "nz is 0"),
         (["+bench=boucwen", "init.method=magic"], "init method is 'magic'"),
+        (["+bench=boucwen", "init=polynomial", "degree=0"], "degree is 0"),
         (["+bench=boucwen", "activation=softsign"], "activation is 'softsign'"),
         (["+bench=boucwen", "trainer.speed=3"], "speed"),
         (["+bench=boucwen", "trainer.damping=-1"], "damping is -1"),
