@@ -28,17 +28,26 @@ class LFR(nn.Module):
         super().__init__()
         self.cell = cell
 
-    def trajectory(self, u: Tensor, x0: Tensor | None = None, start: Start = "zero") -> Trajectory:
+    def trajectory(
+        self,
+        u: Tensor,
+        x0: Tensor | None = None,
+        start: Start = "zero",
+        *,
+        guess: Tensor | None = None,
+    ) -> Trajectory:
         """All signals of a simulation, without gradients.
 
         Args:
             u: input.
             x0: start state; zero where left out. In periodic steady state the guess to begin with.
-            start: ``"zero"`` to begin at ``x0``, ``"periodic"`` for the periodic steady state.
+            start: ``"periodic"`` for the periodic steady state; otherwise from ``x0``.
+            guess: states (R, T + 1, nx) of a nearby trajectory, which may save time.
         """
         if start == "periodic":
-            return steady_state(self.cell, u, x0)
-        return simulate(self.cell, u, u.new_zeros(len(u), self.cell.nx) if x0 is None else x0)
+            return steady_state(self.cell, u, x0 if guess is None else guess)
+        zero = u.new_zeros(len(u), self.cell.nx)
+        return simulate(self.cell, u, zero if x0 is None else x0, guess=guess)
 
     def forward(self, u: Tensor, x0: Tensor | None = None, start: Start = "zero") -> Tensor:
         """Simulated output; ``backward`` costs one adjoint recurrence (no second derivatives)."""

@@ -8,14 +8,13 @@ model linearised along the latest trajectory: a linear recurrence, which is para
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.recurrence import linear_recurrence
+from lfrtorch.slopes import slopes
 
 MAX_NEWTON = 20
 """Iterations after which Newton's method is given up; from a nearby trajectory it needs 3 or 4."""
@@ -35,8 +34,7 @@ def newton(
     *,
     guess: Tensor | None = None,
     periodic: bool = False,
-    slopes: Callable[[Tensor], Tensor],
-) -> Tensor | None:
+) -> Tensor:
     """States of x(k+1) = f(x(k), u(k)), those of the loop over time to rounding.
 
     Args:
@@ -45,16 +43,14 @@ def newton(
         x0: start state; in periodic steady state the start of the search where ``guess`` is not.
         guess: states of a nearby trajectory, whatever their start; x0 at all times where left out.
         periodic: close the boundary by x(T) = x(0) instead of x(0) = x0.
-        slopes: the exact derivative J of the static map at every z.
 
     Shape:
-        u: (R, T, nu), x0: (R, nx), guess: (R, T + 1, nx), slopes: (R, T, nz) -> (R, T, nw, nz);
-        returns (R, T + 1, nx). Normalised units.
+        u: (R, T, nu), x0: (R, nx), guess: (R, T + 1, nx) -> (R, T + 1, nx). Normalised units.
 
     Returns:
-        The states, or None where the iteration does not converge or overflows (a model that
-        diverges or is chaotic), and where the periodic solution is not stable, so that no
-        simulation would settle to it. One record that fails fails them all.
+        The states; NaN for a record where the iteration does not converge or overflows (a model
+        that diverges or is chaotic), or where the periodic solution is not stable, so that no
+        simulation would settle to it.
 
     References:
         Lim, Zhu, Selfridge and Kasim, "Parallelizing non-linear sequential models over the sequence
@@ -63,24 +59,22 @@ def newton(
     tolerance = UPDATE_ROUNDING * torch.finfo(u.dtype).eps ** 0.5
     x = x0.unsqueeze(1).expand(-1, u.shape[1] + 1, -1) if guess is None else guess
     driven = u @ cell.Bu.mT
-    # Bw J Cz is linear in J: one product of J (R, T, nw nz) with the outer products of the columns
-    # of Bw and the rows of Cz, 20 times as fast as small products sample by sample.
-    outer = torch.einsum("...iq,...pj->...qpij", cell.Bw, cell.Cz).flatten(-4, -3).flatten(-2)
-    A = cell.A.flatten(-2).unsqueeze(-2)
+    transition, found = cell.A, torch.zeros(len(u), dtype=torch.bool)  # of no iteration
     for _ in range(MAX_NEWTON):
         z, w = cell.internal(u, x[:, :-1])
-        F = (slopes(z).flatten(2) @ outer + A).unflatten(-1, (cell.nx, cell.nx))
         defect = x[:, :-1] @ cell.A.mT + driven + w @ cell.Bw.mT - x[:, 1:]
         gap = (x[:, -1] if periodic else x0) - x[:, 0]
-        update, transition = (_closed if periodic else _open)(F, defect, gap)
+        update, transition = (_closed if periodic else _open)(slopes(cell, z).F, defect, gap)
         x = x + update
         change, size = (signal.abs().amax(dim=(1, 2)) for signal in (update, x))
-        if not (torch.isfinite(change).all() and torch.isfinite(transition).all()):
-            return None
-        if (change <= tolerance * (1.0 + size)).all():
-            stable = not periodic or bool((torch.linalg.eigvals(transition).abs() < 1.0).all())
-            return x if stable else None
-    return None
+        found = change <= tolerance * (1.0 + size)  # False for NaN
+        if (found | ~torch.isfinite(change)).all():
+            break
+    if periodic:
+        finite = torch.isfinite(transition).all(dim=(1, 2))  # LAPACK is not asked about others
+        poles = torch.linalg.eigvals(torch.where(finite[:, None, None], transition, 0.0))
+        found &= finite & (poles.abs().amax(-1) < 1.0)
+    return torch.where(found[:, None, None], x, torch.nan)
 
 
 def _open(F: Tensor, defect: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:

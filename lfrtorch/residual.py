@@ -102,7 +102,7 @@ class SimulationError:
         """dr/dθ at θ, held as a whole only where it is small."""
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
-        self._guesses = [t.x[:, 0] for t in trajectories]
+        self._guesses = [t.x for t in trajectories]
         cell = self.model.lfr.cell
         parts, first = [], sum(p.numel() for p in self._parameters)
         for i, (batch, trajectory) in enumerate(zip(self.batches, trajectories, strict=True)):
@@ -134,11 +134,11 @@ class SimulationError:
 
     def _trajectory(self, i: int) -> Trajectory:
         batch, cell = self.batches[i], self.model.lfr.cell
-        if batch.start == "periodic":
-            return self.model.lfr.trajectory(batch.u, self._guesses[i], "periodic")
+        guess, lfr = self._guesses[i], self.model.lfr
         if batch.start == "estimated" and self._solved:
             return estimated_start(cell, batch.u, batch.y, batch.weight)
-        return self.model.lfr.trajectory(batch.u, self._starts.get(i, batch.x0))
+        start = "periodic" if batch.start == "periodic" else "zero"
+        return lfr.trajectory(batch.u, self._starts.get(i, batch.x0), start, guess=guess)
 
     def _first_starts(self) -> dict[int, Tensor]:
         """Start states by the number of their batch, where they are parameters."""

@@ -28,7 +28,8 @@ from torch import Tensor
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.recurrence import adjoint_recurrence, linear_recurrence, to_numpy
-from lfrtorch.simulate import PASS, Slopes, Trajectory, of_static, slopes_at
+from lfrtorch.simulate import Trajectory
+from lfrtorch.slopes import PASS, Slopes, of_static, slopes_at
 from lfrtorch.static_slopes import NetworkSlopes, StaticSlopes, static_slopes
 from lfrtorch.threads import spread
 

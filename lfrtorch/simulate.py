@@ -11,9 +11,10 @@ from numba import njit
 from torch import Tensor
 
 from lfrtorch.cell import LFRCell
+from lfrtorch.newton import newton
 from lfrtorch.nonlinearity import Network
 from lfrtorch.recurrence import linear_recurrence, to_numpy
-from lfrtorch.static_slopes import static_slopes
+from lfrtorch.slopes import monodromy, slopes, spectral_radius
 from lfrtorch.threads import spread
 
 PERIODIC_TOLERANCE = 1e-10
@@ -27,9 +28,6 @@ MET_ROUNDING = 4.0
 
 SETTLING_PERIODS = 3
 """Periods simulated forward before Newton's method takes over; a well damped model needs one."""
-
-PASS = 1 << 14
-"""Samples of a long record that are linearised together."""
 
 START_ITERATIONS, START_HALVINGS, START_TOLERANCE = 20, 10, 1e-10
 """Gauss-Newton steps on a start state, trials a step, and the relative gain that ends them."""
@@ -56,34 +54,26 @@ class Trajectory(NamedTuple):
         return bool(torch.isfinite(self.y).all() and torch.isfinite(self.x[:, -1]).all())
 
 
-class Slopes(NamedTuple):
-    """The model linearised along a trajectory: x+ = F x, y = H x.
-
-    Shape:
-        F: (R, T, nx, nx), H: (R, T, ny, nx).
-    """
-
-    F: Tensor
-    H: Tensor
-
-
 @torch.no_grad()
-def simulate(cell: LFRCell, u: Tensor, x0: Tensor, *, near: Trajectory | None = None) -> Trajectory:
+def simulate(cell: LFRCell, u: Tensor, x0: Tensor, *, guess: Tensor | None = None) -> Trajectory:
     """Trajectory from the state ``x0``. A model that diverges gives infinite or NaN samples.
+
+    On the CPU a linear model and a ``Network`` are simulated in machine code; any other map, and
+    any other device, by Newton's method over all of time and, where that fails, step by step.
 
     Args:
         cell: the model. Its weights may have a leading axis of length R: one model a record.
         u: input.
         x0: start state.
-        near: trajectory of the same model and input from another start; once the two have met to
-            rounding, the rest is taken from there. It is overwritten.
+        guess: states of a nearby trajectory, for Newton's method.
 
     Shape:
-        u: (R, T, nu), x0: (R, nx).
+        u: (R, T, nu), x0: (R, nx), guess: (R, T + 1, nx).
     """
-    if u.device.type == "cpu" and (cell.static is None or type(cell.static) is Network):
-        return _compiled(cell, u, x0, near)
-    return _loop(cell, u, x0)
+    if _is_compiled(cell, u):
+        return _compiled(cell, u, x0, None)
+    x = newton(cell, u, x0, guess=guess)
+    return _with_loop_where_lost(cell, u, x0, x)
 
 
 def signals(cell: LFRCell, u: Tensor, x: Tensor) -> Trajectory:
@@ -96,14 +86,24 @@ def signals(cell: LFRCell, u: Tensor, x: Tensor) -> Trajectory:
 def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Trajectory:
     """Trajectory with x(T) = x(0): the response to the periodic repetition of ``u``.
 
-    The record is passed until its end state meets its start state; where that takes more than
-    a few passes, Newton's method on x(T) - x(0) takes over. A periodic solution that is not
-    stable, so that no simulation would settle to it, counts as diverged (NaN samples).
+    In machine code the record is passed until its end state meets its start state; where that
+    takes more than a few passes, Newton's method on x(T) - x(0) takes over. Elsewhere Newton's
+    method over all of time closes the period, too, and passes follow where it fails. A periodic
+    solution that is not stable, so that no simulation would settle to it, counts as diverged (NaN
+    samples).
 
     Shape:
-        u: (R, T, nu), one or more whole periods; guess: (R, nx), start of the search.
+        u: (R, T, nu), one or more whole periods; guess: (R, nx), start of the search, or
+        (R, T + 1, nx), states of a nearby solution.
     """
     x0 = u.new_zeros(len(u), cell.nx) if guess is None else guess
+    compiled = _is_compiled(cell, u)
+    if not compiled:
+        states = x0 if x0.ndim == 3 else None
+        x = newton(cell, u, x0[:, 0] if x0.ndim == 3 else x0, guess=states, periodic=True)
+        if torch.isfinite(x).all():
+            return signals(cell, u, x)
+    x0 = x0[:, 0] if x0.ndim == 3 else x0
     identity = torch.eye(cell.nx, dtype=u.dtype, device=u.device)
     tolerance = max(PERIODIC_TOLERANCE, PERIODIC_ROUNDING * torch.finfo(u.dtype).eps)
     trajectory = simulate(cell, u, x0)
@@ -122,7 +122,10 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
                 break
             gap = (end - x0).unsqueeze(-1)
             x0 = x0 + torch.linalg.solve(identity - transition, gap).squeeze(-1)
-        trajectory = simulate(cell, u, x0, near=trajectory)
+        if compiled:
+            trajectory = _compiled(cell, u, x0, trajectory)
+        else:
+            trajectory = simulate(cell, u, x0, guess=trajectory.x)
     return Trajectory(*(torch.full_like(signal, torch.nan) for signal in trajectory))
 
 
@@ -162,62 +165,32 @@ def estimated_start(cell: LFRCell, u: Tensor, y: Tensor, weight: Tensor) -> Traj
     return best
 
 
-@torch.no_grad()
-def slopes(cell: LFRCell, z: Tensor) -> Slopes:
-    """The linearised model at the inputs z (R, T, nz) of its static nonlinearity."""
-    weights = {name: p.detach() for name, p in cell.named_parameters()}
-    return slopes_at(weights, static_slopes(cell.static, z, of_static(weights)).J)
+def _is_compiled(cell: LFRCell, u: Tensor) -> bool:
+    return u.device.type == "cpu" and (cell.static is None or type(cell.static) is Network)
 
 
-def slopes_at(weights: dict[str, Tensor], J: Tensor) -> Slopes:
-    """F = A + Bw J Cz and H = Cy + Dyw J Cz for J (R, T, nw, nz), by one product with a matrix.
-
-    The product is twenty times faster than as many products of small matrices.
-    """
-    A, Cz = weights["A"], weights["Cz"]
-    left = torch.cat([weights["Bw"], weights["Dyw"]], dim=-2)
-    products = torch.einsum("...iq,...jl->...qjil", left, Cz).flatten(-2).flatten(-3, -2)
-    constant = torch.cat([A, weights["Cy"]], dim=-2).flatten(-2).unsqueeze(-2)
-    nx = A.shape[-1]
-    both = (J.flatten(-2) @ products + constant).unflatten(-1, (-1, nx))
-    return Slopes(both[..., :nx, :], both[..., nx:, :])
+def _with_loop_where_lost(cell: LFRCell, u: Tensor, x0: Tensor, x: Tensor) -> Trajectory:
+    """The trajectory of the states x (R, T + 1, nx), NaN ones found step by step."""
+    lost = ~torch.isfinite(x).all(dim=(1, 2))
+    if lost.any():
+        x = torch.where(lost[:, None, None], _loop(cell, u, x0), x)
+    return signals(cell, u, x)
 
 
-def of_static(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights of the static nonlinearity among those of the cell, by their own names."""
-    start = "static."
-    return {name.removeprefix(start): p for name, p in weights.items() if name.startswith(start)}
-
-
-def spectral_radius(matrices: Tensor) -> float:
-    """Largest magnitude of an eigenvalue of (..., n, n); NaN where an entry is not finite.
-
-    LAPACK is not asked then: some builds crash the process.
-    """
-    if not torch.isfinite(matrices).all():
-        return float("nan")
-    return float(torch.linalg.eigvals(matrices).abs().amax())
-
-
-def monodromy(cell: LFRCell, z: Tensor) -> Tensor:
-    """Transition matrix (R, nx, nx) over a record along z (R, T, nz): the product of all F(k)."""
-    Phi = torch.eye(cell.nx).to(z).expand(len(z), cell.nx, cell.nx)
-    for part in z.split(PASS, dim=1):
-        F = slopes(cell, part).F
-        Phi = linear_recurrence(F, torch.zeros_like(F), Phi)[:, -1]
-    return Phi
-
-
-def _loop(cell: LFRCell, u: Tensor, x0: Tensor) -> Trajectory:
-    """One step after another, for any static map and device: the oracle."""
+def _loop(cell: LFRCell, u: Tensor, x0: Tensor) -> Tensor:
+    """States (R, T + 1, nx), one step after another, any static map and device: the oracle."""
     states = [x0.unsqueeze(1)]
     for u_k in u.split(1, dim=1):
         states.append(cell(u_k, states[-1])[1])
-    return signals(cell, u, torch.cat(states, dim=1))
+    return torch.cat(states, dim=1)
 
 
 def _compiled(cell: LFRCell, u: Tensor, x0: Tensor, near: Trajectory | None) -> Trajectory:
-    """The same in machine code, for a linear cell or one hidden layer, on the CPU."""
+    """Trajectory of a linear cell or one hidden layer, in machine code on the CPU.
+
+    ``near`` is that of the same model and input from another start; once the two have met to
+    rounding, the rest is taken from there. It is overwritten.
+    """
     R, T = u.shape[:2]
     if near is None:
         sizes = ((T + 1, cell.nx), (T, cell.nz), (T, cell.nw), (T, cell.ny))

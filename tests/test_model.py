@@ -86,7 +86,8 @@ def test_net_parameters_of_a_polynomial_are_the_rank_as_well(nu, ny, nx, nz, nw,
     model = random_model(cell)
     assert model.sizes == {"nx": nx, "nz": nz, "nw": nw, "degree": degree}
     u = 0.5 * normal(1, 200, nu)
-    J = output_jacobian(cell, u, steady_state(cell, u), periodic=True).flatten(0, 2)
+    linearisation = Linearisation(cell, u, steady_state(cell, u), periodic=True)
+    J = output_jacobian(linearisation).flatten(0, 2)
     s = torch.linalg.svdvals(J / J.norm(dim=0))
     assert model.parameters_net == int((s > 1e-12 * s[0]).sum())
 

@@ -19,12 +19,10 @@ from lfrtorch.simulate import (
     PERIODIC_TOLERANCE,
     Trajectory,
     estimated_start,
-    monodromy,
     simulate,
-    slopes,
-    spectral_radius,
     steady_state,
 )
+from lfrtorch.slopes import monodromy, slopes, spectral_radius
 
 
 class SameNetwork(torch.nn.Module):
@@ -205,7 +203,7 @@ def test_slopes_are_the_derivatives_of_one_step():
 
 @pytest.mark.parametrize("samples", [1 << 14, 3])
 def test_monodromy_is_the_product_with_the_last_step_leftmost(samples: int, monkeypatch):
-    monkeypatch.setattr("lfrtorch.simulate.PASS", samples)
+    monkeypatch.setattr("lfrtorch.slopes.PASS", samples)
     cell, z = random_cell(1, 1, 3, 2, 2), normal(2, 7, 2)
     F = slopes(cell, z).F
     for r in range(2):
