@@ -19,7 +19,8 @@ from lfrtorch.lfr import LFR
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler, as_records, rms_scale
 from lfrtorch.residual import SimulationError
-from lfrtorch.simulate import spectral_radius
+from lfrtorch.slopes import spectral_radius
+from lfrtorch.threads import spread_by_hand
 
 Array = NDArray[np.float64]
 
@@ -89,6 +90,7 @@ class LinearModel:
         return replace(self, A=A, B=T @ self.B, C=scipy.linalg.solve(T.T, self.C.T).T)
 
 
+@spread_by_hand()
 def estimate_bla(
     records: Record | Sequence[Record],
     nx: int,

@@ -14,6 +14,7 @@ from lfrtorch.batch import EVERY, Batch
 from lfrtorch.factors import Gram, Normal, Orthogonal, System, Triangle
 from lfrtorch.gauge import Reduction
 from lfrtorch.sensitivity import Linearisation, closed, output_jacobian
+from lfrtorch.threads import spread
 
 NORMAL = 1e4
 """Relative damping, in rounding errors, above which the normal equations are as good as QR."""
@@ -152,7 +153,9 @@ class Part:
         """Weighted changes (R, m, ny) of the outputs with θ (P,), or its kept columns (K,)."""
         if self._kept is not None:
             rows, mix = self._kept
-            return (rows @ (mix @ reduced).unsqueeze(-1)).reshape(self.batch.residual_shape)
+            d_y = rows.new_empty(rows.shape[:2])
+            spread(_product, len(rows), rows, mix @ reduced, d_y)
+            return d_y.reshape(self.batch.residual_shape)
         linearisation = self.linearisation
         d_x0 = None if self.x0 is None else d_theta[self.x0].reshape(linearisation.state.shape)
         d_y = linearisation.tangent(d_theta[: linearisation.parameters], d_x0)
@@ -162,8 +165,9 @@ class Part:
         """Add Jᵀ residual (R, m, ny) to the one by θ (P,), or by its kept columns (K,)."""
         if self._kept is not None:
             rows, mix = self._kept
-            by_column = rows.mT @ residual.reshape(len(rows), -1, 1)
-            reduced += (mix.mT @ by_column).sum(0).squeeze(-1)
+            by_column = rows.new_empty(len(rows), rows.shape[2])
+            spread(_product, len(rows), rows.mT, residual.reshape(len(rows), -1), by_column)
+            reduced += (mix.mT @ by_column.unsqueeze(-1)).sum(0).squeeze(-1)
             return
         adjoint = self.linearisation.adjoint(self.batch.unweigh(residual))
         gradient[: self.linearisation.parameters] += adjoint.theta.sum(0)
@@ -181,3 +185,7 @@ class Part:
                 first = self.x0.start + r * nx
                 J[r, ..., first : first + nx] = rows[r, ..., P:]
         return self.batch.weigh(J)
+
+
+def _product(r: int, matrices: Tensor, vectors: Tensor, out: Tensor) -> None:
+    torch.mv(matrices[r], vectors[r], out=out[r])

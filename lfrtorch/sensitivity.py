@@ -31,7 +31,7 @@ from lfrtorch.recurrence import adjoint_recurrence, linear_recurrence, to_numpy
 from lfrtorch.simulate import Trajectory
 from lfrtorch.slopes import PASS, Slopes, of_static, slopes_at
 from lfrtorch.static_slopes import NetworkSlopes, StaticSlopes, static_slopes
-from lfrtorch.threads import spread
+from lfrtorch.threads import spread, workers
 
 BLOCK = 8192
 """Samples of all records together in a block of rows on the CPU."""
@@ -262,12 +262,15 @@ class Linearisation:
         R, nx = self.state.shape
         cpu = self.u.device.type == "cpu"
         samples = BLOCK if cpu else PASS
+        together = workers() if cpu else R  # records, a thread each
         ends = []
-        for records in _slices(R, max(1, samples // self.u.shape[1])):
+        for records in _slices(R, max(together, samples // self.u.shape[1])):
             S = self.state.new_zeros(len(self.u[records]), nx, len(kept) + (nx if start else 0))
             if start:
                 S[:, :, len(kept) :] = torch.eye(nx).to(S)
-            for time in _slices(self.u.shape[1], max(1, samples // len(S))):
+            # A part of rows that are kept must be contiguous: whole records.
+            length = self.u.shape[1] if out is not None else max(1, samples // len(S))
+            for time in _slices(self.u.shape[1], length):
                 block = self._block(records, time)
                 if out is None:
                     rows = S.new_empty(*block.v.shape[:2], self._ny, S.shape[-1] + spare)
@@ -388,8 +391,7 @@ class Linearisation:
         R = len(S)
         W = [block.weights[name] for name in ("A", "Bw", "Cz", "Cy", "Dyw")]
         W = [m if m.ndim == 3 else m.unsqueeze(0) for m in W]
-        threads = torch.get_num_threads()
-        chunks = 1 if R % threads == 0 else threads
+        chunks = 1 if R % workers() == 0 else workers()
         static, none = block.static, S.new_zeros(R, len(block.v[0]), 0)
         if isinstance(static, NetworkSlopes) and len(columns.static) == self.layout.weights:
             network = (static.Ww if static.Ww.ndim == 3 else static.Ww.unsqueeze(0), static.z)
@@ -437,87 +439,92 @@ def _emit(
     job, A, Bw, Cz, Cy, Dyw, J, v, by_weight, slope, h, Ww, z, x_entries, z_entries, y_entries,
     first, chunks, S, rows,
 ):  # fmt: skip
-    B, ny, C = rows.shape[1], rows.shape[2], S.shape[2]
-    nx, nw = Bw.shape[1:]
-    network, nn, nz = h.shape[2] > 0, h.shape[2], z.shape[2]
-    n_weights = nn * (nz + 1 + nw) + nw if network else by_weight.shape[3]
     r, chunk = job // chunks, job % chunks
-    m = min(r, len(A) - 1)  # which model
+    B, ny, C = rows.shape[1], rows.shape[2], S.shape[2]
     c0, c1 = C * chunk // chunks, C * (chunk + 1) // chunks
+    m = min(r, len(A) - 1)  # which model
+    A, Bw, Cz, Cy, Dyw = A[m], Bw[m], Cz[m], Cy[m], Dyw[m]
+    J, v, by_weight, rows, S = J[r], v[r], by_weight[r], rows[r], S[r]
+    slope, h, z, Ww = slope[r], h[r], z[r], Ww[min(m, len(Ww) - 1)]
+    (nx, nw), nn, nz = Bw.shape, h.shape[1], z.shape[1]
+    network = nn > 0
+    n_weights = nn * (nz + 1 + nw) + nw if network else by_weight.shape[2]
     x_own, z_own, y_own = (
         _between(x_entries, c0, c1), _between(z_entries, c0, c1), _between(y_entries, c0, c1)
     )  # fmt: skip
     s0 = min(max(first, c0), c1)
     s1 = max(min(first + n_weights, c1), s0)
-    # S(k+1) = M(k) X(k) and dy(k) = N(k) X(k) with X = [S; direct terms of w], M = [F Bw] and
-    # N = [H Dyw], padded with zeros to whole tiles.
-    rows_of_X = _TILE * (-(-(nx + nw) // _TILE))
-    M = np.zeros((_TILE * (-(-nx // _TILE)), rows_of_X), rows.dtype)
-    N = np.zeros((ny, rows_of_X), rows.dtype)
-    M[:nx, nx : nx + nw] = Bw[m]
-    N[:, nx : nx + nw] = Dyw[m]
-    X, X_next = (
-        np.zeros((rows_of_X, c1 - c0), rows.dtype),
-        np.zeros((rows_of_X, c1 - c0), rows.dtype),
-    )
-    X[:nx] = S[r, :, c0:c1]
     d_w = np.zeros((nw, n_weights), rows.dtype)
     for q in range(nw if network else 0):
         d_w[q, n_weights - nw + q] = 1.0
+    # S(k+1) = M(k) X(k) and dy(k) = N(k) X(k) with X = [S; direct terms of w], M = [F Bw] and
+    # N = [H Dyw], padded with zeros to whole tiles.
+    depth = _TILE * (-(-(nx + nw) // _TILE))
+    M, N = (
+        np.zeros((_TILE * (-(-nx // _TILE)), depth), rows.dtype),
+        np.zeros((ny, depth), rows.dtype),
+    )
+    M[:nx, nx : nx + nw] = Bw
+    N[:, nx : nx + nw] = Dyw
+    X, X_next = np.zeros((depth, c1 - c0), rows.dtype), np.zeros((depth, c1 - c0), rows.dtype)
+    X[:nx] = S[:, c0:c1]
     for k in range(B):
-        _slope(A[m], M, J[r, k], Cz[m])
-        _slope(Cy[m], N, J[r, k], Cz[m])
+        _add_slope(A, M, J, k, Cz)
+        _add_slope(Cy, N, J, k, Cz)
         for q in range(nw):
             for n in range(len(z_own)):
-                X[nx + q, z_own[n, 0]] = J[r, k, q, z_own[n, 1]] * v[r, k, z_own[n, 2]]
+                X[nx + q, z_own[n, 0]] = J[k, q, z_own[n, 1]] * v[k, z_own[n, 2]]
             if network:
-                _by_weight(Ww[m, q], slope[r, k], h[r, k], z[r, k], q, d_w[q])
+                _by_weight(Ww, slope, h, z, k, q, d_w)
+                for c in range(s0, s1):
+                    X[nx + q, c - c0] = d_w[q, c - first]
             else:
-                d_w[q] = by_weight[r, k, q]
-            for c in range(s0, s1):
-                X[nx + q, c - c0] = d_w[q, c - first]
+                for c in range(s0, s1):
+                    X[nx + q, c - c0] = by_weight[k, q, c - first]
         _state_rows(M, X, X_next)
-        for i in range(ny):
-            _output_row(N[i], X, rows[r, k, i, c0:c1])
+        _output_rows(N, X, rows, k, c0)
         for n in range(len(x_own)):
-            X_next[x_own[n, 1], x_own[n, 0]] += v[r, k, x_own[n, 2]]
+            X_next[x_own[n, 1], x_own[n, 0]] += v[k, x_own[n, 2]]
         for n in range(len(y_own)):
-            rows[r, k, y_own[n, 1], c0 + y_own[n, 0]] += v[r, k, y_own[n, 2]]
+            rows[k, y_own[n, 1], c0 + y_own[n, 0]] += v[k, y_own[n, 2]]
         X, X_next = X_next, X
-    for i in range(nx):
-        for c in range(c1 - c0):
-            # A fading state would reach denormal numbers, a hundred times slower, and stay there.
-            S[r, i, c0 + c] = X[i, c] if abs(X[i, c]) > _FADED else 0.0
+        if k % 256 == 0:
+            # Fading states would reach denormal numbers, a hundred times slower, and stay there.
+            for i in range(nx):
+                for c in range(c1 - c0):
+                    if abs(X[i, c]) < _FADED:
+                        X[i, c] = 0.0
+    S[:, c0:c1] = X[:nx]
 
 
 _TILE, _FADED = 4, 1e-30
 
 
-@njit(nogil=True)
-def _by_weight(Ww, slope, h, z, q, d_w):
-    """Row q of what ``NetworkSlopes.by_weight`` computes, at one sample."""
-    nn, nz = len(h), len(z)
+@njit(nogil=True, inline="always")
+def _by_weight(Ww, slope, h, z, k, q, d_w):
+    """Row q of what ``NetworkSlopes.by_weight`` computes, at sample k; the ones stand there."""
+    nn, nz = h.shape[1], z.shape[1]
     for n in range(nn):
-        a = Ww[n] * slope[n]
+        a = Ww[q, n] * slope[k, n]
         for j in range(nz):
-            d_w[n * nz + j] = a * z[j]
-        d_w[nn * nz + n] = a
-        d_w[nn * (nz + 1 + q) + n] = h[n]
+            d_w[q, n * nz + j] = a * z[k, j]
+        d_w[q, nn * nz + n] = a
+        d_w[q, nn * (nz + 1 + q) + n] = h[k, n]
 
 
-@njit(nogil=True, fastmath={"contract"})
-def _slope(constant, M, J, Cz):
-    """M[:, :nx] = constant + M[:, nx:] J Cz."""
+@njit(nogil=True, inline="always")
+def _add_slope(constant, M, J, k, Cz):
+    """M[:, :nx] = constant + M[:, nx:] J(k) Cz."""
     n, nx = constant.shape
     for i in range(n):
         for c in range(nx):
             M[i, c] = constant[i, c]
         for j in range(len(Cz)):
-            slope = M.dtype.type(0)
-            for q in range(len(J)):
-                slope += M[i, nx + q] * J[q, j]
+            a = M.dtype.type(0)
+            for q in range(J.shape[1]):
+                a += M[i, nx + q] * J[k, q, j]
             for c in range(nx):
-                M[i, c] += slope * Cz[j, c]
+                M[i, c] += a * Cz[j, c]
 
 
 @njit(nogil=True)
@@ -556,14 +563,16 @@ def _state_rows(M, X, out):
 
 
 @njit(nogil=True, fastmath={"contract"})
-def _output_row(a, X, out):
-    """out = a @ X."""
-    for j in range(0, len(a), 4):
-        a0, a1, a2, a3 = a[j], a[j + 1], a[j + 2], a[j + 3]
-        x0, x1, x2, x3 = X[j], X[j + 1], X[j + 2], X[j + 3]
-        if j == 0:
-            for t in range(len(out)):
-                out[t] = a0 * x0[t] + a1 * x1[t] + a2 * x2[t] + a3 * x3[t]
-        else:
-            for t in range(len(out)):
-                out[t] += a0 * x0[t] + a1 * x1[t] + a2 * x2[t] + a3 * x3[t]
+def _output_rows(N, X, rows, k, first):
+    """rows[k, :, first:] = N @ X."""
+    for i in range(len(N)):
+        out = rows[k, i]
+        for j in range(0, N.shape[1], 4):
+            a0, a1, a2, a3 = N[i, j], N[i, j + 1], N[i, j + 2], N[i, j + 3]
+            x0, x1, x2, x3 = X[j], X[j + 1], X[j + 2], X[j + 3]
+            if j == 0:
+                for t in range(X.shape[1]):
+                    out[first + t] = a0 * x0[t] + a1 * x1[t] + a2 * x2[t] + a3 * x3[t]
+            else:
+                for t in range(X.shape[1]):
+                    out[first + t] += a0 * x0[t] + a1 * x1[t] + a2 * x2[t] + a3 * x3[t]

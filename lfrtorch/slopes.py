@@ -66,7 +66,7 @@ def spectral_radius(matrices: Tensor) -> float:
 def monodromy(cell: LFRCell, z: Tensor) -> Tensor:
     """Transition matrix (R, nx, nx) over a record along z (R, T, nz): the product of all F(k)."""
     Phi = torch.eye(cell.nx).to(z).expand(len(z), cell.nx, cell.nx)
-    for part in z.split(PASS, dim=1):
+    for part in z.split(max(1, PASS // len(z)), dim=1):
         F = slopes(cell, part).F
         Phi = linear_recurrence(F, torch.zeros_like(F), Phi)[:, -1]
     return Phi

@@ -1,28 +1,51 @@
-"""Compiled kernels on several threads, as many as torch uses."""
+"""Work on several threads without OpenMP: as many as torch was given."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 
 import torch
 
+_workers: ContextVar[int | None] = ContextVar("workers", default=None)
+
 
 def workers() -> int:
-    """Threads that kernels are spread over."""
-    return torch.get_num_threads()
+    """Threads that work is spread over."""
+    return _workers.get() or torch.get_num_threads()
+
+
+@contextmanager
+def spread_by_hand() -> Iterator[None]:
+    """Inside, torch itself works on one thread, and ``spread`` on as many as torch had.
+
+    torch's own threads (OpenMP) wait for each other spinning. Where small operations follow each
+    other, or another process shares the cores, that costs more than it gives: on two cores a
+    Jacobian that takes 3 ms to set up took 73, and an iteration of 27 ms up to 630.
+    """
+    count = workers()
+    token = _workers.set(count)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        _workers.reset(token)
+        if _workers.get() is None:
+            torch.set_num_threads(count)
 
 
 def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
-    """Call ``kernel(job, *arguments)`` for every job, on ``torch.get_num_threads()`` threads.
+    """Call ``kernel(job, *arguments)`` for every job, on ``workers()`` threads.
 
-    The kernel must release the interpreter's lock (``njit(nogil=True)``). numba's own parallel
-    loops bring a second OpenMP beside torch's; where another process shares the cores the two wait
-    for each other spinning, and an iteration of 0.03 s took 0.8 s.
+    The kernel must release the interpreter's lock (``njit(nogil=True)``, or torch's operations).
+    numba's own parallel loops bring a second OpenMP beside torch's; where another process shares
+    the cores an iteration of 0.03 s took 0.8 s with them.
     """
-    threads = min(jobs, torch.get_num_threads())
+    threads = min(jobs, workers())
     if threads == 1:
         for job in range(jobs):
             kernel(job, *arguments)
@@ -32,15 +55,18 @@ def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
         for job in range(thread, jobs, threads):
             kernel(job, *arguments)
 
-    others = [_pool().submit(share, thread) for thread in range(1, threads)]
-    share(0)
-    for other in others:
-        other.result()
+    with spread_by_hand():
+        others = [_pool().submit(share, thread) for thread in range(1, threads)]
+        share(0)
+        for other in others:
+            other.result()
 
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="lfrtorch")
+    return ThreadPoolExecutor(
+        os.cpu_count(), "lfrtorch", initializer=torch.set_num_threads, initargs=(1,)
+    )
 
 
 if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads

@@ -15,6 +15,7 @@ from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 from lfrtorch.residual import Ridge, SimulationError
+from lfrtorch.threads import spread_by_hand
 
 INTERRUPTED = "interrupted"
 
@@ -123,6 +124,7 @@ class FitResult:
         return self.history[-1].iteration
 
 
+@spread_by_hand()
 def fit(
     model: Model,
     train: Record | Sequence[Record],

@@ -3,11 +3,13 @@
 import os
 import subprocess
 import sys
+import time
+from contextlib import nullcontext
 
 import pytest
 import torch
 
-from lfrtorch.threads import spread
+from lfrtorch.threads import spread, spread_by_hand, workers
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
@@ -33,6 +35,34 @@ def test_error_of_any_thread_is_raised(bad: int, monkeypatch: pytest.MonkeyPatch
 
     with pytest.raises(ZeroDivisionError):
         spread(kernel, 2)
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_torch_works_on_one_thread_inside_and_on_as_many_as_before_outside(by_hand: bool):
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    seen: list[int] = []
+
+    def kernel(job: int):
+        seen.append(torch.get_num_threads())
+        time.sleep(0.01)  # so that each thread gets a job
+
+    try:
+        with spread_by_hand() if by_hand else nullcontext():
+            assert workers() == 3
+            spread(kernel, 3)
+            spread(kernel, 1)
+        assert seen == [1, 1, 1, 1 if by_hand else 3]
+        assert (workers(), torch.get_num_threads()) == (3, 3)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_threads_are_given_back_after_an_error():
+    before = torch.get_num_threads()
+    with pytest.raises(ZeroDivisionError), spread_by_hand():
+        raise ZeroDivisionError
+    assert workers() == torch.get_num_threads() == before
 
 
 FORK = """
