@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lfrtorch.model import Model
+from lfrtorch.ranks import Ranks
 from lfrtorch.records import Record, Start
 
 EVERY = slice(None)
@@ -22,7 +23,8 @@ class Batch:
     """Records of one length and start, normalised, and how their errors are weighted.
 
     Shape:
-        u: (R, T, nu), y: (R, T, ny), x0: (R, nx) of given starts.
+        u: (R, T, nu), y: (R, T, ny), x0: (R, nx) of given starts; estimated: (R,), which of the
+        estimated start states is each record's.
         weight: (R, T, ny), or by spectral line (R, F, ny), F = T // 2 + 1: the factors of the
             errors, 0 where a sample or a line does not count.
     """
@@ -30,6 +32,7 @@ class Batch:
     u: Tensor
     y: Tensor
     x0: Tensor | None
+    estimated: Tensor | None
     weight: Tensor
     spectral: bool
     start: Start
@@ -69,11 +72,12 @@ class Batch:
         return T * torch.fft.irfft(spectrum, T, dim=1)
 
 
-def batches_of(model: Model, records: list[Record]) -> list[Batch]:
-    """The records of a model, grouped and normalised, in its dtype and on its device."""
+def batches_of(model: Model, records: list[Record], ranks: Ranks) -> list[Batch]:
+    """A process's share of the records, grouped and normalised, in the model's dtype and device."""
     like = model.lfr.cell.A
+    estimated = [record for record in records if record.start == "estimated"]
     groups: dict[tuple[int, Start, bool], list[Record]] = defaultdict(list)
-    for record in records:
+    for record in ranks.share(records):
         groups[record.samples, record.start, record.line_weight is not None].append(record)
     batches = []
 
@@ -86,6 +90,9 @@ def batches_of(model: Model, records: list[Record]) -> list[Batch]:
                 u=stacked([model.scaler.normalise_u(record.u) for record in group]),
                 y=stacked([model.scaler.normalise_y(record.y) for record in group]),
                 x0=stacked([r.x0 for r in group if r.x0 is not None]) if start == "given" else None,
+                estimated=torch.tensor([estimated.index(record) for record in group])
+                if start == "estimated"
+                else None,
                 weight=stacked([_factors(record) for record in group]),
                 spectral=spectral,
                 start=start,

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from lfrtorch.ranks import Ranks
 from lfrtorch.threads import spread, workers
 
 MERGED = 16
@@ -97,6 +98,10 @@ class Triangle:
         """Add the rows of another, their columns mixed by (its n, n)."""
         self.fold(other.R @ mix)
 
+    def combine(self, ranks: Ranks) -> None:
+        """Take in the rows of all processes."""
+        self._parts = [torch.linalg.qr(ranks.stack(self.R), mode="r").R]
+
     @property
     def R(self) -> Tensor:
         """R (min(M, n), n) with RᵀR = AᵀA, up to the signs of its rows."""
@@ -116,18 +121,23 @@ class Gram:
         pieces = _pieces(rows)
         parts: list[Tensor] = [rows[:0]] * len(pieces)
         spread(_square, len(pieces), pieces, parts)
-        self._add(*parts)
+        self.add(*parts)
 
     def absorb(self, other: Any, mix: Tensor) -> None:
         """Add the rows of another, their columns mixed by (its n, n)."""
-        self._add(mix.mT @ other.G @ mix)
+        self.add(mix.mT @ other.G @ mix)
+
+    def combine(self, ranks: Ranks) -> None:
+        """Take in the rows of all processes."""
+        self._parts = [ranks.sum(self.G)]
 
     @property
     def G(self) -> Tensor:
         """The matrix."""
         return self._parts[0]
 
-    def _add(self, *parts: Tensor) -> None:
+    def add(self, *parts: Tensor) -> None:
+        """Add squares (n, n) of rows."""
         self._parts = [torch.stack([*self._parts, *parts]).sum(0)]
 
 

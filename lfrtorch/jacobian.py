@@ -13,6 +13,7 @@ from torch import Tensor
 from lfrtorch.batch import EVERY, Batch
 from lfrtorch.factors import Gram, Normal, Orthogonal, System, Triangle
 from lfrtorch.gauge import Reduction
+from lfrtorch.ranks import Ranks
 from lfrtorch.sensitivity import Linearisation, closed, output_jacobian
 from lfrtorch.threads import spread
 
@@ -29,14 +30,23 @@ class Jacobian:
     Args:
         parts: of each batch.
         reduced: the columns that are computed.
-        ridge: factors (P,) of θ - θ_start in the residual, which follow the batches ...
-        penalty: ... and that part of the residual; left out where there is none.
+        ridge: factors (P,) of θ - θ_start in the residual of the first process, after the batches.
+        penalty: θ - θ_start (P,).
+        ranks: the processes that hold the parts.
     """
 
     def __init__(
-        self, parts: list[Part], reduced: Reduction, ridge: Tensor, *penalty: Tensor
+        self,
+        parts: list[Part],
+        reduced: Reduction,
+        ridge: Tensor,
+        penalty: Tensor,
+        ranks: Ranks,
     ) -> None:
-        self._parts, self._reduced, self._ridge, self._penalty = parts, reduced, ridge, penalty
+        self._parts, self._reduced, self._ranks = parts, reduced, ranks
+        self._ridge, self._penalty = ridge, penalty
+        self._penalised = bool(ridge.any())
+        self._own_penalty = self._penalised and ranks.rank == 0
 
     def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
         """The least-squares system of J and its gradient Jᵀr (P,).
@@ -46,30 +56,27 @@ class Jacobian:
             truncation: relative size of singular values that are left out.
         """
         kept, expand = self._reduced
-        penalty = (
-            torch.diag(self._ridge) if self._penalty else self._ridge.new_zeros(0, len(expand.mT))
-        )
         precise = damping <= NORMAL * torch.finfo(expand.dtype).eps
         factor = Triangle() if precise else Gram()
         for part in self._parts:
             part.fold(kept, factor)  # [J r] in the kept columns
+        factor.combine(self._ranks)
         if isinstance(factor, Triangle):
             R, r = factor.R[:, :-1] @ expand, factor.R[:, -1]
             gradient = R.mT @ r
-            system = Orthogonal(torch.cat([R, penalty]), truncation)
+            rows = [R, torch.diag(self._ridge)] if self._penalised else [R]
+            system = Orthogonal(torch.cat(rows), truncation)
         else:
             gradient = expand.mT @ factor.G[:-1, -1]
             G = expand.mT @ factor.G[:-1, :-1] @ expand
-            system = Normal(G + penalty.mT @ penalty, len(kept))
-        for own in self._penalty:
-            gradient = gradient + self._ridge * own
-        return system, gradient
+            system = Normal(G + torch.diag(self._ridge.square()), len(kept))
+        return system, gradient + self._ridge.square() * self._penalty
 
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J d_theta (M,)."""
         reduced = self._reduced.expand @ d_theta
         parts = [part.tangent(d_theta, reduced).flatten() for part in self._parts]
-        return torch.cat([*parts, *(self._ridge * d_theta for _ in self._penalty)])
+        return torch.cat([*parts, *([self._ridge * d_theta] if self._own_penalty else [])])
 
     def adjoint(self, residual: Tensor) -> Tensor:
         """Jᵀ residual (P,)."""
@@ -82,12 +89,14 @@ class Jacobian:
             first += own.numel()
             part.adjoint(own, gradient, reduced)
         gradient = gradient + self._reduced.expand.mT @ reduced
-        return gradient + self._ridge * residual[first:] if self._penalty else gradient
+        if self._own_penalty:
+            gradient = gradient + self._ridge * residual[first:]
+        return self._ranks.sum(gradient)
 
     def whole(self) -> Tensor:
         """J (M, P): for a look at it, and for small problems."""
         parts = [part.whole(len(self._ridge)).flatten(0, 2) for part in self._parts]
-        return torch.cat([*parts, *(torch.diag(self._ridge) for _ in self._penalty)])
+        return torch.cat([*parts, *([torch.diag(self._ridge)] if self._own_penalty else [])])
 
 
 class Part:
@@ -96,10 +105,13 @@ class Part:
     Args:
         batch: the records.
         linearisation: the model along them.
-        x0: where their start states stand in θ, if they are parameters.
+        x0: where the start state (nx) of each record stands in θ, if they are parameters.
+
+    Shape:
+        x0: (R, nx).
     """
 
-    def __init__(self, batch: Batch, linearisation: Linearisation, x0: slice | None) -> None:
+    def __init__(self, batch: Batch, linearisation: Linearisation, x0: Tensor | None) -> None:
         self.batch, self.linearisation, self.x0 = batch, linearisation, x0
         self._kept: tuple[Tensor, Tensor] | None = None
 
@@ -141,9 +153,8 @@ class Part:
         if linearisation.periodic:
             mix[:, K:-1, :K] = closed(end[:, :, K:], end[:, :, :K])
         elif self.x0 is not None:
-            first = K + self.x0.start - linearisation.parameters
-            for r in range(R):
-                mix[r, K:-1, first + r * nx : first + (r + 1) * nx] = torch.eye(nx).to(end)
+            for r, own_columns in enumerate(self.x0 - linearisation.parameters + K):
+                mix[r, K:-1, own_columns] = torch.eye(nx).to(end)
         for factor, of_record in zip(factors, mix, strict=start):
             total.absorb(factor, of_record)
         if whole and rows is not None and not batch.spectral:
@@ -157,7 +168,7 @@ class Part:
             spread(_product, len(rows), rows, mix @ reduced, d_y)
             return d_y.reshape(self.batch.residual_shape)
         linearisation = self.linearisation
-        d_x0 = None if self.x0 is None else d_theta[self.x0].reshape(linearisation.state.shape)
+        d_x0 = None if self.x0 is None else d_theta[self.x0]
         d_y = linearisation.tangent(d_theta[: linearisation.parameters], d_x0)
         return self.batch.weigh(d_y)
 
@@ -172,7 +183,7 @@ class Part:
         adjoint = self.linearisation.adjoint(self.batch.unweigh(residual))
         gradient[: self.linearisation.parameters] += adjoint.theta.sum(0)
         if self.x0 is not None:
-            gradient[self.x0] += adjoint.x0.flatten()
+            gradient[self.x0] += adjoint.x0
 
     def whole(self, parameters: int) -> Tensor:
         """All weighted rows (R, m, ny, P)."""
@@ -180,10 +191,8 @@ class Part:
         J = rows.new_zeros(*rows.shape[:3], parameters)
         J[..., :P] = rows[..., :P]
         if self.x0 is not None:
-            nx = self.linearisation.state.shape[1]
-            for r in range(len(J)):
-                first = self.x0.start + r * nx
-                J[r, ..., first : first + nx] = rows[r, ..., P:]
+            for r, own_columns in enumerate(self.x0):
+                J[r][..., own_columns] = rows[r, ..., P:]
         return self.batch.weigh(J)
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
@@ -14,6 +14,7 @@ from lfrtorch.checks import number
 from lfrtorch.gauge import reduction
 from lfrtorch.jacobian import Jacobian, Part
 from lfrtorch.model import Model
+from lfrtorch.ranks import Ranks
 from lfrtorch.records import Record, as_records
 from lfrtorch.sensitivity import Linearisation
 from lfrtorch.simulate import Trajectory, estimated_start
@@ -37,9 +38,12 @@ class SimulationError:
             parameters by the beginning of their names: ``{"static": 1e-3, "A": 1e-2, "x0": 0}``;
             those without get none.
         solved_starts: estimated start states are no part of θ, but solved for at every θ.
+        ranks: the processes that share the records; θ, cost and gradient are the same on all, a
+            residual is each one's own.
 
     Raises:
-        ValueError: records that are not the model's, a negative ridge or an unknown group.
+        ValueError: records that are not the model's, fewer records than processes, a negative ridge
+            or an unknown group.
     """
 
     def __init__(
@@ -49,16 +53,22 @@ class SimulationError:
         *,
         ridge: Ridge = 0.0,
         solved_starts: bool = False,
+        ranks: Ranks | None = None,
     ) -> None:
-        self.model = model
+        self.model, self.ranks = model, Ranks() if ranks is None else ranks
         self._parameters = [p for p in model.lfr.parameters() if p.requires_grad]
         data = as_records(records)
         for record in data:
             model.check(record)
-        self.batches = batches_of(model, data)
+        if len(data) < self.ranks.world:
+            raise ValueError(
+                f"{self.ranks.world} processes share {len(data)} record(s); each needs one: start "
+                "fewer processes, or cut the data into more records."
+            )
+        self.batches = batches_of(model, data, self.ranks)
         self.size = sum(record.samples - record.skip for record in data) * len(model.outputs)
         self._solved = solved_starts
-        self._starts = self._first_starts()
+        self._starts = self._first_starts(sum(record.start == "estimated" for record in data))
         self._start = self.theta
         self._ridge = self._ridge_of(ridge)
         self._guesses: list[Tensor | None] = [None] * len(self.batches)
@@ -67,36 +77,36 @@ class SimulationError:
     @property
     def theta(self) -> Tensor:
         """Parameters (P,) as they stand in the module, then the estimated start states."""
-        starts = [x0.flatten() for x0 in self._starts.values()]
-        return torch.cat([parameters_to_vector(self._parameters).detach(), *starts])
+        return torch.cat([parameters_to_vector(self._parameters).detach(), self._starts.flatten()])
 
     def rmse(self, theta: Tensor) -> float:
         """Root mean squared error at θ over scored samples and outputs, output unit, unweighted."""
-        total, scale = 0.0, torch.as_tensor(self.model.scaler.y_scale).to(self._start)
+        total = torch.zeros((), dtype=torch.float64, device=self._start.device)
+        scale = torch.as_tensor(self.model.scaler.y_scale).to(self._start)
         for batch, trajectory in zip(self.batches, self.trajectories(theta), strict=True):
             errors = (trajectory.y - batch.y) * scale
             if not batch.spectral:
                 errors = errors * (batch.weight != 0)
-            total += float(errors.double().square().sum())
-        return float(np.sqrt(total / self.size))
+            total = total + errors.double().square().sum()
+        return math.sqrt(self.ranks.sum(total) / self.size)
 
     def write(self, theta: Tensor) -> None:
         """Put θ (P,) into the module."""
-        sizes = [x0.numel() for x0 in self._starts.values()]
-        own, *starts = theta.split([len(theta) - sum(sizes), *sizes])
+        own, starts = theta.split([len(theta) - self._starts.numel(), self._starts.numel()])
         vector_to_parameters(own, self._parameters)
-        for (i, x0), start in zip(self._starts.items(), starts, strict=True):
-            self._starts[i] = start.reshape(x0.shape)
+        self._starts = starts.reshape(self._starts.shape)
 
     def cost(self, residual: Tensor) -> float:
-        """|r|²."""
-        return float(residual.square().sum())
+        """|r|² of all processes."""
+        return float(self.ranks.sum(residual.square().sum()))
 
     def residual(self, theta: Tensor) -> Tensor:
         """r (M,); infinite or NaN where the model diverges."""
         pairs = zip(self.batches, self.trajectories(theta), strict=True)
         errors = [batch.weigh(t.y - batch.y).flatten() for batch, t in pairs]
-        return torch.cat([*errors, *self._penalty(theta)])
+        if self._ridge.any() and self.ranks.rank == 0:
+            errors.append(self._ridge.sqrt() * (theta - self._start))
+        return torch.cat(errors)
 
     def linearise(self, theta: Tensor) -> Jacobian:
         """dr/dθ at θ, held as a whole only where it is small."""
@@ -104,17 +114,19 @@ class SimulationError:
         self.write(theta)  # the module may hold a trial that came after the trajectories
         self._guesses = [t.x for t in trajectories]
         cell = self.model.lfr.cell
-        parts, first = [], sum(p.numel() for p in self._parameters)
-        for i, (batch, trajectory) in enumerate(zip(self.batches, trajectories, strict=True)):
-            x0 = slice(first, first + self._starts[i].numel()) if i in self._starts else None
-            first = first if x0 is None else x0.stop
+        parts, P = [], len(theta) - self._starts.numel()
+        for batch, trajectory in zip(self.batches, trajectories, strict=True):
+            x0 = batch.estimated if self._starts.numel() else None
+            if x0 is not None:
+                x0 = P + cell.nx * x0.unsqueeze(1) + torch.arange(cell.nx)
             periodic = batch.start == "periodic"
             linearisation = Linearisation(cell, batch.u, trajectory, periodic=periodic)
             parts.append(Part(batch, linearisation, x0))
-        start = torch.cat([cell.A.new_zeros(0, cell.nx), *self._starts.values()])
         held = any(batch.x0 is not None for batch in self.batches)
-        reduced = reduction(cell, start, coordinates=not held)
-        return Jacobian(parts, reduced, self._ridge.sqrt(), *self._penalty(theta))
+        held = bool(self.ranks.sum(self._start.new_tensor(float(held))))
+        reduced = reduction(cell, self._starts, coordinates=not held)
+        penalty = theta - self._start
+        return Jacobian(parts, reduced, self._ridge.sqrt(), penalty, self.ranks)
 
     def jacobian(self, theta: Tensor) -> Tensor:
         """dr/dθ (M, P) as a whole: for a look at it, and for small problems."""
@@ -135,32 +147,31 @@ class SimulationError:
     def _trajectory(self, i: int) -> Trajectory:
         batch, cell = self.batches[i], self.model.lfr.cell
         guess, lfr = self._guesses[i], self.model.lfr
-        if batch.start == "estimated" and self._solved:
-            return estimated_start(cell, batch.u, batch.y, batch.weight)
-        start = "periodic" if batch.start == "periodic" else "zero"
-        return lfr.trajectory(batch.u, self._starts.get(i, batch.x0), start, guess=guess)
-
-    def _first_starts(self) -> dict[int, Tensor]:
-        """Start states by the number of their batch, where they are parameters."""
+        if batch.estimated is None:
+            start = "periodic" if batch.start == "periodic" else "zero"
+            return lfr.trajectory(batch.u, batch.x0, start, guess=guess)
         if self._solved:
-            return {}
-        cell = self.model.lfr.cell
-        return {
-            i: estimated_start(cell, batch.u, batch.y, batch.weight).x[:, 0].clone()
-            for i, batch in enumerate(self.batches)
-            if batch.start == "estimated"
-        }
+            return estimated_start(cell, batch.u, batch.y, batch.weight)
+        return lfr.trajectory(batch.u, self._starts[batch.estimated], guess=guess)
 
-    def _penalty(self, theta: Tensor) -> list[Tensor]:
-        return [self._ridge.sqrt() * (theta - self._start)] if self._ridge.any() else []
+    def _first_starts(self, count: int) -> Tensor:
+        """Start states (count, nx) of the records where they are parameters."""
+        cell = self.model.lfr.cell
+        starts = cell.A.new_zeros(0 if self._solved else count, cell.nx)
+        for batch in self.batches if len(starts) else ():
+            if batch.estimated is not None:
+                found = estimated_start(cell, batch.u, batch.y, batch.weight)
+                starts[batch.estimated] = found.x[:, 0]
+        return self.ranks.sum(starts)
 
     def _ridge_of(self, ridge: Ridge) -> Tensor:
         """The weight of every entry of θ."""
         groups = ridge if isinstance(ridge, Mapping) else {"": ridge}
         names = [n for n, p in self.model.lfr.cell.named_parameters() if p.requires_grad]
         sizes = [p.numel() for p in self._parameters]
-        names += ["x0"] * len(self._starts)
-        sizes += [x0.numel() for x0 in self._starts.values()]
+        if self._starts.numel():
+            names.append("x0")
+            sizes.append(self._starts.numel())
         weights = [0.0] * len(names)
         for group, value in groups.items():
             number(f"ridge of '{group}'" if group else "ridge", value)
