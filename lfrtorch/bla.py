@@ -17,7 +17,7 @@ from lfrtorch.checks import integer
 from lfrtorch.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
 from lfrtorch.lfr import LFR
 from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, Scaler, as_records, rms_scale
+from lfrtorch.records import Channel, Record, Scaler, as_records, rms_scale, without_coordinates
 from lfrtorch.residual import SimulationError
 from lfrtorch.slopes import spectral_radius
 from lfrtorch.threads import spread_by_hand
@@ -78,7 +78,11 @@ class LinearModel:
         return np.asarray(self.C @ states + self.D, dtype=np.complex128)
 
     def simulate(self, record: Record) -> Array:
-        """Simulated output (T, ny) in physical units, from the record's own start."""
+        """Simulated output (T, ny) in physical units, from the record's own start.
+
+        A given start state is in other coordinates; the one that fits best takes its place.
+        """
+        record = without_coordinates(record)
         nu, ny = len(self.inputs), len(self.outputs)
         unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
         cell = _cell(self.A, self.B, self.C, self.D)
@@ -107,7 +111,8 @@ def estimate_bla(
     refinement rejects every step that leaves it.
 
     Args:
-        records: data; periodic ones are fitted in exact steady state.
+        records: data; periodic ones are fitted in exact steady state, and start states that are
+            given (in another model's coordinates) or estimated are fitted.
         nx: order.
         offset: whether the means of input and output are removed and stored as operating point.
         coordinates: ``"balanced"`` states, or ``"given"`` by the subspace estimate.
@@ -123,7 +128,7 @@ def estimate_bla(
         Verhaegen, "Identification of the deterministic part of MIMO state space models given in
         innovations form from input-output data", Automatica 30, 1994 (PO-MOESP).
     """
-    data = as_records(records)
+    data = [without_coordinates(record) for record in as_records(records)]
     integer("nx", nx, 1)
     integer("max_iter", max_iter, 0)
     if coordinates not in ("balanced", "given"):
@@ -313,7 +318,7 @@ def _with_input_matrices(
     theta = problem.theta
     J, r = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
     if np.isfinite(J).all():
-        theta = torch.as_tensor(np.linalg.lstsq(J, -r, rcond=None)[0])
+        theta = theta + torch.as_tensor(np.linalg.lstsq(J, -r, rcond=None)[0])
     cost = float(problem.residual(theta).square().sum())
     for fixed in (cell.A, cell.Cy):
         fixed.requires_grad_(True)

@@ -48,7 +48,9 @@ def reduction(cell: LFRCell, start: Tensor, *, coordinates: bool = True) -> Redu
         lti += 0 if name.startswith("static.") or not p.requires_grad else p.numel()
     free = torch.tensor([*free, *[True] * start.numel()], device=G.device)
     G, fixed = G[free].double().cpu().numpy(), G[~free].double().cpu().numpy()
-    if len(fixed) and G.shape[1]:  # directions that move no fixed parameter
+    if not np.isfinite(G).all():
+        G = np.zeros((len(G), 0))
+    elif len(fixed) and G.shape[1]:  # directions that move no fixed parameter
         G = G @ scipy.linalg.null_space(fixed)
     # Columns of the linear part only: those of the static map are computed together.
     Q, R, pivots = scipy.linalg.qr(G[:lti].T, mode="economic", pivoting=True)

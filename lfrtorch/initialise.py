@@ -17,7 +17,7 @@ from lfrtorch.checks import integer
 from lfrtorch.lfr import LFR
 from lfrtorch.model import Model
 from lfrtorch.nonlinearity import Network, Polynomial
-from lfrtorch.records import Record, Scaler, as_records, rms_scale
+from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
 
 OUTPUT_RANGE = 0.3
 """Bw, Dyw ~ U(-0.3, 0.3) of the ``"zero_output"`` start."""
@@ -74,7 +74,7 @@ def initialise(
     integer("seed", seed, 0)
     if method not in ("zero_output", "paper"):
         raise ValueError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
-    data = as_records(records)
+    data = [without_coordinates(record) for record in as_records(records)]
     scaler = Scaler(
         bla.u_offset,
         rms_scale([r.u for r in data], bla.u_offset),

@@ -16,7 +16,7 @@ from lfrtorch.cell import LFRCell
 from lfrtorch.lfr import LFR
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Channel, Record, Scaler, Start, as_signal, check_start
-from lfrtorch.simulate import Trajectory
+from lfrtorch.simulate import Trajectory, estimated_start
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +74,10 @@ class Model:
         Args:
             data: a record, or an input in physical units.
             start: ``"zero"`` (x = 0: at rest at the input's offset, exactly so for the linear model
-                and the start of a fit, later up to the network's bias) or ``"periodic"``; where
-                left out, the record's own, and ``"zero"`` for a bare input.
-            x0: start state in the model's coordinates, for ``start="zero"``.
+                and the start of a fit, later up to the network's bias), ``"given"`` (x0),
+                ``"periodic"``, or ``"estimated"``: from the state that fits the record's output
+                best. Where left out, the record's own, and ``"zero"`` for a bare input.
+            x0: start state in the model's coordinates, for ``start="given"``.
 
         Shape:
             data: (T, nu) or (T,), x0: (nx,) -> (T, ny).
@@ -93,15 +94,26 @@ class Model:
         if isinstance(data, Record):
             self.check(data)
             u, start = data.u, start or data.start
+            x0 = data.x0 if x0 is None and start == "given" else x0
         else:
             u, start = as_signal(data, self.inputs, "input"), start or "zero"
         check_start(start, "simulation")
+        if start == "given" and x0 is None:
+            raise ValueError("start='given' needs a start state: pass x0.")
         like = self.lfr.cell.A
         v = torch.as_tensor(self.scaler.normalise_u(u)).to(like).unsqueeze(0)
         state = None if x0 is None else torch.as_tensor(np.asarray(x0)).to(like).reshape(1, -1)
         if state is not None and state.shape[1] != self.lfr.cell.nx:
             raise ValueError(f"x0 has {state.shape[1]} entries; the model has {self.lfr.cell.nx}.")
-        trajectory = self.lfr.trajectory(v, state, start)
+        if start == "estimated":
+            if not isinstance(data, Record):
+                raise ValueError("start='estimated' needs a record: the state is fitted to its y.")
+            y = torch.as_tensor(self.scaler.normalise_y(data.y)).to(like).unsqueeze(0)
+            weight = torch.ones_like(y)
+            weight[:, : data.skip] = 0.0
+            trajectory = estimated_start(self.lfr.cell, v, y, weight)
+        else:
+            trajectory = self.lfr.trajectory(v, state, start)
         return Trajectory(*(signal.cpu() for signal in trajectory))
 
     def check(self, record: Record) -> None:

@@ -200,6 +200,11 @@ def as_records(records: Record | Sequence[Record]) -> list[Record]:
     return found
 
 
+def without_coordinates(record: Record) -> Record:
+    """The record with a given start state, which is in the coordinates of one model, estimated."""
+    return replace(record, start="estimated", x0=None) if record.start == "given" else record
+
+
 @dataclass(frozen=True, eq=False)
 class Scaler:
     """Offsets and scales between physical and normalised signals: (physical - offset) / scale.

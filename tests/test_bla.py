@@ -248,3 +248,15 @@ def test_coordinates():
         1,
         coordinates="modal",
     )
+
+
+@pytest.mark.parametrize("start", ["estimated", "given"])
+def test_start_state_is_fitted(start):
+    """A record that begins in the middle of another, whatever coordinates its state is in."""
+    system = random_system(3)
+    u = np.random.default_rng(0).normal(size=(400, 1))
+    x0 = np.ones(3) if start == "given" else None
+    record = Record(u[100:], reference.dlsim(system, u)[100:], start=start, x0=x0)
+    bla = estimate_bla(record, 3, offset=False)
+    assert frf_error(bla, system) < 1e-8
+    np.testing.assert_allclose(bla.simulate(record), record.y, rtol=0, atol=1e-8)

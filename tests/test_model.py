@@ -1,6 +1,7 @@
 """The identified model: gauge invariance, parameter counts, and what simulate refuses."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -185,3 +186,30 @@ def test_unknown_start(model: Model):
 
 def test_input_without_a_time_axis(model: Model):
     refused(model, "shape ()", 3.0)
+
+
+# --- start states ---------------------------------------------------------------------------
+
+
+def test_record_from_a_given_state(model: Model):
+    whole = measure(model, 60)
+    state = model.signals(whole).x[0, 20].numpy()
+    part = replace(whole[20:], start="given", x0=state)
+    np.testing.assert_allclose(model.simulate(part), part.y, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        model.simulate(part.u, start="given", x0=state), part.y, rtol=0, atol=1e-12
+    )
+
+
+def test_record_from_the_state_that_fits_best(model: Model):
+    whole = measure(model, 200)
+    part = replace(whole[20:], start="estimated")
+    np.testing.assert_allclose(model.simulate(part), part.y, rtol=0, atol=1e-8)
+
+
+def test_starts_that_lack_what_they_need(model: Model):
+    u = measure(model, 20).u
+    with pytest.raises(ValueError, match=r"start='given' needs a start state: pass x0"):
+        model.simulate(u, start="given")
+    with pytest.raises(ValueError, match=r"start='estimated' needs a record"):
+        model.simulate(u, start="estimated")

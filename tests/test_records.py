@@ -16,6 +16,10 @@ def refused(message: str, **given):
         Record(**{"u": U, "y": Y, "name": "lab"} | given)
 
 
+def lab(**given) -> Record:
+    return Record(**{"u": U, "y": Y, "name": "lab"} | given)
+
+
 # --- what it takes --------------------------------------------------------------------------
 
 
@@ -177,3 +181,45 @@ def test_scaler_maps_to_offset_and_scale_and_back():
 def test_rms_scale_is_about_the_offset_and_1_for_a_constant_channel():
     signals = [np.array([[4.0, 7.0], [-2.0, 7.0]]), np.array([[1.0, 7.0]])]
     assert np.allclose(rms_scale(signals, np.array([1.0, 7.0])), [np.sqrt(6.0), 1.0])
+
+
+# --- starts and weights ---------------------------------------------------------------------
+
+
+def test_start_state_goes_with_a_given_start():
+    record = lab(start="given", x0=[1, 2])
+    assert record.x0 is not None
+    assert record.x0.tolist() == [1.0, 2.0]
+    refused("record 'lab': start is 'given' and x0 is None;", start="given")
+    refused("record 'lab': start is 'zero' and x0 is", x0=[1.0])
+
+
+def test_weights_by_output_and_by_line():
+    record = lab(start="periodic", weight=2, line_weight=np.arange(6))
+    assert float(record.weight) == 2.0
+    assert record.line_weight is not None
+    assert record.line_weight.shape == (6, 1)
+
+
+@pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf"), 0.0])
+def test_weights_that_cannot_be(bad: float):
+    refused("record 'lab': weight must be finite, at least 0 and not all 0", weight=bad)
+    lines = np.full(6, bad)
+    refused("record 'lab': line_weight must be finite", start="periodic", line_weight=lines)
+
+
+def test_weights_of_the_wrong_shape():
+    refused("record 'lab': weight has shape (3,); give one number, or", weight=[1, 2, 3])
+    message = "line_weight has shape (5,); 10 samples have 6 lines from 0 to fs / 2: give (6,)"
+    refused(f"record 'lab': {message}", start="periodic", line_weight=np.ones(5))
+
+
+def test_line_weights_are_of_whole_periods():
+    refused("record 'lab': line_weight needs start='periodic'", line_weight=np.ones(6))
+    options = {"start": "periodic", "skip": 2, "line_weight": np.ones(6)}
+    refused("record 'lab': line_weight needs start='periodic' and skip=0", **options)
+
+
+def test_part_of_a_record_begins_at_zero_state_without_line_weights():
+    part = lab(start="periodic", line_weight=np.ones(6), weight=3.0)[2:]
+    assert (part.start, part.line_weight, float(part.weight)) == ("zero", None, 3.0)

@@ -1,5 +1,7 @@
 """The one residual over records of different lengths, starts and windows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -18,7 +20,7 @@ def model() -> Model:
 
 
 def some_records(model: Model) -> list[Record]:
-    """Three groups: (30, zero) twice with other windows, (30, periodic), (20, zero)."""
+    """Groups: (30, zero) twice with other windows, (30, periodic), (20, zero)."""
     noise = np.random.default_rng(0)
     records = []
     groups: list[tuple[int, Start, int]] = [
@@ -29,6 +31,21 @@ def some_records(model: Model) -> list[Record]:
         y = exact.y + noise.normal(size=exact.y.shape)
         records.append(Record(exact.u, y, exact.fs, start, skip, name=f"{start} {T} {skip}"))
     return records
+
+
+def all_kinds(model: Model, *, given: bool = True) -> list[Record]:
+    """Every start, window and weight in one problem."""
+    zero, periodic, third, fourth = some_records(model)
+    lines = np.linspace(0.5, 2.0, 2 * 16).reshape(16, 2) * (np.arange(16) != 3)[:, None]
+    records = [
+        replace(zero, weight=[0.5, 3.0]),
+        periodic,
+        replace(periodic, skip=0, line_weight=lines, weight=2.0),
+        replace(third, start="estimated"),
+        replace(fourth, start="estimated", weight=4.0),
+        replace(zero, start="estimated", skip=3),
+    ]
+    return [*records, replace(fourth, start="given", x0=[0.3, -0.2])] if given else records
 
 
 def test_residual_is_the_error_of_all_scored_samples(model: Model):
@@ -51,9 +68,12 @@ def test_rmse_is_that_of_the_metrics(model: Model):
         assert score == pytest.approx(rmse(record, model.simulate(record)), rel=1e-9)
 
 
-@pytest.mark.parametrize("ridge", [0.0, 0.5])
-def test_gradient_and_jacobian_agree(model: Model, ridge: float):
-    problem = SimulationError(model, some_records(model), ridge=ridge)
+RIDGES = pytest.mark.parametrize("ridge", [0.0, 0.5, {"static": 0.1, "A": 0.3, "x0": 2.0}])
+
+
+@RIDGES
+def test_gradient_and_jacobian_agree(model: Model, ridge):
+    problem = SimulationError(model, all_kinds(model), ridge=ridge)
     theta = problem.theta + 0.1
     r, gradient = problem.gradient(theta)
     J = problem.jacobian(theta)
@@ -61,14 +81,116 @@ def test_gradient_and_jacobian_agree(model: Model, ridge: float):
     assert_close(gradient, 2 * J.mT @ r / problem.size, rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize("ridge", [0.0, 0.5])
-def test_jacobian_is_the_slope_of_the_residual(model: Model, ridge: float):
-    problem = SimulationError(model, some_records(model), ridge=ridge)
+@RIDGES
+def test_jacobian_is_the_slope_of_the_residual(model: Model, ridge):
+    problem = SimulationError(model, all_kinds(model), ridge=ridge)
     theta = problem.theta
+    assert len(theta) == model.parameters + 3 * 2
     step = 1e-4 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
     expected = (problem.residual(theta + step) - problem.residual(theta - step)) / 2
     # Truncation |step|³ = 1e-11, and the periodic start is known to 1e-10.
     assert_close(problem.jacobian(theta) @ step, expected, rtol=0, atol=1e-8)
+
+
+@RIDGES
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("precise", [True, False])
+@pytest.mark.parametrize("kept", [True, False])
+def test_system_and_products_are_those_of_the_whole_jacobian(
+    model: Model, ridge, given: bool, precise: bool, kept: bool, monkeypatch
+):
+    """In blocks of five samples, kept or not, by QR or by normal equations, gauge left out.
+
+    That is exact in periodic steady state, which is known to 1e-10.
+    """
+    monkeypatch.setattr("lfrtorch.sensitivity.BLOCK", 5)
+    monkeypatch.setattr("lfrtorch.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    problem = SimulationError(model, all_kinds(model, given=given), ridge=ridge)
+    theta = problem.theta + 0.1
+    r, J = problem.residual(theta), problem.jacobian(theta)
+    jacobian = problem.linearise(theta)
+    system, gradient = jacobian.system(1e-15 if precise else 1e-2, 1e-12)
+    scale = float(torch.linalg.svdvals(J)[0]) ** 2
+    assert system.scale == pytest.approx(scale, rel=1e-9)
+    assert_close(gradient, J.mT @ r, rtol=0, atol=1e-10 * scale)
+    damping = 1e-3 * scale
+    expected = -torch.linalg.solve(J.mT @ J + damping * torch.eye(len(theta)), J.mT @ r)
+    assert_close(system.solve(gradient, damping), expected, rtol=0, atol=1e-7)
+    assert_close(jacobian.tangent(theta), J @ theta, rtol=0, atol=1e-8)
+    assert_close(jacobian.adjoint(r), J.mT @ r, rtol=0, atol=1e-8)
+
+
+def test_weights_multiply_the_squared_errors(model: Model):
+    (record,) = some_records(model)[:1]
+    plain = SimulationError(model, record)
+    theta = plain.theta + 0.1
+    squares = plain.residual(theta).reshape(-1, 2).square().sum(0)
+    weighted = SimulationError(model, replace(record, weight=[0.5, 3.0]))
+    assert weighted.cost(weighted.residual(theta)) == pytest.approx(
+        float(0.5 * squares[0] + 3.0 * squares[1]), rel=1e-9
+    )
+    assert weighted.rmse(theta) == pytest.approx(plain.rmse(theta), rel=1e-12)
+
+
+@pytest.mark.parametrize("T", [30, 31])
+def test_unit_line_weights_are_plain_least_squares(model: Model, T: int):
+    noise = np.random.default_rng(1).normal(size=(T, 2))
+    record = measure(model, T, start="periodic")
+    record = replace(record, y=record.y + noise)
+    lines = replace(record, line_weight=np.ones(T // 2 + 1))
+    plain, weighted = SimulationError(model, record), SimulationError(model, lines)
+    theta = plain.theta + 0.1
+    cost = plain.cost(plain.residual(theta))
+    assert weighted.cost(weighted.residual(theta)) == pytest.approx(cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("T", [30, 31])
+def test_line_weights_weigh_the_spectrum_of_the_error(model: Model, T: int):
+    record = measure(model, T, start="periodic")
+    t = 2 * np.pi * np.arange(T)[:, None] / T
+    y = record.y + model.scaler.y_scale * (np.cos(3 * t) + 2.0 * np.sin(5 * t))
+    weight = np.zeros(T // 2 + 1)
+    weight[[3, 5, 6]] = 4.0, 0.25, 9.0
+    problem = SimulationError(model, replace(record, y=y, line_weight=weight))
+    # Σ cos² = Σ sin² = T / 2 over whole periods, in each of two outputs.
+    expected = 2 * (4.0 * 1.0 + 0.25 * 4.0) * T / 2
+    assert problem.cost(problem.residual(problem.theta)) == pytest.approx(expected, rel=1e-7)
+
+
+def test_start_state_is_fitted_with_the_parameters(model: Model):
+    """A record cut from the middle of another, and the first of its samples thrown away."""
+    whole = measure(model, 200)
+    later = replace(whole[50:], start="estimated")
+    problem = SimulationError(model, [whole, later])
+    states = model.signals(whole).x[0]
+    assert_close(problem.theta[-2:], states[50], rtol=0, atol=1e-7)
+    assert problem.rmse(problem.theta) < 1e-8
+    solved = SimulationError(model, [whole, later], solved_starts=True)
+    assert len(solved.theta) == model.parameters
+    assert solved.rmse(solved.theta) < 1e-8
+
+
+def test_given_start_state(model: Model):
+    whole = measure(model, 200)
+    state = model.signals(whole).x[0, 50].numpy()
+    problem = SimulationError(model, replace(whole[50:], start="given", x0=state))
+    assert problem.rmse(problem.theta) < 1e-9
+
+
+def test_ridge_by_group_is_of_its_parameters_only(model: Model):
+    problem = SimulationError(model, some_records(model), ridge={"A": 0.25, "static.bz": 4.0})
+    theta = problem.theta
+    longer = problem.residual(theta + 1.0)[-len(theta) :]
+    names = [name for name, p in model.lfr.cell.named_parameters() for _ in range(p.numel())]
+    expected = [{"A": 0.5, "static.bz": 2.0}.get(name, 0.0) for name in names]
+    assert_close(longer, torch.tensor(expected, dtype=longer.dtype), rtol=1e-12, atol=0)
+
+
+def test_ridge_of_an_unknown_group(model: Model):
+    with pytest.raises(ValueError, match=r"ridge has a group 'B',.*parameters are A, Bu, .*bw"):
+        SimulationError(model, some_records(model), ridge={"B": 1.0})
+    with pytest.raises(ValueError, match=r"ridge of 'A' is -1; give"):
+        SimulationError(model, some_records(model), ridge={"A": -1})
 
 
 def test_penalty_is_no_part_of_the_score(model: Model):
