@@ -69,6 +69,8 @@ def _recur(r, F, g, s):
                 for j in range(n):
                     a += F[r, k, i, j] * s[r, k, j, c]
                 s[r, k + 1, i, c] = a
+        if k % 256 == 255:
+            _flush(s[r, k + 1])
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -81,6 +83,20 @@ def _recur_back(r, F, g, s):
                 for j in range(n):
                     a += F[r, k, j, i] * s[r, k + 1, j, c]
                 s[r, k, i, c] = a
+        if k % 256 == 255:
+            _flush(s[r, k])
+
+
+@njit(nogil=True)
+def _flush(s):
+    """A fading state would reach denormal numbers, a hundred times slower, and stay there."""
+    for i in range(s.shape[0]):
+        for c in range(s.shape[1]):
+            if abs(s[i, c]) < _NOTHING:
+                s[i, c] = 0.0
+
+
+_NOTHING = 1e-30
 
 
 def scan(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:

@@ -33,6 +33,9 @@ from lfrtorch.slopes import PASS, Slopes, of_static, slopes_at
 from lfrtorch.static_slopes import NetworkSlopes, StaticSlopes, static_slopes
 from lfrtorch.threads import spread, workers
 
+FADED = 1e-18
+"""What is left of a start state, relative to it, that counts as nothing."""
+
 BLOCK = 8192
 """Samples of all records together in a block of rows on the CPU."""
 
@@ -211,7 +214,6 @@ class Linearisation:
         self.layout = layout(cell, every=weights is not None)
         self.state = cell.A.new_zeros(len(u), cell.nx)
         self._ny = cell.ny
-        self._transition: Tensor | None = None
         self._whole: _Block | None = None
         if u.shape[:2].numel() <= PASS:
             self._whole = self._block(slice(0, len(u)), slice(0, u.shape[1]))
@@ -220,18 +222,6 @@ class Linearisation:
     def parameters(self) -> int:
         """P."""
         return self.layout.table.shape[1]
-
-    @property
-    def transition(self) -> Tensor:
-        """Φ (R, nx, nx): how the start state moves the end state."""
-        if self._transition is None:
-            Phi = torch.eye(self.state.shape[1]).to(self.state).expand(len(self.state), -1, -1)
-            for block in self._blocks():
-                Phi = linear_recurrence(block.slopes.F, torch.zeros_like(block.slopes.F), Phi)[
-                    :, -1
-                ]
-            self._transition = Phi
-        return self._transition
 
     @torch.no_grad()
     def rows(
@@ -280,47 +270,38 @@ class Linearisation:
                 S = emit(block, columns, S, rows)
                 visit(records, time, rows)
             ends.append(S)
-        end = torch.cat(ends)
-        if start:
-            self._transition = end[:, :, len(kept) :]
-        return end
+        return torch.cat(ends)
 
     @torch.no_grad()
     def tangent(self, d_theta: Tensor, d_x0: Tensor | None = None) -> Tensor:
         """dy (R, T, ny) of a change d_theta (P,) or (R, P) and of the start state, (R, nx)."""
         d_x, d_z, d_y, d_static = self.layout.matrices(d_theta)
         Bw, Dyw = self.weights["Bw"], self.weights["Dyw"]
-        start = self.state if d_x0 is None else d_x0
-
-        def direct(block: _Block) -> tuple[Tensor, Tensor]:
-            d_w = _apply(block.static.J, block.v @ d_z.mT) + block.static.tangent(d_static)
-            return block.v @ d_x.mT + d_w @ Bw.mT, block.v @ d_y.mT + d_w @ Dyw.mT
-
-        def states(block: _Block, g: Tensor, s: Tensor) -> Tensor:
-            return linear_recurrence(block.slopes.F, g.unsqueeze(-1), s.unsqueeze(-1)).squeeze(-1)
-
-        whole = None if self._whole is None else direct(self._whole)
-        if self.periodic:
-            for block in self._blocks():
-                start = states(block, (whole or direct(block))[0], start)[:, -1]
-            start = closed(self.transition, start.unsqueeze(-1)).squeeze(-1)
+        R, nx = self.state.shape
+        s = (self.state if d_x0 is None else d_x0).unsqueeze(-1)
+        if self.periodic:  # beside it the response to the start state
+            s = torch.cat([s, torch.eye(nx).to(s).expand(R, nx, nx)], dim=-1)
         outputs = []
         for block in self._blocks():
-            g, d_out = whole or direct(block)
-            s = states(block, g, start)
-            start = s[:, -1]
-            outputs.append(_apply(block.slopes.H, s[:, :-1]) + d_out)
-        return torch.cat(outputs, dim=1)
+            d_w = _apply(block.static.J, block.v @ d_z.mT) + block.static.tangent(d_static)
+            g = d_w.new_zeros(*d_w.shape[:2], nx, s.shape[-1])
+            g[..., 0] = block.v @ d_x.mT + d_w @ Bw.mT
+            states = linear_recurrence(block.slopes.F, g, s)
+            s = states[:, -1]
+            d_out = (block.slopes.H.unsqueeze(-1) * states[:, :-1].unsqueeze(2)).sum(3)
+            d_out[..., 0] += block.v @ d_y.mT + d_w @ Dyw.mT
+            outputs.append(d_out)
+        d_out = torch.cat(outputs, dim=1)
+        if not self.periodic:
+            return d_out.squeeze(-1)
+        start = closed(s[..., 1:], s[..., :1])
+        return d_out[..., 0] + (d_out[..., 1:] @ start.unsqueeze(1)).squeeze(-1)
 
     @torch.no_grad()
     def adjoint(self, e: Tensor) -> Adjoint:
         """Derivatives of Σ e(k) · y(k), for e (R, T, ny)."""
         W = self.weights
-        end = self.state
-        if self.periodic:
-            for block in self._blocks(backwards=True):
-                end = self._costates(block, e, end)[:, 0]
-            end = closed(self.transition.mT, end.unsqueeze(-1)).squeeze(-1)
+        end = self._closed_costate(e) if self.periodic else self.state
         parts, by_u = [], []
         for block in self._blocks(backwards=True):
             e_block = e[:, block.time]
@@ -333,6 +314,21 @@ class Linearisation:
             parts.append(self.layout.vector(by_x, by_z, by_y, block.static.adjoint(d_w)))
             by_u.append(ahead @ W["Bu"] + e_block @ W["Dyu"] + d_z @ W["Dzu"])
         return Adjoint(torch.stack(parts).sum(0), torch.cat(by_u[::-1], dim=1), end)
+
+    def _closed_costate(self, e: Tensor) -> Tensor:
+        """λ(T) = λ(0) (R, nx), which is what the start state does to the outputs until it fades."""
+        Phi, blocks = torch.eye(self.state.shape[1]).to(self.state).expand(len(e), -1, -1), []
+        for block in self._blocks():
+            blocks.append(block.time)
+            F = block.slopes.F
+            Phi = linear_recurrence(F, torch.zeros_like(F), Phi)[:, -1]
+            if Phi.abs().amax() < FADED:
+                break
+        end = self.state
+        for time in reversed(blocks):
+            block = self._whole or self._block(slice(0, len(e)), time)
+            end = self._costates(block, e, end)[:, 0]
+        return closed(Phi.mT, end.unsqueeze(-1)).squeeze(-1)
 
     def _costates(self, block: _Block, e: Tensor, end: Tensor) -> Tensor:
         """λ(k) = F(k)ᵀ λ(k+1) + H(k)ᵀ e(k) (R, B + 1, nx) from λ behind the block."""
