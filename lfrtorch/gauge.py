@@ -65,6 +65,12 @@ def reduction(cell: LFRCell, start: Tensor, *, coordinates: bool = True) -> Redu
     return Reduction(torch.as_tensor(kept).to(cell.A.device), torch.as_tensor(expand).to(cell.A))
 
 
+def everything(theta: Tensor) -> Reduction:
+    """All columns of the Jacobian by θ (P,)."""
+    kept = torch.arange(len(theta), device=theta.device)
+    return Reduction(kept, torch.eye(len(theta)).to(theta))
+
+
 def _directions(cell: LFRCell, start: Tensor) -> Tensor:
     """Gauge directions (all parameters and start states, number of directions)."""
     A, Bu, Bw, Cz, Dzu = cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu

@@ -43,7 +43,7 @@ class Jacobian:
         penalty: Tensor,
         ranks: Ranks,
     ) -> None:
-        self._parts, self._reduced, self._ranks = parts, reduced, ranks
+        self.parts, self._reduced, self._ranks = parts, reduced, ranks
         self._ridge, self._penalty = ridge, penalty
         self._penalised = bool(ridge.any())
         self._own_penalty = self._penalised and ranks.rank == 0
@@ -58,7 +58,7 @@ class Jacobian:
         kept, expand = self._reduced
         precise = damping <= NORMAL * torch.finfo(expand.dtype).eps
         factor = Triangle() if precise else Gram()
-        for part in self._parts:
+        for part in self.parts:
             part.fold(kept, factor)  # [J r] in the kept columns
         factor.combine(self._ranks)
         if isinstance(factor, Triangle):
@@ -75,7 +75,7 @@ class Jacobian:
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J d_theta (M,)."""
         reduced = self._reduced.expand @ d_theta
-        parts = [part.tangent(d_theta, reduced).flatten() for part in self._parts]
+        parts = [part.tangent(d_theta, reduced).flatten() for part in self.parts]
         return torch.cat([*parts, *([self._ridge * d_theta] if self._own_penalty else [])])
 
     def adjoint(self, residual: Tensor) -> Tensor:
@@ -83,7 +83,7 @@ class Jacobian:
         gradient = torch.zeros_like(self._ridge)
         reduced = gradient.new_zeros(len(self._reduced.kept))
         first = 0
-        for part in self._parts:
+        for part in self.parts:
             shape = part.batch.residual_shape
             own = residual[first : first + shape.numel()].reshape(shape)
             first += own.numel()
@@ -95,7 +95,7 @@ class Jacobian:
 
     def whole(self) -> Tensor:
         """J (M, P): for a look at it, and for small problems."""
-        parts = [part.whole(len(self._ridge)).flatten(0, 2) for part in self._parts]
+        parts = [part.whole(len(self._ridge)).flatten(0, 2) for part in self.parts]
         return torch.cat([*parts, *([torch.diag(self._ridge)] if self._own_penalty else [])])
 
 
@@ -114,18 +114,29 @@ class Part:
     def __init__(self, batch: Batch, linearisation: Linearisation, x0: Tensor | None) -> None:
         self.batch, self.linearisation, self.x0 = batch, linearisation, x0
         self._kept: tuple[Tensor, Tensor] | None = None
+        self.computed: tuple[Tensor, Tensor] | None = None
+        """All rows (R, T, ny, P [+ nx] + 1) and the end state's, where another computed them."""
+
+    @property
+    def has_start(self) -> bool:
+        """Whether the rows have columns of the start state."""
+        return self.linearisation.periodic or self.x0 is not None
 
     def fold(self, kept: Tensor, total: Triangle | Gram) -> None:
         """Add the rows [J r], in the kept columns (K,), to the factor."""
         batch, linearisation = self.batch, self.linearisation
         own = kept[kept < linearisation.parameters]
         K, nx = len(own), linearisation.state.shape[1]
-        start = linearisation.periodic or self.x0 is not None
+        start = self.has_start
         errors = linearisation.trajectory.y - batch.y
         R, T, ny = errors.shape
         columns = K + nx * start + 1
         whole = R * T * ny * columns * errors.element_size() <= KEPT_BYTES
-        rows = errors.new_empty(R, T, ny, columns) if whole or batch.spectral else None
+        computed, self.computed = self.computed, None  # they are weighted in place, once
+        if computed is not None:
+            rows = computed[0]
+        else:
+            rows = errors.new_empty(R, T, ny, columns) if whole or batch.spectral else None
         # The start state's columns become others in each record's own way.
         factors = [type(total)() for _ in batch.u] if start else [type(total)()]
 
@@ -145,7 +156,11 @@ class Part:
             else:
                 factors[0].fold(weighted.flatten(0, 2))
 
-        end = linearisation.rows(own, visit, start=start, spare=1, out=rows)
+        if computed is not None:
+            visit(slice(0, R), slice(0, T), computed[0])
+            end = computed[1]
+        else:
+            end = linearisation.rows(own, visit, start=start, spare=1, out=rows)
         # What the columns are made of: (R, columns, kept and the residual).
         mix = end.new_zeros(R, columns, len(kept) + 1)
         mix[:, :K, :K] = torch.eye(K).to(end)

@@ -15,8 +15,9 @@ References:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -64,6 +65,26 @@ class LeastSquares(Protocol):
     def cost(self, residual: Tensor) -> float:
         """|r|²: of all parts of r, where processes share it."""
         ...
+
+
+class ManyLeastSquares(Protocol):
+    """Several such problems, evaluated together."""
+
+    @property
+    def problems(self) -> Sequence[LeastSquares]:
+        """Each of them."""
+        ...
+
+    def residuals(self, models: Sequence[int], thetas: Sequence[Tensor]) -> Sequence[Tensor]:
+        """r of some of them (by their numbers), each at its own θ."""
+        ...
+
+    def linearise(self, models: Sequence[int], thetas: Sequence[Tensor]) -> Sequence[Jacobian]:
+        """dr/dθ of some of them."""
+        ...
+
+
+JACOBIAN, RESIDUAL = "jacobian", "residual"
 
 
 class DenseJacobian:
@@ -189,7 +210,48 @@ class LevenbergMarquardt:
 
     def step(self, problem: LeastSquares, state: LMState) -> LMState:
         """One iteration: linearise, then raise the damping until a step lowers the cost."""
-        jacobian = problem.linearise(state.theta)
+        search = self._search(problem.cost, state)
+        answer = None
+        while True:
+            try:
+                wanted, theta = search.send(answer)
+            except StopIteration as end:
+                return end.value
+            answer = problem.linearise(theta) if wanted is JACOBIAN else problem.residual(theta)
+
+    def steps(self, stack: ManyLeastSquares, states: Sequence[LMState]) -> list[LMState]:
+        """One iteration of each of several searches, evaluated together.
+
+        The searches go in step: each round answers what all of them ask for. A search that is over
+        stays as it is.
+        """
+        after = list(states)
+        searches = {
+            i: self._search(stack.problems[i].cost, state)
+            for i, state in enumerate(states)
+            if not state.reason
+        }
+        answers: dict[int, Any] = dict.fromkeys(searches)
+        while answers:
+            asked: dict[str, list[tuple[int, Tensor]]] = {JACOBIAN: [], RESIDUAL: []}
+            for i, answer in answers.items():
+                try:
+                    wanted, theta = searches[i].send(answer)
+                    asked[wanted].append((i, theta))
+                except StopIteration as end:
+                    after[i] = end.value
+            answers = {}
+            for wanted, evaluate in ((JACOBIAN, stack.linearise), (RESIDUAL, stack.residuals)):
+                if asked[wanted]:
+                    models, thetas = zip(*asked[wanted], strict=True)
+                    answers |= dict(zip(models, evaluate(models, thetas), strict=True))
+        return after
+
+    def _search(
+        self, cost_of: Callable[[Tensor], float], state: LMState
+    ) -> Generator[tuple[str, Tensor], Any, LMState]:
+        """One iteration that asks for the residuals and Jacobians it needs."""
+        jacobian: Jacobian = yield JACOBIAN, state.theta
         relative = self.damping if state.damping is None else state.damping / state.scale
         system, gradient = jacobian.system(relative, self.truncation)
         scale = system.scale
@@ -205,9 +267,13 @@ class LevenbergMarquardt:
             predicted = float(damping * delta.square().sum() - gradient @ delta)
             theta = state.theta + delta
             if self.acceleration:
-                theta = theta + self._acceleration(problem, state, delta, jacobian, system, damping)
-            residual = problem.residual(theta)
-            new_cost = problem.cost(residual)
+                h = self.finite_step
+                ahead = yield RESIDUAL, state.theta + h * delta
+                if math.isfinite(cost_of(ahead)):
+                    second = 2.0 / h * ((ahead - state.residual) / h - jacobian.tangent(delta))
+                    theta = theta + self._acceleration(second, delta, jacobian, system, damping)
+            residual = yield RESIDUAL, theta
+            new_cost = cost_of(residual)
             actual = cost - new_cost
             gain_ratio = actual / predicted if predicted > 0 else float("nan")
             if actual > 0:  # False for NaN: a diverging trial is a rejected step
@@ -227,7 +293,7 @@ class LevenbergMarquardt:
                     rank=system.rank,
                     quiet=quiet,
                 )
-                if accepted.cost <= self.floor**2 * problem.cost(torch.ones_like(residual)):
+                if accepted.cost <= self.floor**2 * cost_of(torch.ones_like(residual)):
                     return replace(accepted, reason="converged: the residual vanishes")
                 if quiet >= self.patience:
                     return replace(accepted, reason="converged: the cost no longer falls")
@@ -246,20 +312,9 @@ class LevenbergMarquardt:
         )
 
     def _acceleration(
-        self,
-        problem: LeastSquares,
-        state: LMState,
-        delta: Tensor,
-        jacobian: Jacobian,
-        system: System,
-        damping: float,
+        self, second: Tensor, delta: Tensor, jacobian: Jacobian, system: System, damping: float
     ) -> Tensor:
         """Second-order correction a = ½ argmin |J a + r''|² + λ|a|², or 0 where it is too long."""
-        h = self.finite_step
-        ahead = problem.residual(state.theta + h * delta)
-        if not math.isfinite(problem.cost(ahead)):
-            return torch.zeros_like(delta)
-        second = 2.0 / h * ((ahead - state.residual) / h - jacobian.tangent(delta))
         a = 0.5 * system.solve(jacobian.adjoint(second), damping)
         trusted = 2.0 * a.norm() <= self.acceleration_limit * delta.norm()  # False for NaN
         return a if trusted else torch.zeros_like(delta)

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.recurrence import linear_recurrence
-from lfrtorch.slopes import slopes
+from lfrtorch.slopes import slopes, spectral_radius
 
 MAX_NEWTON = 20
 """Iterations after which Newton's method is given up; from a nearby trajectory it needs 3 or 4."""
@@ -71,9 +71,7 @@ def newton(
         if (found | ~torch.isfinite(change)).all():
             break
     if periodic:
-        finite = torch.isfinite(transition).all(dim=(1, 2))  # LAPACK is not asked about others
-        poles = torch.linalg.eigvals(torch.where(finite[:, None, None], transition, 0.0))
-        found &= finite & (poles.abs().amax(-1) < 1.0)
+        found &= spectral_radius(transition) < 1.0  # False for NaN
     return torch.where(found[:, None, None], x, torch.nan)
 
 

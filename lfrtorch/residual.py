@@ -11,7 +11,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch.batch import batches_of
 from lfrtorch.checks import number
-from lfrtorch.gauge import reduction
+from lfrtorch.gauge import everything, reduction
 from lfrtorch.jacobian import Jacobian, Part
 from lfrtorch.model import Model
 from lfrtorch.ranks import Ranks
@@ -71,8 +71,11 @@ class SimulationError:
         self._starts = self._first_starts(sum(record.start == "estimated" for record in data))
         self._start = self.theta
         self._ridge = self._ridge_of(ridge)
-        self._guesses: list[Tensor | None] = [None] * len(self.batches)
+        self.guesses: list[Tensor | None] = [None] * len(self.batches)
+        """States of each batch near those to come."""
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
+        self.reduces = True
+        """Whether columns of gauge directions are left out of the Jacobian's rows."""
 
     @property
     def theta(self) -> Tensor:
@@ -112,7 +115,7 @@ class SimulationError:
         """dr/dθ at θ, held as a whole only where it is small."""
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
-        self._guesses = [t.x for t in trajectories]
+        self.guesses = [t.x for t in trajectories]
         cell = self.model.lfr.cell
         parts, P = [], len(theta) - self._starts.numel()
         for batch, trajectory in zip(self.batches, trajectories, strict=True):
@@ -122,9 +125,12 @@ class SimulationError:
             periodic = batch.start == "periodic"
             linearisation = Linearisation(cell, batch.u, trajectory, periodic=periodic)
             parts.append(Part(batch, linearisation, x0))
-        held = any(batch.x0 is not None for batch in self.batches)
-        held = bool(self.ranks.sum(self._start.new_tensor(float(held))))
-        reduced = reduction(cell, self._starts, coordinates=not held)
+        if self.reduces:
+            held = any(batch.x0 is not None for batch in self.batches)
+            held = bool(self.ranks.sum(self._start.new_tensor(float(held))))
+            reduced = reduction(cell, self._starts, coordinates=not held)
+        else:
+            reduced = everything(theta)
         penalty = theta - self._start
         return Jacobian(parts, reduced, self._ridge.sqrt(), penalty, self.ranks)
 
@@ -144,15 +150,23 @@ class SimulationError:
             self._latest = theta, [self._trajectory(i) for i in range(len(self.batches))]
         return self._latest[1]
 
+    def remember(self, theta: Tensor, trajectories: list[Trajectory]) -> None:
+        """Take trajectories at θ, one a batch, from elsewhere."""
+        self._latest = theta, trajectories
+
+    def start_of(self, i: int) -> Tensor | None:
+        """Start state (R, nx) of a batch where it is given or a parameter."""
+        batch = self.batches[i]
+        if batch.estimated is None or self._solved:
+            return batch.x0
+        return self._starts[batch.estimated]
+
     def _trajectory(self, i: int) -> Trajectory:
-        batch, cell = self.batches[i], self.model.lfr.cell
-        guess, lfr = self._guesses[i], self.model.lfr
-        if batch.estimated is None:
-            start = "periodic" if batch.start == "periodic" else "zero"
-            return lfr.trajectory(batch.u, batch.x0, start, guess=guess)
-        if self._solved:
-            return estimated_start(cell, batch.u, batch.y, batch.weight)
-        return lfr.trajectory(batch.u, self._starts[batch.estimated], guess=guess)
+        batch, lfr = self.batches[i], self.model.lfr
+        if batch.estimated is not None and self._solved:
+            return estimated_start(lfr.cell, batch.u, batch.y, batch.weight)
+        start = "periodic" if batch.start == "periodic" else "zero"
+        return lfr.trajectory(batch.u, self.start_of(i), start, guess=self.guesses[i])
 
     def _first_starts(self, count: int) -> Tensor:
         """Start states (count, nx) of the records where they are parameters."""

@@ -214,14 +214,19 @@ class Linearisation:
         self.layout = layout(cell, every=weights is not None)
         self.state = cell.A.new_zeros(len(u), cell.nx)
         self._ny = cell.ny
-        self._whole: _Block | None = None
-        if u.shape[:2].numel() <= PASS:
-            self._whole = self._block(slice(0, len(u)), slice(0, u.shape[1]))
 
     @property
     def parameters(self) -> int:
         """P."""
         return self.layout.table.shape[1]
+
+    @cached_property
+    def _whole(self) -> _Block | None:
+        """All samples, kept from one pass to the next where they are few."""
+        R, T = self.u.shape[:2]
+        if R * T > PASS:
+            return None
+        return self._at(slice(0, R), slice(0, T))
 
     @torch.no_grad()
     def rows(
@@ -346,14 +351,16 @@ class Linearisation:
             yield self._whole or self._block(everything, time)
 
     def _block(self, records: slice, time: slice) -> _Block:
-        if self._whole is not None:
-            v, static = self._whole.v[records, time], self._whole.static.part(records, time)
-        else:
-            t = self.trajectory
-            z, w, x, u = (signal[records, time] for signal in (t.z, t.w, t.x, self.u))
-            static = static_slopes(self.static, z, of_static(self._of(records)))
-            v = torch.cat([x, u, w], dim=-1)
+        if self._whole is None:
+            return self._at(records, time)
+        v, static = self._whole.v[records, time], self._whole.static.part(records, time)
         return _Block(time, v, static, self._of(records))
+
+    def _at(self, records: slice, time: slice) -> _Block:
+        t = self.trajectory
+        z, w, x, u = (signal[records, time] for signal in (t.z, t.w, t.x, self.u))
+        static = static_slopes(self.static, z, of_static(self._of(records)))
+        return _Block(time, torch.cat([x, u, w], dim=-1), static, self._of(records))
 
     def _of(self, records: slice) -> dict[str, Tensor]:
         """The weights of some of the records."""

@@ -89,8 +89,8 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
     In machine code the record is passed until its end state meets its start state; where that
     takes more than a few passes, Newton's method on x(T) - x(0) takes over. Elsewhere Newton's
     method over all of time closes the period, too, and passes follow where it fails. A periodic
-    solution that is not stable, so that no simulation would settle to it, counts as diverged (NaN
-    samples).
+    solution that is not stable, so that no simulation would settle to it, counts as diverged: its
+    record has NaN samples.
 
     Shape:
         u: (R, T, nu), one or more whole periods; guess: (R, nx), start of the search, or
@@ -107,26 +107,31 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
     identity = torch.eye(cell.nx, dtype=u.dtype, device=u.device)
     tolerance = max(PERIODIC_TOLERANCE, PERIODIC_ROUNDING * torch.finfo(u.dtype).eps)
     trajectory = simulate(cell, u, x0)
-    for passes in range(MAX_PERIODS):
-        if not trajectory.finite:
+    lost = torch.zeros(len(u), dtype=torch.bool, device=u.device)  # diverged, or unstable
+    settled = lost
+    for passes in range(MAX_PERIODS + 1):
+        x = trajectory.x
+        end, size = x[:, -1].clone(), x.abs().amax(dim=(1, 2))
+        lost |= ~torch.isfinite(size)
+        settled = (end - x0).abs().amax(dim=1) <= tolerance * (1.0 + size)
+        if (settled | lost).all() or passes == MAX_PERIODS:
             break
-        end = trajectory.x[:, -1].clone()
-        scale = 1.0 + trajectory.x.abs().amax()
-        if (end - x0).abs().amax() <= tolerance * scale:
-            return trajectory
         if passes < SETTLING_PERIODS:
-            x0 = end
+            closer = end
         else:
             transition = monodromy(cell, trajectory.z)
-            if not spectral_radius(transition) < 1.0:
-                break
+            lost |= ~settled & ~(spectral_radius(transition) < 1.0)  # False for NaN
             gap = (end - x0).unsqueeze(-1)
-            x0 = x0 + torch.linalg.solve(identity - transition, gap).squeeze(-1)
+            closer = x0 + torch.linalg.solve_ex(identity - transition, gap).result.squeeze(-1)
+        x0 = torch.where((settled | lost).unsqueeze(1), x0, closer)
         if compiled:
             trajectory = _compiled(cell, u, x0, trajectory)
         else:
             trajectory = simulate(cell, u, x0, guess=trajectory.x)
-    return Trajectory(*(torch.full_like(signal, torch.nan) for signal in trajectory))
+    failed = (lost | ~settled)[:, None, None]
+    if not failed.any():
+        return trajectory
+    return Trajectory(*(torch.where(failed, torch.nan, signal) for signal in trajectory))
 
 
 @torch.no_grad()

@@ -53,14 +53,14 @@ def of_static(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(start): p for name, p in weights.items() if name.startswith(start)}
 
 
-def spectral_radius(matrices: Tensor) -> float:
-    """Largest magnitude of an eigenvalue of (..., n, n); NaN where an entry is not finite.
+def spectral_radius(matrices: Tensor) -> Tensor:
+    """Largest magnitude of an eigenvalue of each of (..., n, n); NaN where an entry is not finite.
 
     LAPACK is not asked then: some builds crash the process.
     """
-    if not torch.isfinite(matrices).all():
-        return float("nan")
-    return float(torch.linalg.eigvals(matrices).abs().amax())
+    finite = torch.isfinite(matrices).all(dim=-1).all(dim=-1)
+    radii = torch.linalg.eigvals(torch.where(finite[..., None, None], matrices, 0.0)).abs().amax(-1)
+    return torch.where(finite, radii, torch.nan)
 
 
 def monodromy(cell: LFRCell, z: Tensor) -> Tensor:

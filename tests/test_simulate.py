@@ -1,6 +1,5 @@
 """Trajectories against the plain loop, and the periodic steady state."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -236,8 +235,22 @@ def test_expanding_but_bounded_trajectory_counts_as_diverged():
 
 def test_spectral_radius():
     matrices = torch.tensor([[[0.0, 2.0], [-2.0, 0.0]], [[0.5, 0.0], [0.0, 0.1]]])
-    assert spectral_radius(matrices) == pytest.approx(2.0)
-    assert math.isnan(spectral_radius(matrices * torch.inf))
+    assert_close(spectral_radius(matrices), torch.tensor([2.0, 0.5]))
+    matrices[0, 0, 0] = torch.inf
+    assert_close(spectral_radius(matrices), torch.tensor([torch.nan, 0.5]), equal_nan=True)
+
+
+def test_record_that_diverges_leaves_the_others_their_steady_state():
+    """The slope of the first model is beyond one; each record has its own model."""
+    cell = random_cell(1, 1, 2, 0, 0, radius=0.5)
+    poles = torch.tensor([[1.2, 0.5], [0.6, 0.5]], dtype=torch.float64)
+    cell.A = torch.nn.Parameter(torch.diag_embed(poles))
+    for name in ("Bu", "Bw", "Cz", "Dzu", "Cy", "Dyu", "Dyw"):
+        weight = cell.get_parameter(name).detach()
+        setattr(cell, name, torch.nn.Parameter(weight.expand(2, *weight.shape).clone()))
+    y = steady_state(cell, normal(2, 30, 1)).y
+    assert torch.isnan(y[0]).all()
+    assert torch.isfinite(y[1]).all()
 
 
 # --- estimated start states -----------------------------------------------------------------
