@@ -16,6 +16,14 @@ from torch import Tensor
 
 from lfrtorch.threads import spread
 
+COMPILED_ON = {"cpu"}
+"""Devices that have compiled kernels; all else runs in torch, parallel in time."""
+
+
+def has_kernels(tensor: Tensor) -> bool:
+    """Whether compiled kernels serve the tensor's device."""
+    return tensor.device.type in COMPILED_ON
+
 
 def linear_recurrence(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
     """All states of s(k+1) = F(k) s(k) + g(k), s(0) = s0.
@@ -23,7 +31,7 @@ def linear_recurrence(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
     Shape:
         F: (R, T, n, n), g: (R, T, n, m), s0: (R, n, m) -> (R, T + 1, n, m).
     """
-    return compiled(F, g, s0) if F.device.type == "cpu" else scan(F, g, s0)
+    return compiled(F, g, s0) if has_kernels(F) else scan(F, g, s0)
 
 
 def adjoint_recurrence(F: Tensor, g: Tensor, end: Tensor) -> Tensor:
@@ -32,7 +40,7 @@ def adjoint_recurrence(F: Tensor, g: Tensor, end: Tensor) -> Tensor:
     Shape:
         F: (R, T, n, n), g: (R, T, n, m), end: (R, n, m) -> (R, T + 1, n, m).
     """
-    if F.device.type == "cpu":
+    if has_kernels(F):
         return compiled(F, g, end, backwards=True)
     return scan(F.mT.flip(1), g.flip(1), end).flip(1)
 

@@ -197,7 +197,8 @@ class SimulationError:
                 )
             for i in own:
                 weights[i] = float(value)
-        return torch.tensor(weights).to(self._start).repeat_interleave(torch.tensor(sizes))
+        every = torch.tensor(weights, dtype=torch.float64).repeat_interleave(torch.tensor(sizes))
+        return every.to(self._start)
 
 
 def _belongs(name: str, group: str) -> bool:

@@ -27,7 +27,12 @@ from numba import njit
 from torch import Tensor
 
 from lfrtorch.cell import LFRCell
-from lfrtorch.recurrence import adjoint_recurrence, linear_recurrence, to_numpy
+from lfrtorch.recurrence import (
+    adjoint_recurrence,
+    has_kernels,
+    linear_recurrence,
+    to_numpy,
+)
 from lfrtorch.simulate import Trajectory
 from lfrtorch.slopes import PASS, Slopes, of_static, slopes_at
 from lfrtorch.static_slopes import NetworkSlopes, StaticSlopes, static_slopes
@@ -255,9 +260,9 @@ class Linearisation:
         """
         columns = self.layout.columns(kept)
         R, nx = self.state.shape
-        cpu = self.u.device.type == "cpu"
-        samples = BLOCK if cpu else PASS
-        together = workers() if cpu else R  # records, a thread each
+        compiled = has_kernels(self.u)
+        samples = BLOCK if compiled else PASS
+        together = workers() if compiled else R  # records, a thread each
         ends = []
         for records in _slices(R, max(together, samples // self.u.shape[1])):
             S = self.state.new_zeros(len(self.u[records]), nx, len(kept) + (nx if start else 0))
@@ -271,7 +276,7 @@ class Linearisation:
                     rows = S.new_empty(*block.v.shape[:2], self._ny, S.shape[-1] + spare)
                 else:
                     rows = out[records, time]
-                emit = self._rows_compiled if cpu else self._rows_generic
+                emit = self._rows_compiled if compiled else self._rows_generic
                 S = emit(block, columns, S, rows)
                 visit(records, time, rows)
             ends.append(S)

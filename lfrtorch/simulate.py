@@ -13,7 +13,7 @@ from torch import Tensor
 from lfrtorch.cell import LFRCell
 from lfrtorch.newton import newton
 from lfrtorch.nonlinearity import Network
-from lfrtorch.recurrence import linear_recurrence, to_numpy
+from lfrtorch.recurrence import has_kernels, linear_recurrence, to_numpy
 from lfrtorch.slopes import monodromy, slopes, spectral_radius
 from lfrtorch.threads import spread
 
@@ -171,7 +171,7 @@ def estimated_start(cell: LFRCell, u: Tensor, y: Tensor, weight: Tensor) -> Traj
 
 
 def _is_compiled(cell: LFRCell, u: Tensor) -> bool:
-    return u.device.type == "cpu" and (cell.static is None or type(cell.static) is Network)
+    return has_kernels(u) and (cell.static is None or type(cell.static) is Network)
 
 
 def _with_loop_where_lost(cell: LFRCell, u: Tensor, x0: Tensor, x: Tensor) -> Trajectory:

@@ -76,6 +76,49 @@ def test_second_derivatives_are_refused():
         gradient.sum().backward()
 
 
+@pytest.mark.parametrize("start", STARTS)
+def test_any_optimiser_trains_it_within_a_larger_model(start: Start):
+    """A learned input filter before the model and a gain behind it."""
+    lfr, u = LFR(random_cell(1, 1, 2, 1, 1, 3, radius=0.5)), normal(2, 60, 1)
+    before, behind = torch.nn.Linear(1, 1).double(), torch.nn.Linear(1, 1).double()
+    target = reference_output(u)
+    parameters = [*before.parameters(), *lfr.parameters(), *behind.parameters()]
+
+    def loss() -> Tensor:
+        return (behind(lfr(before(u), start=start)) - target).square().mean()
+
+    first = float(loss().detach())
+    optimiser = torch.optim.LBFGS(parameters, max_iter=40, line_search_fn="strong_wolfe")
+
+    def closure() -> float:
+        optimiser.zero_grad()
+        value = loss()
+        value.backward()
+        return float(value.detach())
+
+    optimiser.step(closure)
+    assert float(loss().detach()) < 0.1 * first
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in parameters)
+
+
+def reference_output(u: Tensor) -> Tensor:
+    return LFR(random_cell(1, 1, 2, 1, 1, 3, radius=0.5, seed=3))(u).detach()
+
+
+def test_backward_takes_the_weights_of_its_forward_pass():
+    """``functional_call`` has put the module's own weights back by then."""
+    lfr, u = small(), normal(1, 10, 2)
+    other = {name: (p.detach() * 0.9).requires_grad_() for name, p in lfr.named_parameters()}
+    y = torch.func.functional_call(lfr, other, (u,))
+    gradients = torch.autograd.grad(y.sum(), list(other.values()))
+    with torch.no_grad():
+        for name, p in lfr.named_parameters():
+            p.copy_(other[name])
+    expected = torch.autograd.grad(lfr(u).sum(), list(lfr.parameters()))
+    for mine, wanted in zip(gradients, expected, strict=True):
+        assert_close(mine, wanted, rtol=1e-12, atol=1e-13)
+
+
 def test_no_graph_without_gradients():
     lfr, u = small(), normal(1, 5, 2)
     with torch.no_grad():

@@ -253,6 +253,12 @@ def test_record_that_diverges_leaves_the_others_their_steady_state():
     assert torch.isfinite(y[1]).all()
 
 
+def test_steady_state_is_the_last_of_a_thousand_periods():
+    cell, u = random_cell(2, 1, 3, 2, 2, 4, radius=0.85), normal(2, 5, 2)
+    expected = reference.simulate(cell, u, u.new_zeros(2, 3), periods=1000)
+    assert_same(steady_state(cell, u), expected, 1e-9)
+
+
 # --- estimated start states -----------------------------------------------------------------
 
 

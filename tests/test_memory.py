@@ -1,0 +1,65 @@
+"""What an iteration allocates, counted tensor by tensor."""
+
+import numpy as np
+import torch
+from reference import random_cell, random_model
+from torch.multiprocessing.reductions import StorageWeakRef
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from lfrtorch.jacobian import KEPT_BYTES
+from lfrtorch.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.records import Record, Start
+from lfrtorch.residual import SimulationError
+
+
+class Allocations(TorchDispatchMode):
+    """Bytes of all storages alive that were made inside, and their peak."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.alive: dict[int, tuple[StorageWeakRef, int]] = {}
+        self.peak = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        for tensor in made if isinstance(made, tuple | list) else (made,):
+            if isinstance(tensor, torch.Tensor):
+                storage = tensor.untyped_storage()
+                ref = StorageWeakRef(storage)
+                self.alive[ref.cdata] = ref, storage.nbytes()
+        self.alive = {key: (ref, n) for key, (ref, n) in self.alive.items() if not ref.expired()}
+        self.peak = max(self.peak, sum(n for _, n in self.alive.values()))
+        return made
+
+
+def peak_of_an_iteration(T: int, start: Start, nn: int = 15) -> tuple[int, int]:
+    """Bytes, and parameters of the model: Bouc-Wen's sizes."""
+    model = random_model(random_cell(1, 1, 3, 2, 1, nn))
+    noise = np.random.default_rng(0).normal(size=(2, T, 1))
+    problem = SimulationError(model, Record(noise[0], noise[1], model.fs, start))
+    optimiser = LevenbergMarquardt()
+    state = optimiser.init(problem, problem.theta)
+    with Allocations() as allocations:
+        optimiser.step(problem, state)
+    return allocations.peak, model.parameters
+
+
+def test_iteration_over_a_million_samples_stays_below_half_a_gigabyte():
+    peak, parameters = peak_of_an_iteration(1_000_000, "zero")
+    assert 8 * 1_000_000 * parameters > 700e6  # what the Jacobian alone would take
+    assert peak < 400e6
+
+
+def test_memory_of_a_long_record_does_not_depend_on_the_number_of_neurons():
+    """Signals alone grow with the record: 20 or so doubles a sample (x, z, w, y, r, a trial)."""
+    T = 300_000
+    few, many = (peak_of_an_iteration(T, "zero", nn)[0] for nn in (15, 30))
+    assert KEPT_BYTES < 8 * T * 89  # too many rows to be kept
+    blocks = 8 * 16384 * 20 * 30  # of neurons and derivatives, whatever the record's length
+    assert many - few < blocks
+    assert few < 8 * T * 40 + blocks
+
+
+def test_memory_of_a_long_periodic_record():
+    peak, _ = peak_of_an_iteration(300_000, "periodic")
+    assert peak < 8 * 300_000 * 50 + 8 * 16384 * 20 * 30
