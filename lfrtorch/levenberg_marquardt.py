@@ -121,7 +121,7 @@ class LMState:
         iteration: accepted and refused steps so far.
         gain_ratio: actual over predicted decrease of the last trial.
         trials: dampings tried in the last step.
-        rank: singular values above the truncation in the last step.
+        rank: directions that the Jacobian of the last step saw.
         quiet: steps in a row that changed the cost by less than the tolerance.
         reason: why the search is over; empty while it is not.
     """
@@ -163,8 +163,8 @@ class LevenbergMarquardt:
         tolerance: relative decrease of the cost that counts as no progress ...
         patience: ... and the number of such steps in a row that ends the search.
         floor: root mean square of the residual that counts as zero.
-        truncation: singular values below this part of the largest are gauge and left out. (Those
-            below about 1e-8 count only as far as the damping lets them: the steps come from Jᵀr.)
+        truncation: singular values below this part of the largest are left out as gauge, where
+            they are computed: not while the damping is far above rounding errors.
         finite_step: h of the directional second derivative (Transtrum et al. use 0.1).
         acceleration_limit: largest 2|a| / |δ| at which the acceleration is trusted.
         max_damping: λ relative to the largest squared singular value that ends the search.
