@@ -472,10 +472,12 @@ def _emit(
         np.zeros((_TILE * (-(-nx // _TILE)), depth), rows.dtype),
         np.zeros((ny, depth), rows.dtype),
     )
-    M[:nx, nx : nx + nw] = Bw
-    N[:, nx : nx + nw] = Dyw
+    _copy(Bw, M, nx)
+    _copy(Dyw, N, nx)
     X, X_next = np.zeros((depth, c1 - c0), rows.dtype), np.zeros((depth, c1 - c0), rows.dtype)
-    X[:nx] = S[:, c0:c1]
+    for i in range(nx):
+        for c in range(c1 - c0):
+            X[i, c] = S[i, c0 + c]
     for k in range(B):
         _add_slope(A, M, J, k, Cz)
         _add_slope(Cy, N, J, k, Cz)
@@ -502,10 +504,21 @@ def _emit(
                 for c in range(c1 - c0):
                     if abs(X[i, c]) < _FADED:
                         X[i, c] = 0.0
-    S[:, c0:c1] = X[:nx]
+    for i in range(nx):
+        for c in range(c1 - c0):
+            S[i, c0 + c] = X[i, c]
 
 
 _TILE, _FADED = 4, 1e-30
+
+
+# Loops for assignments of slices and masks: the latter take numba seconds to compile.
+@njit(nogil=True)
+def _copy(source, target, column):
+    """target[:, column:] = source."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, column + j] = source[i, j]
 
 
 @njit(nogil=True, inline="always")
@@ -538,9 +551,13 @@ def _add_slope(constant, M, J, k, Cz):
 @njit(nogil=True)
 def _between(entries, c0, c1):
     """The entries whose column lies between c0 and c1, counted from c0."""
-    own = entries[(entries[:, 0] >= c0) & (entries[:, 0] < c1)].copy()
-    own[:, 0] -= c0
-    return own
+    own, count = np.empty_like(entries), 0
+    for n in range(len(entries)):
+        if c0 <= entries[n, 0] < c1:
+            own[count, 0] = entries[n, 0] - c0
+            own[count, 1], own[count, 2] = entries[n, 1], entries[n, 2]
+            count += 1
+    return own[:count]
 
 
 @njit(nogil=True, fastmath={"contract"})

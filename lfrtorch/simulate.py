@@ -232,7 +232,8 @@ def _run(
     h = np.empty(len(bz), u.dtype)
     for k in range(len(u)):
         _affine(Cz, x[k], Dzu, u[k], z[k])
-        h[:] = bz
+        for n in range(len(h)):
+            h[n] = bz[n]
         for j in range(z.shape[1]):
             for n in range(len(h)):
                 h[n] += WzT[j, n] * z[k, j]
