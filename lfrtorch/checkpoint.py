@@ -32,11 +32,13 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
-        text = {"format": FORMAT, "version": VERSION, **description}
-        (fresh / DESCRIPTION).write_text(json.dumps(text, indent=2) + "\n")
+        text = json.dumps({"format": FORMAT, "version": VERSION, **description}, indent=2) + "\n"
+        (fresh / DESCRIPTION).write_text(text)
         save_file({k: t.detach().contiguous().cpu() for k, t in weights.items()}, fresh / WEIGHTS)
         os.chmod(fresh, 0o777 & ~_umask())
-        if folder.exists():
+        if _holds(folder, text):  # other weights of the same model: at no moment is there neither
+            os.replace(fresh / WEIGHTS, folder / WEIGHTS)
+        elif folder.exists():
             old = fresh.with_name(fresh.name + "-old")
             folder.rename(old)
             fresh.rename(folder)
@@ -80,6 +82,14 @@ def read(folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             f"'{folder / WEIGHTS}' is damaged or missing ({error}); restore it or train anew."
         ) from None
     return description, weights
+
+
+def _holds(folder: Path, description: str) -> bool:
+    """Whether ``folder`` is a checkpoint with that description."""
+    try:
+        return (folder / DESCRIPTION).read_text() == description
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def _occupied(folder: Path) -> bool:

@@ -249,6 +249,21 @@ def test_old_checkpoint_is_replaced(saved: Path):
     assert sorted(p.name for p in saved.iterdir()) == ["model.json", "weights.safetensors"]
 
 
+def test_other_weights_of_the_same_model_replace_one_file(saved: Path):
+    before = (saved / "model.json").stat().st_ino, (saved / "weights.safetensors").stat().st_ino
+    small(seed=1).save(saved)
+    after = (saved / "model.json").stat().st_ino, (saved / "weights.safetensors").stat().st_ino
+    assert after[0] == before[0]  # so that at no moment there is none
+    assert after[1] != before[1]
+
+
+def test_another_model_replaces_both_files(saved: Path):
+    newer = random_model(random_cell(2, 2, 2))
+    newer.save(saved)
+    assert np.array_equal(load(saved).simulate(U), newer.simulate(U))
+    assert [p.name for p in saved.parent.iterdir()] == ["saved"]
+
+
 def test_link_to_a_checkpoint_is_replaced(saved: Path):
     link = saved.with_name("latest")
     link.symlink_to(saved)
