@@ -1,7 +1,8 @@
-"""What a user sees while a fit runs: a progress line and TensorBoard."""
+"""What a user sees while a fit runs, a progress line and TensorBoard, and what is left of it."""
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 from pathlib import Path
@@ -106,3 +107,25 @@ class TensorBoard:
     def close(self) -> None:
         """Write what is pending."""
         self.writer.close()
+
+
+class Checkpoint:
+    """The best iterate so far as a checkpoint on disk: what is left of a run that is killed.
+
+    Args:
+        folder: of the checkpoint.
+        every: least seconds between two of them, the first is that of the start.
+    """
+
+    def __init__(self, folder: str | Path, every: float = 5.0) -> None:
+        self.folder, self.every = Path(folder), every
+        self._due = 0.0
+        self._unwritten: Model | None = None
+
+    def __call__(self, model: Model, progress: Progress) -> None:
+        """Keep the iterate where it is the best; write the best one where it is time."""
+        if progress.best:
+            self._unwritten = copy.deepcopy(model)
+        if self._unwritten is not None and progress.seconds >= self._due:
+            self._unwritten.save(self.folder)
+            self._unwritten, self._due = None, progress.seconds + self.every

@@ -1,14 +1,15 @@
-"""The progress line and the TensorBoard events."""
+"""The progress line, the TensorBoard events and the checkpoints of a fit."""
 
 import io
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import lfrtorch
-from lfrtorch.monitor import ProgressLine, TensorBoard, progress_text
+from lfrtorch.monitor import Checkpoint, ProgressLine, TensorBoard, progress_text
 from lfrtorch.records import Channel, Record
 from lfrtorch.trainer import Progress
 
@@ -77,3 +78,18 @@ def test_tensorboard_holds_scalars_figures_and_texts(model: lfrtorch.Model, tmp_
     assert events.Scalars("model/spectral_radius_A")[0].value == pytest.approx(radius)
     for name in ("validation/spectrum", "validation/static_map"):
         assert [e.step for e in events.Images(name)] == [0, 2]
+
+
+def test_checkpoint_holds_the_best_so_far_where_it_is_time(tmp_path: Path):
+    bla = lfrtorch.estimate_bla(RECORD, nx=1)
+    model = lfrtorch.initialise(bla, RECORD, nz=1, nw=1, nn=2)
+    keep = Checkpoint(tmp_path / "model", every=5.0)
+    held = []
+    for iteration, (seconds, best) in enumerate(
+        [(1.0, True), (2.0, True), (5.9, False), (6.1, False), (20.0, False), (21.0, True)]
+    ):
+        with torch.no_grad():
+            model.lfr.cell.A.fill_(float(iteration))
+        keep(model, Progress(iteration, 40, 1.0, 1.0, seconds, best, {}))
+        held.append(float(lfrtorch.load(tmp_path).lfr.cell.A.detach()))
+    assert held == [0, 0, 0, 1, 1, 5]
