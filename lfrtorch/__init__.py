@@ -5,7 +5,7 @@ records -> estimate_bla -> initialise -> fit -> simulate, save, load
 
 from importlib.metadata import version
 
-from lfrtorch import datasets
+from lfrtorch import datasets, distributed
 from lfrtorch.adam import Adam
 from lfrtorch.bla import LinearModel, estimate_bla
 from lfrtorch.cell import LFRCell
@@ -34,6 +34,7 @@ __all__ = [
     "Record",
     "Scaler",
     "datasets",
+    "distributed",
     "estimate_bla",
     "fit",
     "initialise",

@@ -79,6 +79,23 @@ class Normal:
         return torch.full_like(delta, torch.nan) if failed else delta
 
 
+class Agreed:
+    """A system that all processes solve alike, by the first one's solution.
+
+    Each process could solve its own, were it not for rounding errors: they differ between kinds of
+    processors, and a search multiplies them.
+    """
+
+    def __init__(self, system: System, ranks: Ranks) -> None:
+        self._system, self._ranks = system, ranks
+        self.scale = float(ranks.first(torch.tensor(system.scale, dtype=torch.float64)))
+        self.rank = int(ranks.first(torch.tensor(system.rank)))
+
+    def solve(self, gradient: Tensor, damping: float) -> Tensor:
+        """-(JᵀJ + λI)⁻¹ gradient (P,)."""
+        return self._ranks.first(self._system.solve(gradient, damping))
+
+
 class Triangle:
     """R factor of the rows (M, n) seen so far, by orthogonal transformations."""
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lfrtorch.batch import EVERY, Batch
-from lfrtorch.factors import Gram, Normal, Orthogonal, System, Triangle
+from lfrtorch.factors import Agreed, Gram, Normal, Orthogonal, System, Triangle
 from lfrtorch.gauge import Reduction
 from lfrtorch.ranks import Ranks
 from lfrtorch.sensitivity import Linearisation, closed, output_jacobian
@@ -70,7 +70,10 @@ class Jacobian:
             gradient = expand.mT @ factor.G[:-1, -1]
             G = expand.mT @ factor.G[:-1, :-1] @ expand
             system = Normal(G + torch.diag(self._ridge.square()), len(kept))
-        return system, gradient + self._ridge.square() * self._penalty
+        gradient = gradient + self._ridge.square() * self._penalty
+        if self._ranks.world == 1:
+            return system, gradient
+        return Agreed(system, self._ranks), self._ranks.first(gradient)
 
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J d_theta (M,)."""

@@ -11,7 +11,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch.batch import batches_of
 from lfrtorch.checks import number
-from lfrtorch.gauge import everything, reduction
+from lfrtorch.gauge import Reduction, everything, reduction
 from lfrtorch.jacobian import Jacobian, Part
 from lfrtorch.model import Model
 from lfrtorch.ranks import Ranks
@@ -129,6 +129,8 @@ class SimulationError:
             held = any(batch.x0 is not None for batch in self.batches)
             held = bool(self.ranks.sum(self._start.new_tensor(float(held))))
             reduced = reduction(cell, self._starts, coordinates=not held)
+            # A tie between columns is broken by rounding errors, on each process by its own.
+            reduced = Reduction(*map(self.ranks.first, reduced))
         else:
             reduced = everything(theta)
         penalty = theta - self._start

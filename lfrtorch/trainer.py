@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from torch import Tensor
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
+from lfrtorch.ranks import ProcessLost, Ranks
 from lfrtorch.records import Record
 from lfrtorch.residual import Ridge, SimulationError
 from lfrtorch.threads import spread_by_hand
@@ -133,11 +135,13 @@ def fit(
     optimiser: Optimiser | None = None,
     ridge: Ridge = 0.0,
     monitors: Sequence[Monitor] = (),
+    ranks: Ranks | None = None,
 ) -> FitResult:
     """Minimise the simulation error of a model over records.
 
     The iterate with the smallest error on the validation records (without them: on the training
-    records) is kept, also when the search is interrupted by Ctrl-C.
+    records) is kept, also when the search is interrupted by Ctrl-C, or one of the processes that
+    share the records is lost: ``reason`` then begins with "a process was lost".
 
     Args:
         model: where to start; its weights are changed in place.
@@ -145,15 +149,25 @@ def fit(
         validation: records that choose among the iterates.
         optimiser: Levenberg-Marquardt with its defaults where left out.
         ridge: weight of |θ - θ_start|², see ``SimulationError``.
-        monitors: called with the model and its progress after every iteration.
+        monitors: called with the model and its progress after every iteration. Each process calls
+            its own: give those that print or write files to the first alone.
+        ranks: the processes that share the training records, ``distributed.connect()``; each calls
+            this function with the same arguments, starts from the first one's weights and returns
+            the same fit.
 
     Raises:
-        ValueError: the model diverges on the training records at the start.
+        ValueError: the model diverges on the training records at the start, or there are fewer
+            records than processes.
+        ProcessLost: before there was an iterate to keep.
     """
     optimiser = LevenbergMarquardt() if optimiser is None else optimiser
-    problem = SimulationError(model, train, ridge=ridge)
+    ranks = Ranks() if ranks is None else ranks
+    if ranks.world > 1:
+        weights = parameters_to_vector(model.lfr.parameters())
+        vector_to_parameters(ranks.first(weights), model.lfr.parameters())
+    problem = SimulationError(model, train, ridge=ridge, ranks=ranks)
     judge = SimulationError(model, validation, solved_starts=True) if validation else None
-    if not torch.isfinite(problem.residual(problem.theta)).all():
+    if not math.isfinite(problem.cost(problem.residual(problem.theta))):
         raise ValueError(
             "the model diverges on the training records at the start; start from a stable model."
         )
@@ -200,6 +214,10 @@ def fit(
         if not history:
             raise
         reason = INTERRUPTED
+    except ProcessLost as lost:
+        if not history:
+            raise
+        reason = str(lost)
     finally:
         problem.write(theta_best)
     usual = durations[1:] or durations

@@ -15,7 +15,9 @@ from lfrtorch.adam import Adam
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
+from lfrtorch.ranks import LOST, ProcessLost, Ranks
 from lfrtorch.records import Record
+from lfrtorch.residual import SimulationError
 from lfrtorch.trainer import INTERRUPTED, Progress, fit
 
 
@@ -248,6 +250,37 @@ def test_ctrl_c_amid_a_trial_keeps_the_best():
     assert (result.reason, result.chosen_iteration) == (INTERRUPTED, 2)
     assert rmse(train[0], model.simulate(train[0])) < result.history[0].train
     assert np.isfinite(model.simulate(test)).all()
+
+
+class Lonely(Ranks):
+    """Loses its others at some sum."""
+
+    def __init__(self, sums: int):
+        self.sums = sums
+
+    def sum(self, part: Tensor) -> Tensor:
+        self.sums -= 1
+        if self.sums < 0:
+            raise ProcessLost(f"{LOST}: all of them")
+        return part
+
+
+def test_a_lost_process_keeps_the_best():
+    model, train, _ = planted()
+    result = fit(model, train, ranks=Lonely(20))
+    assert result.reason == "a process was lost: all of them"
+    chosen = result.history[result.chosen_iteration]
+    assert chosen.train < result.history[0].train
+    error = SimulationError(model, train)
+    assert error.rmse(error.theta) == pytest.approx(chosen.train, rel=1e-9)
+
+
+def test_a_process_lost_before_the_first_iterate_is_an_error():
+    model, train, _ = planted(T=50)
+    start = theta(model)
+    with pytest.raises(ProcessLost, match="all of them"):
+        fit(model, train, ranks=Lonely(2))
+    assert torch.equal(theta(model), start)
 
 
 def test_start_that_diverges_is_refused():

@@ -1,0 +1,127 @@
+"""Several processes that share the records of one fit, by ``torch.distributed``.
+
+    torchrun --nproc-per-node 2 script.py
+
+with ``with connect() as ranks: fit(..., ranks=ranks)`` in the script: gloo between CPUs, NCCL
+between GPUs. All processes take the same steps, for what decides is a sum over all of them or the
+first one's: rounding errors differ from one kind of processor to another, and a search lets them
+grow.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from datetime import timedelta
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from lfrtorch.checks import number
+from lfrtorch.ranks import LOST, ProcessLost, Ranks
+
+TIMEOUT = 600.0
+"""Seconds that a process waits for the others: the slowest share of an iteration, amply."""
+
+AXES = 8
+"""Most axes of a tensor that is handed on."""
+
+
+def connect(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Ranks:
+    """The processes that torchrun started, or the one that is alone; use it in a ``with``.
+
+    Args:
+        device: where the model is: ``"cpu"``, or ``"cuda"`` for each process its own GPU.
+        timeout: seconds after which a process that does not answer counts as lost.
+
+    Raises:
+        ValueError: a timeout that is not positive.
+        ProcessLost: the others did not come.
+    """
+    number("timeout", timeout, positive=True)
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return Ranks()
+    gpu = None
+    if torch.device(device).type == "cuda":
+        # A failed collective is an exception here, where NCCL's own watchdog would abort.
+        os.environ.setdefault("TORCH_NCCL_BLOCKING_WAIT", "1")
+        gpu = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+        torch.cuda.set_device(gpu)
+    try:
+        dist.init_process_group(
+            "nccl" if gpu else "gloo", timeout=timedelta(seconds=timeout), device_id=gpu
+        )
+    except RuntimeError as error:
+        raise ProcessLost(f"{LOST}: the processes did not meet ({_gist(error)})") from error
+    return ProcessGroup(gpu or "cpu")
+
+
+class ProcessGroup(Ranks):
+    """The processes of torch's default group.
+
+    Args:
+        device: where its backend works.
+
+    Raises:
+        ProcessLost: a process ended, or did not answer in time; from any of the methods.
+    """
+
+    def __init__(self, device: str | torch.device = "cpu") -> None:
+        self.rank, self.world = dist.get_rank(), dist.get_world_size()
+        self._device = torch.device(device)  # that of the backend
+
+    def sum(self, part: Tensor) -> Tensor:
+        """The sum of all processes' parts, on each of them."""
+        total = self._sent(part).clone()
+        self._call(lambda: dist.all_reduce(total))
+        return total.to(part.device)
+
+    def stack(self, part: Tensor) -> Tensor:
+        """The rows of all processes' parts, which may differ in number, on each of them."""
+        count = torch.tensor([len(part)], device=self._device)
+        counts = [torch.empty_like(count) for _ in range(self.world)]
+        self._call(lambda: dist.all_gather(counts, count))
+        lengths = [int(n) for n in counts]
+        rows = self._sent(part)
+        padded = rows.new_zeros(max(lengths), *rows.shape[1:])
+        padded[: len(rows)] = rows
+        parts = [torch.empty_like(padded) for _ in lengths]
+        self._call(lambda: dist.all_gather(parts, padded))
+        cut = [rows[:n] for rows, n in zip(parts, lengths, strict=True)]
+        return torch.cat(cut).to(part.device)
+
+    def first(self, part: Tensor) -> Tensor:
+        """The part of the first process, whatever its shape, on each of them."""
+        shape = [part.ndim, *part.shape, *[0] * (AXES - part.ndim)]
+        known = torch.tensor(shape, device=self._device)
+        self._call(lambda: dist.broadcast(known, 0))
+        axes, *sizes = known.tolist()
+        sent = self._sent(part)
+        if self.rank:
+            sent = sent.new_empty(sizes[:axes])
+        self._call(lambda: dist.broadcast(sent, 0))
+        return sent.to(part.device)
+
+    def close(self) -> None:
+        """Leave the other processes: what they share from now on ends in a ``ProcessLost``."""
+        if dist.is_initialized():
+            dist.destroy_process_group()
+
+    def _sent(self, part: Tensor) -> Tensor:
+        return part.detach().to(self._device).contiguous()
+
+    def _call(self, collective: Callable[[], object]) -> None:
+        try:
+            collective()
+        except RuntimeError as error:  # of whatever kind the backend has
+            other = f"rank {1 - self.rank}" if self.world == 2 else "one of the others"
+            seen = f"rank {self.rank} of {self.world} has no answer from {other}"
+            raise ProcessLost(f"{LOST}: {seen} ({_gist(error)})") from error
+
+
+def _gist(error: Exception) -> str:
+    """A backend's message without its source file and its advice."""
+    text = re.sub(r"^\[[^]]*\]\s*", "", str(error))
+    return text.split(". ")[0]

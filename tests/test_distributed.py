@@ -1,0 +1,285 @@
+"""Processes that share the records of a fit: the fit of one process, and what is left of a loss."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from reference import measure, normal, random_cell, random_model
+from torch import Tensor
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from lfrtorch import jacobian
+from lfrtorch.adam import Adam
+from lfrtorch.datasets import Dataset
+from lfrtorch.distributed import connect
+from lfrtorch.levenberg_marquardt import LevenbergMarquardt, LMState
+from lfrtorch.model import Model, load
+from lfrtorch.monitor import Checkpoint
+from lfrtorch.ranks import LOST, ProcessLost, Ranks
+from lfrtorch.records import Record
+from lfrtorch.residual import SimulationError
+from lfrtorch.trainer import FitResult, fit
+
+ROOT = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parent
+
+
+def case() -> tuple[Model, list[Record], Record]:
+    """A model some way off, records of three lengths and starts of the true one, and another."""
+    truth, model = (random_model(random_cell(1, 1, 2, 1, 1, 3, radius=0.7)) for _ in range(2))
+    late = measure(truth, 120, seed=2)
+    train = [
+        measure(truth, 80),
+        measure(truth, 60, seed=1, start="periodic"),
+        Record(late.u[20:], late.y[20:], late.fs, "estimated", inputs=late.inputs,
+               outputs=late.outputs),
+    ]  # fmt: skip
+    vector = theta(model)
+    vector = vector + 0.05 * normal(len(vector), seed=9)
+    vector_to_parameters(vector, model.lfr.parameters())
+    return model, train, measure(truth, 50, seed=3)
+
+
+def dataset() -> Dataset:
+    """The same for train.py."""
+    _, train, other = case()
+    return Dataset("several", train, [other], [other])
+
+
+def theta(model: Model) -> Tensor:
+    return parameters_to_vector(model.lfr.parameters()).detach().clone()
+
+
+@dataclass(frozen=True)
+class Dying(LevenbergMarquardt):
+    """Levenberg-Marquardt, killed on one of the processes."""
+
+    rank: int = 1
+
+    def step(self, problem: Any, state: LMState) -> LMState:
+        if state.iteration == 3 and problem.ranks.rank == self.rank:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(problem, state)
+
+
+# --- processes ------------------------------------------------------------------------------
+
+
+def start(task: Callable[[Ranks], Any], folder: Path, world: int = 2) -> list[Any]:
+    """What the task returns on each process; ``None`` where it was killed."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    spawn = multiprocessing.get_context("spawn")
+    processes = [
+        spawn.Process(target=_work, args=(task, folder, rank, world, port)) for rank in range(world)
+    ]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(60)
+        assert process.exitcode is not None
+    files = [folder / f"{rank}.pt" for rank in range(world)]
+    return [torch.load(f, weights_only=False) if f.exists() else None for f in files]
+
+
+def _work(task: Callable[[Ranks], Any], folder: Path, rank: int, world: int, port: int) -> None:
+    warnings.simplefilter("error")
+    torch.set_num_threads(1)
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(world)}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    os.chdir(folder)
+    with connect(timeout=30) as ranks:
+        torch.save(task(ranks), f"{rank}.pt")
+
+
+# --- the same fit ---------------------------------------------------------------------------
+
+FITS: dict[str, tuple[Any, float, float]] = {  # optimiser, ridge, NORMAL of the Jacobian
+    "normal equations": (LevenbergMarquardt(max_iter=6), 0.0, 0.0),
+    "orthogonal": (LevenbergMarquardt(max_iter=6), 0.0, math.inf),
+    "normal equations, ridge": (LevenbergMarquardt(max_iter=6), 1e-2, 0.0),
+    "orthogonal, ridge": (LevenbergMarquardt(max_iter=6), 1e-2, math.inf),
+    "adam": (Adam(epochs=20, learning_rate=1e-2), 1e-2, jacobian.NORMAL),
+}
+
+
+def fitted(name: str, ranks: Ranks) -> tuple[Tensor, FitResult]:
+    optimiser, ridge, regime = FITS[name]
+    usual, jacobian.NORMAL = jacobian.NORMAL, regime
+    try:
+        model, train, validation = case()
+        if ranks.rank == 1:  # starts from what the first process has all the same
+            vector_to_parameters(2.0 * theta(model), model.lfr.parameters())
+        result = fit(model, train, validation, optimiser=optimiser, ridge=ridge, ranks=ranks)
+        return theta(model), result
+    finally:
+        jacobian.NORMAL = usual
+
+
+def slope(ranks: Ranks) -> dict[str, Any]:
+    """Cost, gradients and error of the start."""
+    model, train, _ = case()
+    problem = SimulationError(model, train, ridge=1e-2, ranks=ranks)
+    at = problem.theta + 0.01
+    r, gradient = problem.gradient(at)
+    system, product = problem.linearise(at).system(0.0, 1e-12)
+    found = {"cost": torch.tensor(problem.cost(r)), "rmse": torch.tensor(problem.rmse(at))}
+    found |= {"gradient": gradient, "product": product, "scale": torch.tensor(system.scale)}
+    return found | {"step": system.solve(product, 0.1), "start": problem.theta}
+
+
+def everything(ranks: Ranks) -> dict[str, Any]:
+    found: dict[str, Any] = {name: fitted(name, ranks) for name in FITS}
+    found["slope"] = slope(ranks)
+    rows = normal(2 * ranks.rank, 3, seed=ranks.rank)
+    found["stacked"] = ranks.stack(rows), ranks.first(normal(3 - ranks.rank, 2))
+    model, train, _ = case()
+    try:
+        fit(model, train[:1], ranks=ranks)
+    except ValueError as error:
+        found["refusal"] = str(error)
+    return found
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    return start(everything, tmp_path_factory.mktemp("ranks"))
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_two_processes_fit_as_one(name: str, both: list[dict[str, Any]]):
+    expected, alone = fitted(name, Ranks())
+    (first, result), (second, other) = (found[name] for found in both)
+    assert torch.equal(first, second)
+    assert result.iterations == other.iterations == alone.iterations == FITS[name][0].limit
+    assert result.chosen_iteration == other.chosen_iteration == alone.chosen_iteration
+    # Sums in another order are other in the last digit, 1e-16. A problem that is as badly
+    # conditioned as 1e6 makes 1e-10 of it, and more iterations would make more.
+    np.testing.assert_allclose(first, expected, rtol=1e-9, atol=1e-9)
+    for mine, theirs in zip(result.history, alone.history, strict=True):
+        assert mine.train == pytest.approx(theirs.train, rel=1e-8)
+        assert mine.validation == pytest.approx(theirs.validation, rel=1e-8)
+
+
+def test_cost_and_gradient_are_those_of_all_records(both: list[dict[str, Any]]):
+    expected = slope(Ranks())
+    for name, value in expected.items():
+        first, second = (found["slope"][name] for found in both)
+        assert torch.equal(first, second), name
+        # The periodic state is known to 1e-10.
+        torch.testing.assert_close(first, value, rtol=1e-9, atol=1e-9)
+
+
+def test_parts_of_other_shapes(both: list[dict[str, Any]]):
+    for found in both:
+        stacked, first = found["stacked"]
+        assert torch.equal(stacked, normal(2, 3, seed=1))
+        assert torch.equal(first, normal(3, 2))
+
+
+def test_more_processes_than_records(both: list[dict[str, Any]]):
+    for found in both:
+        assert "2 processes share 1 record(s); each needs one: start fewer" in found["refusal"]
+
+
+def test_outside_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    with connect() as ranks:
+        assert type(ranks) is Ranks
+    with pytest.raises(ValueError, match="timeout is 0"):
+        connect(timeout=0)
+
+
+# --- a lost process -------------------------------------------------------------------------
+
+
+def losing(ranks: Ranks) -> Any:
+    model, train, validation = case()
+    begin = time.monotonic()
+    result = fit(
+        model, train, validation,
+        optimiser=Dying(max_iter=50), monitors=[Checkpoint("model", every=0.0)], ranks=ranks,
+    )  # fmt: skip
+    seconds = time.monotonic() - begin
+    try:
+        ranks.sum(torch.ones(1))
+    except ProcessLost as error:
+        return theta(model), result, seconds, str(error)
+
+
+def test_a_lost_process_ends_the_fit_with_the_best_model(tmp_path: Path):
+    left, killed = start(losing, tmp_path)
+    assert killed is None
+    best, result, seconds, again = left
+    assert result.reason.startswith(LOST + ": rank 0 of 2 has no answer from rank 1 (")
+    assert again.startswith(LOST)
+    assert result.iterations == 3
+    assert seconds < 20
+    assert torch.equal(theta(load(tmp_path / "model")), best)
+
+
+# --- train.py -------------------------------------------------------------------------------
+
+
+def torchrun(*overrides: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join([str(TESTS), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    settings = ["+data._target_=test_distributed.dataset", "name=several", "nx=2", "nn=3"]
+    return subprocess.run(
+        [sys.executable, *command, str(ROOT / "train.py"), *settings, *overrides],
+        capture_output=True, text=True, check=False, cwd=folder, timeout=100,
+        env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+
+
+def run_folder(folder: Path) -> Path:
+    """The one run there; nothing else was written."""
+    assert [p.name for p in folder.iterdir()] == ["runs"]
+    assert [p.name for p in (folder / "runs").iterdir()] == ["several"]
+    (found,) = (folder / "runs" / "several").iterdir()
+    assert len(list(found.glob("events.out.tfevents.*"))) == 1
+    assert len(list(found.glob("*.log"))) == 1
+    assert not list(found.glob(".model*"))
+    return found
+
+
+def test_torchrun_makes_one_run(tmp_path: Path):
+    done = torchrun("trainer.max_iter=3", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("training samples") == done.stdout.count("Run in") == 1
+    folder = run_folder(tmp_path)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["fit"]["iterations"] == 3
+    assert metrics["command"].startswith("torchrun --nproc-per-node 2 train.py +data._target_")
+    assert load(folder).sizes["nx"] == 2
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_killed_process_leaves_the_last_model(rank: int, tmp_path: Path):
+    dying = ["trainer._target_=test_distributed.Dying", f"+trainer.rank={rank}"]
+    done = torchrun(*dying, folder=tmp_path)
+    assert done.returncode != 0
+    folder = run_folder(tmp_path)
+    assert f"rank {1 - rank} of 2 has no answer from rank {rank} (" in done.stderr
+    assert f"the best model so far is in {folder / 'model'}\n" in done.stderr
+    assert load(folder).sizes["nx"] == 2
+    if rank == 1:  # the first process goes on to score what there is
+        metrics = json.loads((folder / "metrics.json").read_text())
+        assert metrics["fit"]["reason"].startswith(LOST)
