@@ -2,15 +2,21 @@
 
 python train.py +bench=boucwen
 python train.py data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750 nx=3
+torchrun --nproc-per-node 2 train.py ...
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import shlex
+import signal
 import sys
+from contextlib import ExitStack, redirect_stdout
+from functools import partial
 from pathlib import Path
+from typing import Any, Self
 
 import hydra
 import torch
@@ -23,13 +29,59 @@ import lfrtorch
 from lfrtorch import plots, report
 from lfrtorch.checks import integer
 from lfrtorch.datasets import Dataset
-from lfrtorch.monitor import ProgressLine, TensorBoard
+from lfrtorch.distributed import connect
+from lfrtorch.monitor import Checkpoint, ProgressLine, TensorBoard
+from lfrtorch.ranks import LOST, ProcessLost, Ranks
+from lfrtorch.trainer import INTERRUPTED, Progress
 
 CONF = Path(__file__).resolve().parent / "conf"
 
+WORLD = int(os.environ.get("WORLD_SIZE", "1"))
+"""Processes, where torchrun starts them."""
 
-def identify(cfg: DictConfig, folder: Path, command: str = "") -> float:
-    """One run, its files written into ``folder``; returns the validation RMSE."""
+WITHOUT_FILES = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
+"""Of Hydra, for the processes beside the first."""
+
+
+class Terminated(Exception):
+    """SIGTERM ended the fit; what it had found is written."""
+
+
+class Termination:
+    """SIGTERM as a monitor: the fit ends as by Ctrl-C, after an iteration, and files are written.
+
+    A batch system sends it before it kills, and torchrun to the processes that are left. Several
+    processes end together where one is asked to, and by Ctrl-C as well.
+    """
+
+    def __init__(self, ranks: Ranks) -> None:
+        self.ranks, self.asked = ranks, 0
+        self._signals = [signal.SIGTERM, *[signal.SIGINT] * (ranks.world > 1)]
+
+    def __enter__(self) -> Self:
+        self._usual = [signal.signal(number, self._note) for number in self._signals]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, usual in zip(self._signals, self._usual, strict=True):
+            signal.signal(number, usual)
+
+    def __call__(self, model: lfrtorch.Model, progress: Progress) -> None:
+        """End the fit where that was asked for."""
+        if self.ranks.sum(torch.tensor(self.asked)):
+            raise KeyboardInterrupt
+
+    def _note(self, number: int, _: Any) -> None:
+        self.asked = number
+
+
+def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = None) -> float:
+    """One run, its files written into ``folder`` by the first process; returns the validation RMSE.
+
+    Raises:
+        ProcessLost, Terminated: the fit ended early, and what it had found is written.
+    """
+    ranks = Ranks() if ranks is None else ranks
     require(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
@@ -46,23 +98,42 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> float:
         f"{model.parameters} parameters ({model.parameters_net} without the gauge directions)"
     )
 
-    line = ProgressLine()
-    board = TensorBoard(folder, shown, bla.simulate(shown))
-    result = lfrtorch.fit(
-        model,
-        dataset.train,
-        dataset.validation,
-        optimiser=instantiate(cfg.trainer),
-        ridge=cfg.ridge,
-        monitors=[line, board],
+    records = (dataset.train, dataset.validation)
+    optimiser, best = instantiate(cfg.trainer), folder / "model"
+    search = partial(
+        lfrtorch.fit, model, *records, optimiser=optimiser, ridge=cfg.ridge, ranks=ranks
     )
-    line.close()
+    with Termination(ranks) as termination:
+        if ranks.rank > 0:
+            result = search(monitors=[termination])
+        else:
+            line, board = ProgressLine(), TensorBoard(folder, shown, bla.simulate(shown))
+            result = search(monitors=[line, board, Checkpoint(best), termination])
+            line.close()
+            write(cfg, folder, command, result, bla, dataset, board)
+    if result.reason.startswith(LOST):
+        raise ProcessLost(f"{result.reason}; the best model so far is in {best}")
+    if termination.asked == signal.SIGTERM and result.reason == INTERRUPTED:
+        raise Terminated(f"the fit was terminated; the best model so far is in {best}")
+    kept = result.history[result.chosen_iteration]
+    return kept.train if math.isnan(kept.validation) else kept.validation
+
+
+def write(
+    cfg: DictConfig,
+    folder: Path,
+    command: str,
+    result: lfrtorch.FitResult,
+    bla: lfrtorch.LinearModel,
+    dataset: Dataset,
+    board: TensorBoard,
+) -> None:
+    """Print the scores, and write all files of a run."""
     print(
         f"{result.reason}; kept iteration {result.chosen_iteration} of {result.iterations}, "
         f"{result.seconds:.1f} s, {1e3 * result.seconds_per_iteration:.0f} ms an iteration\n"
     )
-
-    model.save(folder / "model")
+    result.model.save(folder / "model")
     metrics = report.metrics(result, bla, dataset, seed=cfg.data.get("seed"), command=command)
     text = json.dumps(metrics, indent=2, allow_nan=False)
     (folder / "metrics.json").write_text(text + "\n")
@@ -75,8 +146,6 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> float:
         board.figure(f"result/{name}", figure, result.iterations)
     board.close()
     print(f"\nRun in {folder}\nTensorBoard: tensorboard --logdir {folder}")
-    kept = result.history[result.chosen_iteration]
-    return kept.train if math.isnan(kept.validation) else kept.validation
 
 
 def require(cfg: DictConfig) -> None:
@@ -136,22 +205,48 @@ def made(folder: Path) -> Path:
     return folder
 
 
+def common(folder: Path, ranks: Ranks) -> Path:
+    """The first process's folder."""
+    name = torch.tensor(list(str(folder).encode()), dtype=torch.uint8)
+    return Path(bytes(ranks.first(name).tolist()).decode())
+
+
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(cfg: DictConfig) -> float:
     """The command line: user errors end with one message and exit code 1, no traceback."""
-    run = HydraConfig.get()
-    command = shlex.join(["python", "train.py", *run.overrides.task])
+    run, rank = HydraConfig.get(), os.environ.get("RANK", "0")
+    start = ["python"]
+    if WORLD > 1:
+        start = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", str(WORLD))]
+    command = shlex.join([*start, "train.py", *run.overrides.task])
+    error = "error" if rank == "0" else f"error on rank {rank}"
     try:
-        return identify(cfg, Path(run.runtime.output_dir), command)
-    except InstantiationException as error:
-        print(f"error: {error.__cause__ or error}", file=sys.stderr)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        with connect(timeout=cfg.timeout) as ranks, ExitStack() as silence:
+            if ranks.rank > 0:
+                silence.enter_context(redirect_stdout(silence.enter_context(open(os.devnull, "w"))))
+            return identify(cfg, common(Path(run.runtime.output_dir), ranks), command, ranks)
+    except InstantiationException as failed:
+        print(f"{error}: {failed.__cause__ or failed}", file=sys.stderr)
+    except (ValueError, OSError, ProcessLost) as failed:
+        print(f"{error}: {failed}", file=sys.stderr)
+    except Terminated as end:
+        if rank == "0":
+            print(end, file=sys.stderr)
+        sys.exit(128 + signal.SIGTERM)
     except KeyboardInterrupt:
         print("interrupted outside the fit: nothing to keep", file=sys.stderr)
         sys.exit(130)
     sys.exit(1)
 
 
-if __name__ == "__main__":
+def launch() -> None:
+    """``main``; of several processes the first alone has Hydra write files."""
+    if WORLD > 1 and {"-m", "--multirun"} & set(sys.argv):
+        sys.exit("error: torchrun shares one fit; start several runs one after another.")
+    if WORLD > 1 and os.environ["RANK"] != "0":
+        sys.argv += WITHOUT_FILES
     main()
+
+
+if __name__ == "__main__":
+    launch()

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -189,6 +190,27 @@ def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
     assert lfrtorch.load(tmp_path).sizes["nx"] == 3
 
 
+class Terminated(lfrtorch.LevenbergMarquardt):
+    """Levenberg-Marquardt whose process is asked to end in its third iteration."""
+
+    def step(self, problem: Any, state: Any) -> Any:
+        if state.iteration == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().step(problem, state)
+
+
+def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, tmp_path: Path):
+    usual = signal.getsignal(signal.SIGTERM)
+    cfg = configuration(*file_overrides(csv), "nx=1", "trainer._target_=test_train.Terminated")
+    with pytest.raises(train.Terminated, match="the best model so far is in"):
+        train.identify(cfg, tmp_path)
+    assert signal.getsignal(signal.SIGTERM) == usual
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["fit"]["reason"] == "interrupted"
+    assert metrics["fit"]["iterations"] == 3
+    assert metrics["scores"]["test"]["rmse"] < metrics["scores"]["test"]["lti_rmse"]
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -207,6 +229,7 @@ def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
         (["+bench=boucwen", "ridge=-1"], "ridge is -1"),
         (["+bench=boucwen", "ridge=abc"], "ridge is abc"),
         (["+bench=boucwen", "threads=0"], "threads is 0"),
+        (["+bench=boucwen", "timeout=-1"], "timeout is -1"),
         (["+bench=boucwen", "nx=2.5"], "nx is 2.5"),
         (["+bench=boucwen", "nn=x"], "nn is x"),
         (["+bench=boucwen", "seed=a"], "seed is a"),
