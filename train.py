@@ -93,6 +93,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
         model: lfrtorch.Model = instantiate(cfg.init, bla, dataset.train)
     else:
         model = continued(cfg, dataset)
+    model.lfr.to(device=cfg.device, dtype=getattr(torch, cfg.dtype))
     print(
         f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples, "
         f"{model.parameters} parameters ({model.parameters_net} without the gauge directions)"
@@ -162,6 +163,16 @@ def require(cfg: DictConfig) -> None:
         )
     if cfg.threads is not None:
         integer("threads", cfg.threads, 1)
+    if cfg.dtype not in ("float32", "float64"):
+        raise ValueError(f"dtype is {cfg.dtype}; give float64 or float32.")
+    try:
+        torch.empty(0, device=cfg.device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"device is {cfg.device}, which torch cannot use here ({reason}); "
+            "device=cpu always works."
+        ) from None
 
 
 def continued(cfg: DictConfig, dataset: Dataset) -> lfrtorch.Model:
@@ -221,7 +232,7 @@ def main(cfg: DictConfig) -> float:
     command = shlex.join([*start, "train.py", *run.overrides.task])
     error = "error" if rank == "0" else f"error on rank {rank}"
     try:
-        with connect(timeout=cfg.timeout) as ranks, ExitStack() as silence:
+        with connect(cfg.device, cfg.timeout) as ranks, ExitStack() as silence:
             if ranks.rank > 0:
                 silence.enter_context(redirect_stdout(silence.enter_context(open(os.devnull, "w"))))
             return identify(cfg, common(Path(run.runtime.output_dir), ranks), command, ranks)
