@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +26,7 @@ class Batch:
     Shape:
         u: (R, T, nu), y: (R, T, ny), x0: (R, nx) of given starts; estimated: (R,), which of the
         estimated start states is each record's.
+        scored: (R, T), 1 where a sample counts in the score.
         weight: (R, T, ny), or by spectral line (R, F, ny), F = T // 2 + 1: the factors of the
             errors, 0 where a sample or a line does not count.
     """
@@ -33,6 +35,7 @@ class Batch:
     y: Tensor
     x0: Tensor | None
     estimated: Tensor | None
+    scored: Tensor
     weight: Tensor
     spectral: bool
     start: Start
@@ -75,24 +78,28 @@ class Batch:
 def batches_of(model: Model, records: list[Record], ranks: Ranks) -> list[Batch]:
     """A process's share of the records, grouped and normalised, in the model's dtype and device."""
     like = model.lfr.cell.A
-    estimated = [record for record in records if record.start == "estimated"]
     groups: dict[tuple[int, Start, bool], list[Record]] = defaultdict(list)
-    for record in ranks.share(records):
-        groups[record.samples, record.start, record.line_weight is not None].append(record)
+    estimated: dict[tuple[int, Start, bool], list[int]] = defaultdict(list)
+    count = itertools.count()
+    numbers = [next(count) if record.start == "estimated" else 0 for record in records]
+    for record, number in ranks.share(list(zip(records, numbers, strict=True))):
+        kind = record.samples, record.start, record.line_weight is not None
+        groups[kind].append(record)
+        estimated[kind].append(number)
     batches = []
 
     def stacked(arrays: list[NDArray]) -> Tensor:
         return torch.tensor(np.stack(arrays)).to(like)
 
-    for (_, start, spectral), group in groups.items():
+    for kind, group in groups.items():
+        _, start, spectral = kind
         batches.append(
             Batch(
                 u=stacked([model.scaler.normalise_u(record.u) for record in group]),
                 y=stacked([model.scaler.normalise_y(record.y) for record in group]),
                 x0=stacked([r.x0 for r in group if r.x0 is not None]) if start == "given" else None,
-                estimated=torch.tensor([estimated.index(record) for record in group])
-                if start == "estimated"
-                else None,
+                estimated=torch.tensor(estimated[kind]) if start == "estimated" else None,
+                scored=stacked([np.arange(record.samples) >= record.skip for record in group]),
                 weight=stacked([_factors(record) for record in group]),
                 spectral=spectral,
                 start=start,
@@ -105,8 +112,7 @@ def _factors(record: Record) -> NDArray:
     """What multiplies the errors, (T, ny), or their spectrum by ``rfft``, (F, ny)."""
     T, ny = record.y.shape
     if record.line_weight is None:
-        counts = np.arange(T)[:, None] >= record.skip
-        return np.broadcast_to(np.sqrt(record.weight) * counts, (T, ny))
+        return record.factors
     # Parseval: Σ e² = Σ |E|² / T over all T lines; those between 0 and fs / 2 stand for two.
     twice = np.full((T // 2 + 1, 1), 2.0)
     twice[0] = 1.0

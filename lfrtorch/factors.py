@@ -51,7 +51,7 @@ class Orthogonal:
             _, s, Vh = torch.linalg.svd(R, full_matrices=False)
             kept = s > truncation * s[0]
             self._squares, self._Vh = s[kept].square(), Vh[kept]
-            self.scale, self.rank = float(s[0]) ** 2, len(self._squares)
+            self.scale, self.rank = float(s[0].square()), len(self._squares)
 
     def solve(self, gradient: Tensor, damping: float) -> Tensor:
         """-(JᵀJ + λI)⁻¹ gradient (P,), its part along the directions that are left out 0."""
@@ -69,14 +69,17 @@ class Normal:
     def __init__(self, G: Tensor, rank: int) -> None:
         finite = bool(torch.isfinite(G).all())
         self._G, self.rank = G, rank
+        self._latest: tuple[float, Tensor] | None = None  # damping and Cholesky factor
         self.scale = float(torch.linalg.eigvalsh(G)[-1]) if finite else float("nan")
 
     def solve(self, gradient: Tensor, damping: float) -> Tensor:
         """-(JᵀJ + λI)⁻¹ gradient (P,); NaN where rounding errors make that no minimum."""
-        damped = self._G + damping * torch.eye(len(self._G)).to(self._G)
-        L, failed = torch.linalg.cholesky_ex(damped)
-        delta = -torch.cholesky_solve(gradient.unsqueeze(-1), L).squeeze(-1)
-        return torch.full_like(delta, torch.nan) if failed else delta
+        if self._latest is None or self._latest[0] != damping:
+            damped = self._G.clone()
+            damped.diagonal().add_(damping)
+            L, failed = torch.linalg.cholesky_ex(damped)
+            self._latest = damping, torch.full_like(L, torch.nan) if failed else L
+        return -torch.cholesky_solve(gradient.unsqueeze(-1), self._latest[1]).squeeze(-1)
 
 
 class Agreed:

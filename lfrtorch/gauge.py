@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from lfrtorch.cell import LFRCell
-from lfrtorch.nonlinearity import Network
+from lfrtorch.nonlinearity import is_network
 
 DEPENDENT = 1e-3
 """Smallest pivot, relative to the largest, of a column that is left out; the rest is computed."""
@@ -30,6 +30,10 @@ class Reduction(NamedTuple):
 
     kept: Tensor
     expand: Tensor
+
+
+ROUNDING = 1e-10
+"""The same relative to all gauge directions: below it none is left but rounding errors."""
 
 
 @torch.no_grad()
@@ -48,14 +52,16 @@ def reduction(cell: LFRCell, start: Tensor, *, coordinates: bool = True) -> Redu
         lti += 0 if name.startswith("static.") or not p.requires_grad else p.numel()
     free = torch.tensor([*free, *[True] * start.numel()], device=G.device)
     G, fixed = G[free].double().cpu().numpy(), G[~free].double().cpu().numpy()
+    size = np.linalg.norm(G)
     if not np.isfinite(G).all():
-        G = np.zeros((len(G), 0))
+        G, size = np.zeros((len(G), 0)), 0.0
     elif len(fixed) and G.shape[1]:  # directions that move no fixed parameter
         G = G @ scipy.linalg.null_space(fixed)
     # Columns of the linear part only: those of the static map are computed together.
     Q, R, pivots = scipy.linalg.qr(G[:lti].T, mode="economic", pivoting=True)
     diagonal = np.abs(np.diag(R))
-    rank = int((diagonal > DEPENDENT * diagonal.max(initial=0.0)).sum())
+    least = max(DEPENDENT * diagonal.max(initial=0.0), ROUNDING * size)
+    rank = int((diagonal > least).sum())
     left_out, G = pivots[:rank], G @ Q[:, :rank]
     kept = np.delete(np.arange(len(G)), left_out)
     expand = np.zeros((len(kept), len(G)))
@@ -77,7 +83,7 @@ def _directions(cell: LFRCell, start: Tensor) -> Tensor:
     T = _units(cell.nx, A)  # x -> (I + εT) x
     changes = {"A": T @ A - A @ T, "Bu": T @ Bu, "Bw": T @ Bw, "Cz": -Cz @ T, "Cy": -cell.Cy @ T}
     groups: list[tuple[dict[str, Tensor], Tensor | None]] = [(changes, start @ T.mT)]
-    if isinstance(cell.static, Network):
+    if is_network(cell.static):
         Wz, Ww, bw = cell.static.Wz, cell.static.Ww, cell.static.bw
         T = _units(cell.nz, A)
         groups.append(({"Cz": T @ Cz, "Dzu": T @ Dzu, "static.Wz": -Wz @ T}, None))

@@ -21,7 +21,7 @@ NORMAL = 1e4
 """Relative damping, in rounding errors, above which the normal equations are as good as QR."""
 
 KEPT_BYTES = 1 << 27
-"""Rows of a batch up to this size are kept."""
+"""Rows up to this size, of all batches, are kept."""
 
 
 class Jacobian:
@@ -58,8 +58,9 @@ class Jacobian:
         kept, expand = self._reduced
         precise = damping <= NORMAL * torch.finfo(expand.dtype).eps
         factor = Triangle() if precise else Gram()
+        room = KEPT_BYTES
         for part in self.parts:
-            part.fold(kept, factor)  # [J r] in the kept columns
+            room -= part.fold(kept, factor, room)  # [J r] in the kept columns
         factor.combine(self._ranks)
         if isinstance(factor, Triangle):
             R, r = factor.R[:, :-1] @ expand, factor.R[:, -1]
@@ -125,8 +126,11 @@ class Part:
         """Whether the rows have columns of the start state."""
         return self.linearisation.periodic or self.x0 is not None
 
-    def fold(self, kept: Tensor, total: Triangle | Gram) -> None:
-        """Add the rows [J r], in the kept columns (K,), to the factor."""
+    def fold(self, kept: Tensor, total: Triangle | Gram, room: int) -> int:
+        """Add the rows [J r], in the kept columns (K,), to the factor.
+
+        Rows are kept where they fit into so many bytes, which are returned.
+        """
         batch, linearisation = self.batch, self.linearisation
         own = kept[kept < linearisation.parameters]
         K, nx = len(own), linearisation.state.shape[1]
@@ -134,7 +138,7 @@ class Part:
         errors = linearisation.trajectory.y - batch.y
         R, T, ny = errors.shape
         columns = K + nx * start + 1
-        whole = R * T * ny * columns * errors.element_size() <= KEPT_BYTES
+        whole = R * T * ny * columns * errors.element_size() <= room
         computed, self.computed = self.computed, None  # they are weighted in place, once
         if computed is not None:
             rows = computed[0]
@@ -177,6 +181,8 @@ class Part:
             total.absorb(factor, of_record)
         if whole and rows is not None and not batch.spectral:
             self._kept = rows[..., :-1].flatten(1, 2), mix[:, :-1, :-1]
+            return rows.numel() * rows.element_size()
+        return 0
 
     def tangent(self, d_theta: Tensor, reduced: Tensor) -> Tensor:
         """Weighted changes (R, m, ny) of the outputs with θ (P,), or its kept columns (K,)."""

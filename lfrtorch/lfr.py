@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from lfrtorch.cell import LFRCell
-from lfrtorch.records import Start
+from lfrtorch.records import Start, check_start
 from lfrtorch.sensitivity import Linearisation
 from lfrtorch.simulate import Trajectory, simulate, steady_state
 
@@ -44,6 +44,9 @@ class LFR(nn.Module):
             start: ``"periodic"`` for the periodic steady state; otherwise from ``x0``.
             guess: states (R, T + 1, nx) of a nearby trajectory, which may save time.
         """
+        check_start(start, "simulation")
+        if start == "estimated":
+            raise ValueError("start='estimated' is fitted to a record's output: Model.simulate.")
         if start == "periodic":
             return steady_state(self.cell, u, x0 if guess is None else guess)
         zero = u.new_zeros(len(u), self.cell.nx)

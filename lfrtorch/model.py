@@ -14,7 +14,7 @@ from torch.nn import Module
 from lfrtorch import checkpoint
 from lfrtorch.cell import LFRCell
 from lfrtorch.lfr import LFR
-from lfrtorch.nonlinearity import Network, Polynomial
+from lfrtorch.nonlinearity import Network, Polynomial, is_network
 from lfrtorch.records import Channel, Record, Scaler, Start, as_signal, check_start
 from lfrtorch.simulate import Trajectory, estimated_start
 
@@ -43,7 +43,7 @@ class Model:
         sizes = {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw}
         if isinstance(cell.static, Polynomial):
             return sizes | {"degree": cell.static.degree}
-        return sizes | {"nn": len(cell.static.bz) if isinstance(cell.static, Network) else 0}
+        return sizes | {"nn": len(cell.static.bz) if is_network(cell.static) else 0}
 
     @property
     def parameters(self) -> int:
@@ -109,8 +109,7 @@ class Model:
             if not isinstance(data, Record):
                 raise ValueError("start='estimated' needs a record: the state is fitted to its y.")
             y = torch.as_tensor(self.scaler.normalise_y(data.y)).to(like).unsqueeze(0)
-            weight = torch.ones_like(y)
-            weight[:, : data.skip] = 0.0
+            weight = torch.as_tensor(np.array(data.factors)).to(like).unsqueeze(0)
             trajectory = estimated_start(self.lfr.cell, v, y, weight)
         else:
             trajectory = self.lfr.trajectory(v, state, start)
@@ -128,6 +127,11 @@ class Model:
                     f"record '{record.name}' has {signal.shape[1]} {side}(s) and the model "
                     f"{len(channels)} ({names}); give a column for each."
                 )
+        if record.x0 is not None and len(record.x0) != self.lfr.cell.nx:
+            raise ValueError(
+                f"record '{record.name}' has a start state x0 of {len(record.x0)} entries and the "
+                f"model {self.lfr.cell.nx} states; give one for each."
+            )
         if not np.isclose(record.fs, self.fs):
             raise ValueError(
                 f"record '{record.name}' is sampled at {record.fs} Hz and the model at {self.fs} "
@@ -138,7 +142,7 @@ class Model:
         """Write the checkpoint folder; ``lfrtorch.load`` reads it back to the same bits."""
         cell, s = self.lfr.cell, self.scaler
         static: dict[str, Any] | None = None
-        if type(cell.static) is Network:
+        if is_network(cell.static):
             static = {"type": "Network", "nn": len(cell.static.bz)}
             static["activation"] = cell.static.activation
         elif type(cell.static) is Polynomial:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import reduce
 from itertools import combinations_with_replacement
 from operator import mul
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -75,6 +76,11 @@ class Network(Module):
         """Sizes and activation, for ``print(module)``."""
         (nn, nz), nw = self.Wz.shape, len(self.Ww)
         return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}"
+
+
+def is_network(static: Module | None) -> TypeGuard[Network]:
+    """Whether a map is a ``Network`` itself: a class of one's own may have another forward pass."""
+    return type(static) is Network
 
 
 class Polynomial(Module):

@@ -118,7 +118,10 @@ class Record:
                 "a start state goes with start='given', and only with it."
             )
         if self.x0 is not None:
-            object.__setattr__(self, "x0", np.array(self.x0, dtype=np.float64).reshape(-1))
+            x0 = np.array(self.x0, dtype=np.float64).reshape(-1)
+            if not np.isfinite(x0).all():
+                raise ValueError(f"record '{self.name}': x0 is {x0}; give finite numbers.")
+            object.__setattr__(self, "x0", x0)
         self._check_weights(len(u), y.shape[1])
         for field, value in (("u", u), ("y", y), ("inputs", inputs), ("outputs", outputs)):
             object.__setattr__(self, field, value)
@@ -154,6 +157,12 @@ class Record:
                     f"record '{self.name}': {name} must be finite, at least 0 and not all 0."
                 )
             object.__setattr__(self, name, values)
+
+    @property
+    def factors(self) -> NDArray[np.float64]:
+        """What the errors (T, ny) are multiplied by in a fit: √weight, 0 in the skipped samples."""
+        counts = np.arange(len(self.y))[:, None] >= self.skip
+        return np.broadcast_to(np.sqrt(self.weight) * counts, self.y.shape)
 
     @property
     def samples(self) -> int:

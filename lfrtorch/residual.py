@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.utils import vector_to_parameters
 
 from lfrtorch.batch import batches_of
 from lfrtorch.checks import number
@@ -28,7 +28,7 @@ class SimulationError:
     r = weighted y_hat - y in normalised units, over all samples of all records (0 where a sample
     does not count), followed by √ridge (θ - θ_start). θ is the vector of all parameters of
     ``model.lfr`` that require a gradient, then the start state of each record whose start is
-    ``"estimated"``; evaluating at θ writes it into the module.
+    ``"estimated"``; the module holds the θ that was evaluated or written last.
 
     Args:
         model: the model whose parameters are θ; θ_start is what they are now.
@@ -58,6 +58,9 @@ class SimulationError:
         self.model, self.ranks = model, Ranks() if ranks is None else ranks
         self._parameters = [p for p in model.lfr.parameters() if p.requires_grad]
         data = as_records(records)
+        estimated = any(record.start == "estimated" for record in data)
+        if not self._parameters and not estimated and not solved_starts:
+            raise ValueError("all parameters of the model are frozen; there is nothing to fit.")
         for record in data:
             model.check(record)
         if len(data) < self.ranks.world:
@@ -74,27 +77,25 @@ class SimulationError:
         self.guesses: list[Tensor | None] = [None] * len(self.batches)
         """States of each batch near those to come."""
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
-        self.reduces = True
-        """Whether columns of gauge directions are left out of the Jacobian's rows."""
 
     @property
     def theta(self) -> Tensor:
         """Parameters (P,) as they stand in the module, then the estimated start states."""
-        return torch.cat([parameters_to_vector(self._parameters).detach(), self._starts.flatten()])
+        own = [p.detach().flatten() for p in self._parameters]
+        return torch.cat([*own, self._starts.flatten()])
 
     def rmse(self, theta: Tensor) -> float:
         """Root mean squared error at θ over scored samples and outputs, output unit, unweighted."""
         total = torch.zeros((), dtype=torch.float64, device=self._start.device)
         scale = torch.as_tensor(self.model.scaler.y_scale).to(self._start)
         for batch, trajectory in zip(self.batches, self.trajectories(theta), strict=True):
-            errors = (trajectory.y - batch.y) * scale
-            if not batch.spectral:
-                errors = errors * (batch.weight != 0)
+            errors = (trajectory.y - batch.y) * scale * batch.scored.unsqueeze(-1)
             total = total + errors.double().square().sum()
         return math.sqrt(self.ranks.sum(total) / self.size)
 
     def write(self, theta: Tensor) -> None:
         """Put θ (P,) into the module."""
+        theta = theta.detach().to(self._starts, copy=True)  # the module's weights are its own
         own, starts = theta.split([len(theta) - self._starts.numel(), self._starts.numel()])
         vector_to_parameters(own, self._parameters)
         self._starts = starts.reshape(self._starts.shape)
@@ -111,8 +112,13 @@ class SimulationError:
             errors.append(self._ridge.sqrt() * (theta - self._start))
         return torch.cat(errors)
 
-    def linearise(self, theta: Tensor) -> Jacobian:
-        """dr/dθ at θ, held as a whole only where it is small."""
+    def linearise(self, theta: Tensor, *, reduce: bool = True) -> Jacobian:
+        """dr/dθ at θ, held as a whole only where it is small.
+
+        Args:
+            theta: θ (P,).
+            reduce: leave the columns of gauge directions out of its rows.
+        """
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
         self.guesses = [t.x for t in trajectories]
@@ -125,7 +131,7 @@ class SimulationError:
             periodic = batch.start == "periodic"
             linearisation = Linearisation(cell, batch.u, trajectory, periodic=periodic)
             parts.append(Part(batch, linearisation, x0))
-        if self.reduces:
+        if reduce:
             held = any(batch.x0 is not None for batch in self.batches)
             held = bool(self.ranks.sum(self._start.new_tensor(float(held))))
             reduced = reduction(cell, self._starts, coordinates=not held)
@@ -143,30 +149,30 @@ class SimulationError:
     def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """r (M,) and the gradient (P,) of |r|² / samples, by the adjoint recurrence."""
         r = self.residual(theta)
-        return r, 2.0 / self.size * self.linearise(theta).adjoint(r)
+        return r, 2.0 / self.size * self.linearise(theta, reduce=False).adjoint(r)
 
     def trajectories(self, theta: Tensor) -> list[Trajectory]:
         """Trajectories at θ, those of the latest θ kept; periodic ones start from a good guess."""
-        if self._latest is None or self._latest[0] is not theta:
+        if self._latest is None or not torch.equal(self._latest[0], theta):
             self.write(theta)
-            self._latest = theta, [self._trajectory(i) for i in range(len(self.batches))]
+            self._latest = theta.clone(), [self._trajectory(i) for i in range(len(self.batches))]
         return self._latest[1]
 
     def remember(self, theta: Tensor, trajectories: list[Trajectory]) -> None:
         """Take trajectories at θ, one a batch, from elsewhere."""
-        self._latest = theta, trajectories
+        self._latest = theta.clone(), trajectories
 
     def start_of(self, i: int) -> Tensor | None:
         """Start state (R, nx) of a batch where it is given or a parameter."""
         batch = self.batches[i]
-        if batch.estimated is None or self._solved:
+        if batch.estimated is None:
             return batch.x0
+        if self._solved:
+            return estimated_start(self.model.lfr.cell, batch.u, batch.y, batch.weight).x[:, 0]
         return self._starts[batch.estimated]
 
     def _trajectory(self, i: int) -> Trajectory:
         batch, lfr = self.batches[i], self.model.lfr
-        if batch.estimated is not None and self._solved:
-            return estimated_start(lfr.cell, batch.u, batch.y, batch.weight)
         start = "periodic" if batch.start == "periodic" else "zero"
         return lfr.trajectory(batch.u, self.start_of(i), start, guess=self.guesses[i])
 

@@ -437,9 +437,9 @@ def _slices(length: int, size: int) -> Iterator[slice]:
 
 
 def closed(transition: Tensor, end: Tensor) -> Tensor:
-    """The start S (R, nx, m) that returns to itself: S = Φ S + end."""
+    """The start S (R, nx, m) that returns to itself, S = Φ S + end; not finite where none does."""
     identity = torch.eye(end.shape[1]).to(end)
-    return torch.linalg.solve(identity - transition, end)
+    return torch.linalg.solve_ex(identity - transition, end).result
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.newton import newton
-from lfrtorch.nonlinearity import Network
+from lfrtorch.nonlinearity import is_network
 from lfrtorch.recurrence import has_kernels, linear_recurrence, to_numpy
 from lfrtorch.slopes import monodromy, slopes, spectral_radius
 from lfrtorch.threads import spread
@@ -29,8 +29,11 @@ MET_ROUNDING = 4.0
 SETTLING_PERIODS = 3
 """Periods simulated forward before Newton's method takes over; a well damped model needs one."""
 
-START_ITERATIONS, START_HALVINGS, START_TOLERANCE = 20, 10, 1e-10
+START_ITERATIONS, START_HALVINGS, START_TOLERANCE = 20, 6, 1e-10
 """Gauss-Newton steps on a start state, trials a step, and the relative gain that ends them."""
+
+START_SEEN = 1e-9
+"""Least that a start state moves the weighted outputs to be told from them."""
 
 MAX_PERIODS = 30
 """Passes over the record after which the periodic steady state is given up."""
@@ -145,33 +148,37 @@ def estimated_start(cell: LFRCell, u: Tensor, y: Tensor, weight: Tensor) -> Traj
     best = simulate(cell, u, x0)
     cost = (weight * (best.y - y)).square().sum(dim=(1, 2))
     for _ in range(START_ITERATIONS):
-        if not best.finite:
-            break
         F, H = slopes(cell, best.z)
         identity = torch.eye(cell.nx).to(x0).expand_as(F[:, 0])
         free = H @ linear_recurrence(F, torch.zeros_like(F), identity)[:, :-1]
         rows = (weight.unsqueeze(-1) * free).flatten(1, 2)
         errors = (weight * (best.y - y)).flatten(1).unsqueeze(-1)
+        usable = torch.isfinite(rows).all(dim=(1, 2)) & torch.isfinite(cost)
+        rows, errors = (torch.where(usable[:, None, None], t, 0.0) for t in (rows, errors))
         # A state that the output does not show stays where it is.
-        step = -(torch.linalg.pinv(rows, rtol=1e-9) @ errors).squeeze(-1)
-        improved = False
+        seen = START_SEEN * weight.abs().amax()
+        step = -(torch.linalg.pinv(rows, atol=seen, rtol=START_SEEN) @ errors).squeeze(-1)
+        before = cost
+        waiting = usable.clone()
         for _ in range(START_HALVINGS):
             trial = simulate(cell, u, x0 + step)
             trial_cost = (weight * (trial.y - y)).square().sum(dim=(1, 2))
-            better = trial_cost < cost  # False for NaN
-            if better.all():
-                gain = (cost - trial_cost).sum() > START_TOLERANCE * cost.sum()
-                improved = bool(gain)
-                x0, best, cost = x0 + step, trial, trial_cost
+            better = waiting & (trial_cost < cost)  # False for NaN
+            x0 = torch.where(better[:, None], x0 + step, x0)
+            cost = torch.where(better, trial_cost, cost)
+            pairs = zip(trial, best, strict=True)
+            best = Trajectory(*(torch.where(better[:, None, None], t, b) for t, b in pairs))
+            waiting &= ~better
+            if not waiting.any():
                 break
-            step = torch.where(better.unsqueeze(-1), step, step / 4)
-        if not improved:
+            step = step / 4
+        if not (cost < (1.0 - START_TOLERANCE) * before).any():
             break
     return best
 
 
 def _is_compiled(cell: LFRCell, u: Tensor) -> bool:
-    return has_kernels(u) and (cell.static is None or type(cell.static) is Network)
+    return has_kernels(u) and (cell.static is None or is_network(cell.static))
 
 
 def _with_loop_where_lost(cell: LFRCell, u: Tensor, x0: Tensor, x: Tensor) -> Trajectory:
@@ -204,7 +211,7 @@ def _compiled(cell: LFRCell, u: Tensor, x0: Tensor, near: Trajectory | None) -> 
     if cell.static is None:
         vectors, matrices, activation = [u.new_zeros(0)] * 2, [u.new_zeros(0, 0)] * 2, "tanh"
     else:
-        assert isinstance(cell.static, Network)
+        assert is_network(cell.static)
         network = cell.static
         vectors, matrices = [network.bz, network.bw], [network.Wz.mT, network.Ww]
         activation = network.activation

@@ -16,7 +16,7 @@ from torch.nn import Parameter
 from lfrtorch.cell import LFRCell
 from lfrtorch.jacobian import Jacobian
 from lfrtorch.lfr import LFR
-from lfrtorch.nonlinearity import Network, Stacked
+from lfrtorch.nonlinearity import Stacked, is_network
 from lfrtorch.residual import SimulationError
 from lfrtorch.sensitivity import Linearisation
 from lfrtorch.simulate import Trajectory
@@ -41,7 +41,7 @@ def stacked(cells: Sequence[LFRCell], repeat: int = 1) -> LFRCell:
     own = {n.removeprefix("static."): w for n, w in weights.items() if n.startswith("static.")}
     if first.static is None:
         static = None
-    elif type(first.static) is Network:
+    elif is_network(first.static):
         static = copy.deepcopy(first.static)
         for name, w in own.items():  # vectors are broadcast over time
             setattr(static, name, Parameter(w if w.ndim == 3 else w.unsqueeze(1)))
@@ -61,12 +61,26 @@ class Stack:
 
     Args:
         problems: one a model, all of the same records.
+
+    Raises:
+        ValueError: problems that share a model, or differ in records, scaling or parameters.
     """
 
     def __init__(self, problems: Sequence[SimulationError]) -> None:
         self.problems = list(problems)
+        first = self.problems[0]
+        if len({id(problem.model) for problem in problems}) < len(self.problems):
+            raise ValueError("two problems share one model; give each a model of its own.")
         for problem in self.problems:
-            problem.reduces = False  # the same columns for all
+            alike = len(problem.theta) == len(first.theta)
+            alike &= len(problem.batches) == len(first.batches)
+            for mine, other in zip(problem.batches, first.batches, strict=False):
+                alike &= torch.equal(mine.u, other.u) and torch.equal(mine.y, other.y)
+            if not alike:
+                raise ValueError(
+                    "the problems differ in records, scaling or free parameters; "
+                    "a stack is of models of one structure over the same records."
+                )
 
     def residuals(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[Tensor]:
         """r (M,) of some of the models (by their numbers), each at its own θ (P,)."""
@@ -98,7 +112,10 @@ class Stack:
     def linearise(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[Jacobian]:
         """dr/dθ of some of the models, their rows computed together."""
         problems = [self.problems[i] for i in models]
-        jacobians = [p.linearise(theta) for p, theta in zip(problems, thetas, strict=True)]
+        # The same columns for all: none is left out.
+        jacobians = [
+            p.linearise(theta, reduce=False) for p, theta in zip(problems, thetas, strict=True)
+        ]
         for i, batch in enumerate(problems[0].batches):
             parts = [jacobian.parts[i] for jacobian in jacobians]
             R, T, ny = batch.y.shape

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vjp, vmap
 
-from lfrtorch.nonlinearity import ACTIVATIONS, Network, Stacked
+from lfrtorch.nonlinearity import ACTIVATIONS, Network, Stacked, is_network
 
 Weights = dict[str, Tensor]
 
@@ -46,7 +46,7 @@ class StaticSlopes(Protocol):
 
 def static_slopes(static: nn.Module | None, z: Tensor, weights: Weights) -> StaticSlopes:
     """The map linearised at z (R, T, nz), with the given weights in place of its own."""
-    if type(static) is Network:
+    if is_network(static):
         return NetworkSlopes(static, z, weights)
     return ModuleSlopes(static, z, weights)
 

@@ -1,4 +1,5 @@
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,3 +25,10 @@ def benchmark_root() -> Path:
     if given:
         pytest.fail(f"LFRTORCH_DATA is {given!r}, which is not a folder")
     pytest.skip("no benchmark files: set LFRTORCH_DATA to a folder of the nonlinear benchmarks")
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Whatever a test does to torch's threads ends with it."""
+    yield
+    torch.set_num_threads(1)

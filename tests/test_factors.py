@@ -75,3 +75,7 @@ def test_entries_that_are_not_finite_have_no_scale(bad: float):
     G[0, 1] = bad
     assert math.isnan(Normal(G, 3).scale)
     assert math.isnan(Orthogonal(G, 1e-12).scale)
+
+
+def test_singular_values_whose_squares_overflow_have_an_infinite_scale():
+    assert Orthogonal(torch.tensor([[1e200]], dtype=torch.float64), 1e-12).scale == math.inf

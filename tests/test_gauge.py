@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.gauge import reduction
-from lfrtorch.nonlinearity import Polynomial
+from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.sensitivity import Linearisation, output_jacobian
 from lfrtorch.simulate import simulate, steady_state
 
@@ -104,3 +104,25 @@ def test_weights_that_are_not_finite_leave_nothing_out():
         cell.A[0, 0] = torch.inf
     kept, expand = reduction(cell, none(cell))
     assert torch.equal(expand, torch.eye(len(kept), dtype=expand.dtype))
+
+
+@pytest.mark.parametrize(
+    ("frozen", "sizes"),
+    [
+        (["A", "Bu", "Bw", "Cz", "Dzu", "Cy"], {"nz": 6, "nw": 2}),
+        (["A", "Bu", "Bw", "Cz", "Dzu", "Dyw"], {"nz": 2, "nw": 6}),
+    ],
+)
+def test_rounding_errors_of_frozen_directions_leave_nothing_out(frozen, sizes):
+    cell = random_cell(1, 1, 3, **sizes, nn=10, radius=0.5)
+    for name in frozen:
+        cell.get_parameter(name).requires_grad_(False)
+    assert reduction(cell, none(cell)).expand.abs().max() < 1e3
+
+
+def test_a_class_of_one_s_own_that_begins_with_a_network_keeps_its_coordinates():
+    class More(Network):
+        def forward(self, z: torch.Tensor) -> torch.Tensor:
+            return super().forward(z) + 0.5 * torch.sin(z[..., :1])
+
+    check(random_cell(1, 1, 2, 2, 1, static=More(2, 1, 3), radius=0.3, feedback=0.05), 2**2)

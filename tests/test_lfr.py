@@ -176,3 +176,11 @@ def test_guess_of_the_periodic_start_takes_no_gradient():
     assert_close(y, lfr(u, start="periodic"), rtol=0, atol=1e-9)
     (gradient,) = torch.autograd.grad(y.sum(), guess, allow_unused=True)
     assert gradient is None
+
+
+def test_starts_that_it_does_not_have():
+    lfr, u = small(), normal(1, 10, 2)
+    with pytest.raises(ValueError, match="start is 'peridoic'"):
+        lfr(u, None, "peridoic")
+    with pytest.raises(ValueError, match="start='estimated' is fitted to a record's output"):
+        lfr(u, None, "estimated")

@@ -8,6 +8,7 @@ import torch
 from reference import measure, random_cell, random_model
 from torch.testing import assert_close
 
+from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start
@@ -244,3 +245,84 @@ def test_records_that_are_not_the_model_s(model: Model, nu: int, ny: int, fs: fl
     record = Record(np.ones((20, nu)), np.ones((20, ny)), fs, name="lab")
     with pytest.raises(ValueError, match=f"(?s)lab.*{message}"):
         SimulationError(model, record)
+
+
+def test_integrator_in_steady_state_ends_the_search_with_a_reason():
+    """x+ = x + u with a zero-mean input closes from any start: I - Φ is singular."""
+    cell = random_cell(1, 1, 1, 0, 0)
+    with torch.no_grad():
+        cell.A.fill_(1.0)
+        cell.Bu.fill_(1.0)
+    model = random_model(cell)
+    u = np.tile([1.0, -1.0], 10) * model.scaler.u_scale + model.scaler.u_offset
+    record = Record(u, np.ones(20), model.fs, "periodic")
+    problem = SimulationError(model, record)
+    optimiser = LevenbergMarquardt()
+    state = optimiser.step(problem, optimiser.init(problem, problem.theta))
+    assert state.reason == "the Jacobian vanishes or is not finite"
+
+
+def test_one_record_twice_has_two_start_states(model: Model):
+    record = replace(some_records(model)[0], start="estimated")
+    problem = SimulationError(model, [record, record])
+    theta = problem.theta + 0.1
+    r, gradient = problem.gradient(theta)
+    J = problem.jacobian(theta)
+    assert_close(gradient, 2 * J.mT @ r / problem.size, rtol=1e-8, atol=1e-8)
+    assert (J[:, -4:] != 0).any(dim=0).all()
+
+
+def test_theta_changed_in_place_is_another_theta(model: Model):
+    problem = SimulationError(model, some_records(model))
+    theta = problem.theta
+    before = problem.residual(theta)
+    theta += 0.1
+    assert not torch.allclose(problem.residual(theta), before)
+
+
+def test_weights_of_the_module_are_not_those_of_theta(model: Model):
+    problem = SimulationError(model, some_records(model))
+    theta = problem.theta
+    problem.residual(theta)
+    kept = theta.clone()
+    with torch.no_grad():
+        model.lfr.cell.A.mul_(2.0)
+    assert torch.equal(theta, kept)
+    problem.write(theta.float())
+    assert model.lfr.cell.A.dtype == torch.float64
+
+
+def test_an_output_without_weight_is_scored_all_the_same(model: Model):
+    record = measure(model, 30)
+    off = replace(record, y=record.y + model.scaler.y_scale, weight=[0.0, 1.0])
+    problem = SimulationError(model, off)
+    expected = np.sqrt(np.mean(model.scaler.y_scale**2))
+    assert problem.rmse(problem.theta) == pytest.approx(expected, rel=1e-9)
+
+
+def test_start_state_of_the_wrong_length(model: Model):
+    record = replace(some_records(model)[0], start="given", x0=[1.0])
+    with pytest.raises(ValueError, match=r"x0 of 1 entries and the model 2 states"):
+        SimulationError(model, record)
+
+
+def test_nothing_to_fit(model: Model):
+    model.lfr.requires_grad_(False)
+    with pytest.raises(ValueError, match="all parameters of the model are frozen"):
+        SimulationError(model, some_records(model))
+    start = replace(some_records(model)[0], start="estimated")
+    assert len(SimulationError(model, start).theta) == 2
+
+
+def test_rows_of_all_batches_share_the_room_for_them(model: Model, monkeypatch):
+    """Two of four batches fit."""
+    records = some_records(model)
+    problem = SimulationError(model, records)
+    columns = len(problem.linearise(problem.theta)._reduced.kept) + 1
+    monkeypatch.setattr("lfrtorch.jacobian.KEPT_BYTES", 8 * 2 * (60 + 20 + 5) * columns)
+    jacobian = problem.linearise(problem.theta)
+    jacobian.system(1e-2, 1e-12)
+    kept = [part._kept is not None for part in jacobian.parts]
+    assert kept == [True, False, True]
+    d = torch.ones_like(problem.theta)
+    assert_close(jacobian.tangent(d), jacobian.whole() @ d, rtol=0, atol=1e-8)

@@ -134,10 +134,15 @@ def test_all_parameters_frozen():
 
 
 def rows_and_end(linearisation: Linearisation, kept: Tensor) -> list[Tensor]:
-    blocks: list[Tensor] = []
-    end = linearisation.rows(kept, lambda r, t, rows: blocks.append(rows.clone()), start=True)
     R, T = linearisation.u.shape[:2]
-    return [torch.cat([b.flatten(0, 1) for b in blocks]).reshape(R, T, *blocks[0].shape[2:]), end]
+    ny, nx = linearisation.trajectory.y.shape[2], linearisation.state.shape[1]
+    whole = linearisation.state.new_full((R, T, ny, len(kept) + nx), torch.nan)
+
+    def visit(records: slice, time: slice, rows: Tensor):
+        whole[records, time] = rows
+
+    end = linearisation.rows(kept, visit, start=True)
+    return [whole, end]
 
 
 def generic(monkeypatch: pytest.MonkeyPatch):

@@ -294,3 +294,31 @@ def test_estimated_start_of_a_diverging_model_is_not_finite():
     cell, u = random_cell(1, 1, 2, 0, 0, radius=3.0), normal(1, 2000, 1)
     y = torch.zeros_like(u)
     assert not estimated_start(cell, u, y, torch.ones_like(y)).finite
+
+
+def test_estimated_start_of_one_record_does_not_hold_up_the_others():
+    """The first is at rest already: nothing improves there."""
+    cell, u, x0 = random_cell(2, 2, 3, 2, 2, 4), normal(4, 60, 2), normal(4, 3, seed=1)
+    x0[0] = 0.0
+    made = simulate(cell, u, x0)
+    found = estimated_start(cell, u, made.y, torch.ones_like(made.y))
+    assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
+
+
+def test_estimated_start_that_has_faded_before_the_first_sample_that_counts_stays():
+    cell, u = random_cell(1, 1, 2, 0, 0, radius=0.3), normal(1, 100, 1)
+    y = simulate(cell, u, normal(1, 2)).y + 0.1 * normal(1, 100, 1, seed=3)
+    weight = torch.ones_like(y)
+    weight[:, :90] = 0.0
+    assert torch.equal(estimated_start(cell, u, y, weight).x[:, 0], u.new_zeros(1, 2))
+
+
+def test_estimated_start_whose_response_overflows_stays():
+    """The unstable state is not driven, but would be moved by its start."""
+    cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 2000, 1)
+    with torch.no_grad():
+        cell.A.copy_(torch.diag(torch.tensor([0.5, 2.0])))
+        cell.Bu[1] = 0.0
+    y = simulate(cell, u, u.new_zeros(1, 2)).y + 0.1
+    found = estimated_start(cell, u, y, torch.ones_like(y))
+    assert torch.equal(found.x[:, 0], u.new_zeros(1, 2))

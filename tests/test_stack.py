@@ -128,3 +128,23 @@ def test_frozen_parameters_stay_frozen():
     for problem, jacobian in zip(stack.problems, stack.linearise([0, 1, 2], thetas), strict=True):
         gradient = jacobian.system(1e-2, 1e-12)[1]
         assert len(gradient) == len(problem.theta) == models[0].parameters - 4
+
+
+def test_problems_that_are_no_stack():
+    models = some_models("network", 2)
+    records = some_records(models[0])
+    one = SimulationError(models[0], records)
+    with pytest.raises(ValueError, match="two problems share one model"):
+        Stack([one, SimulationError(models[0], records)])
+    with pytest.raises(ValueError, match="differ in records, scaling or free parameters"):
+        Stack([one, SimulationError(models[1], records[:2])])
+
+
+def test_start_states_that_are_solved_for():
+    models = some_models("network", 2)
+    records = [record for record in some_records(models[0]) if record.start == "estimated"]
+    stack = Stack([SimulationError(m, records, solved_starts=True) for m in models])
+    alone = [SimulationError(m, records, solved_starts=True) for m in some_models("network", 2)]
+    thetas = [problem.theta for problem in alone]
+    for mine, problem, theta in zip(stack.residuals([0, 1], thetas), alone, thetas, strict=True):
+        assert_close(mine, problem.residual(theta), rtol=0, atol=1e-10)
