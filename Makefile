@@ -28,8 +28,8 @@ check: $(READY)  ## format, lint, types, import order
 	@$(BIN)/basedpyright
 	@$(BIN)/lint-imports --no-logo
 
-bench: $(READY)  ## time one Levenberg-Marquardt iteration
-	@$(BIN)/python benchmarks/lm_iteration.py $(ARGS)
+bench: $(READY)  ## costs against what is required (PEERS=DIR, ARGS=--quick)
+	@$(BIN)/python benchmarks/engine.py $(if $(PEERS),--peers "$(PEERS)") $(ARGS)
 
 clean:  ## remove caches and builds; .venv and runs stay
 	@rm -rf build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache

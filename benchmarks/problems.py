@@ -1,0 +1,135 @@
+"""The problems that are timed: records and a model to start from.
+
+Two of them are prepared once, in a folder that all processes read: the Bouc-Wen case, and five
+periods of a parallel Wiener-Hammerstein system of the benchmark's size.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import signal
+
+import lfrtorch
+from lfrtorch import LinearModel, Model, Record
+from lfrtorch.residual import SimulationError
+
+Array = NDArray[np.float64]
+
+SIZES = {
+    "boucwen": {"nx": 3, "nz": 2, "nw": 1, "nn": 15},
+    "parallel_wh": {"nx": 12, "nz": 2, "nw": 2, "nn": 15},
+}
+PEER_FILES = {"boucwen": "boucwen.npz", "parallel_wh": "pwh_synth.npz"}
+RATES = {"boucwen": 750.0, "parallel_wh": 78e3}
+PARALLEL_WH = {"records": 5, "samples": 16384, "lines": 4095}
+BLA_ITERATIONS = 3
+"""Of the linear start: its quality is of no concern here, and the peer's has as many."""
+RIDGE = 1e-3
+"""As in conf/bench/boucwen.yaml."""
+RADIUS = 0.9
+"""Of the poles of a synthetic system."""
+
+
+def prepare(folder: Path, peers: Path | None) -> dict[str, int]:
+    """Write the problems to the folder, with the peers' records where there are any."""
+    parameters = {}
+    for name, sizes in SIZES.items():
+        u, y = _signals(name, peers)
+        np.savez(folder / f"{name}.npz", u=u, y=y)
+        bla = lfrtorch.estimate_bla(
+            records(folder, name), sizes["nx"], offset=False, max_iter=BLA_ITERATIONS
+        )
+        rest = {key: size for key, size in sizes.items() if key != "nx"}
+        model = lfrtorch.initialise(bla, records(folder, name), **rest)
+        model.save(folder / name)
+        parameters[name] = model.parameters
+    return parameters
+
+
+def records(
+    folder: Path, name: str, *, start: Literal["periodic", "zero"] = "periodic", periods: int = 1
+) -> list[Record]:
+    """The records of a problem, each repeated over some periods."""
+    with np.load(folder / f"{name}.npz") as file:
+        return [
+            Record(np.tile(u, periods), np.tile(y, periods), fs=RATES[name], start=start)
+            for u, y in zip(file["u"], file["y"], strict=True)
+        ]
+
+
+def problem(folder: Path, name: str, ridge: float = RIDGE, **options: object) -> SimulationError:
+    """The residual that a fit of the problem minimises."""
+    model = lfrtorch.load(folder / name)
+    return SimulationError(model, records(folder, name, **options), ridge=ridge)
+
+
+def synthetic(
+    *, samples: int = 8192, count: int = 1, nx: int = 4, nz: int = 2, nw: int = 1, nn: int = 15
+) -> tuple[Model, SimulationError]:
+    """A fit of any size: a random linear system with a quadratic output, records from rest."""
+    rng = np.random.default_rng(0)
+    rotation = np.linalg.qr(rng.standard_normal((nx, nx)))[0]
+    u = rng.standard_normal((count, samples))
+    system = (RADIUS * rotation, rng.standard_normal((nx, 1)), np.ones((1, nx)), np.zeros((1, 1)))
+    data = []
+    for u_of_record in u:
+        linear = signal.dlsim((*system, 1.0), u_of_record)[1][:, 0] / np.sqrt(nx)
+        data.append(Record(u_of_record, linear + 0.1 * linear**2))
+    A, B, C, D = system
+    none = np.zeros(1)
+    channels = data[0].inputs, data[0].outputs
+    bla = LinearModel(A, B, C / np.sqrt(nx), D, 1.0, none, none, *channels)
+    model = lfrtorch.initialise(bla, data, nz=nz, nw=nw, nn=nn)
+    return model, SimulationError(model, data)
+
+
+def plain_gradient(problem: SimulationError, theta: torch.Tensor) -> torch.Tensor:
+    """The gradient (P,) of the mean square by autograd through a loop in Python, from rest."""
+    problem.write(theta)
+    cell, (batch,) = problem.model.lfr.cell, problem.batches
+    x, outputs = batch.u.new_zeros(len(batch.u), cell.nx), []
+    for u in batch.u.unbind(1):
+        y, x = cell(u, x)
+        outputs.append(y)
+    errors = torch.stack(outputs, dim=1) - batch.y
+    gradients = torch.autograd.grad(errors.square().mean(), list(cell.parameters()))
+    return torch.cat([gradient.flatten() for gradient in gradients])
+
+
+def _signals(name: str, peers: Path | None) -> tuple[Array, Array]:
+    """Inputs and outputs (R, T)."""
+    if peers is not None:
+        with np.load(peers / PEER_FILES[name]) as file:
+            if name == "boucwen":
+                return file["u_train"][None], file["y_train"][None]
+            return file["u_train_R"], file["y_train_R"]
+    if name == "boucwen":
+        (record,) = lfrtorch.datasets.boucwen.load().train
+        return record.u.T, record.y.T
+    pairs = [_parallel_wh(np.random.default_rng(seed)) for seed in range(PARALLEL_WH["records"])]
+    u, y = (np.stack(signals) for signals in zip(*pairs, strict=True))
+    return u, y
+
+
+def _parallel_wh(rng: np.random.Generator) -> tuple[Array, Array]:
+    """One period in steady state of two branches filter - static map - filter, order 12."""
+    T, lines = PARALLEL_WH["samples"], np.arange(1, PARALLEL_WH["lines"] + 1)
+    spectrum = np.zeros(T // 2 + 1, dtype=complex)
+    spectrum[lines] = np.exp(2j * np.pi * rng.random(len(lines)))
+    u = np.fft.irfft(spectrum, T)
+    u /= u.std()
+    branches = (
+        (signal.butter(3, 0.25), lambda v: np.tanh(1.2 * v), signal.cheby1(3, 0.5, 0.3)),
+        (signal.cheby2(3, 30, 0.35), lambda v: v / (1.0 + 0.1 * v**2), signal.butter(3, 0.2)),
+    )
+    settled = np.tile(u, 3)
+    y = sum(
+        signal.lfilter(*behind, static(signal.lfilter(*ahead, settled)))
+        for ahead, static, behind in branches
+    )
+    return u, y[-T:]
