@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lfrtorch.cell import LFRCell
@@ -37,38 +38,61 @@ ROUNDING = 1e-10
 
 
 @torch.no_grad()
-def reduction(cell: LFRCell, start: Tensor, *, coordinates: bool = True) -> Reduction:
+def reduction(
+    cell: LFRCell,
+    start: Tensor,
+    *,
+    coordinates: bool = True,
+    before: Reduction | None = None,
+) -> Reduction:
     """Which columns of the Jacobian of the free parameters to compute.
 
     Args:
         cell: the model.
         start: start states (S, nx) that are parameters, too; their columns come last and are kept.
         coordinates: whether those of x are free: no start state is given in them.
+        before: of the same cell with weights close by: its columns are taken where they still do.
     """
-    G = _directions(cell, start)[:, 0 if coordinates else cell.nx**2 :]
+    G = _directions(cell, start)[:, 0 if coordinates else cell.nx**2 :].double().cpu().numpy()
     free, lti = [], 0
     for name, p in cell.named_parameters():
-        free += [p.requires_grad] * p.numel()
+        free.append((p.numel(), p.requires_grad))
         lti += 0 if name.startswith("static.") or not p.requires_grad else p.numel()
-    free = torch.tensor([*free, *[True] * start.numel()], device=G.device)
-    G, fixed = G[free].double().cpu().numpy(), G[~free].double().cpu().numpy()
     size = np.linalg.norm(G)
-    if not np.isfinite(G).all():
-        G, size = np.zeros((len(G), 0)), 0.0
-    elif len(fixed) and G.shape[1]:  # directions that move no fixed parameter
-        G = G @ scipy.linalg.null_space(fixed)
+    if not np.isfinite(size):
+        return everything(start.new_zeros(len(G)))
+    if not all(is_free for _, is_free in free):
+        mask = np.repeat([is_free for _, is_free in free], [count for count, _ in free])
+        mask = np.concatenate([mask, np.ones(start.numel(), dtype=bool)])
+        # Directions that move no fixed parameter.
+        G = G[mask] @ scipy.linalg.null_space(G[~mask]) if G.shape[1] else G[mask]
+    elif before is not None and len(before.kept) + G.shape[1] == len(G):
+        left_out = np.setdiff1d(np.arange(len(G)), before.kept.cpu().numpy(), assume_unique=True)
+        found = _expanded(G, left_out, cell.A)
+        if found is not None:
+            return found
     # Columns of the linear part only: those of the static map are computed together.
     Q, R, pivots = scipy.linalg.qr(G[:lti].T, mode="economic", pivoting=True)
     diagonal = np.abs(np.diag(R))
     least = max(DEPENDENT * diagonal.max(initial=0.0), ROUNDING * size)
     rank = int((diagonal > least).sum())
-    left_out, G = pivots[:rank], G @ Q[:, :rank]
+    found = _expanded(G @ Q[:, :rank], pivots[:rank], cell.A)
+    return everything(start.new_zeros(len(G))) if found is None else found
+
+
+def _expanded(G: NDArray, left_out: NDArray, like: Tensor) -> Reduction | None:
+    """The reduction without those columns; None where it would blow up rounding errors."""
     kept = np.delete(np.arange(len(G)), left_out)
     expand = np.zeros((len(kept), len(G)))
     expand[np.arange(len(kept)), kept] = 1.0
     # J G = 0, so that J[:, left_out] = -J[:, kept] G[kept] G[left_out]⁻¹.
-    expand[:, left_out] = -np.linalg.solve(G[left_out].T, G[kept].T).T
-    return Reduction(torch.as_tensor(kept).to(cell.A.device), torch.as_tensor(expand).to(cell.A))
+    try:
+        expand[:, left_out] = -np.linalg.solve(G[left_out].T, G[kept].T).T
+    except np.linalg.LinAlgError:
+        return None
+    if not np.abs(expand).max(initial=0.0) < 1.0 / DEPENDENT:
+        return None
+    return Reduction(torch.as_tensor(kept).to(like.device), torch.as_tensor(expand).to(like))
 
 
 def everything(theta: Tensor) -> Reduction:

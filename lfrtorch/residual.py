@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.utils import vector_to_parameters
 
 from lfrtorch.batch import batches_of
 from lfrtorch.checks import number
@@ -74,6 +73,7 @@ class SimulationError:
         self._starts = self._first_starts(sum(record.start == "estimated" for record in data))
         self._start = self.theta
         self._ridge = self._ridge_of(ridge)
+        self._reduced: Reduction | None = None
         self.guesses: list[Tensor | None] = [None] * len(self.batches)
         """States of each batch near those to come."""
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
@@ -96,9 +96,11 @@ class SimulationError:
     def write(self, theta: Tensor) -> None:
         """Put θ (P,) into the module."""
         theta = theta.detach().to(self._starts, copy=True)  # the module's weights are its own
-        own, starts = theta.split([len(theta) - self._starts.numel(), self._starts.numel()])
-        vector_to_parameters(own, self._parameters)
-        self._starts = starts.reshape(self._starts.shape)
+        sizes = [p.numel() for p in self._parameters]
+        *own, starts = theta.split([*sizes, self._starts.numel()])
+        for parameter, part in zip(self._parameters, own, strict=True):
+            parameter.data = part.view(parameter.shape)
+        self._starts = starts.view(self._starts.shape)
 
     def cost(self, residual: Tensor) -> float:
         """|r|² of all processes."""
@@ -134,9 +136,9 @@ class SimulationError:
         if reduce:
             held = any(batch.x0 is not None for batch in self.batches)
             held = bool(self.ranks.sum(self._start.new_tensor(float(held))))
-            reduced = reduction(cell, self._starts, coordinates=not held)
+            reduced = reduction(cell, self._starts, coordinates=not held, before=self._reduced)
             # A tie between columns is broken by rounding errors, on each process by its own.
-            reduced = Reduction(*map(self.ranks.first, reduced))
+            reduced = self._reduced = Reduction(*map(self.ranks.first, reduced))
         else:
             reduced = everything(theta)
         penalty = theta - self._start

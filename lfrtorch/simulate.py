@@ -111,12 +111,13 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
     tolerance = max(PERIODIC_TOLERANCE, PERIODIC_ROUNDING * torch.finfo(u.dtype).eps)
     trajectory = simulate(cell, u, x0)
     lost = torch.zeros(len(u), dtype=torch.bool, device=u.device)  # diverged, or unstable
-    settled = lost
+    settled, size = lost, u.new_ones(len(u))
     for passes in range(MAX_PERIODS + 1):
-        x = trajectory.x
-        end, size = x[:, -1].clone(), x.abs().amax(dim=(1, 2))
-        lost |= ~torch.isfinite(size)
-        settled = (end - x0).abs().amax(dim=1) <= tolerance * (1.0 + size)
+        end = trajectory.x[:, -1].clone()
+        if passes == 0:
+            size = 1.0 + trajectory.x.abs().amax(dim=(1, 2))  # of states that hardly change
+        lost |= ~torch.isfinite(end).all(dim=1)
+        settled = (end - x0).abs().amax(dim=1) <= tolerance * size
         if (settled | lost).all() or passes == MAX_PERIODS:
             break
         if passes < SETTLING_PERIODS:
@@ -308,24 +309,23 @@ def _activate(activation, h):
             h[n] = t if h[n] == h[n] else h[n]
 
 
-_POWERS = 2.0 ** -np.arange(1024)
+_STEPS = 32  # of an octave
+_POWERS = 2.0 ** (-np.arange(_STEPS * 1024) / _STEPS)
 _LOWEST = -700.0
-_LOG2_E = 1.0 / math.log(2.0)
-_LN_2_HIGH, _LN_2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # sum: ln 2
-_C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10, _C11, _C12, _C13 = (
-    1.0 / math.factorial(n) for n in range(14)
-)
+_PER_STEP = _STEPS / math.log(2.0)
+_STEP_HIGH = 6.93147180369123816490e-01 / _STEPS  # sum: ln 2 / 32; products with integers are exact
+_STEP_LOW = 1.90821492927058770002e-10 / _STEPS
+_C2, _C3, _C4, _C5, _C6 = (1.0 / math.factorial(n) for n in range(2, 7))
 
 
 @njit(nogil=True, inline="always")
 def _exp(v):
-    """exp(v) for v <= 0, to a rounding error of 1: exp(v) = 2^-k exp(r) with |r| <= ln(2) / 2.
+    """exp(v) for v <= 0, to rounding: exp(v) = 2^(-k / 32) exp(r) with |r| <= ln(2) / 64.
 
     Twice as fast as the library's in a loop over neurons, as it has no branch.
     """
     v = v if v > _LOWEST else _LOWEST  # NaN, too: the index must stay in the table
-    k = np.int32(0.5 - v * _LOG2_E)
-    r = v + k * _LN_2_HIGH + k * _LN_2_LOW
-    p = _C9 + r * (_C10 + r * (_C11 + r * (_C12 + r * _C13)))
-    p = _C4 + r * (_C5 + r * (_C6 + r * (_C7 + r * (_C8 + r * p))))
-    return _POWERS[k] * (_C0 + r * (_C1 + r * (_C2 + r * (_C3 + r * p))))
+    k = np.int32(0.5 - v * _PER_STEP)
+    r = v + k * _STEP_HIGH + k * _STEP_LOW
+    p = r * r * (_C2 + r * (_C3 + r * (_C4 + r * (_C5 + r * _C6))))
+    return _POWERS[k] + _POWERS[k] * (r + p)

@@ -52,7 +52,7 @@ def static_slopes(static: nn.Module | None, z: Tensor, weights: Weights) -> Stat
 
 
 _SLOPES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "tanh": lambda v, h: 1.0 - h.square(),
+    "tanh": lambda v, h: h.square().neg_().add_(1.0),
     "sigmoid": lambda v, h: h * (1.0 - h),
     "relu": lambda v, h: (v > 0).to(v.dtype),
     "rbf": lambda v, h: -2.0 * v * h,
@@ -66,7 +66,7 @@ class NetworkSlopes:
     def __init__(self, network: Network, z: Tensor, weights: Weights) -> None:
         self.z = z
         self.Wz, self.Ww = weights["Wz"], weights["Ww"]
-        v = z @ self.Wz.mT + weights["bz"]
+        v = (z @ self.Wz.mT).add_(weights["bz"])
         self.h = ACTIVATIONS[network.activation](v)
         self.slope = _SLOPES[network.activation](v, self.h)  # (R, T, nn)
         nw, (nn, nz) = self.Ww.shape[-2], self.Wz.shape[-2:]
