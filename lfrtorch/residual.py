@@ -11,7 +11,7 @@ from torch import Tensor
 from lfrtorch.batch import batches_of
 from lfrtorch.checks import number
 from lfrtorch.gauge import Reduction, everything, reduction
-from lfrtorch.jacobian import Jacobian, Part
+from lfrtorch.jacobian import Jacobian, Memory, Part
 from lfrtorch.model import Model
 from lfrtorch.ranks import Ranks
 from lfrtorch.records import Record, as_records
@@ -74,6 +74,7 @@ class SimulationError:
         self._start = self.theta
         self._ridge = self._ridge_of(ridge)
         self._reduced: Reduction | None = None
+        self._memory = Memory()
         self.guesses: list[Tensor | None] = [None] * len(self.batches)
         """States of each batch near those to come."""
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
@@ -132,7 +133,7 @@ class SimulationError:
                 x0 = P + cell.nx * x0.unsqueeze(1) + torch.arange(cell.nx)
             periodic = batch.start == "periodic"
             linearisation = Linearisation(cell, batch.u, trajectory, periodic=periodic)
-            parts.append(Part(batch, linearisation, x0))
+            parts.append(Part(batch, linearisation, x0, self._memory))
         if reduce:
             held = any(batch.x0 is not None for batch in self.batches)
             held = bool(self.ranks.sum(self._start.new_tensor(float(held))))

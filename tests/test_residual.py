@@ -326,3 +326,22 @@ def test_rows_of_all_batches_share_the_room_for_them(model: Model, monkeypatch):
     assert kept == [True, False, True]
     d = torch.ones_like(problem.theta)
     assert_close(jacobian.tangent(d), jacobian.whole() @ d, rtol=0, atol=1e-8)
+
+
+def test_two_jacobians_keep_their_own_rows_and_a_third_takes_over_the_room(model: Model):
+    problem = SimulationError(model, some_records(model))
+    first_theta, second_theta = problem.theta, problem.theta + 0.1
+    first, second = problem.linearise(first_theta), problem.linearise(second_theta)
+    for jacobian in (first, second):
+        jacobian.system(1e-2, 1e-12)
+    d = torch.ones_like(first_theta)
+    assert_close(first.tangent(d), first.whole() @ d, rtol=0, atol=1e-8)
+    assert_close(second.tangent(d), second.whole() @ d, rtol=0, atol=1e-8)
+    rows = second.parts[0]._kept
+    assert rows is not None
+    where = rows[0].untyped_storage().data_ptr()
+    del second, jacobian, rows
+    third = problem.linearise(second_theta)
+    third.system(1e-2, 1e-12)
+    assert third.parts[0]._kept is not None
+    assert third.parts[0]._kept[0].untyped_storage().data_ptr() == where
