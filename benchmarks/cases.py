@@ -8,6 +8,7 @@ prints one line of JSON; ``engine.py`` calls it.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import time
@@ -25,6 +26,8 @@ from lfrtorch.levenberg_marquardt import LMState
 from lfrtorch.residual import SimulationError
 from lfrtorch.threads import spread_by_hand
 
+NEARBY = (1.0 + 1e-12 * i for i in itertools.count())
+"""Factors of what is kept from one call to the next where it is the same."""
 ENDLESS = lfrtorch.LevenbergMarquardt(max_iter=10**9, tolerance=0.0)
 REPETITIONS = 15
 RESTART = 4
@@ -85,7 +88,7 @@ def parts(folder: Path, name: str, repetitions: int = REPETITIONS) -> dict:
     residual = state.residual
 
     def simulated_anew() -> None:
-        problem.residual(ahead.clone())
+        problem.residual(ahead * next(NEARBY))
 
     def linearised() -> None:
         problem.residual(state.theta)  # kept from the repetition before
@@ -96,7 +99,9 @@ def parts(folder: Path, name: str, repetitions: int = REPETITIONS) -> dict:
         "linearisation": median(linearised, repetitions),
         "rows and normal equations": median(lambda: jacobian.system(1.0, 1e-12), repetitions),
         "rows and QR": median(lambda: jacobian.system(0.0, 1e-12), repetitions),
-        "Cholesky solution": median(lambda: system.solve(gradient, system.scale), repetitions),
+        "Cholesky solution": median(
+            lambda: system.solve(gradient, system.scale * next(NEARBY)), repetitions
+        ),
         "tangent": median(lambda: jacobian.tangent(gradient), repetitions),
         "adjoint": median(lambda: jacobian.adjoint(residual), repetitions),
     }
@@ -130,8 +135,8 @@ def gradient(folder: Path) -> dict:
         plain = problems.plain_gradient(problem, theta)
         seconds.append(clock() - begin)
     return {
-        "s": median(lambda: periodic.gradient(theta.clone())),
-        "from_rest_s": median(lambda: problem.gradient(theta.clone())),
+        "s": median(lambda: periodic.gradient(theta * next(NEARBY))),
+        "from_rest_s": median(lambda: problem.gradient(theta * next(NEARBY))),
         "python_loop_s": float(np.median(seconds)),
         "difference": float((plain - own).norm() / own.norm()),
     }

@@ -462,9 +462,8 @@ def _emit(
     )  # fmt: skip
     s0 = min(max(first, c0), c1)
     s1 = max(min(first + n_weights, c1), s0)
+    whole = network and s1 - s0 == n_weights  # all weights of the network are this job's
     d_w = np.zeros((nw, n_weights), rows.dtype)
-    for q in range(nw if network else 0):
-        d_w[q, n_weights - nw + q] = 1.0
     # S(k+1) = M(k) X(k) and dy(k) = N(k) X(k) with X = [S; direct terms of w], M = [F Bw] and
     # N = [H Dyw], padded with zeros to whole tiles.
     depth = _TILE * (-(-(nx + nw) // _TILE))
@@ -484,8 +483,10 @@ def _emit(
         for q in range(nw):
             for n in range(len(z_own)):
                 X[nx + q, z_own[n, 0]] = J[k, q, z_own[n, 1]] * v[k, z_own[n, 2]]
-            if network:
-                _by_weight(Ww, slope, h, z, k, q, d_w)
+            if whole:
+                _by_weight(Ww, slope, h, z, k, q, X[nx + q], first - c0)
+            elif network:
+                _by_weight(Ww, slope, h, z, k, q, d_w[q], 0)
                 for c in range(s0, s1):
                     X[nx + q, c - c0] = d_w[q, c - first]
             else:
@@ -522,15 +523,17 @@ def _copy(source, target, column):
 
 
 @njit(nogil=True, inline="always")
-def _by_weight(Ww, slope, h, z, k, q, d_w):
-    """Row q of what ``NetworkSlopes.by_weight`` computes, at sample k; the ones stand there."""
+def _by_weight(Ww, slope, h, z, k, q, d_w, first):
+    """Row q of what ``NetworkSlopes.by_weight`` computes, at sample k, from a column on."""
     nn, nz = h.shape[1], z.shape[1]
+    bz = first + nn * nz
     for n in range(nn):
         a = Ww[q, n] * slope[k, n]
         for j in range(nz):
-            d_w[q, n * nz + j] = a * z[k, j]
-        d_w[q, nn * nz + n] = a
-        d_w[q, nn * (nz + 1 + q) + n] = h[k, n]
+            d_w[first + n * nz + j] = a * z[k, j]
+        d_w[bz + n] = a
+        d_w[bz + nn * (1 + q) + n] = h[k, n]
+    d_w[bz + nn * (1 + len(Ww)) + q] = 1.0
 
 
 @njit(nogil=True, inline="always")

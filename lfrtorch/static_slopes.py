@@ -52,7 +52,7 @@ def static_slopes(static: nn.Module | None, z: Tensor, weights: Weights) -> Stat
 
 
 _SLOPES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "tanh": lambda v, h: h.square().neg_().add_(1.0),
+    "tanh": lambda v, h: torch.addcmul(h.new_ones(()), h, h, value=-1.0),
     "sigmoid": lambda v, h: h * (1.0 - h),
     "relu": lambda v, h: (v > 0).to(v.dtype),
     "rbf": lambda v, h: -2.0 * v * h,
