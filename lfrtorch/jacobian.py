@@ -148,6 +148,7 @@ class Part:
         self, batch: Batch, linearisation: Linearisation, x0: Tensor | None, memory: Memory
     ) -> None:
         self.batch, self.linearisation, self.x0, self._memory = batch, linearisation, x0, memory
+        self._rows: Tensor | None = None
         self._kept: tuple[Tensor, Tensor] | None = None
         self.computed: tuple[Tensor, Tensor] | None = None
         """All rows (R, T, ny, P [+ nx] + 1) and the end state's, where another computed them."""
@@ -174,8 +175,10 @@ class Part:
         if computed is not None:
             rows = computed[0]
         else:
-            kind = (R, T, ny, columns)
-            rows = self._memory.take(self, kind, errors) if whole or batch.spectral else None
+            kind = torch.Size((R, T, ny, columns))
+            if (whole or batch.spectral) and (self._rows is None or self._rows.shape != kind):
+                self._rows = self._memory.take(self, kind, errors)
+            rows = self._rows if whole or batch.spectral else None
         # The start state's columns become others in each record's own way.
         factors = [type(total)() for _ in batch.u] if start else [type(total)()]
 

@@ -345,3 +345,11 @@ def test_two_jacobians_keep_their_own_rows_and_a_third_takes_over_the_room(model
     third.system(1e-2, 1e-12)
     assert third.parts[0]._kept is not None
     assert third.parts[0]._kept[0].untyped_storage().data_ptr() == where
+
+
+def test_a_jacobian_asks_for_room_once(model: Model, monkeypatch):
+    problem = SimulationError(model, some_records(model))
+    jacobian = problem.linearise(problem.theta)
+    jacobian.system(1e-2, 1e-12)
+    monkeypatch.setattr("lfrtorch.jacobian.Memory.take", None)
+    jacobian.system(1e-15, 1e-12)
