@@ -7,6 +7,7 @@ their order, which is how blocks of time, threads and processes share the work. 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -107,10 +108,7 @@ class Triangle:
 
     def fold(self, rows: Tensor) -> None:
         """Add rows (m, n)."""
-        pieces = _pieces(rows)
-        parts: list[Tensor] = [rows[:0]] * len(pieces)
-        spread(_triangularise, len(pieces), pieces, parts)
-        self._parts += parts
+        self._parts += _of_pieces(_triangularise, rows)
         if sum(map(len, self._parts)) > MERGED * rows.shape[1]:
             self._parts = [self.R]
 
@@ -138,10 +136,7 @@ class Gram:
 
     def fold(self, rows: Tensor) -> None:
         """Add rows (m, n)."""
-        pieces = _pieces(rows)
-        parts: list[Tensor] = [rows[:0]] * len(pieces)
-        spread(_square, len(pieces), pieces, parts)
-        self.add(*parts)
+        self.add(*_of_pieces(_square, rows))
 
     def absorb(self, other: Any, mix: Tensor) -> None:
         """Add the rows of another, their columns mixed by (its n, n)."""
@@ -161,15 +156,20 @@ class Gram:
         self._parts = [torch.stack([*self._parts, *parts]).sum(0)]
 
 
-def _pieces(rows: Tensor) -> tuple[Tensor, ...]:
-    """The rows in as many pieces as there are threads for them."""
+def _of_pieces(
+    kernel: Callable[[int, Sequence[Tensor], list[Tensor]], None], rows: Tensor
+) -> list[Tensor]:
+    """What the kernel makes of the rows, in as many pieces as there are threads for them."""
     threads = workers() if rows.device.type == "cpu" else 1
-    return rows.tensor_split(max(1, min(threads, len(rows) // rows.shape[1])))
+    pieces = rows.tensor_split(max(1, min(threads, len(rows) // rows.shape[1])))
+    parts: list[Tensor] = [rows[:0]] * len(pieces)
+    spread(kernel, len(pieces), pieces, parts)
+    return parts
 
 
-def _triangularise(job: int, pieces: tuple[Tensor, ...], parts: list[Tensor]) -> None:
+def _triangularise(job: int, pieces: Sequence[Tensor], parts: list[Tensor]) -> None:
     parts[job] = torch.linalg.qr(pieces[job], mode="r").R
 
 
-def _square(job: int, pieces: tuple[Tensor, ...], parts: list[Tensor]) -> None:
+def _square(job: int, pieces: Sequence[Tensor], parts: list[Tensor]) -> None:
     parts[job] = pieces[job].mT @ pieces[job]

@@ -100,11 +100,12 @@ def _flush(s):
     """A fading state would reach denormal numbers, a hundred times slower, and stay there."""
     for i in range(s.shape[0]):
         for c in range(s.shape[1]):
-            if abs(s[i, c]) < _NOTHING:
+            if abs(s[i, c]) < NOTHING:
                 s[i, c] = 0.0
 
 
-_NOTHING = 1e-30
+NOTHING = 1e-30
+"""States of unit size that have faded to less are zero."""
 
 
 def scan(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:

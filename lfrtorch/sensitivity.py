@@ -28,6 +28,7 @@ from torch import Tensor
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.recurrence import (
+    NOTHING,
     adjoint_recurrence,
     has_kernels,
     linear_recurrence,
@@ -503,14 +504,14 @@ def _emit(
             # Fading states would reach denormal numbers, a hundred times slower, and stay there.
             for i in range(nx):
                 for c in range(c1 - c0):
-                    if abs(X[i, c]) < _FADED:
+                    if abs(X[i, c]) < NOTHING:
                         X[i, c] = 0.0
     for i in range(nx):
         for c in range(c1 - c0):
             S[i, c0 + c] = X[i, c]
 
 
-_TILE, _FADED = 4, 1e-30
+_TILE = 4
 
 
 # Loops for assignments of slices and masks: the latter take numba seconds to compile.
