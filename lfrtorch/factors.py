@@ -112,9 +112,14 @@ class Triangle:
         if sum(map(len, self._parts)) > MERGED * rows.shape[1]:
             self._parts = [self.R]
 
-    def absorb(self, other: Any, mix: Tensor) -> None:
-        """Add the rows of another, their columns mixed by (its n, n)."""
-        self.fold(other.R @ mix)
+    def absorb(self, other: Any, place: Tensor, width: int, mix: Tensor | None = None) -> None:
+        """Add the rows of another: its columns, first mixed by (m, n), are those at ``place`` (n,)
+        among so many.
+        """
+        R = other.R if mix is None else other.R @ mix
+        wide = R.new_zeros(len(R), width)
+        wide[:, place] = R
+        self.fold(wide)
 
     def combine(self, ranks: Ranks) -> None:
         """Take in the rows of all processes."""
@@ -138,9 +143,14 @@ class Gram:
         """Add rows (m, n)."""
         self.add(*_of_pieces(_square, rows))
 
-    def absorb(self, other: Any, mix: Tensor) -> None:
-        """Add the rows of another, their columns mixed by (its n, n)."""
-        self.add(mix.mT @ other.G @ mix)
+    def absorb(self, other: Any, place: Tensor, width: int, mix: Tensor | None = None) -> None:
+        """Add the rows of another: its columns, first mixed by (m, n), are those at ``place`` (n,)
+        among so many.
+        """
+        if not self._parts:
+            self._parts = [other.G.new_zeros(width, width)]
+        G = other.G if mix is None else mix.mT @ other.G @ mix
+        self._parts[0][place.unsqueeze(1), place] += G
 
     def combine(self, ranks: Ranks) -> None:
         """Take in the rows of all processes."""

@@ -32,6 +32,15 @@ class Reduction(NamedTuple):
     kept: Tensor
     expand: Tensor
 
+    def columns(self, own: Tensor) -> Tensor:
+        """All columns (M, P) from the kept ones (M, K): own @ expand, most of which is identity."""
+        whole = own.new_empty(len(own), self.expand.shape[1])
+        whole[:, self.kept] = own
+        left_out = torch.ones(whole.shape[1], dtype=torch.bool, device=own.device)
+        left_out[self.kept] = False
+        whole[:, left_out] = own @ self.expand[:, left_out]
+        return whole
+
 
 ROUNDING = 1e-10
 """The same relative to all gauge directions: below it none is left but rounding errors."""

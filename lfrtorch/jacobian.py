@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -67,13 +68,13 @@ class Jacobian:
             room -= part.fold(kept, factor, room)  # [J r] in the kept columns
         factor.combine(self._ranks)
         if isinstance(factor, Triangle):
-            R, r = factor.R[:, :-1] @ expand, factor.R[:, -1]
+            R, r = self._reduced.columns(factor.R[:, :-1]), factor.R[:, -1]
             gradient = R.mT @ r
             rows = [R, torch.diag(self._ridge)] if self._penalised else [R]
             system = Orthogonal(torch.cat(rows), truncation)
         else:
             gradient = expand.mT @ factor.G[:-1, -1]
-            G = expand.mT @ factor.G[:-1, :-1] @ expand
+            G = self._reduced.columns(self._reduced.columns(factor.G[:-1, :-1]).mT)
             system = Normal(G + torch.diag(self._ridge.square()), len(kept))
         gradient = gradient + self._ridge.square() * self._penalty
         if self._ranks.world == 1:
@@ -131,6 +132,18 @@ class Memory:
         self._free.setdefault(buffer.numel(), []).append(buffer)
 
 
+class _Kept(NamedTuple):
+    """Weighted rows, where their columns stand among the kept ones, and what mixes them before.
+
+    Shape:
+        rows: (R, m ny, C), places: (R, n), mix: (R, C, n) or none for n = C.
+    """
+
+    rows: Tensor
+    places: Tensor
+    mix: Tensor | None
+
+
 class Part:
     """The rows of one batch.
 
@@ -149,7 +162,7 @@ class Part:
     ) -> None:
         self.batch, self.linearisation, self.x0, self._memory = batch, linearisation, x0, memory
         self._rows: Tensor | None = None
-        self._kept: tuple[Tensor, Tensor] | None = None
+        self._kept: _Kept | None = None
         self.computed: tuple[Tensor, Tensor] | None = None
         """All rows (R, T, ny, P [+ nx] + 1) and the end state's, where another computed them."""
 
@@ -203,28 +216,35 @@ class Part:
             end = computed[1]
         else:
             end = linearisation.rows(own, visit, start=start, spare=1, out=rows)
-        # What the columns are made of: (R, columns, kept and the residual).
-        mix = end.new_zeros(R, columns, len(kept) + 1)
-        mix[:, :K, :K] = torch.eye(K).to(end)
-        mix[:, -1, -1] = 1.0
+        # In periodic steady state the start's columns go over into the others, which then stand at
+        # these places among the kept ones; estimated starts have places of their own.
+        width = len(kept) + 1
+        places = torch.arange(K, device=end.device).expand(R, K)
+        mix = None
         if linearisation.periodic:
-            mix[:, K:-1, :K] = closed(end[:, :, K:], end[:, :, :K])
+            identity = torch.eye(K).to(end).expand(R, K, K)
+            mix = torch.cat([identity, closed(end[:, :, K:], end[:, :, :K])], dim=1)
         elif self.x0 is not None:
-            for r, own_columns in enumerate(self.x0 - linearisation.parameters + K):
-                mix[r, K:-1, own_columns] = torch.eye(nx).to(end)
-        for factor, of_record in zip(factors, mix, strict=start):
-            total.absorb(factor, of_record)
+            own_places = self.x0.to(end.device) - linearisation.parameters + K
+            places = torch.cat([places, own_places], dim=1)
+        last = places.new_full((R, 1), width - 1)
+        for r, factor in enumerate(factors):
+            with_residual = None if mix is None else torch.block_diag(mix[r], end.new_ones(1, 1))
+            total.absorb(factor, torch.cat([places, last], dim=1)[r], width, with_residual)
         if whole and rows is not None and not batch.spectral:
-            self._kept = rows[..., :-1].flatten(1, 2), mix[:, :-1, :-1]
+            self._kept = _Kept(rows[..., :-1].flatten(1, 2), places, mix)
             return rows.numel() * rows.element_size()
         return 0
 
     def tangent(self, d_theta: Tensor, reduced: Tensor) -> Tensor:
         """Weighted changes (R, m, ny) of the outputs with θ (P,), or its kept columns (K,)."""
         if self._kept is not None:
-            rows, mix = self._kept
+            rows, places, mix = self._kept
+            by_column = reduced[places]
+            if mix is not None:
+                by_column = (mix @ by_column.unsqueeze(-1)).squeeze(-1)
             d_y = rows.new_empty(rows.shape[:2])
-            spread(_product, len(rows), rows, mix @ reduced, d_y)
+            spread(_product, len(rows), rows, by_column, d_y)
             return d_y.reshape(self.batch.residual_shape)
         linearisation = self.linearisation
         d_x0 = None if self.x0 is None else d_theta[self.x0]
@@ -234,10 +254,12 @@ class Part:
     def adjoint(self, residual: Tensor, gradient: Tensor, reduced: Tensor) -> None:
         """Add Jᵀ residual (R, m, ny) to the one by θ (P,), or by its kept columns (K,)."""
         if self._kept is not None:
-            rows, mix = self._kept
+            rows, places, mix = self._kept
             by_column = rows.new_empty(len(rows), rows.shape[2])
             spread(_product, len(rows), rows.mT, residual.reshape(len(rows), -1), by_column)
-            reduced += (mix.mT @ by_column.unsqueeze(-1)).sum(0).squeeze(-1)
+            if mix is not None:
+                by_column = (mix.mT @ by_column.unsqueeze(-1)).squeeze(-1)
+            reduced.index_add_(0, places.flatten(), by_column.flatten())
             return
         adjoint = self.linearisation.adjoint(self.batch.unweigh(residual))
         gradient[: self.linearisation.parameters] += adjoint.theta.sum(0)

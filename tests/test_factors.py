@@ -34,13 +34,16 @@ def test_many_small_blocks_do_not_pile_up():
 
 
 @pytest.mark.parametrize("kind", [Triangle, Gram])
-def test_absorbed_rows_have_their_columns_mixed(kind):
-    rows, others, mix = normal(50, 4), normal(60, 6, seed=1), normal(6, 4, seed=2)
+def test_absorbed_rows_have_their_columns_mixed_and_placed(kind):
+    rows, others, mix = normal(50, 4), normal(60, 6, seed=1), normal(6, 3, seed=2)
     total, other = kind(), kind()
     total.fold(rows)
     other.fold(others)
-    total.absorb(other, mix)
-    whole = torch.cat([rows, others @ mix])
+    place = torch.tensor([2, 0, 3])
+    total.absorb(other, place, 4, mix)
+    wide = normal(60, 4) * 0
+    wide[:, place] = others @ mix
+    whole = torch.cat([rows, wide])
     assert_close(squares(total), whole.mT @ whole, rtol=1e-11, atol=1e-10)
 
 
