@@ -18,17 +18,16 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from lfrtorch.cell import LFRCell
+from lfrtorch.emission import emit
+from lfrtorch.layout import Columns, layout
 from lfrtorch.recurrence import (
-    NOTHING,
     adjoint_recurrence,
     has_kernels,
     linear_recurrence,
@@ -58,112 +57,6 @@ class Adjoint(NamedTuple):
     x0: Tensor
 
 
-_EQUATIONS = {
-    "x": {"A": "x", "Bu": "u", "Bw": "w"},
-    "z": {"Cz": "x", "Dzu": "u"},
-    "y": {"Cy": "x", "Dyu": "u", "Dyw": "w"},
-}
-"""What each matrix multiplies, by the equation it stands in, in the order of the parameters."""
-
-
-class Columns(NamedTuple):
-    """Direct terms of some columns.
-
-    Each row (column, row, regressor) of ``x``, ``z``, ``y`` says that the column's parameter
-    multiplies ``v[regressor]`` in that row of the equation. Those of the static map begin at the
-    column ``first``.
-
-    Shape:
-        x, z, y: (entries, 3), static: (kept,), positions among all weights of the map.
-    """
-
-    x: Tensor
-    z: Tensor
-    y: Tensor
-    static: Tensor
-    first: int
-
-
-def layout(cell: LFRCell, *, every: bool = False) -> Layout:
-    """Layout of the free parameters, or of all: the same object for cells that are alike."""
-    models = cell.A.numel() // cell.nx**2
-    parameters = tuple(
-        (name, p.numel() // models, every or p.requires_grad) for name, p in cell.named_parameters()
-    )
-    return _layout(cell.nx, cell.nu, cell.ny, cell.nz, cell.nw, parameters)
-
-
-class Layout:
-    """Where parameters (name, size, whether free) stand: in θ (the free), and in the equations."""
-
-    def __init__(
-        self,
-        nx: int,
-        nu: int,
-        ny: int,
-        nz: int,
-        nw: int,
-        parameters: tuple[tuple[str, int, bool], ...],
-    ) -> None:
-        self.rows = {"x": nx, "z": nz, "y": ny}
-        self.width = nx + nu + nw
-        start, size = {"x": 0, "u": nx, "w": nx + nu}, {"x": nx, "u": nu, "w": nw}
-        places = {
-            name: (e, self.rows[left], start[right], size[right])
-            for e, (left, matrices) in enumerate(_EQUATIONS.items())
-            for name, right in matrices.items()
-        }
-        # For every element of θ: equation (3: static map), row (its position), regressor.
-        table = []
-        self.weights = 0
-        for name, count, free in parameters:
-            if name in places:
-                e, n, first, m = places[name]
-                row = torch.arange(n).repeat_interleave(m)
-                entries = torch.stack(
-                    [torch.full_like(row, e), row, first + torch.arange(m).repeat(n)]
-                )
-            else:
-                position = self.weights + torch.arange(count)
-                entries = torch.stack([torch.full_like(position, 3), position, position])
-                self.weights += count
-            if free:
-                table.append(entries)
-        self.table = torch.cat([torch.zeros(3, 0, dtype=torch.int64), *table], dim=1)
-
-    def columns(self, kept: Tensor) -> Columns:
-        """The direct terms of the kept parameters (K,), positions in θ, ascending."""
-        equation, row, regressor = self.table[:, kept.cpu()]
-        column = torch.arange(len(equation))
-        entries = torch.stack([column, row, regressor], dim=1)
-        x, z, y = (entries[equation == e] for e in range(3))
-        static = row[equation == 3]
-        return Columns(x, z, y, static, len(column) - len(static))
-
-    def matrices(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Changes of [A Bu Bw], [Cz Dzu 0], [Cy Dyu Dyw] and the static map for θ (..., P)."""
-        equation, row, regressor = self.table.to(theta.device)
-        parts = []
-        for e, rows in enumerate(self.rows.values()):
-            own = equation == e
-            matrix = theta.new_zeros(*theta.shape[:-1], rows, self.width)
-            matrix[..., row[own], regressor[own]] = theta[..., own]
-            parts.append(matrix)
-        static = theta.new_zeros(*theta.shape[:-1], self.weights)
-        static[..., row[equation == 3]] = theta[..., equation == 3]
-        return *parts, static
-
-    def vector(self, x: Tensor, z: Tensor, y: Tensor, static: Tensor) -> Tensor:
-        """The entries of such matrices (R, rows, width) that belong to θ: (R, P)."""
-        equation, row, regressor = self.table.to(x.device)
-        theta = x.new_empty(len(x), len(equation))
-        for e, matrix in enumerate((x, z, y)):
-            own = equation == e
-            theta[:, own] = matrix[:, row[own], regressor[own]]
-        theta[:, equation == 3] = static[:, row[equation == 3]]
-        return theta
-
-
 class _Block:
     """The model linearised at neighbouring samples of some records.
 
@@ -180,9 +73,6 @@ class _Block:
     def slopes(self) -> Slopes:
         """x+ = F x, y = H x."""
         return slopes_at(self.weights, self.static.J)
-
-
-_layout = lru_cache(maxsize=64)(Layout)
 
 
 class Linearisation:
@@ -277,8 +167,8 @@ class Linearisation:
                     rows = S.new_empty(*block.v.shape[:2], self._ny, S.shape[-1] + spare)
                 else:
                     rows = out[records, time]
-                emit = self._rows_compiled if compiled else self._rows_generic
-                S = emit(block, columns, S, rows)
+                write = self._rows_compiled if compiled else self._rows_generic
+                S = write(block, columns, S, rows)
                 visit(records, time, rows)
             ends.append(S)
         return torch.cat(ends)
@@ -409,7 +299,7 @@ class Linearisation:
             by_weight = (self._by_weight(block, columns), none, none, none[:1], none)
         tensors = (*W, static.J, block.v, *by_weight, *columns[:3])
         arguments = (*map(to_numpy, tensors), columns.first, chunks, S.numpy(), rows.numpy())
-        spread(_emit, R * chunks, *arguments)
+        spread(emit, R * chunks, *arguments)
         return S
 
 
@@ -441,167 +331,3 @@ def closed(transition: Tensor, end: Tensor) -> Tensor:
     """The start S (R, nx, m) that returns to itself, S = Φ S + end; not finite where none does."""
     identity = torch.eye(end.shape[1]).to(end)
     return torch.linalg.solve_ex(identity - transition, end).result
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _emit(
-    job, A, Bw, Cz, Cy, Dyw, J, v, by_weight, slope, h, Ww, z, x_entries, z_entries, y_entries,
-    first, chunks, S, rows,
-):  # fmt: skip
-    r, chunk = job // chunks, job % chunks
-    B, ny, C = rows.shape[1], rows.shape[2], S.shape[2]
-    c0, c1 = C * chunk // chunks, C * (chunk + 1) // chunks
-    m = min(r, len(A) - 1)  # which model
-    A, Bw, Cz, Cy, Dyw = A[m], Bw[m], Cz[m], Cy[m], Dyw[m]
-    J, v, by_weight, rows, S = J[r], v[r], by_weight[r], rows[r], S[r]
-    slope, h, z, Ww = slope[r], h[r], z[r], Ww[min(m, len(Ww) - 1)]
-    (nx, nw), nn, nz = Bw.shape, h.shape[1], z.shape[1]
-    network = nn > 0
-    n_weights = nn * (nz + 1 + nw) + nw if network else by_weight.shape[2]
-    x_own, z_own, y_own = (
-        _between(x_entries, c0, c1), _between(z_entries, c0, c1), _between(y_entries, c0, c1)
-    )  # fmt: skip
-    s0 = min(max(first, c0), c1)
-    s1 = max(min(first + n_weights, c1), s0)
-    whole = network and s1 - s0 == n_weights  # all weights of the network are this job's
-    d_w = np.zeros((nw, n_weights), rows.dtype)
-    # S(k+1) = M(k) X(k) and dy(k) = N(k) X(k) with X = [S; direct terms of w], M = [F Bw] and
-    # N = [H Dyw], padded with zeros to whole tiles.
-    depth = _TILE * (-(-(nx + nw) // _TILE))
-    M, N = (
-        np.zeros((_TILE * (-(-nx // _TILE)), depth), rows.dtype),
-        np.zeros((ny, depth), rows.dtype),
-    )
-    _copy(Bw, M, nx)
-    _copy(Dyw, N, nx)
-    X, X_next = np.zeros((depth, c1 - c0), rows.dtype), np.zeros((depth, c1 - c0), rows.dtype)
-    for i in range(nx):
-        for c in range(c1 - c0):
-            X[i, c] = S[i, c0 + c]
-    for k in range(B):
-        _add_slope(A, M, J, k, Cz)
-        _add_slope(Cy, N, J, k, Cz)
-        for q in range(nw):
-            for n in range(len(z_own)):
-                X[nx + q, z_own[n, 0]] = J[k, q, z_own[n, 1]] * v[k, z_own[n, 2]]
-            if whole:
-                _by_weight(Ww, slope, h, z, k, q, X[nx + q], first - c0)
-            elif network:
-                _by_weight(Ww, slope, h, z, k, q, d_w[q], 0)
-                for c in range(s0, s1):
-                    X[nx + q, c - c0] = d_w[q, c - first]
-            else:
-                for c in range(s0, s1):
-                    X[nx + q, c - c0] = by_weight[k, q, c - first]
-        _state_rows(M, X, X_next)
-        _output_rows(N, X, rows, k, c0)
-        for n in range(len(x_own)):
-            X_next[x_own[n, 1], x_own[n, 0]] += v[k, x_own[n, 2]]
-        for n in range(len(y_own)):
-            rows[k, y_own[n, 1], c0 + y_own[n, 0]] += v[k, y_own[n, 2]]
-        X, X_next = X_next, X
-        if k % 256 == 0:
-            # Fading states would reach denormal numbers, a hundred times slower, and stay there.
-            for i in range(nx):
-                for c in range(c1 - c0):
-                    if abs(X[i, c]) < NOTHING:
-                        X[i, c] = 0.0
-    for i in range(nx):
-        for c in range(c1 - c0):
-            S[i, c0 + c] = X[i, c]
-
-
-_TILE = 4
-
-
-# Loops for assignments of slices and masks: the latter take numba seconds to compile.
-@njit(nogil=True)
-def _copy(source, target, column):
-    """target[:, column:] = source."""
-    for i in range(source.shape[0]):
-        for j in range(source.shape[1]):
-            target[i, column + j] = source[i, j]
-
-
-@njit(nogil=True, inline="always")
-def _by_weight(Ww, slope, h, z, k, q, d_w, first):
-    """Row q of what ``NetworkSlopes.by_weight`` computes, at sample k, from a column on."""
-    nn, nz = h.shape[1], z.shape[1]
-    bz = first + nn * nz
-    for n in range(nn):
-        a = Ww[q, n] * slope[k, n]
-        for j in range(nz):
-            d_w[first + n * nz + j] = a * z[k, j]
-        d_w[bz + n] = a
-        d_w[bz + nn * (1 + q) + n] = h[k, n]
-    d_w[bz + nn * (1 + len(Ww)) + q] = 1.0
-
-
-@njit(nogil=True, inline="always")
-def _add_slope(constant, M, J, k, Cz):
-    """M[:, :nx] = constant + M[:, nx:] J(k) Cz."""
-    n, nx = constant.shape
-    for i in range(n):
-        for c in range(nx):
-            M[i, c] = constant[i, c]
-        for j in range(len(Cz)):
-            a = M.dtype.type(0)
-            for q in range(J.shape[1]):
-                a += M[i, nx + q] * J[k, q, j]
-            for c in range(nx):
-                M[i, c] += a * Cz[j, c]
-
-
-@njit(nogil=True)
-def _between(entries, c0, c1):
-    """The entries whose column lies between c0 and c1, counted from c0."""
-    own, count = np.empty_like(entries), 0
-    for n in range(len(entries)):
-        if c0 <= entries[n, 0] < c1:
-            own[count, 0] = entries[n, 0] - c0
-            own[count, 1], own[count, 2] = entries[n, 1], entries[n, 2]
-            count += 1
-    return own[:count]
-
-
-@njit(nogil=True, fastmath={"contract"})
-def _state_rows(M, X, out):
-    """out[:len(M)] = M @ X, tile by tile: 16 coefficients stay in registers."""
-    for i in range(0, len(M), 4):
-        ya, yb, yc, yd = out[i], out[i + 1], out[i + 2], out[i + 3]
-        for j in range(0, M.shape[1], 4):
-            a0, a1, a2, a3 = M[i, j], M[i, j + 1], M[i, j + 2], M[i, j + 3]
-            b0, b1, b2, b3 = M[i + 1, j], M[i + 1, j + 1], M[i + 1, j + 2], M[i + 1, j + 3]
-            c0, c1, c2, c3 = M[i + 2, j], M[i + 2, j + 1], M[i + 2, j + 2], M[i + 2, j + 3]
-            d0, d1, d2, d3 = M[i + 3, j], M[i + 3, j + 1], M[i + 3, j + 2], M[i + 3, j + 3]
-            x0, x1, x2, x3 = X[j], X[j + 1], X[j + 2], X[j + 3]
-            if j == 0:
-                for t in range(X.shape[1]):
-                    p, q, r, s = x0[t], x1[t], x2[t], x3[t]
-                    ya[t] = a0 * p + a1 * q + a2 * r + a3 * s
-                    yb[t] = b0 * p + b1 * q + b2 * r + b3 * s
-                    yc[t] = c0 * p + c1 * q + c2 * r + c3 * s
-                    yd[t] = d0 * p + d1 * q + d2 * r + d3 * s
-            else:
-                for t in range(X.shape[1]):
-                    p, q, r, s = x0[t], x1[t], x2[t], x3[t]
-                    ya[t] += a0 * p + a1 * q + a2 * r + a3 * s
-                    yb[t] += b0 * p + b1 * q + b2 * r + b3 * s
-                    yc[t] += c0 * p + c1 * q + c2 * r + c3 * s
-                    yd[t] += d0 * p + d1 * q + d2 * r + d3 * s
-
-
-@njit(nogil=True, fastmath={"contract"})
-def _output_rows(N, X, rows, k, first):
-    """rows[k, :, first:] = N @ X."""
-    for i in range(len(N)):
-        out = rows[k, i]
-        for j in range(0, N.shape[1], 4):
-            a0, a1, a2, a3 = N[i, j], N[i, j + 1], N[i, j + 2], N[i, j + 3]
-            x0, x1, x2, x3 = X[j], X[j + 1], X[j + 2], X[j + 3]
-            if j == 0:
-                for t in range(X.shape[1]):
-                    out[first + t] = a0 * x0[t] + a1 * x1[t] + a2 * x2[t] + a3 * x3[t]
-            else:
-                for t in range(X.shape[1]):
-                    out[first + t] += a0 * x0[t] + a1 * x1[t] + a2 * x2[t] + a3 * x3[t]

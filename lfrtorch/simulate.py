@@ -92,8 +92,8 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
     In machine code the record is passed until its end state meets its start state; where that
     takes more than a few passes, Newton's method on x(T) - x(0) takes over. Elsewhere Newton's
     method over all of time closes the period, too, and passes follow where it fails. A periodic
-    solution that is not stable, so that no simulation would settle to it, counts as diverged: its
-    record has NaN samples.
+    solution that is not stable, so that no simulation would settle to it, counts as diverged (its
+    record has NaN samples), unless the search starts right on it.
 
     Shape:
         u: (R, T, nu), one or more whole periods; guess: (R, nx), start of the search, or
