@@ -67,14 +67,16 @@ class Record:
         name: what tables and messages call it.
         source: where it comes from: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
         inputs, outputs: channel names and units, one a column of ``u`` and ``y``.
+        period: samples of one period of the input, where it repeats; a ``"periodic"`` record holds
+            a whole number of them, one where left out.
 
     Shape:
         u: (T, nu), y: (T, ny), x0: (nx,), weight: () or (ny,),
         line_weight: (T // 2 + 1,) or (T // 2 + 1, ny).
 
     Raises:
-        ValueError: NaN or infinite samples, different lengths, wrong shapes, negative weights, or a
-            ``skip`` that leaves no sample.
+        ValueError: NaN or infinite samples, different lengths, wrong shapes, negative weights, a
+            ``skip`` that leaves no sample, or a period that does not fit.
     """
 
     u: NDArray[np.float64]
@@ -86,6 +88,7 @@ class Record:
     source: str = "file"
     inputs: tuple[Channel, ...] = ()
     outputs: tuple[Channel, ...] = ()
+    period: int | None = None
     x0: NDArray[np.float64] | None = None
     weight: float | NDArray[np.float64] = 1.0
     line_weight: NDArray[np.float64] | None = None
@@ -112,6 +115,7 @@ class Record:
                 f"record '{self.name}': skip={self.skip} leaves no sample of {len(u)}; "
                 "use a smaller skip or a longer record."
             )
+        self._check_period(len(u))
         if (self.start == "given") != (self.x0 is not None):
             raise ValueError(
                 f"record '{self.name}': start is {self.start!r} and x0 is {self.x0}; "
@@ -125,6 +129,20 @@ class Record:
         self._check_weights(len(u), y.shape[1])
         for field, value in (("u", u), ("y", y), ("inputs", inputs), ("outputs", outputs)):
             object.__setattr__(self, field, value)
+
+    def _check_period(self, T: int) -> None:
+        if self.period is None:
+            return
+        integer(f"record '{self.name}': period", self.period, 1)
+        if self.period > T or (self.start == "periodic" and T % self.period):
+            raise ValueError(
+                f"record '{self.name}' has {T} samples and a period of {self.period}; "
+                + (
+                    "a steady-state record holds a whole number of periods: cut it to one."
+                    if self.start == "periodic"
+                    else "it must hold at least one."
+                )
+            )
 
     def _check_weights(self, T: int, ny: int) -> None:
         weight = np.array(self.weight, dtype=np.float64)
@@ -172,15 +190,18 @@ class Record:
     def __getitem__(self, window: slice) -> Record:
         """The part of the record in ``window``: a record from zero state with nothing skipped.
 
+        It keeps its period where it is as long as that.
+
         Raises:
             ValueError: not a slice, or one with a step (it would change the rate).
         """
         if not isinstance(window, slice) or window.step not in (None, 1):
             raise ValueError(f"a record is cut by record[first:last], not by {window!r}.")
+        u, y = self.u[window], self.y[window]
+        period = self.period if self.period is not None and self.period <= len(u) else None
         return replace(
-            self, u=self.u[window], y=self.y[window], start="zero", skip=0, x0=None,
-            line_weight=None,
-        )  # fmt: skip
+            self, u=u, y=y, start="zero", skip=0, period=period, x0=None, line_weight=None
+        )
 
 
 def as_records(records: Record | Sequence[Record]) -> list[Record]:

@@ -223,3 +223,20 @@ def test_line_weights_are_of_whole_periods():
 def test_part_of_a_record_begins_at_zero_state_without_line_weights():
     part = lab(start="periodic", line_weight=np.ones(6), weight=3.0)[2:]
     assert (part.start, part.line_weight, float(part.weight)) == ("zero", None, 3.0)
+
+
+# --- periods --------------------------------------------------------------------------------
+
+
+def test_period_is_kept_by_a_part_that_holds_one():
+    record = lab(start="periodic", period=5)
+    assert record.period == 5
+    assert record[3:8].period == 5
+    assert record[3:7].period is None
+
+
+def test_period_must_fit():
+    refused("has 10 samples and a period of 4; a steady-state", start="periodic", period=4)
+    refused("has 10 samples and a period of 11; it must hold at least one", period=11)
+    refused("record 'lab': period is 0; give a whole number of at least 1", period=0)
+    assert lab(period=4).period == 4
