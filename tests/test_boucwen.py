@@ -9,7 +9,7 @@ from scipy.io import savemat
 from scipy.signal import firwin, freqz, resample
 
 from lfrtorch import metrics
-from lfrtorch.datasets import boucwen
+from lfrtorch.datasets import boucwen, official
 
 PERIOD, RATIO, SWEEP = 8192, 20, 153_000
 FOLDER = "BoucWen/BoucWenFiles/Test signals/Validation signals"
@@ -24,7 +24,7 @@ def difference(a, b):
 def cache(tmp_path, monkeypatch):
     """An empty cache folder, so that no test depends on the user's downloads."""
     folder = tmp_path / "cache"
-    monkeypatch.setattr(boucwen, "_cache", lambda: folder)
+    monkeypatch.setattr(official, "cache", lambda: folder)
     return folder
 
 
@@ -32,7 +32,7 @@ def cache(tmp_path, monkeypatch):
 def simulated():
     """The default data set without official files."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(boucwen, "_cache", lambda: Path("nowhere"))
+        patch.setattr(official, "cache", lambda: Path("nowhere"))
         return boucwen.load()
 
 
@@ -281,20 +281,6 @@ def test_one_test_without_its_files_is_simulated(tmp_path):
         (folder / f"{letter}val_multisine.mat").unlink()
     multisine, sweep = boucwen.load(root=tmp_path, samples=150).tests
     assert (multisine.source, sweep.source) == ("simulated", "official")
-
-
-def test_cache_folder_of_each_system(monkeypatch):
-    monkeypatch.undo()  # the fixture's stand-in
-    monkeypatch.setenv("HOME", "/home/ada")
-    monkeypatch.setenv("USERPROFILE", "/home/ada")
-    monkeypatch.setenv("LOCALAPPDATA", "C:/Users/ada/AppData/Local")
-    for platform, expected in {
-        "linux": "/home/ada/.nonlinear_benchmarks",
-        "darwin": "/home/ada/Library/Application Support/nonlinear_benchmarks",
-        "win32": "C:/Users/ada/AppData/Local/nonlinear_benchmarks",
-    }.items():
-        monkeypatch.setattr(boucwen.sys, "platform", platform)
-        assert boucwen._cache().as_posix() == expected
 
 
 def test_refused_root(tmp_path):

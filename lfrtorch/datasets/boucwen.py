@@ -15,8 +15,6 @@ References:
 
 from __future__ import annotations
 
-import os
-import sys
 from math import ceil, floor, prod
 from numbers import Integral
 from pathlib import Path
@@ -25,11 +23,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy.io import loadmat
 from scipy.signal import firwin, resample
 
 from lfrtorch.checks import integer, number
-from lfrtorch.datasets import Dataset, Published
+from lfrtorch.datasets import Dataset, Published, official
 from lfrtorch.records import Channel, Record
 
 __all__ = ["load", "multisine", "simulate", "sweep"]
@@ -312,21 +309,10 @@ def _record(u: NDArray[np.float64], y: NDArray[np.float64], **kwargs: Any) -> Re
     return Record(u, y, fs=_FS, **channels, **kwargs)
 
 
-def _cache() -> Path:
-    """Where the package nonlinear_benchmarks keeps its downloads."""
-    if sys.platform == "win32":
-        folder = os.environ.get("LOCALAPPDATA", "~/AppData/Local") + "/nonlinear_benchmarks"
-    elif sys.platform == "darwin":
-        folder = "~/Library/Application Support/nonlinear_benchmarks"
-    else:
-        folder = "~/.nonlinear_benchmarks"
-    return Path(os.path.expanduser(folder))
-
-
 def _official_folder(root: str | Path | None) -> Path:
     """Folder of the official test files; below a ``root`` that is given there must be some."""
     if root is None:
-        return _cache() / _FILES
+        return official.cache() / _FILES
     folder = Path(root).expanduser() / _FILES
     if not any(path.is_file() for test in _TESTS for path in _pair(folder, test)):
         raise FileNotFoundError(
@@ -345,7 +331,7 @@ def _read_official(
     folder: Path, test: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Input (N) and output (m) of a test, (samples,) each; ``None`` if neither file is there."""
-    u, y = paths = _pair(folder, test)
+    paths = _pair(folder, test)
     missing = [path for path in paths if not path.is_file()]
     if missing == paths:
         return None
@@ -354,25 +340,6 @@ def _read_official(
             f"'{missing[0]}' is missing although its partner is there; put it back, or remove "
             "both to have the test simulated."
         )
-    return _read_mat(u, _TESTS[test]), _read_mat(y, _TESTS[test])
-
-
-def _read_mat(path: Path, samples: int) -> NDArray[np.float64]:
-    """The signal (samples,) that a .mat file holds under its own name."""
     advice = "download the file again, or remove it and its partner to have the test simulated."
-    try:
-        signal = np.asarray(loadmat(path)[path.stem])
-    except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
-        raise ValueError(
-            f"'{path}' holds no readable '{path.stem}' ({error!r}); {advice}"
-        ) from error
-    if (
-        signal.dtype.kind not in "iuf"
-        or signal.shape not in ((1, samples), (samples, 1))
-        or not np.isfinite(signal).all()
-    ):
-        raise ValueError(
-            f"'{path}': '{path.stem}' has shape {signal.shape} and type {signal.dtype}; expected "
-            f"(1, {samples}) and real numbers without NaN; {advice}"
-        )
-    return signal.ravel().astype(np.float64)
+    (u,), (y,) = (official.read_mat(path, [path.stem], _TESTS[test], advice) for path in paths)
+    return u, y
