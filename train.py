@@ -201,7 +201,9 @@ def figures(result: lfrtorch.FitResult, bla: lfrtorch.LinearModel, dataset: Data
     drawn = {}
     for record in dataset.tests:
         y_lti, y_hat = bla.simulate(record), model.simulate(record)
-        draw = plots.spectrum if record.start == "periodic" else plots.response
+        # Periods with a skip window are no whole periods: their spectrum would leak.
+        whole = record.start == "periodic" and not record.skip
+        draw = plots.spectrum if whole else plots.response
         drawn[record.name] = draw(record, y_lti, y_hat)
     signals = model.signals(dataset.train[0])
     drawn["static_map"] = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
