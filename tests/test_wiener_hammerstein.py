@@ -1,0 +1,85 @@
+"""Wiener-Hammerstein benchmark of 2009: the official split, and the file."""
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from lfrtorch.datasets import wiener_hammerstein
+
+FILE = "WienerHammerBenchMark/WienerHammerBenchMark.mat"
+SAMPLES = 188_000
+
+
+@pytest.fixture
+def numbered(tmp_path):
+    """Root of a file of the official layout whose samples are their numbers, counted from 1."""
+    path = tmp_path / FILE
+    path.parent.mkdir()
+    number = np.arange(1.0, SAMPLES + 1)[:, None]
+    savemat(path, {"uBenchMark": number, "yBenchMark": -number, "fs": 51200.0})
+    return tmp_path
+
+
+def scored(record):
+    """First and last scored sample."""
+    return int(record.u[record.skip, 0]), int(record.u[-1, 0])
+
+
+def test_official_split(numbered):
+    data = wiener_hammerstein.load(root=numbered)
+    (train,), (validation,), (test,) = data.train, data.validation, data.tests
+    assert [r.name for r in (train, validation, test)] == ["train", "validation", "test"]
+    assert scored(train) == (5001, 80_000)
+    assert scored(validation) == (80_001, 100_000)
+    assert scored(test) == (101_001, 188_000)
+    assert [r.samples for r in (train, validation, test)] == [80_000, 21_000, 88_000]
+    for record in (train, validation, test):
+        assert np.array_equal(record.y, -record.u)
+        assert (record.fs, record.start, record.source) == (51200.0, "zero", "official")
+        assert [str(c) for c in (*record.inputs, *record.outputs)] == ["u (V)", "y (V)"]
+    assert (data.name, data.noise_rms) == ("wiener_hammerstein", None)
+    assert {p.label: p.scores["test"] for p in data.published}["SUBNET"] == 0.241e-3
+
+
+def test_the_rule_of_the_validation_part(numbered):
+    data = wiener_hammerstein.load(root=str(numbered), validation=0.5, skip=0)
+    assert scored(data.train[0]) == (1, 50_000)
+    assert scored(data.validation[0]) == (50_001, 100_000)
+    assert scored(data.tests[0]) == (101_001, 188_000)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"validation": 0}, "data.validation is 0"),
+        ({"validation": 1.0}, "leaves 0 of the 100000"),
+        ({"validation": 0.95}, "leaves 5000 of the 100000 .* needs 6001"),
+        ({"skip": -1}, "data.skip is -1"),
+        ({"skip": 80_000}, "data.validation is 0.2, which leaves 80000"),
+    ],
+)
+def test_refused_arguments(arguments, match):
+    with pytest.raises(ValueError, match=match):
+        wiener_hammerstein.load(**arguments)
+
+
+def test_a_missing_file_is_one_message(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no 'WienerHammerBenchMark/Wiener.*data.root=DIR"):
+        wiener_hammerstein.load(root=tmp_path)
+
+
+def test_a_file_of_another_length_is_refused(numbered):
+    savemat(numbered / FILE, {"uBenchMark": np.zeros((9, 1)), "yBenchMark": np.zeros((9, 1))})
+    with pytest.raises(ValueError, match=r"'uBenchMark' has shape \(9, 1\)"):
+        wiener_hammerstein.load(root=numbered)
+
+
+@pytest.mark.data
+def test_official_file(benchmark_root):
+    data = wiener_hammerstein.load(root=benchmark_root)
+    (train,), (test,) = data.train, data.tests
+    assert 1e3 * np.std(test.y) == pytest.approx(239.1, abs=0.1)
+    # What is skipped of the training part is rest but for an old response, and the input follows.
+    assert np.std(train.u[100:4990]) < 5e-4
+    assert np.std(train.y[100:5000]) < 5e-4
+    assert np.std(train.u[5000:5200]) > 0.5
