@@ -263,6 +263,8 @@ def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, t
         (["+bench=boucwen", "bla.coordinates=polar"], "coordinates is 'polar'"),
         (["+bench=boucwen", "data.root=/nowhere"], "/nowhere"),
         (["+bench=boucwen", "data.samples=ten"], "samples"),
+        (["+bench=silverbox", "data.root=/nowhere"], "there is no 'Silverbox/"),
+        (["+bench=parwh", "data.levels=[200]"], "data.levels is [200]; give one or more of 100"),
         (["+bench=boucwen", "init_from=/nowhere"], "'/nowhere' is not a checkpoint"),
         (["+bench=boucwen", "ridge=-1"], "ridge is -1"),
         (["+bench=boucwen", "ridge=abc"], "ridge is abc"),

@@ -2,6 +2,6 @@
 
 from lfrtorch.datasets.dataset import Dataset, Published  # first: the others import it from here
 
-from lfrtorch.datasets import boucwen, files, silverbox, wiener_hammerstein  # isort: skip
+from lfrtorch.datasets import boucwen, files, parwh, silverbox, wiener_hammerstein  # isort: skip
 
-__all__ = ["Dataset", "Published", "boucwen", "files", "silverbox", "wiener_hammerstein"]
+__all__ = ["Dataset", "Published", "boucwen", "files", "parwh", "silverbox", "wiener_hammerstein"]
