@@ -14,6 +14,7 @@ from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.lfr import LFR
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
+from lfrtorch.multisine import multisine
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Channel, Record, Scaler
 from lfrtorch.trainer import FitResult, fit
@@ -39,6 +40,7 @@ __all__ = [
     "fit",
     "initialise",
     "load",
+    "multisine",
     "nrmse",
     "rmse",
 ]
