@@ -9,6 +9,7 @@ from lfrtorch import datasets, distributed
 from lfrtorch.adam import Adam
 from lfrtorch.bla import LinearModel, estimate_bla
 from lfrtorch.cell import LFRCell
+from lfrtorch.frf import FRF, estimate_frf
 from lfrtorch.initialise import initialise
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.lfr import LFR
@@ -22,6 +23,7 @@ from lfrtorch.trainer import FitResult, fit
 __version__ = version("lfrtorch")
 
 __all__ = [
+    "FRF",
     "LFR",
     "Adam",
     "Channel",
@@ -37,6 +39,7 @@ __all__ = [
     "datasets",
     "distributed",
     "estimate_bla",
+    "estimate_frf",
     "fit",
     "initialise",
     "load",
