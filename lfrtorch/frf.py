@@ -16,6 +16,7 @@ from lfrtorch.regression import Complex, Regression, covariance, outer, regress
 from lfrtorch.spectra import (
     Array,
     Lines,
+    Removal,
     Spectra,
     excited_lines,
     given_lines,
@@ -188,6 +189,7 @@ def estimate_frf(
     band: tuple[float, float] | None = None,
     order: int = 2,
     degrees_of_freedom: int | None = None,
+    transient: bool = False,
 ) -> FRF:
     """Frequency response of the best linear approximation, with the variances the data allow.
 
@@ -214,10 +216,12 @@ def estimate_frf(
             ``start="periodic"`` (of one period, where it names none).
         method: see above.
         lines: DFT lines of the period (or, for local polynomials, of the record), 0 < line < N / 2;
-            by default the lines that are found to be excited.
+            by default those that are found to be excited. The fast method needs all of these.
         band: lowest and highest frequency in Hz; all lines by default.
         order: of the local polynomials.
         degrees_of_freedom: that a window of local polynomials leaves at least; ny + 4 by default.
+        transient: whether the transient of periodic records is removed, by local polynomials at
+            the lines between those of the period. It takes two periods, and adds to the noise.
 
     Shape:
         lines: (F,).
@@ -245,12 +249,21 @@ def estimate_frf(
     if method == "auto":
         periodic = all(record.period or record.start == "periodic" for record in data)
         method = "robust" if periodic else "local_polynomial"
+    freedom = degrees_of_freedom or len(data[0].outputs) + SPARE_FREEDOM
     if method == "local_polynomial":
-        freedom = degrees_of_freedom or len(data[0].outputs) + SPARE_FREEDOM
         return _local_polynomial(data, lines, band, order, freedom)
-    spectra = spectra_of_periods(data)
+    spectra = spectra_of_periods(data, Removal(order, freedom) if transient else None)
     chosen = in_band(excited_lines(spectra, data, lines), spectra.resolution, band)
-    return (_robust if method == "robust" else _fast)(spectra, data, chosen)
+    frf = (_robust if method == "robust" else _fast)(spectra, data, chosen)
+    at_once = [
+        f"noise: record '{record.name}' is used from its first sample on; a transient there counts "
+        "as noise (Record.skip leaves it out, transient=True removes it)."
+        for record, P in zip(data, spectra.P, strict=True)
+        if record.start != "periodic" and record.samples == P * spectra.N
+    ]
+    return (
+        frf if transient or not spectra.freedom else replace(frf, notes=(*frf.notes, *at_once[:1]))
+    )
 
 
 def _robust(spectra: Spectra, data: list[Record], lines: Lines) -> FRF:
@@ -262,16 +275,6 @@ def _robust(spectra: Spectra, data: list[Record], lines: Lines) -> FRF:
     notes = []
     if spectra.freedom:
         cov_noise = _noise(spectra, lines, fitted)
-        at_once = [
-            r.name
-            for r, P in zip(data, spectra.P, strict=True)
-            if r.start != "periodic" and r.samples == P * spectra.N
-        ]
-        if at_once:
-            notes.append(
-                f"noise: record '{at_once[0]}' is used from its first sample on; a transient there "
-                "counts as noise (Record.skip leaves it out)."
-            )
     else:
         notes.append(
             "noise: not available from one period a record; two or more periods give it "

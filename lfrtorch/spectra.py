@@ -38,7 +38,8 @@ class Spectra(NamedTuple):
 
     Args:
         U, Y: means over the periods of a record.
-        C: covariance of the noise of [Y, U] in one period, pooled over the records.
+        C: covariance of the noise of [Y, U] in one period (P times that of the mean over P
+            periods), pooled over the records.
         freedom: degrees of freedom of C, which is 0 where there are none.
         P: numbers of periods.
         N: samples of a period.
@@ -61,12 +62,19 @@ class Spectra(NamedTuple):
         return np.asarray(lines * self.resolution, dtype=np.float64)
 
 
-def spectra_of_periods(data: Sequence[Record]) -> Spectra:
-    """Spectra of the last whole periods after ``skip``.
+class Removal(NamedTuple):
+    """How transients are removed: local polynomials of an order, and the freedom these leave."""
+
+    order: int
+    degrees_of_freedom: int
+
+
+def spectra_of_periods(data: Sequence[Record], removal: Removal | None = None) -> Spectra:
+    """Spectra of the last whole periods after ``skip``, less their transients if wanted.
 
     Raises:
-        ValueError: a record without a period or of another one, or shorter than it; an input that
-            is constant or does not repeat.
+        ValueError: a record without a period or of another one, or shorter than it (with removal:
+            than two); an input that is constant or does not repeat.
     """
     N = _period(data[0])
     windows = []
@@ -82,8 +90,13 @@ def spectra_of_periods(data: Sequence[Record]) -> Spectra:
                 f"record '{record.name}': skip={record.skip} leaves less than one period of {N} "
                 f"out of {record.samples} samples; skip less or measure longer."
             )
+        if removal and count == 1:
+            raise ValueError(
+                f"record '{record.name}' has one period of {N} samples after skip; "
+                "transient=True needs two or more, as it shows between the lines of the period."
+            )
         windows.append(slice(record.samples - count * N, record.samples))
-    return _spectra(data, windows, N)
+    return _spectra(data, windows, N, removal)
 
 
 def spectra_of_records(data: Sequence[Record]) -> Spectra:
@@ -105,7 +118,9 @@ def _period(record: Record) -> int:
     return int(record.period or record.samples)
 
 
-def _spectra(data: Sequence[Record], windows: list[slice], N: int) -> Spectra:
+def _spectra(
+    data: Sequence[Record], windows: list[slice], N: int, removal: Removal | None = None
+) -> Spectra:
     """Spectra of whole periods of N samples in a window of each record."""
     if N < 3:
         raise ValueError(f"{N} samples have no line between 0 and fs / 2; give more.")
@@ -124,26 +139,63 @@ def _spectra(data: Sequence[Record], windows: list[slice], N: int) -> Spectra:
     ny = data[0].y.shape[1]
     size = ny + data[0].u.shape[1]
     C = np.zeros((N // 2 + 1, size, size), np.complex128)
-    means, P, changes = [], [], []
+    means, P, changes, freedom = [], [], [], 0
     for record, window in zip(data, windows, strict=True):
         signals = np.concatenate([record.y[window], record.u[window]], axis=1)
         Z = np.fft.rfft(signals.reshape(-1, N, size), axis=1) * (np.sqrt(2) / N)
-        means.append(Z.mean(axis=0))
-        P.append(len(Z))
-        if len(Z) == 1:
-            changes.append(np.zeros(size - ny))
-            continue
-        D = (Z - means[-1]).swapaxes(0, 1)
-        C += outer(D)
+        mean = Z.mean(axis=0)
+        D = (Z - mean).swapaxes(0, 1)
+        count = len(Z) - 1
         # Without line 0: a drift of the offset is no change of the input.
-        changes.append(np.sum(np.abs(D[1:, :, ny:]) ** 2, axis=(0, 1)) / (len(Z) - 1))
+        change = np.sum(np.abs(D[1:, :, ny:]) ** 2, axis=(0, 1)) / max(count, 1)
+        if removal:
+            mean, D = _without_transient(signals, N, removal)
+            count = D.shape[1]
+        if count:
+            C += outer(D)
+        freedom += count
+        means.append(mean)
+        P.append(len(Z))
+        changes.append(change)
     both = np.stack(means, axis=1)
     Y, U = both[:, :, :ny], both[:, :, ny:]
     rms = np.sqrt(np.sum(np.abs(U[1:]) ** 2, axis=(0, 1)) / len(data))
     _check_repetition(data, np.sqrt(changes) / rms, N)
-    freedom = sum(P) - len(P)
     C /= max(freedom, 1)
     return Spectra(U, Y, C, freedom, np.array(P), N, data[0].fs / N)
+
+
+def _without_transient(signals: Array, N: int, removal: Removal) -> tuple[Complex, Complex]:
+    """Mean spectrum over P periods less the transient, and errors with the covariance of one.
+
+    In the spectrum of all P N samples the periods have power at every P-th line only. What the
+    lines about each of these hold is transient and noise: polynomials in the line r, of which the
+    value at r = 0 is taken off (Pintelon and Schoukens, 2012, chapter 7). The window is the same
+    about each line, and so are the weights b of this value; it adds |b|² to the noise.
+
+    Shape:
+        signals: (P N, n) -> (F, n), (F, degrees of freedom, n).
+    """
+    P = len(signals) // N
+    Z = np.fft.fft(signals, axis=0) * (np.sqrt(2) / len(signals))
+    least = removal.order + 1 + removal.degrees_of_freedom
+    n = 1
+    while 2 * (n - n // P) < least:
+        n += 1
+    if 2 * n + 1 > len(signals):
+        raise ValueError(
+            f"{len(signals)} samples have no {2 * n + 1} lines to remove a transient by; use "
+            "longer records, a lower order or fewer degrees_of_freedom."
+        )
+    r = np.arange(-n, n + 1)
+    r = r[r % P != 0]
+    vandermonde = (r[:, None] / n) ** np.arange(removal.order + 1)
+    b = np.linalg.pinv(vandermonde)[0]
+    complement = np.linalg.qr(vandermonde, mode="complete")[0][:, removal.order + 1 :]
+    at = np.arange(N // 2 + 1) * P
+    window = Z[(at[:, None] + r) % len(signals)]
+    D = complement.T @ window * np.sqrt(P * (1 + b @ b))
+    return Z[at] - b @ window, D
 
 
 def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
