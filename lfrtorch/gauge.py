@@ -53,6 +53,7 @@ def reduction(
     *,
     coordinates: bool = True,
     before: Reduction | None = None,
+    fixed: Tensor | None = None,
 ) -> Reduction:
     """Which columns of the Jacobian of the free parameters to compute.
 
@@ -61,18 +62,24 @@ def reduction(
         start: start states (S, nx) that are parameters, too; their columns come last and are kept.
         coordinates: whether those of x are free: no start state is given in them.
         before: of the same cell with weights close by: its columns are taken where they still do.
+        fixed: which entries of the free parameters stay as they are, too: columns of zeros.
+
+    Shape:
+        fixed: as many as the cell has free parameters.
     """
     G = _directions(cell, start)[:, 0 if coordinates else cell.nx**2 :].double().cpu().numpy()
-    free, lti = [], 0
-    for name, p in cell.named_parameters():
-        free.append((p.numel(), p.requires_grad))
-        lti += 0 if name.startswith("static.") or not p.requires_grad else p.numel()
+    parameters = list(cell.named_parameters())
+    counts = [p.numel() for _, p in parameters] + [start.numel()]
+    mask = np.repeat([p.requires_grad for _, p in parameters] + [True], counts)
+    linear = np.repeat([not n.startswith("static.") for n, _ in parameters] + [False], counts)
+    theta = np.cumsum(mask) - 1  # where each free entry stands in θ
+    P = int(mask.sum())
+    if fixed is not None:
+        mask[np.flatnonzero(mask)[: len(fixed)]] = ~fixed.cpu().numpy()
     size = np.linalg.norm(G)
     if not np.isfinite(size):
-        return everything(start.new_zeros(len(G)))
-    if not all(is_free for _, is_free in free):
-        mask = np.repeat([is_free for _, is_free in free], [count for count, _ in free])
-        mask = np.concatenate([mask, np.ones(start.numel(), dtype=bool)])
+        return everything(cell.A.new_zeros(P))
+    if not mask.all():
         # Directions that move no fixed parameter.
         G = G[mask] @ scipy.linalg.null_space(G[~mask]) if G.shape[1] else G[mask]
     elif before is not None and len(before.kept) + G.shape[1] == len(G):
@@ -81,12 +88,20 @@ def reduction(
         if found is not None:
             return found
     # Columns of the linear part only: those of the static map are computed together.
+    lti = int((mask & linear).sum())
     Q, R, pivots = scipy.linalg.qr(G[:lti].T, mode="economic", pivoting=True)
     diagonal = np.abs(np.diag(R))
     least = max(DEPENDENT * diagonal.max(initial=0.0), ROUNDING * size)
     rank = int((diagonal > least).sum())
     found = _expanded(G @ Q[:, :rank], pivots[:rank], cell.A)
-    return everything(start.new_zeros(len(G))) if found is None else found
+    if found is None:
+        found = everything(cell.A.new_zeros(len(G)))
+    if len(G) == P:
+        return found
+    places = torch.as_tensor(theta[mask]).to(found.kept)
+    expand = found.expand.new_zeros(len(found.kept), P)
+    expand[:, places] = found.expand
+    return Reduction(places[found.kept], expand)
 
 
 def _expanded(G: NDArray, left_out: NDArray, like: Tensor) -> Reduction | None:

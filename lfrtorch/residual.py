@@ -73,6 +73,8 @@ class SimulationError:
         self._starts = self._first_starts(sum(record.start == "estimated" for record in data))
         self._start = self.theta
         self._ridge = self._ridge_of(ridge)
+        self.fixed: Tensor | None = None
+        """Which entries of the module's free parameters stay as they are; None for none."""
         self._reduced: Reduction | None = None
         self._memory = Memory()
         self.guesses: list[Tensor | None] = [None] * len(self.batches)
@@ -137,7 +139,9 @@ class SimulationError:
         if reduce:
             held = any(batch.x0 is not None for batch in self.batches)
             held = bool(self.ranks.sum(self._start.new_tensor(float(held))))
-            reduced = reduction(cell, self._starts, coordinates=not held, before=self._reduced)
+            reduced = reduction(
+                cell, self._starts, coordinates=not held, before=self._reduced, fixed=self.fixed
+            )
             # A tie between columns is broken by rounding errors, on each process by its own.
             reduced = self._reduced = Reduction(*map(self.ranks.first, reduced))
         else:
