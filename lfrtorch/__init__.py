@@ -7,12 +7,13 @@ from importlib.metadata import version
 
 from lfrtorch import datasets, distributed
 from lfrtorch.adam import Adam
-from lfrtorch.bla import LinearModel, estimate_bla
+from lfrtorch.bla import estimate_bla
 from lfrtorch.cell import LFRCell
 from lfrtorch.frf import FRF, estimate_frf
 from lfrtorch.initialise import initialise
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.lfr import LFR
+from lfrtorch.linear_model import LinearFit, LinearModel
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
 from lfrtorch.multisine import multisine
@@ -30,6 +31,7 @@ __all__ = [
     "FitResult",
     "LFRCell",
     "LevenbergMarquardt",
+    "LinearFit",
     "LinearModel",
     "Model",
     "Network",

@@ -1,172 +1,179 @@
-"""Parametric best linear approximation: subspace start, refined on the simulation error."""
+"""Parametric best linear approximation: subspace start, refined in one of three errors."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
+from typing import Literal, Protocol, get_args
 
 import numpy as np
-import scipy.linalg
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from lfrtorch.cell import LFRCell
 from lfrtorch.checks import integer
-from lfrtorch.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
-from lfrtorch.lfr import LFR
-from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, Scaler, as_records, rms_scale, without_coordinates
-from lfrtorch.residual import SimulationError
-from lfrtorch.slopes import spectral_radius
+from lfrtorch.frf import FRF, estimate_frf
+from lfrtorch.linear_model import LinearFit, LinearModel, balancing
+from lfrtorch.linear_search import Matrices, Refined
+from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
+from lfrtorch.response_error import Lines, ResponseFit, lines_of
+from lfrtorch.signal_error import SignalFit
+from lfrtorch.subspace import Start, shortest
 from lfrtorch.threads import spread_by_hand
 
 Array = NDArray[np.float64]
+Criterion = Literal["simulation", "prediction", "frequency"]
+Weight = Literal["total", "noise", "none"]
 
-HORIZONS = (2, 3, 5, 10)
-"""Block rows of the subspace start in multiples of nx + 1; the best in simulation is kept."""
+EMPTY = 1e-10
+"""Relative singular value of an order that the data do not carry: rounding errors."""
 
-LARGEST_POLE = 1.0 - 1e-6
-"""Radius that no pole reaches: the margin keeps a model stable when its coordinates change."""
+AT_THE_LIMIT = 1.0 - 1e-4
+"""Pole radius above which a model looks like one of unstable data."""
 
-MOVED_POLE = 0.999
-"""Largest radius that an unstable pole of the subspace start is moved to."""
+DEGREES_OF_FREEDOM = 20
+"""Of a variance that is used as a weight."""
+
+VANISHING = 1e-12
+"""Smallest variance of a line, relative to the largest, that counts as a weight."""
+
+NARROW = 1e-10
+"""Relative size of a direction that the input does not excite."""
 
 
-@dataclass(frozen=True, eq=False)
-class LinearModel:
-    """Linear state-space model in physical units, about an operating point::
+class LinearLeastSquares(Protocol):
+    """Least squares between data and a linear model, in normalised units."""
 
-        x+ = A x + B (u - u_offset)
-        y  = C x + D (u - u_offset) + y_offset
+    def starts(self, nx: int) -> list[Start]:
+        """Subspace estimates of A and C."""
+        ...
 
-    Args:
-        A, B, C, D: system matrices.
-        fs: sampling frequency in Hz.
-        u_offset, y_offset: operating point.
-        inputs, outputs: channel names and units.
+    def with_input_matrices(self, A: Array, C: Array) -> tuple[float, Matrices]:
+        """Cost and system with the best B and D for A and C."""
+        ...
 
-    Shape:
-        A: (nx, nx), B: (nx, nu), C: (ny, nx), D: (ny, nu), u_offset: (nu,), y_offset: (ny,).
-    """
+    def state_deviation(self, matrices: Matrices) -> Array:
+        """Standard deviation (nx,) of the states over the data."""
+        ...
 
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    fs: float
-    u_offset: Array
-    y_offset: Array
-    inputs: tuple[Channel, ...]
-    outputs: tuple[Channel, ...]
-
-    @property
-    def poles(self) -> NDArray[np.complex128]:
-        """Poles (nx,), in the z plane."""
-        return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
-
-    def frf(self, frequencies: Array) -> NDArray[np.complex128]:
-        """Frequency response C (zI - A)⁻¹ B + D.
-
-        Shape:
-            frequencies: (F,) in Hz -> (F, ny, nu).
-        """
-        z = np.exp(2j * np.pi * np.asarray(frequencies) / self.fs)
-        shifted = z[:, None, None] * np.eye(len(self.A)) - self.A
-        states = np.linalg.solve(shifted, np.broadcast_to(self.B, (len(z), *self.B.shape)))
-        return np.asarray(self.C @ states + self.D, dtype=np.complex128)
-
-    def simulate(self, record: Record) -> Array:
-        """Simulated output (T, ny) in physical units, from the record's own start.
-
-        A given start state is in other coordinates; the one that fits best takes its place.
-        """
-        record = without_coordinates(record)
-        nu, ny = len(self.inputs), len(self.outputs)
-        unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
-        cell = _cell(self.A, self.B, self.C, self.D)
-        return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs).simulate(record)
-
-    def transformed(self, T: Array) -> LinearModel:
-        """The same system in the coordinates T x."""
-        A = scipy.linalg.solve(T.T, (T @ self.A).T).T
-        return replace(self, A=A, B=T @ self.B, C=scipy.linalg.solve(T.T, self.C.T).T)
+    def refined(self, matrices: Matrices, max_iter: int) -> Refined:
+        """The minimum near the given system."""
+        ...
 
 
 @spread_by_hand()
 def estimate_bla(
-    records: Record | Sequence[Record],
+    data: Record | Sequence[Record] | FRF,
     nx: int,
     *,
+    refine: Criterion | None = None,
+    weight: Weight | Array | None = None,
     offset: bool = True,
     coordinates: Literal["balanced", "given"] = "balanced",
     max_iter: int = 200,
 ) -> LinearModel:
-    """Best linear approximation of order ``nx``, stable, least squares in the simulation error.
+    """Best linear approximation of order ``nx``, stable, by least squares.
 
-    A subspace estimate (PO-MOESP and its past-input variant, several horizons) gives A and C, a
-    linear least-squares fit of the simulated output B and D; the best in simulation is refined by
-    Levenberg-Marquardt. Unstable poles of the start are reflected into the unit circle, and the
-    refinement rejects every step that leaves it.
+    Subspace estimates give A and C, a linear least-squares fit B and D; the best of them is refined
+    by Levenberg-Marquardt in the error of choice. Unstable poles of a start are reflected into the
+    unit circle, and the refinement rejects every step that brings one out.
+
+    - ``"simulation"``, the usual one of records: simulated minus measured output. Periodic records
+      in steady state are fitted line by line of their spectra, the same sum of squares at a
+      fraction of the work.
+    - ``"prediction"``: output predicted one sample ahead by an innovation model: more precise where
+      disturbances act on the states. The gain K is part of the model. Records in steady state get
+      an estimated start state, as their noise does not repeat.
+    - ``"frequency"``, the only one of a response: the nonparametric response, weighted by its
+      variance. Records are turned into a response by ``estimate_frf``.
 
     Args:
-        records: data; periodic ones are fitted in exact steady state, and start states that are
-            given (in another model's coordinates) or estimated are fitted.
+        data: records, or a nonparametric response. Start states that are given (in another model's
+            coordinates) are estimated.
         nx: order.
-        offset: whether the means of input and output are removed and stored as operating point.
+        refine: the error.
+        weight: of the errors of a response: one over its ``"total"`` or ``"noise"`` variance,
+            ``"none"``, or weights of one's own. Where left out the total variance, or the noise's
+            where that is all there is, or none.
+        offset: whether constants are removed and stored as operating point.
         coordinates: ``"balanced"`` states, or ``"given"`` by the subspace estimate.
-        max_iter: iterations of the refinement.
+        max_iter: iterations of the refinement; 0 leaves the start.
+
+    Shape:
+        weight: (F, ny, nu).
 
     Returns:
-        The model, with states of unit standard deviation over the data.
+        The model, with states of unit standard deviation over the data (of a response: under an
+        input of equal power in all lines), the covariance of its parameters, and notes in ``fit``.
+        The covariance holds for errors of any spectrum where lines are fitted, and for white ones
+        where signals are.
 
     Raises:
-        ValueError: an order below 1, a constant channel, or fewer samples than the order needs.
+        ValueError: an order below 1, a constant channel, or data that do not reach for the order.
 
     References:
-        Verhaegen, "Identification of the deterministic part of MIMO state space models given in
-        innovations form from input-output data", Automatica 30, 1994 (PO-MOESP).
+        Pintelon and Schoukens, System Identification, 2nd ed., Wiley 2012, chapters 4, 9 and 10.
+        Ljung, System Identification, 2nd ed., Prentice Hall 1999, chapters 7 and 10.
     """
-    data = [without_coordinates(record) for record in as_records(records)]
+    clock = time.perf_counter()
     integer("nx", nx, 1)
     integer("max_iter", max_iter, 0)
     if coordinates not in ("balanced", "given"):
         raise ValueError(f"coordinates is {coordinates!r}; use 'balanced' or 'given'.")
-    _check_excitation(data, nx)
-    scaler = data_scaler(data, offset=offset)
+    if refine not in (None, *get_args(Criterion)):
+        raise ValueError(f"refine is {refine!r}; use 'simulation', 'prediction' or 'frequency'.")
+    records = [] if isinstance(data, FRF) else [without_coordinates(r) for r in as_records(data)]
+    notes: list[str] = []
+    if records:
+        _check_signals(records)
+    about: FRF | Record
+    if isinstance(data, FRF) or refine == "frequency":
+        if refine not in (None, "frequency"):
+            raise ValueError(f"refine is {refine!r}, an error of records; a response has none.")
+        refine = "frequency"
+        about = data if isinstance(data, FRF) else estimate_frf(records)
+        notes += about.notes
+        problem, scaler = _of_response(about, weight, notes, offset=offset)
+    else:
+        if weight is not None:
+            raise ValueError("weight is that of a response: use refine='frequency'.")
+        refine, about = refine or "simulation", records[0]
+        scaler = data_scaler(records, offset=offset)
+        problem = _of_records(records, scaler, offset=offset, prediction=refine == "prediction")
+    if isinstance(problem, ResponseFit):
+        _check_lines(problem.lines, nx)
+    else:
+        _check_length(records, nx)
+        notes += _narrow(records, nx)
 
-    starts = [
-        _with_input_matrices(A, C, data, scaler, offset=offset)
-        for A, C in _subspace_estimates(data, scaler, nx)
-    ]
-    cost, cell = min(starts, key=lambda start: start[0])
-    if not np.isfinite(cost):
-        raise ValueError(
-            f"no stable linear model of order {nx} could be started from these data; "
-            "try a lower nx or a longer record."
-        )
-    _to_unit_variance(cell, data, scaler, balanced=coordinates == "balanced")
-    _refine(cell, data, scaler, max_iter, offset=offset)
-    _to_unit_variance(cell, data, scaler, balanced=coordinates == "balanced")
-
-    A, B, C, D = (m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu))
-    model = LinearModel(
-        A=A,
-        B=B / scaler.u_scale,
-        C=scaler.y_scale[:, None] * C,
-        D=scaler.y_scale[:, None] * D / scaler.u_scale,
-        fs=data[0].fs,
-        u_offset=scaler.u_offset,
-        y_offset=scaler.y_offset,
-        inputs=data[0].inputs,
-        outputs=data[0].outputs,
+    start, matrices = _best_start(problem, nx)
+    balanced = coordinates == "balanced"
+    found = problem.refined(_scaled(problem, matrices, balanced=balanced), max_iter)
+    notes += _findings(start, found.A)
+    if max_iter and found.iterations >= max_iter:
+        notes.append(f"the search was stopped after {max_iter} iterations: raise max_iter.")
+    model = _physical(found, scaler, about)
+    model = model.transformed(*_transformation(problem, found.matrices, balanced=balanced))
+    rmse = found.rmse
+    if records and refine != "frequency":
+        errors = [(r.y - model.simulate(r))[r.skip :] for r in records]
+        constant = np.concatenate(errors).mean(axis=0)  # that the fit took off
+        if offset:
+            model = replace(model, y_offset=model.y_offset + constant)
+            errors = [e - constant for e in errors]
+        if refine == "simulation":
+            rmse = float(np.sqrt(np.mean((np.concatenate(errors) / scaler.y_scale) ** 2)))
+    return replace(
+        model,
+        fit=LinearFit(
+            criterion=refine,
+            rmse=rmse,
+            iterations=found.iterations,
+            reason=found.reason,
+            seconds=time.perf_counter() - clock,
+            singular_values=tuple(map(float, start.singular_values / start.singular_values[0])),
+            notes=tuple(notes),
+        ),
     )
-    if not offset:
-        return model
-    # The constant that the fit took off.
-    errors = [(r.y - model.simulate(r))[r.skip :] for r in data]
-    return replace(model, y_offset=model.y_offset + np.concatenate(errors).mean(axis=0))
 
 
 def data_scaler(records: list[Record], *, offset: bool) -> Scaler:
@@ -181,7 +188,124 @@ def data_scaler(records: list[Record], *, offset: bool) -> Scaler:
     return Scaler(u_offset, rms_scale(us, u_offset), y_offset, rms_scale(ys, y_offset))
 
 
-def _check_excitation(records: list[Record], nx: int) -> None:
+def _of_records(
+    records: list[Record], scaler: Scaler, *, offset: bool, prediction: bool
+) -> ResponseFit | SignalFit:
+    """By their lines, where that is the same, or by their signals."""
+    us = [scaler.normalise_u(r.u) for r in records]
+    ys = [scaler.normalise_y(r.y) for r in records]
+    if not prediction:
+        lines = lines_of(us, ys, records, offset=offset)
+        if lines is not None:
+            return ResponseFit(lines, known=False)
+    return SignalFit(us, ys, records, offset=offset, prediction=prediction)
+
+
+def _of_response(
+    frf: FRF, weight: Weight | Array | None, notes: list[str], *, offset: bool
+) -> tuple[ResponseFit, Scaler]:
+    """A response with channels of unit size, by its weights."""
+    weights, known = _weights(frf, weight, notes)
+    u_scale = 1.0 / rms_scale([np.abs(frf.G).reshape(-1, frf.G.shape[2])], np.zeros(1))
+    G = frf.G * u_scale
+    y_scale = rms_scale([np.abs(G).swapaxes(1, 2).reshape(-1, G.shape[1])], np.zeros(1))
+    size = y_scale[:, None] / u_scale
+    nu, ny = len(u_scale), len(y_scale)
+    offsets = (frf.u_offset, frf.y_offset) if offset else (np.zeros(nu), np.zeros(ny))
+    scaler = Scaler(offsets[0], u_scale, offsets[1], y_scale)
+    z = np.exp(2j * np.pi * frf.frequencies / frf.fs)
+    U = np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu))
+    lines = Lines(z, U, frf.G / size, None if weights is None else weights * size**2)
+    return ResponseFit(lines, known=known), scaler
+
+
+def _weights(
+    frf: FRF, weight: Weight | Array | None, notes: list[str]
+) -> tuple[Array | None, bool]:
+    """Weights (F, ny, nu) of the errors of G, and whether they are inverse variances."""
+    if isinstance(weight, np.ndarray):
+        if weight.shape != frf.G.shape or not (np.isfinite(weight).all() and (weight >= 0).all()):
+            raise ValueError(
+                f"weight has shape {weight.shape}; give finite numbers of at least 0 in the shape "
+                f"of the response, {frf.G.shape}."
+            )
+        return weight.astype(np.float64), False
+    variances = {"total": frf.var_total, "noise": frf.var_noise}
+    if weight is None:
+        if frf.var_total is not None:
+            weight = "total"
+        else:
+            weight = "none" if frf.var_noise is None else "noise"
+        if weight == "noise":
+            notes.append("the fit is weighted by the noise alone: the total variance is not known.")
+        elif weight == "none":
+            notes.append("all lines count alike in the fit: no variance is known.")
+    if weight == "none":
+        return None, False
+    if not isinstance(weight, str) or weight not in variances:
+        raise ValueError(
+            f"weight is {weight!r}; use 'total', 'noise', 'none' or an array (F, ny, nu)."
+        )
+    variance = variances[weight]
+    if variance is None:
+        raise ValueError(
+            f"the {weight} variance of the response is not known: {' '.join(frf.notes)} "
+            "Use another weight, or measure more."
+        )
+    if not (variance > 0).any():
+        notes.append("the variance is 0 at all lines, so that they count alike in the fit.")
+        return None, False
+    smooth = _smoothed(variance, 1 if frf.method == "local_polynomial" else frf.realisations - 1)
+    return 1.0 / np.maximum(smooth, VANISHING * smooth.max()), True
+
+
+def _smoothed(variance: Array, degrees_of_freedom: int) -> Array:
+    """Variances (F, ny, nu) averaged over neighbouring lines: a weight must not be drawn by lot.
+
+    One over an estimate of few degrees of freedom has no finite mean.
+    """
+    half = min((DEGREES_OF_FREEDOM // max(1, degrees_of_freedom)) // 2, (len(variance) - 1) // 2)
+    if half == 0:
+        return variance
+    padded = np.pad(variance, ((half, half), (0, 0), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
+    return windows.mean(axis=-1)
+
+
+def _best_start(problem: LinearLeastSquares, nx: int) -> tuple[Start, Matrices]:
+    """The subspace estimate that fits best, with its B and D."""
+    found = [
+        (start, *problem.with_input_matrices(start.A, start.C)) for start in problem.starts(nx)
+    ]
+    start, cost, matrices = min(found, key=lambda each: each[1], default=(None, np.inf, None))
+    if start is None or matrices is None or not np.isfinite(cost):
+        raise ValueError(
+            f"no stable linear model of order {nx} could be started from these data; "
+            "try a lower nx or a longer record."
+        )
+    return start, matrices
+
+
+def _findings(start: Start, A: Array) -> list[str]:
+    """What the subspace and the poles say of data and order."""
+    nx, notes, s = len(A), [], start.singular_values / start.singular_values[0]
+    if len(s) >= nx and s[nx - 1] < EMPTY:
+        carried = int((s > EMPTY).sum())
+        notes.append(
+            f"order {nx} is above what the data carry: the subspace has {carried} direction(s) "
+            f"above rounding errors; try nx={carried}."
+        )
+    radius = float(np.abs(np.linalg.eigvals(A)).max())
+    if radius > AT_THE_LIMIT:
+        notes.append(
+            f"the slowest pole has radius {radius:.6f}: data that drift, integrate or come from an "
+            "unstable system ask for one, and so does an order above what they carry; look at the "
+            "data, or lower nx."
+        )
+    return notes
+
+
+def _check_signals(records: list[Record]) -> None:
     for signals, channels in (
         ([r.u for r in records], records[0].inputs),
         ([r.y for r in records], records[0].outputs),
@@ -194,9 +318,11 @@ def _check_excitation(records: list[Record], nx: int) -> None:
                     "a model needs an input that excites and an output that responds: "
                     "check the columns."
                 )
+
+
+def _check_length(records: list[Record], nx: int) -> None:
     nu, ny = len(records[0].inputs), len(records[0].outputs)
-    needed = 2 * _rows(HORIZONS[0], nx) * (nu + ny + 1)
-    longest = max(r.samples for r in records)
+    needed, longest = shortest(nx, nu, ny), max(r.samples for r in records)
     if longest < needed:
         raise ValueError(
             f"the longest record has {longest} samples; order nx={nx} with {nu} input(s) and "
@@ -204,183 +330,72 @@ def _check_excitation(records: list[Record], nx: int) -> None:
         )
 
 
-def _rows(multiple: int, nx: int) -> int:
-    return multiple * (nx + 1)
-
-
-def _subspace_estimates(
-    records: list[Record], scaler: Scaler, nx: int
-) -> list[tuple[Array, Array]]:
-    """(A, C) of MOESP with past inputs and outputs, or past inputs alone, as instruments."""
-    us = [scaler.normalise_u(r.u) for r in records]
-    ys = [scaler.normalise_y(r.y) for r in records]
-    nu, ny = us[0].shape[1], ys[0].shape[1]
-    estimates = []
-    for multiple in HORIZONS:
-        i = _rows(multiple, nx)
-        pairs = [(u, y) for u, y in zip(us, ys, strict=True) if len(u) >= 2 * i]
-        columns = sum(len(u) - 2 * i + 1 for u, _ in pairs)
-        if columns < 2 * i * (nu + ny):
-            break
-        U = np.hstack([_hankel(u, 2 * i) for u, _ in pairs])
-        Y = np.hstack([_hankel(y, 2 * i) for _, y in pairs])
-        stacked = np.vstack([U[i * nu :], U[: i * nu], Y[: i * ny], Y[i * ny :]])
-        (R,) = scipy.linalg.qr(stacked.T, mode="r", overwrite_a=True)
-        L = R[: len(stacked)].T
-        inputs, past_u, past = i * nu, 2 * i * nu, i * (2 * nu + ny)
-        for instruments in (past, past_u):
-            U1, s, _ = np.linalg.svd(L[past:, inputs:instruments])
-            O = U1[:, :nx] * np.sqrt(s[:nx])  # noqa: E741 - extended observability matrix
-            A = np.linalg.lstsq(O[:-ny], O[ny:], rcond=None)[0]
-            estimates.append((_stabilised(A), O[:ny]))
-    return estimates
-
-
-def _hankel(signal: Array, rows: int) -> Array:
-    """Block Hankel matrix (rows * n, T - rows + 1) of a signal (T, n)."""
-    windows = np.lib.stride_tricks.sliding_window_view(signal, rows, axis=0)  # (columns, n, rows)
-    return windows.transpose(2, 1, 0).reshape(-1, windows.shape[0])
-
-
-def _stabilised(A: Array) -> Array:
-    """A with its unstable eigenvalues reflected into the unit circle, at most to MOVED_POLE."""
-    values, vectors = np.linalg.eig(A)
-    radius = np.abs(values)
-    unstable = radius > LARGEST_POLE
-    if not unstable.any():
-        return A
-    factor = np.where(unstable, np.minimum(1.0 / np.maximum(radius, 1.0), MOVED_POLE), radius)
-    values = values * np.where(unstable, factor / np.maximum(radius, 1e-300), 1.0)
-    return np.real(vectors * values @ np.linalg.pinv(vectors))
-
-
-def _cell(A: Array, B: Array, C: Array, D: Array) -> LFRCell:
-    cell = LFRCell(B.shape[1], C.shape[0], len(A), dtype=torch.float64)
-    with torch.no_grad():
-        for parameter, value in ((cell.A, A), (cell.Bu, B), (cell.Cy, C), (cell.Dyu, D)):
-            parameter.copy_(torch.as_tensor(np.ascontiguousarray(value)))
-    return cell
-
-
-def _model(cell: LFRCell, records: list[Record], scaler: Scaler) -> Model:
-    first = records[0]
-    return Model(LFR(cell), scaler, first.fs, first.inputs, first.outputs)
-
-
-class _LinearProblem(SimulationError):
-    """Simulation error of a linear model, undefined where a pole passes LARGEST_POLE.
-
-    With ``offset`` the best constant output is taken off in closed form: residual and derivatives
-    are orthogonal to what a constant makes (variable projection).
-    """
-
-    def __init__(
-        self, cell: LFRCell, records: list[Record], scaler: Scaler, *, offset: bool
-    ) -> None:
-        super().__init__(_model(cell, records, scaler), records)
-        self.offset = offset
-        # The residuals (M, ny) that a constant in each output makes, at unit length.
-        each = torch.eye(len(self.model.outputs), dtype=torch.float64)
-        constants = torch.cat(
-            [b.weigh(each.expand(*b.y.shape, -1)).flatten(0, 2) for b in self.batches]
+def _check_lines(lines: Lines, nx: int) -> None:
+    nu, ny = lines.U.shape[1], lines.Y.shape[1]
+    unknowns, equations = nx * (nu + ny) + nu * ny, lines.equations
+    if equations < unknowns:
+        raise ValueError(
+            f"{len(lines.z)} excited line(s) make {equations} equations; order nx={nx} with {nu} "
+            f"input(s) and {ny} output(s) has {unknowns} unknowns: excite more lines, or lower nx."
         )
-        self._constants = constants / constants.norm(dim=0)
-
-    def residual(self, theta: Tensor) -> Tensor:
-        r = super().residual(theta)
-        self.write(theta)
-        stable = spectral_radius(self.model.lfr.cell.A.detach()) < LARGEST_POLE
-        return self._centred(r) if stable else torch.full_like(r, torch.inf)
-
-    def jacobian(self, theta: Tensor) -> Tensor:
-        return self._centred(super().jacobian(theta))
-
-    def linearise(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, theta: Tensor
-    ) -> DenseJacobian:
-        return DenseJacobian(self.jacobian(theta), self.residual(theta))
-
-    def _centred(self, rows: Tensor) -> Tensor:
-        if not self.offset:
-            return rows
-        return rows - self._constants @ (self._constants.mT @ rows)
 
 
-def _with_input_matrices(
-    A: Array, C: Array, records: list[Record], scaler: Scaler, *, offset: bool
-) -> tuple[float, LFRCell]:
-    """Mean square error and cell with the best B and D for A and C: y is linear in them."""
-    nu, ny = len(scaler.u_scale), len(scaler.y_scale)
-    cell = _cell(A, np.zeros((len(A), nu)), C, np.zeros((ny, nu)))
-    for fixed in (cell.A, cell.Cy):
-        fixed.requires_grad_(False)
-    problem = _LinearProblem(cell, records, scaler, offset=offset)
-    theta = problem.theta
-    J, r = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
-    if np.isfinite(J).all():
-        theta = theta + torch.as_tensor(np.linalg.lstsq(J, -r, rcond=None)[0])
-    cost = float(problem.residual(theta).square().sum())
-    for fixed in (cell.A, cell.Cy):
-        fixed.requires_grad_(True)
-    return (cost if np.isfinite(cost) else np.inf), cell
+def _narrow(records: list[Record], nx: int) -> list[str]:
+    """A note where the input moves in too few directions to tell all parameters apart."""
+    nu = records[0].u.shape[1]
+    wanted = 2 * nx + 1
+    windows = [
+        np.lib.stride_tricks.sliding_window_view(r.u - r.u.mean(axis=0), wanted, axis=0)
+        for r in records
+        if r.samples >= wanted
+    ]
+    rows = np.concatenate([w.reshape(len(w), -1) for w in windows])
+    rows = rows / np.maximum(np.sqrt((rows**2).mean(axis=0)), 1e-300)
+    size = np.linalg.eigvalsh(rows.T @ rows)
+    rank = int((size > NARROW * size[-1]).sum())
+    if rank == nu * wanted:
+        return []
+    return [
+        f"the input is too narrow: it excites {rank} of the {nu * wanted} directions that "
+        f"order {nx} has (one a frequency and phase); between its frequencies the model is a guess."
+    ]
 
 
-def _refine(
-    cell: LFRCell, records: list[Record], scaler: Scaler, max_iter: int, *, offset: bool
-) -> None:
-    """Levenberg-Marquardt on A, Bu, Cy, Dyu until the cost no longer falls."""
-    problem = _LinearProblem(cell, records, scaler, offset=offset)
-    optimiser = LevenbergMarquardt(max_iter=max_iter, acceleration=False, tolerance=1e-9)
-    state = optimiser.init(problem, problem.theta)
-    while not state.reason and state.iteration < max_iter:
-        state = optimiser.step(problem, state)
-    problem.write(state.theta)
+def _physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearModel:
+    """The model in physical units, with all that is known of its uncertainty."""
+    nx = len(found.A)
+    by_u, by_y = 1.0 / scaler.u_scale, scaler.y_scale[:, None]
+    sizes = [np.ones((nx, nx)), np.tile(by_u, (nx, 1)), np.tile(by_y, (1, nx)), by_y * by_u]
+    size = np.concatenate([part.ravel() for part in sizes])
+    S = found.innovation_covariance
+    return LinearModel(
+        *(part * matrix for part, matrix in zip(sizes, found.matrices, strict=True)),
+        fs=about.fs,
+        u_offset=scaler.u_offset,
+        y_offset=scaler.y_offset,
+        inputs=about.inputs,
+        outputs=about.outputs,
+        K=None if found.K is None else found.K / scaler.y_scale,
+        innovation_covariance=None if S is None else by_y * S * scaler.y_scale,
+        covariance=size[:, None] * found.covariance * size,
+    )
 
 
-def _to_unit_variance(
-    cell: LFRCell, records: list[Record], scaler: Scaler, *, balanced: bool
-) -> None:
-    """Write balanced coordinates into a linear cell, then scale each state to unit variance."""
+def _scaled(problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool) -> Matrices:
+    """The system in balanced coordinates with states of unit deviation."""
+    A, B, C, D = matrices
+    T, inverse = _transformation(problem, matrices, balanced=balanced)
+    return T @ A @ inverse, T @ B, C @ inverse, D
+
+
+def _transformation(
+    problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool
+) -> tuple[Array, Array]:
+    """T and T⁻¹ (nx, nx) to balanced coordinates, or from the given ones, of unit deviation."""
+    A, B, C, D = matrices
+    T = inverse = np.eye(len(A))
     if balanced:
-        T, T_inverse = _balancing(*(m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy)))
-        _transform(cell, T, T_inverse)
-    model = _model(cell, records, scaler)
-    states = torch.cat([model.signals(record).x[0, :-1] for record in records])
-    std = states.std(dim=0, correction=0).numpy()
+        T, inverse = balancing(A, B, C)
+    std = problem.state_deviation((T @ A @ inverse, T @ B, C @ inverse, D))
     std = np.where(std > 0, std, 1.0)
-    _transform(cell, np.diag(1.0 / std), np.diag(std))
-
-
-def _transform(cell: LFRCell, T: Array, T_inverse: Array) -> None:
-    forward, backward = torch.as_tensor(T), torch.as_tensor(T_inverse)
-    with torch.no_grad():
-        cell.A.copy_(forward @ cell.A @ backward)
-        cell.Bu.copy_(forward @ cell.Bu)
-        cell.Cy.copy_(cell.Cy @ backward)
-
-
-def _balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
-    """T and T⁻¹ to balanced coordinates by the square-root method (Laub et al. 1987)."""
-    Lp, Lq = _square_root(_gramian(A, B @ B.T)), _square_root(_gramian(A.T, C.T @ C))
-    U, s, Vh = np.linalg.svd(Lq.T @ Lp)
-    # A state that is all but uncontrollable or unobservable would be scaled by its rounding error.
-    root = np.sqrt(np.maximum(s, s[0] * np.finfo(float).eps))
-    return (U / root).T @ Lq.T, Lp @ (Vh.T / root)
-
-
-def _gramian(A: Array, Q: Array) -> Array:
-    """P = A P Aᵀ + Q by Smith's doubling.
-
-    scipy's solver forms I - A ⊗ A, which is singular to rounding where two poles are close to the
-    unit circle; the sum of A^k Q A^kᵀ stays positive semidefinite there.
-    """
-    P = Q
-    while np.abs(A).max() > np.finfo(float).eps:
-        P = P + A @ P @ A.T
-        A = A @ A
-    return P
-
-
-def _square_root(gramian: Array) -> Array:
-    values, vectors = np.linalg.eigh((gramian + gramian.T) / 2)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+    return T / std[:, None], inverse * std

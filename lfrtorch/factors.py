@@ -58,6 +58,11 @@ class Orthogonal:
         """-(JᵀJ + λI)⁻¹ gradient (P,), its part along the directions that are left out 0."""
         return -self._Vh.mT @ ((self._Vh @ gradient) / (self._squares + damping))
 
+    @property
+    def inverse(self) -> Tensor:
+        """Pseudo-inverse (P, P) of JᵀJ."""
+        return (self._Vh.mT / self._squares) @ self._Vh
+
 
 class Normal:
     """From G = JᵀJ (P, P), by Cholesky: three times faster, for λ well above G's rounding error.

@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from copy import deepcopy
 from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import Module
 
-from lfrtorch.bla import LinearModel
 from lfrtorch.cell import LFRCell
 from lfrtorch.checks import integer
 from lfrtorch.lfr import LFR
+from lfrtorch.linear_model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
@@ -93,7 +92,7 @@ def initialise(
     sizes = len(bla.inputs), len(bla.outputs), len(bla.A)
     linear, cell = LFRCell(*sizes, dtype=dtype), LFRCell(*sizes, nz, nw, static, dtype=dtype)
     for target in (linear, cell):
-        write_bla(target, bla, scaler)
+        bla.write(target, scaler)
     response, model = (
         Model(LFR(c), scaler, bla.fs, bla.inputs, bla.outputs) for c in (linear, cell)
     )
@@ -120,18 +119,6 @@ def initialise(
             uniform(cell.Bw, OUTPUT_RANGE)
             uniform(cell.Dyw, OUTPUT_RANGE)
     return model
-
-
-def write_bla(cell: LFRCell, bla: LinearModel, scaler: Scaler) -> None:
-    """A, Bu, Cy and Dyu of the cell from the linear model, in the scaler's normalised units."""
-    with torch.no_grad():
-        for weight, value in (
-            (cell.A, bla.A),
-            (cell.Bu, bla.B * scaler.u_scale),
-            (cell.Cy, bla.C / scaler.y_scale[:, None]),
-            (cell.Dyu, bla.D * scaler.u_scale / scaler.y_scale[:, None]),
-        ):
-            weight.copy_(torch.as_tensor(np.ascontiguousarray(value)))
 
 
 def _check_sizes(static: Module, nz: int, nw: int, dtype: torch.dtype) -> None:

@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
-from lfrtorch.bla import LinearModel
 from lfrtorch.datasets import Dataset, Published
+from lfrtorch.linear_model import LinearModel
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record

@@ -8,7 +8,8 @@ import reference
 import scipy.linalg
 from reference import Array, System, random_system
 
-from lfrtorch.bla import LinearModel, data_scaler, estimate_bla
+from lfrtorch.bla import data_scaler, estimate_bla
+from lfrtorch.linear_model import LinearModel
 from lfrtorch.records import Channel, Record, Start
 
 OMEGA = np.linspace(0.01, 3.1, 50)

@@ -9,8 +9,9 @@ import torch
 from reference import random_system
 from torch import Tensor, nn
 
-from lfrtorch.bla import LinearModel, estimate_bla
+from lfrtorch.bla import estimate_bla
 from lfrtorch.initialise import OUTPUT_RANGE, initialise
+from lfrtorch.linear_model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Record

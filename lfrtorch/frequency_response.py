@@ -1,0 +1,76 @@
+"""Frequency response of a linear state-space model, and its slope with the matrices.
+
+The response at z is G = C (zI - A)⁻¹ B + D. With X = (zI - A)⁻¹ B and L = C (zI - A)⁻¹ its slope is
+a product: dG = [L I] [dA dB; dC dD] [X; I].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Numbers = NDArray[np.intp]
+
+
+def resolvents(A: Array, B: Array, C: Array, z: Complex) -> tuple[Complex, Complex]:
+    """X = (zI - A)⁻¹ B and L = C (zI - A)⁻¹.
+
+    By a Schur form of A, one substitution over all z together: as accurate as a solution for every
+    z, where eigenvectors would lose digits at poles that lie close together.
+
+    Shape:
+        z: (F,) -> X: (F, nx, nu), L: (F, ny, nx).
+    """
+    T, Q = scipy.linalg.schur(A, output="complex")
+    forced, seen = Q.conj().T @ B, (C @ Q).T
+    nx = len(A)
+    X = np.empty((nx, B.shape[1], len(z)), dtype=complex)
+    L = np.empty((nx, C.shape[0], len(z)), dtype=complex)
+    for i in range(nx):
+        pole = 1.0 / (z - T[i, i])
+        known = np.tensordot(T[:i, i], L[:i], 1) if i else 0.0
+        L[i] = (seen[i][:, None] + known) * pole
+        k = nx - 1 - i
+        pole = 1.0 / (z - T[k, k])
+        known = np.tensordot(T[k, k + 1 :], X[k + 1 :], 1) if i else 0.0
+        X[k] = (forced[k][:, None] + known) * pole
+    X = np.tensordot(Q, X, 1).transpose(2, 0, 1)
+    L = np.tensordot(Q.conj(), L, 1).transpose(2, 1, 0)
+    return X, L
+
+
+def frequency_response(A: Array, B: Array, C: Array, D: Array, z: Complex) -> Complex:
+    """G (F, ny, nu) at z (F,)."""
+    return np.asarray(C @ resolvents(A, B, C, z)[0] + D, dtype=np.complex128)
+
+
+def slopes(X: Complex, L: Complex, U: Complex, columns: Numbers | None = None) -> Complex:
+    """Slope of G U with the entries of A, B, C, D, each by rows, one after another.
+
+    Args:
+        X, L: the resolvents.
+        U: input spectra.
+        columns: the entries wanted; all of them where left out.
+
+    Shape:
+        X: (F, nx, nu), L: (F, ny, nx), U: (F, nu, m), columns: (K,) -> (F, ny, m, K).
+    """
+    F, nx, nu = X.shape
+    ny = L.shape[1]
+    rows, others = _places(nx, nu, ny)
+    if columns is not None:
+        rows, others = rows[columns], others[columns]
+    left = np.concatenate([L, np.broadcast_to(np.eye(ny), (F, ny, ny))], axis=2)
+    right = np.concatenate([X @ U, U], axis=1).swapaxes(1, 2)
+    return left[:, :, None, rows] * right[:, None, :, others]
+
+
+def _places(nx: int, nu: int, ny: int) -> tuple[Numbers, Numbers]:
+    """Row and column of every entry of A, B, C, D in [A B; C D]."""
+    x, u, y = np.arange(nx), nx + np.arange(nu), nx + np.arange(ny)
+    blocks = [np.meshgrid(r, c, indexing="ij") for r, c in ((x, x), (x, u), (y, x), (y, u))]
+    rows, columns = zip(*blocks, strict=True)
+    return np.concatenate([r.ravel() for r in rows]), np.concatenate([c.ravel() for c in columns])
