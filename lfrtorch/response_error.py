@@ -1,14 +1,8 @@
-"""Fit of a linear model to spectral lines: the frequency-domain side of the linear fits.
-
-Lines Y = G(z) U are all that a linear model is asked for: a frequency response (U = I, weighted by
-its variance), or periodic records, whose mean squared simulation error is the sum over their lines.
-"""
+"""Fit of a linear model to spectral lines Y = G(z) U: least squares in the response."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -21,123 +15,11 @@ from lfrtorch.frequency_response import resolvents, slopes
 from lfrtorch.gauge import Reduction, reduction
 from lfrtorch.linear_model import linear_cell
 from lfrtorch.linear_search import TRUNCATION, Matrices, Refined, search
-from lfrtorch.records import Record
+from lfrtorch.lines import Lines
 from lfrtorch.subspace import LARGEST_POLE, Start, from_spectra
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-
-SILENT = 1e-10
-"""Relative amplitude below which a line of the input is not excited."""
-
-
-@dataclass(frozen=True, eq=False)
-class Lines:
-    """What is fitted: Y = G(z) U, and the weight of each error.
-
-    Args:
-        z: points on the unit circle.
-        U, Y: spectra, scaled so that the sum of squared errors is their mean square.
-        weight: of the errors Y - G U, where they do not count alike.
-
-    Shape:
-        z: (F,), U: (F, nu, m), Y: (F, ny, m), weight: (F, ny, m).
-    """
-
-    z: Complex
-    U: Complex
-    Y: Complex
-    weight: Array | None = None
-
-    def weighted(self, errors: Complex) -> Complex:
-        """√weight times errors (F, ny, m), or rows (F, ny, m, K) of them."""
-        if self.weight is None:
-            return errors
-        root = np.sqrt(self.weight)
-        return errors * root.reshape(*root.shape, *[1] * (errors.ndim - 3))
-
-    @property
-    def equations(self) -> int:
-        """Real equations: two a line, one at 0 and fs / 2, for each output and excited column."""
-        real = np.abs(self.z.imag) < 1e-12
-        excited = (np.abs(self.U) ** 2).sum(axis=1) > 0
-        return int(self.Y.shape[1] * (excited.sum(1) * np.where(real, 1, 2)).sum())
-
-
-def lines_of(
-    us: Sequence[Array], ys: Sequence[Array], records: Sequence[Record], *, offset: bool
-) -> Lines | None:
-    """The lines of periodic records, or None where their simulation error is no sum over lines.
-
-    As many columns as inputs carry all that matters of any number of records: what is left of the
-    outputs no linear model changes.
-
-    Args:
-        us, ys: normalised signals of each record.
-        records: how they are weighted.
-        offset: whether a constant in the output is free, which takes it out of line 0.
-
-    Shape:
-        us: of (T, nu), ys: of (T, ny).
-    """
-    ny = ys[0].shape[1]
-    if any(r.start != "periodic" or r.skip for r in records):
-        return None
-    if ny > 1 and any(np.ptp(r.weight) > 0 or r.line_weight is not None for r in records):
-        return None
-    groups: dict[int, list[tuple[Complex, Complex]]] = {}
-    means: list[tuple[Complex, Complex, float]] = []
-    total = sum(map(len, us))
-    for u, y, record in zip(us, ys, records, strict=True):
-        N = record.period or len(u)
-        U, Y = (np.fft.rfft(s.reshape(-1, N, s.shape[1]).mean(0), axis=0) / N for s in (u, y))
-        twice = np.full((len(U), 1), 2.0)
-        twice[0] = 1.0
-        if N % 2 == 0:
-            twice[-1] = 1.0
-        weight = np.max(record.weight) * twice * len(u) / total
-        if record.line_weight is not None:
-            weight = weight * record.line_weight[:: len(u) // N]
-        root = np.sqrt(weight)
-        means.append((root[0] * U[0], root[0] * Y[0], float(root[0, 0])))
-        groups.setdefault(N, []).append((root[1:] * U[1:], root[1:] * Y[1:]))
-    parts = [_line_0(means, offset=offset)]
-    for N, group in groups.items():
-        U, Y = (np.stack([pair[side] for pair in group], axis=-1) for side in (0, 1))
-        z = np.exp(2j * np.pi * np.arange(1, len(U) + 1) / N)
-        parts.append((z, *_compressed(U, Y)))
-    m = max(U.shape[2] for _, U, _ in parts)
-
-    def together(which: int) -> Complex:
-        wide = [np.pad(p[which], ((0, 0), (0, 0), (0, m - p[which].shape[2]))) for p in parts]
-        return np.concatenate(wide)
-
-    z, U, Y = np.concatenate([z for z, _, _ in parts]), together(1), together(2)
-    size = np.abs(U).max(axis=(1, 2))
-    excited = size > SILENT * size.max(initial=0.0)
-    return Lines(z[excited], U[excited], Y[excited])
-
-
-def _line_0(
-    means: list[tuple[Complex, Complex, float]], *, offset: bool
-) -> tuple[Complex, Complex, Complex]:
-    """Line 0 of all records, less what a constant common to them makes."""
-    U, Y = (np.stack([mean[side] for mean in means], axis=-1) for side in (0, 1))
-    if offset:
-        one = np.array([weight for _, _, weight in means])
-        one /= max(float(np.linalg.norm(one)), np.finfo(float).tiny)
-        U, Y = (S - np.outer(S @ one, one) for S in (U, Y))
-    return np.ones(1, dtype=complex), *_compressed(U[None], Y[None])
-
-
-def _compressed(U: Complex, Y: Complex) -> tuple[Complex, Complex]:
-    """As many columns as inputs with the same normal equations, where there are more."""
-    nu = U.shape[1]
-    if U.shape[2] <= nu:
-        return U, Y
-    stacked = np.concatenate([U, Y], axis=1).swapaxes(1, 2).conj()
-    R = np.asarray(np.linalg.qr(stacked, mode="r"))[:, :nu].conj().swapaxes(1, 2)
-    return R[:, :nu], R[:, nu:]
 
 
 class ResponseFit:
@@ -147,6 +29,8 @@ class ResponseFit:
         lines: what is fitted.
         known: whether the weights are the inverse variances of the lines.
     """
+
+    contenders = 12
 
     def __init__(self, lines: Lines, *, known: bool) -> None:
         self.lines, self.known = lines, known

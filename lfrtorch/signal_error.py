@@ -47,6 +47,8 @@ class SignalFit:
         us: of (T, nu), ys: of (T, ny).
     """
 
+    contenders = 1
+
     def __init__(
         self,
         us: Sequence[Array],
@@ -147,7 +149,7 @@ class SignalFit:
             record, u=np.hstack(inputs), y=y, start=start, inputs=(), outputs=(), **weights
         )
 
-    def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> _Stable:
+    def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> SimulationError:
         """The simulation error of the cell; unless observed, by B, D and the constant alone."""
         A, B, C, D = matrices
         nu, ny = self.nu, self.ny
@@ -166,7 +168,10 @@ class SignalFit:
         for parameter in (cell.A, cell.Cy):
             parameter.requires_grad_(observed)
         model = Model(LFR(cell), self._unit, first.fs, first.inputs, first.outputs)
-        problem = _Stable(model, self._records, slice(nu, nu + ny) if self._prediction else None)
+        problem = SimulationError(model, self._records)
+        if observed:
+            measured = slice(nu, nu + ny) if self._prediction else None
+            problem = _Stable(model, self._records, measured)
         free = {"Bu": free_B, "Dyu": free_D}
         problem.fixed = torch.cat(
             [

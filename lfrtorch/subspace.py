@@ -47,16 +47,16 @@ class Start(NamedTuple):
         A: stable, by moving the poles that are not.
         C: output matrix.
         singular_values: of the subspace, which fall off behind the order that the data carry.
-        unstable: largest pole radius before poles were moved; 0 where none was.
+        unstable: A before poles were moved, where any was.
 
     Shape:
-        A: (nx, nx), C: (ny, nx), singular_values: (n,).
+        A, unstable: (nx, nx), C: (ny, nx), singular_values: (n,).
     """
 
     A: Array
     C: Array
     singular_values: Array
-    unstable: float
+    unstable: Array | None
 
 
 def from_spectra(z: Complex, U: Complex, Y: Complex, nx: int) -> list[Start]:
@@ -103,7 +103,7 @@ def from_spectra(z: Complex, U: Complex, Y: Complex, nx: int) -> list[Start]:
                     A = np.linalg.solve((eye + a * A_axis).T, (A_axis + a * eye).T).T
                 except np.linalg.LinAlgError:
                     continue
-                starts.append(Start(_stabilised(A), C, s, _unstable(A)))
+                starts.append(_stable(A, C, s))
     return starts
 
 
@@ -129,7 +129,7 @@ def from_signals(us: Sequence[Array], ys: Sequence[Array], nx: int) -> list[Star
         for instruments in (past, past_u):
             observability, s = _observability(L[past:, inputs:instruments], nx)
             A, C = _shift(observability, ny)
-            starts.append(Start(_stabilised(A), C, s, _unstable(A)))
+            starts.append(_stable(A, C, s))
     return starts
 
 
@@ -157,21 +157,17 @@ def _shift(observability: Array, ny: int) -> tuple[Array, Array]:
     return np.asarray(A, dtype=np.float64), observability[:ny]
 
 
-def _unstable(A: Array) -> float:
-    radius = float(np.abs(np.linalg.eigvals(A)).max())
-    return radius if radius > LARGEST_POLE else 0.0
-
-
-def _stabilised(A: Array) -> Array:
-    """A with its unstable eigenvalues reflected into the unit circle, at most to MOVED_POLE."""
+def _stable(A: Array, C: Array, singular_values: Array) -> Start:
+    """With unstable eigenvalues reflected into the unit circle, at most to MOVED_POLE."""
     values, vectors = np.linalg.eig(A)
     radius = np.abs(values)
     unstable = radius > LARGEST_POLE
     if not unstable.any():
-        return A
-    factor = np.where(unstable, np.minimum(1.0 / np.maximum(radius, 1.0), MOVED_POLE), radius)
+        return Start(A, C, singular_values, None)
+    factor = np.minimum(1.0 / np.maximum(radius, 1.0), MOVED_POLE)
     values = values * np.where(unstable, factor / np.maximum(radius, 1e-300), 1.0)
-    return np.real(vectors * values @ np.linalg.pinv(vectors))
+    moved = np.real(vectors * values @ np.linalg.pinv(vectors))
+    return Start(moved, C, singular_values, A)
 
 
 def _hankel(signal: Array, rows: int) -> Array:

@@ -1,6 +1,7 @@
 """The best linear approximation: exact on linear data, stable on any, and what it refuses."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import scipy.linalg
 from reference import Array, System, random_system
 
 from lfrtorch.bla import data_scaler, estimate_bla
+from lfrtorch.frf import estimate_frf
 from lfrtorch.linear_model import LinearModel
 from lfrtorch.records import Channel, Record, Start
 
@@ -261,3 +263,208 @@ def test_start_state_is_fitted(start):
     bla = estimate_bla(record, 3, offset=False)
     assert frf_error(bla, system) < 1e-8
     np.testing.assert_allclose(bla.simulate(record), record.y, rtol=0, atol=1e-8)
+
+
+# --- orders, channels and bands -------------------------------------------------------------
+
+# "FRF to 1e-8" on the excited lines. Order 12 from a tenth of the axis leaves 1e-11 and less.
+BANDS = {"all": (0.0, 1.0), "a third": (0.05, 0.4), "a tenth": (0.0, 0.1)}
+
+
+def excited(
+    system: System, band: tuple[float, float], *, T: int = 2048, R: int = 3
+) -> list[Record]:
+    """Steady-state records of multisines that excite only a part of the frequency axis."""
+    nu, first, last = system[3].shape[1], *(np.array(band) * T / 2)
+    records = []
+    for seed in range(R):
+        rng = np.random.default_rng([seed, 5])
+        U = np.zeros((T // 2 + 1, nu), dtype=complex)
+        lines = np.arange(max(1, round(first)), round(last))
+        U[lines] = np.exp(2j * np.pi * rng.random((len(lines), nu)))
+        u = np.fft.irfft(U, T, axis=0)
+        records.append(Record(u, reference.periodic_response(system, u), 10.0, "periodic"))
+    return records
+
+
+@pytest.mark.parametrize("band", BANDS)
+@pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 1), (3, 3)])
+@pytest.mark.parametrize("nx", [1, 2, 5, 8, 12])
+def test_linear_system_is_recovered_from_a_part_of_the_axis(nx: int, nu: int, ny: int, band: str):
+    system = random_system(nx, nu, ny)
+    low, high = BANDS[band]
+    model = estimate_bla(excited(system, BANDS[band], R=nu), nx)
+    omega = np.linspace(max(low, 1 / 1024) * np.pi, (high - 1 / 1024) * np.pi, 200)
+    G = reference.frf(system, omega)
+    error = np.abs(model.frf(omega * model.fs / 2 / np.pi) - G).max() / np.abs(G).max()
+    assert error < 1e-8
+    assert np.abs(model.poles).max() < 1
+
+
+@pytest.mark.parametrize("nx", [9, 12])
+@pytest.mark.parametrize(("nu", "ny"), [(1, 1), (3, 3)])
+def test_high_orders_are_recovered_from_signals(nx: int, nu: int, ny: int):
+    system = random_system(nx, nu, ny)
+    model = estimate_bla(record_of(system, "zero", T=1500), nx, offset=False)
+    assert frf_error(model, system) < 1e-8
+
+
+# --- nonparametric responses ----------------------------------------------------------------
+
+
+def noisy(system: System, *, R: int, P: int, noise: float = 0.05, T: int = 256) -> list[Record]:
+    """R realisations of P periods with noise in the output."""
+    records = []
+    for record in excited(system, (0.0, 1.0), T=T, R=R):
+        y = np.tile(record.y, (P, 1))
+        rng = np.random.default_rng([len(records), 9])
+        y = y + noise * rng.normal(size=y.shape) + 4.0
+        records.append(Record(np.tile(record.u, (P, 1)) + 1.0, y, 10.0, "periodic", period=T))
+    return records
+
+
+def test_response_is_fitted_with_its_operating_point():
+    system = random_system(3, 2, 2)
+    records = noisy(system, R=2, P=1, noise=0.0)
+    frf = estimate_frf(records)
+    for model in (estimate_bla(frf, 3), estimate_bla(records, 3, refine="frequency")):
+        assert frf_error(model, system) < 1e-9
+        np.testing.assert_allclose(model.u_offset, np.ones(2))
+        y = model.simulate(records[0])
+        np.testing.assert_allclose(y, records[0].y, atol=1e-8)
+        assert model.fit is not None
+        assert model.fit.criterion == "frequency"
+
+
+def test_weighted_error_of_a_true_model_is_one():
+    """Where the variances are those of the errors, only they are left."""
+    system = random_system(2)
+    frf = estimate_frf(noisy(system, R=40, P=1))
+    model = estimate_bla(frf, 2)
+    assert model.fit is not None
+    # 127 lines, 254 real residuals: 1 / √(2 · 254) = 4.4 %; smoothing and 39 degrees of freedom
+    # of the variances add about as much.
+    assert model.fit.rmse == pytest.approx(1.0, abs=0.25)
+
+
+def test_weights_decide():
+    """Lines without weight are not fitted; a variance that is not known cannot weigh."""
+    system = random_system(2)
+    frf = estimate_frf(noisy(system, R=3, P=2, noise=0.0))
+    wrong = replace(frf, G=np.where(np.arange(len(frf.G))[:, None, None] < 60, frf.G, 7.0))
+    weight = np.where(np.arange(len(frf.G))[:, None, None] < 60, 1.0, 0.0)
+    assert frf_error(estimate_bla(wrong, 2, weight=weight), system) < 1e-8
+    assert frf_error(estimate_bla(wrong, 2), system) > 0.1
+    with pytest.raises(ValueError, match="weight has shape"):
+        estimate_bla(frf, 2, weight=weight[1:])
+    with pytest.raises(ValueError, match="weight is 'all'; use 'total'"):
+        estimate_bla(frf, 2, weight="all")  # pyright: ignore[reportArgumentType]
+    once = estimate_frf(noisy(system, R=1, P=1))
+    for name in ("total", "noise"):
+        with pytest.raises(ValueError, match=f"the {name} variance of the response is not known"):
+            estimate_bla(once, 2, weight=name)
+
+
+def test_what_a_response_does_not_know_is_said():
+    system = random_system(2)
+
+    def notes(R: int, P: int) -> str:
+        fit = estimate_bla(estimate_frf(noisy(system, R=R, P=P)), 2).fit
+        assert fit is not None
+        return " ".join(fit.notes)
+
+    assert "noise: not available from one period" in notes(1, 1)
+    assert "all lines count alike in the fit" in notes(1, 1)
+    assert "weighted by the noise alone" in notes(1, 3)
+    assert "total: not available" in notes(1, 3)
+    assert notes(3, 3) == ""
+
+
+@pytest.mark.parametrize("refine", ["simulation", "frequency"])
+def test_standard_deviation_of_the_response_is_that_of_many_fits(refine):
+    """60 records of periodic data with coloured noise, which changes from line to line."""
+    system, frequencies = random_system(2), np.array([0.3, 1.0, 2.5])
+    found, predicted = [], []
+    clean = excited(system, (0.0, 1.0), T=256, R=4)
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 11])
+        records = []
+        for record in clean:
+            e = rng.normal(size=record.y.shape)
+            e = 0.05 * (e + 0.8 * np.roll(e, 1, axis=0))
+            records.append(replace(record, y=record.y + e))
+        model = estimate_bla(records, 2, refine=refine)
+        found.append(model.frf(frequencies)[:, 0, 0])
+        predicted.append(model.frf_std(frequencies)[:, 0, 0] ** 2)
+    variance = np.mean(np.abs(found - np.mean(found, axis=0)) ** 2, axis=0)
+    # A complex mean square over 60 draws deviates by at most √(2 / 60) = 18 %: four of them.
+    np.testing.assert_allclose(np.mean(predicted, axis=0), variance, rtol=0.73)
+
+
+# --- what a fit says of itself --------------------------------------------------------------
+
+
+def notes_of(record: Record | list[Record], nx: int, **options) -> str:
+    fit = estimate_bla(record, nx, **options).fit
+    assert fit is not None
+    return " ".join(fit.notes)
+
+
+def test_fit_is_described():
+    record = record_of(random_system(2), "zero", noise=0.1)
+    model = estimate_bla(record, 2)
+    fit = model.fit
+    assert fit is not None
+    error = (record.y - model.simulate(record))[:, 0]
+    assert fit.rmse == pytest.approx(error.std() / record.y.std(), rel=1e-9)
+    assert fit.criterion == "simulation"
+    assert fit.reason.startswith("converged")
+    assert 0 < fit.iterations < 200
+    assert fit.notes == ()
+    # Two of many singular values stand out: the order.
+    s = np.array(fit.singular_values)
+    assert s[0] == 1.0
+    assert s[1] > 5 * s[2]
+
+
+def test_search_that_was_cut_short_says_so():
+    record = record_of(random_system(4), "periodic", noise=0.5)
+    assert "stopped after 1 iterations: raise max_iter" in notes_of(record, 3, max_iter=1)
+    assert "stopped" not in notes_of(record, 3, max_iter=0)
+
+
+def test_order_above_what_the_data_carry():
+    record = record_of(random_system(2), "periodic")
+    assert "order 5 is above what the data carry" in notes_of(record, 5, offset=False)
+    assert "try nx=2" in notes_of(record, 5, offset=False)
+    assert notes_of(record, 2) == ""
+
+
+def test_unstable_data():
+    u = np.random.default_rng(0).normal(size=300)
+    y = reference.dlsim((1.03 * ONE, ONE, ONE, 0 * ONE), u)
+    assert "come from an unstable system" in notes_of(Record(u, y), 1)
+
+
+def test_narrow_input():
+    record = Record(*ANY_DATA["sine"])
+    assert "the input is too narrow: it excites 3 of the 5 directions" in notes_of(record, 2)
+
+
+def test_fewer_lines_than_unknowns():
+    N = 64
+    u = np.cos(2 * np.pi * np.arange(N) * 5 / N) + np.cos(2 * np.pi * np.arange(N) * 9 / N)
+    record = Record(u, np.roll(u, 1), start="periodic")
+    refused(
+        "2 excited line(s) make 4 equations; order nx=2 with 1 input(s) and 1 output(s) has 5 "
+        "unknowns: excite more lines, or lower nx.",
+        record,
+    )
+
+
+def test_error_and_data_must_go_together():
+    record = record_of(random_system(1), "periodic")
+    refused("refine is 'output'; use 'simulation', 'prediction' or", record, refine="output")
+    refused("weight is that of a response: use refine='frequency'.", record, weight="noise")
+    with pytest.raises(ValueError, match="refine is 'simulation', an error of records"):
+        estimate_bla(estimate_frf(record), 1, refine="simulation")
