@@ -51,7 +51,8 @@ class Orthogonal:
         if torch.isfinite(R).all():
             _, s, Vh = torch.linalg.svd(R, full_matrices=False)
             kept = s > truncation * s[0]
-            self._squares, self._Vh = s[kept].square(), Vh[kept]
+            # A parameter that R does not see stays as it is, to the last bit.
+            self._squares, self._Vh = s[kept].square(), Vh[kept].masked_fill((R == 0).all(0), 0.0)
             self.scale, self.rank = float(s[0].square()), len(self._squares)
 
     def solve(self, gradient: Tensor, damping: float) -> Tensor:

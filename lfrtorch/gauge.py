@@ -77,8 +77,9 @@ def reduction(
     if fixed is not None:
         mask[np.flatnonzero(mask)[: len(fixed)]] = ~fixed.cpu().numpy()
     size = np.linalg.norm(G)
+    places = torch.as_tensor(theta[mask]).to(cell.A.device)
     if not np.isfinite(size):
-        return everything(cell.A.new_zeros(P))
+        return _placed(everything(cell.A.new_zeros(len(places))), places, P)
     if not mask.all():
         # Directions that move no fixed parameter.
         G = G[mask] @ scipy.linalg.null_space(G[~mask]) if G.shape[1] else G[mask]
@@ -96,9 +97,13 @@ def reduction(
     found = _expanded(G @ Q[:, :rank], pivots[:rank], cell.A)
     if found is None:
         found = everything(cell.A.new_zeros(len(G)))
-    if len(G) == P:
+    return _placed(found, places, P)
+
+
+def _placed(found: Reduction, places: Tensor, P: int) -> Reduction:
+    """A reduction of the columns at some places (n,) as one of all P; the others are zeros."""
+    if len(places) == P:
         return found
-    places = torch.as_tensor(theta[mask]).to(found.kept)
     expand = found.expand.new_zeros(len(found.kept), P)
     expand[:, places] = found.expand
     return Reduction(places[found.kept], expand)

@@ -38,6 +38,7 @@ class Jacobian:
         ridge: factors (P,) of θ - θ_start in the residual of the first process, after the batches.
         penalty: θ - θ_start (P,).
         ranks: the processes that hold the parts.
+        fixed: entries (P,) of θ that are constants: columns of zeros, none where left out.
     """
 
     def __init__(
@@ -47,10 +48,12 @@ class Jacobian:
         ridge: Tensor,
         penalty: Tensor,
         ranks: Ranks,
+        fixed: Tensor | None = None,
     ) -> None:
         self.parts, self._reduced, self._ranks = parts, reduced, ranks
-        self._ridge, self._penalty = ridge, penalty
-        self._penalised = bool(ridge.any())
+        self._fixed = torch.zeros_like(ridge, dtype=torch.bool) if fixed is None else fixed
+        self._ridge, self._penalty = ridge.masked_fill(self._fixed, 0.0), penalty
+        self._penalised = bool(ridge.any())  # its rows are there, whatever is fixed
         self._own_penalty = self._penalised and ranks.rank == 0
 
     def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
@@ -69,13 +72,16 @@ class Jacobian:
         factor.combine(self._ranks)
         if isinstance(factor, Triangle):
             R, r = self._reduced.columns(factor.R[:, :-1]), factor.R[:, -1]
+            R = R.masked_fill(self._fixed, 0.0)
             gradient = R.mT @ r
             rows = [R, torch.diag(self._ridge)] if self._penalised else [R]
             system = Orthogonal(torch.cat(rows), truncation)
         else:
-            gradient = expand.mT @ factor.G[:-1, -1]
+            gradient = (expand.mT @ factor.G[:-1, -1]).masked_fill(self._fixed, 0.0)
             G = self._reduced.columns(self._reduced.columns(factor.G[:-1, :-1]).mT)
-            system = Normal(G + torch.diag(self._ridge.square()), len(kept))
+            G = G.masked_fill(self._fixed | self._fixed.unsqueeze(1), 0.0)
+            rank = int((~self._fixed[kept]).sum())
+            system = Normal(G + torch.diag(self._ridge.square()), rank)
         gradient = gradient + self._ridge.square() * self._penalty
         if self._ranks.world == 1:
             return system, gradient
@@ -83,6 +89,7 @@ class Jacobian:
 
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J d_theta (M,)."""
+        d_theta = d_theta.masked_fill(self._fixed, 0.0)
         reduced = self._reduced.expand @ d_theta
         parts = [part.tangent(d_theta, reduced).flatten() for part in self.parts]
         return torch.cat([*parts, *([self._ridge * d_theta] if self._own_penalty else [])])
@@ -100,12 +107,13 @@ class Jacobian:
         gradient = gradient + self._reduced.expand.mT @ reduced
         if self._own_penalty:
             gradient = gradient + self._ridge * residual[first:]
-        return self._ranks.sum(gradient)
+        return self._ranks.sum(gradient.masked_fill(self._fixed, 0.0))
 
     def whole(self) -> Tensor:
         """J (M, P): for a look at it, and for small problems."""
         parts = [part.whole(len(self._ridge)).flatten(0, 2) for part in self.parts]
-        return torch.cat([*parts, *([torch.diag(self._ridge)] if self._own_penalty else [])])
+        J = torch.cat([*parts, *([torch.diag(self._ridge)] if self._own_penalty else [])])
+        return J.masked_fill(self._fixed, 0.0)
 
 
 class Memory:

@@ -74,7 +74,7 @@ class SimulationError:
         self._start = self.theta
         self._ridge = self._ridge_of(ridge)
         self.fixed: Tensor | None = None
-        """Which entries of the module's free parameters stay as they are; None for none."""
+        """Which entries of the module's free parameters stay as they are: columns of zeros in J."""
         self._reduced: Reduction | None = None
         self._memory = Memory()
         self.guesses: list[Tensor | None] = [None] * len(self.batches)
@@ -136,6 +136,10 @@ class SimulationError:
             periodic = batch.start == "periodic"
             linearisation = Linearisation(cell, batch.u, trajectory, periodic=periodic)
             parts.append(Part(batch, linearisation, x0, self._memory))
+        fixed = None
+        if self.fixed is not None:
+            fixed = torch.zeros_like(theta, dtype=torch.bool)
+            fixed[: len(self.fixed)] = self.fixed.to(fixed)
         if reduce:
             held = any(batch.x0 is not None for batch in self.batches)
             held = bool(self.ranks.sum(self._start.new_tensor(float(held))))
@@ -147,7 +151,7 @@ class SimulationError:
         else:
             reduced = everything(theta)
         penalty = theta - self._start
-        return Jacobian(parts, reduced, self._ridge.sqrt(), penalty, self.ranks)
+        return Jacobian(parts, reduced, self._ridge.sqrt(), penalty, self.ranks, fixed)
 
     def jacobian(self, theta: Tensor) -> Tensor:
         """dr/dθ (M, P) as a whole: for a look at it, and for small problems."""

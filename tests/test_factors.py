@@ -82,3 +82,19 @@ def test_entries_that_are_not_finite_have_no_scale(bad: float):
 
 def test_singular_values_whose_squares_overflow_have_an_infinite_scale():
     assert Orthogonal(torch.tensor([[1e200]], dtype=torch.float64), 1e-12).scale == math.inf
+
+
+@pytest.mark.parametrize("rows", [4, 6, 20])
+def test_inverse_is_the_pseudo_inverse(rows: int):
+    """Of JᵀJ, with directions that J does not see and with a column of zeros."""
+    J = normal(rows, 6)
+    J[:, 2] = 0.0
+    J[:, 5] = J[:, 0] - J[:, 1]
+    G, inverse = J.mT @ J, Orthogonal(J, 1e-12).inverse
+    # eps times |G| = 70 times its condition 90: 1e-12.
+    for product in (G @ inverse, inverse @ G):
+        assert_close(product, product.mT, rtol=0, atol=1e-11)
+    assert_close(G @ inverse @ G, G, rtol=0, atol=1e-11)
+    assert_close(inverse @ G @ inverse, inverse, rtol=1e-11, atol=1e-11)
+    assert_close(inverse, torch.linalg.pinv(G, rtol=1e-12), rtol=1e-10, atol=1e-10)
+    assert torch.equal(inverse[2], torch.zeros(6, dtype=torch.float64))

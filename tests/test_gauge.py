@@ -126,3 +126,83 @@ def test_a_class_of_one_s_own_that_begins_with_a_network_keeps_its_coordinates()
             return super().forward(z) + 0.5 * torch.sin(z[..., :1])
 
     check(random_cell(1, 1, 2, 2, 1, static=More(2, 1, 3), radius=0.3, feedback=0.05), 2**2)
+
+
+# --- fixed entries ----------------------------------------------------------------------------
+
+
+def check_fixed(cell: LFRCell, fixed: torch.Tensor, left_out: int):
+    """Columns of zeros at the fixed entries, the plain ones elsewhere; so many are not computed."""
+    u = normal(2, 12, cell.nu)
+    J = output_jacobian(Linearisation(cell, u, steady_state(cell, u), periodic=True))
+    kept, expand = reduction(cell, none(cell), fixed=fixed)
+    assert len(kept) == J.shape[-1] - int(fixed.sum()) - left_out
+    assert not fixed[kept].any()
+    found = J[..., kept] @ expand
+    assert torch.equal(expand[:, fixed], torch.zeros_like(expand[:, fixed]))
+    # The expansion multiplies by 1 / DEPENDENT at most, the steady state is known to 1e-10.
+    assert_close(found[..., ~fixed], J[..., ~fixed], rtol=0, atol=1e-8 * float(J.abs().max()))
+
+
+def entries(cell: LFRCell, *names: str) -> torch.Tensor:
+    """Which free entries belong to those parameters."""
+    parts = [
+        torch.full((p.numel(),), name in names)
+        for name, p in cell.named_parameters()
+        if p.requires_grad
+    ]
+    return torch.cat(parts)
+
+
+@pytest.mark.parametrize(
+    ("names", "left_out"),
+    [((), 4 + 4 + 1), (("A",), 2 + 4 + 1), (("Cz", "Dzu"), 2 + 1), (("A", "Bu", "Bw", "Cy"), 4)],
+)
+def test_fixed_parameters_are_frozen_ones(names: tuple[str, ...], left_out: int):
+    """As many directions as where the whole parameter has no gradient."""
+    cell = random_cell(1, 1, 2, 2, 1, 4, radius=0.5)
+    check_fixed(cell, entries(cell, *names), left_out)
+
+
+def test_single_entries_hold_the_directions_that_move_them():
+    """Of the diagonal of A they move nx - 1 entries freely: the trace stays as it is."""
+    cell = random_cell(1, 1, 3, 0, 0, radius=0.5)
+    fixed = entries(cell)
+    fixed[[0, 4, 8]] = True
+    check_fixed(cell, fixed, 9 - 2)
+
+
+def test_fixed_entries_beside_a_frozen_parameter_and_start_states():
+    """`fixed` numbers the free parameters alone, and start states stay free behind them."""
+    cell = random_cell(1, 1, 2, 1, 1, 3, radius=0.5)
+    cell.Bu.requires_grad_(False)
+    fixed = entries(cell, "Cy")
+    x0, u = normal(2, 2, seed=4), normal(2, 12, 1)
+    kept, expand = reduction(cell, x0, fixed=fixed)
+    P = len(fixed)
+    assert expand.shape[1] == P + 4
+    assert kept[-4:].tolist() == [P, P + 1, P + 2, P + 3]
+    rows = output_jacobian(Linearisation(cell, u, simulate(cell, u, x0)))
+    J = rows.new_zeros(*rows.shape[:3], P + 4)
+    J[..., :P] = rows[..., :P]
+    J[0, ..., P : P + 2], J[1, ..., P + 2 :] = rows[0, ..., P:], rows[1, ..., P:]
+    J[..., :P][..., fixed] = 0.0
+    assert_close(J[..., kept] @ expand, J, rtol=0, atol=1e-9 * float(J.abs().max()))
+
+
+def test_reduction_of_before_does_not_bring_fixed_entries_back():
+    cell = random_cell(1, 1, 2, 1, 1, 3, radius=0.5)
+    before = reduction(cell, none(cell))
+    fixed = entries(cell, "A")
+    _, expand = reduction(cell, none(cell), before=before, fixed=fixed)
+    assert not expand[:, fixed].any()
+
+
+def test_weights_that_are_not_finite_leave_fixed_entries_out():
+    cell = random_cell()
+    with torch.no_grad():
+        cell.A[0, 0] = torch.inf
+    fixed = entries(cell, "Bu")
+    kept, expand = reduction(cell, none(cell), fixed=fixed)
+    assert not expand[:, fixed].any()
+    assert len(kept) == int((~fixed).sum())

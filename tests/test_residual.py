@@ -13,6 +13,7 @@ from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start
 from lfrtorch.residual import SimulationError
+from lfrtorch.stack import Stack
 
 
 @pytest.fixture
@@ -353,3 +354,93 @@ def test_a_jacobian_asks_for_room_once(model: Model, monkeypatch):
     jacobian.system(1e-2, 1e-12)
     monkeypatch.setattr("lfrtorch.jacobian.Memory.take", None)
     jacobian.system(1e-15, 1e-12)
+
+
+# --- entries that stay as they are ------------------------------------------------------------
+
+RIDGE_AND_ROOM = pytest.mark.parametrize(
+    ("ridge", "kept"), [(0.0, True), (0.0, False), (0.5, True), (0.5, False)]
+)
+
+
+def some_fixed(model: Model) -> torch.Tensor:
+    """Every third free parameter of the module, the first one too."""
+    return torch.arange(model.parameters) % 3 == 0
+
+
+@RIDGE_AND_ROOM
+@pytest.mark.parametrize("precise", [True, False])
+def test_fixed_entries_have_columns_of_zeros(
+    model: Model, ridge: float, kept: bool, precise: bool, monkeypatch
+):
+    """The other columns are the plain Jacobian's, whichever way a product or a system takes."""
+    monkeypatch.setattr("lfrtorch.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    records = all_kinds(model, given=False)
+    theta = SimulationError(model, records).theta + 0.1
+    plain = SimulationError(model, records, ridge=ridge).jacobian(theta)
+    problem = SimulationError(model, records, ridge=ridge)
+    problem.fixed = some_fixed(model)
+    held = torch.cat([problem.fixed, torch.zeros(3 * 2, dtype=torch.bool)])  # start states follow
+    r, J = problem.residual(theta), problem.jacobian(theta)
+    assert torch.equal(J[:, held], torch.zeros_like(J[:, held]))
+    # The same recurrence from a periodic start known to 1e-10.
+    assert_close(J[:, ~held], plain[:, ~held], rtol=0, atol=1e-9 * float(plain.abs().max()))
+
+    zeros = torch.zeros(int(held.sum()), dtype=torch.float64)
+    _, slope = problem.gradient(theta)
+    assert torch.equal(slope[held], zeros)
+    assert_close(slope, 2 * J.mT @ r / problem.size, rtol=1e-8, atol=1e-8)
+
+    jacobian = problem.linearise(theta)
+    system, gradient = jacobian.system(1e-15 if precise else 1e-2, 1e-12)
+    assert torch.equal(gradient[held], zeros)
+    assert torch.equal(jacobian.adjoint(r)[held], zeros)
+    # As for the whole Jacobian above: the scale of J times 1e-10.
+    assert_close(jacobian.tangent(theta), J @ theta, rtol=0, atol=1e-8)
+    assert_close(jacobian.adjoint(r), J.mT @ r, rtol=0, atol=1e-8)
+    damping = 1e-3 * system.scale
+    expected = -torch.linalg.solve(J.mT @ J + damping * torch.eye(len(theta)), J.mT @ r)
+    step = system.solve(gradient, damping)
+    assert torch.equal(step[held], zeros)
+    # The condition is 1e3 by the damping, the steady state known to 1e-10.
+    assert_close(step, expected, rtol=0, atol=1e-7 * float(expected.abs().max()))
+
+
+@RIDGE_AND_ROOM
+def test_search_leaves_fixed_entries_and_brings_the_rest_home(
+    model: Model, ridge: float, kept: bool, monkeypatch
+):
+    """With geodesic acceleration, whose right side is a product with J by itself."""
+    monkeypatch.setattr("lfrtorch.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    records = [measure(model, 60, seed=i) for i in range(2)]
+    theta = SimulationError(model, records).theta
+    problem = SimulationError(model, records, ridge=1e-8 * ridge)
+    problem.fixed = some_fixed(model)
+    away = 0.02 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
+    away[problem.fixed] = 0.0
+    optimiser = LevenbergMarquardt(max_iter=100)
+    state = optimiser.init(problem, theta + away)
+    while not state.reason:
+        state = optimiser.step(problem, state)
+    assert torch.equal(state.theta[problem.fixed], theta[problem.fixed])
+    # Noise-free, and θ_start of the ridge is the planted θ: the search ends at rounding.
+    assert problem.rmse(state.theta) < 1e-8
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_stack_leaves_fixed_entries(kept: bool, monkeypatch):
+    """The searches of a stack compute all columns, and move the free entries alone."""
+    monkeypatch.setattr("lfrtorch.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    models = [random_model(random_cell(2, 2, 2, 2, 1, 3, seed=i)) for i in range(2)]
+    record = measure(models[0], 60)
+    problems = [SimulationError(m, replace(record, y=record.y + 0.1)) for m in models]
+    for problem, m in zip(problems, models, strict=True):
+        problem.fixed = some_fixed(m)
+    starts = [p.theta for p in problems]
+    optimiser = LevenbergMarquardt()
+    states = [optimiser.init(p, p.theta) for p in problems]
+    for _ in range(3):
+        states = optimiser.steps(Stack(problems), states)
+    for problem, state, theta in zip(problems, states, starts, strict=True):
+        assert torch.equal(state.theta[problem.fixed], theta[problem.fixed])
+        assert not torch.equal(state.theta, theta)
