@@ -21,8 +21,9 @@ from lfrtorch.records import Channel, Record, Scaler, without_coordinates
 
 Array = NDArray[np.float64]
 
-INFINITE = 1e8
-"""Radius beyond which a generalised eigenvalue is a zero at infinity."""
+SINGULAR = 1e-12
+"""Singular value, relative to the size of the system, that counts as zero where zeros at infinity
+are told from finite ones."""
 
 
 @dataclass(frozen=True)
@@ -104,22 +105,19 @@ class LinearModel:
                 many outputs as inputs.
 
         Raises:
-            ValueError: a whole model that is not square (it has no zeros in general).
+            ValueError: other numbers of outputs and inputs (there are no zeros in general).
         """
         B, C, D = self.B, self.C, self.D
-        if output is not None and input is not None:
-            B, C, D = B[:, [input]], C[[output]], D[[output]][:, [input]]
+        if output is not None:
+            C, D = C[[output]], D[[output]]
+        if input is not None:
+            B, D = B[:, [input]], D[:, [input]]
         if D.shape[0] != D.shape[1]:
             raise ValueError(
                 f"a model of {D.shape[1]} input(s) and {D.shape[0]} output(s) has no transmission "
                 "zeros in general; ask for those of a channel: zeros(output, input)."
             )
-        nx, n = len(self.A), len(D)
-        pencil = np.block([[self.A, B], [C, D]])
-        mass = scipy.linalg.block_diag(np.eye(nx), np.zeros((n, n)))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            found = scipy.linalg.eigvals(pencil, mass)
-        return found[np.isfinite(found) & (np.abs(found) < INFINITE)]
+        return _zeros(self.A, B, C, D)
 
     def frf(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
         """Frequency response C (zI - A)⁻¹ B + D.
@@ -295,6 +293,52 @@ def linear_cell(A: Array, B: Array, C: Array, D: Array) -> LFRCell:
         for parameter, value in ((cell.A, A), (cell.Bu, B), (cell.Cy, C), (cell.Dyu, D)):
             parameter.copy_(torch.as_tensor(np.ascontiguousarray(value)))
     return cell
+
+
+def _zeros(A: Array, B: Array, C: Array, D: Array) -> NDArray[np.complex128]:
+    """Finite invariant zeros, after those at infinity are taken out one by one.
+
+    The eigenvalues of the pencil [A - zI, B; C, D] will not do: rounding moves one at infinity of
+    multiplicity k to a radius of eps^(-1/k), 2e7 for a delay of five samples.
+
+    References:
+        Emami-Naeini and Van Dooren, "Computation of zeros of linear multivariable systems",
+        Automatica 18, 1982.
+    """
+    by_y = np.linalg.norm(np.hstack([C, D]), axis=1)
+    C, D = (M / np.where(by_y > 0, by_y, 1.0)[:, None] for M in (C, D))
+    by_u = np.linalg.norm(np.vstack([B, D]), axis=0)
+    B, D = (M / np.where(by_u > 0, by_u, 1.0) for M in (B, D))
+    limit = SINGULAR * float(np.linalg.norm(np.block([[A, B], [C, D]]), 2))
+    A, B, C, D = _outputs_reduced(A, B, C, D, limit)
+    A, C, B, D = (M.T for M in _outputs_reduced(A.T, C.T, B.T, D.T, limit))
+    zeros = np.linalg.eigvals(A - B @ np.linalg.solve(D, C))  # D is square and regular now
+    return np.asarray(zeros, dtype=np.complex128)
+
+
+def _outputs_reduced(
+    A: Array, B: Array, C: Array, D: Array, limit: float
+) -> tuple[Array, Array, Array, Array]:
+    """A system with the same finite zeros whose D has full row rank."""
+    while True:
+        U, rank = _range(D, limit)
+        C, D = U.T @ C, (U.T @ D)[:rank]
+        V, free = _range(C[rank:].T, limit)
+        C = C[:rank]
+        if not free:
+            return A, B, C, D
+        # Outputs without direct term are 0: the states that they see are, and stay so.
+        V = np.roll(V, -free, axis=1)
+        A, B, C = V.T @ A @ V, V.T @ B, C @ V
+        n = len(A) - free
+        C, D = np.vstack([C[:, :n], A[n:, :n]]), np.vstack([D, B[n:]])
+        A, B = A[:n, :n], B[:n]
+
+
+def _range(M: Array, limit: float) -> tuple[Array, int]:
+    """Orthogonal matrix whose first columns, so many, span the range of M."""
+    U, s, _ = np.linalg.svd(M)
+    return U, int((s > limit).sum())
 
 
 def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
