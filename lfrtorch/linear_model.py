@@ -270,6 +270,16 @@ class LinearModel:
             inputs, outputs = (
                 tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")
             )
+            nx, nu, ny = len(arrays["A"]), len(inputs), len(outputs)
+            P = (nx + ny) * (nx + nu)
+            for name, shape in (
+                ("A", (nx, nx)), ("B", (nx, nu)), ("C", (ny, nx)), ("D", (ny, nu)),
+                ("u_offset", (nu,)), ("y_offset", (ny,)), ("K", (nx, ny)),
+                ("innovation_covariance", (ny, ny)), ("covariance", (P, P)),
+            ):  # fmt: skip
+                found = (arrays | optional).get(name)
+                if found is not None and found.shape != shape:
+                    raise ValueError(f"{name} is {found.shape}, not {shape}")
             return cls(
                 **arrays, fs=float(made["fs"]), inputs=inputs, outputs=outputs, **optional, fit=fit
             )

@@ -172,9 +172,15 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             checkpoint holds weights, never code).
 
     Raises:
-        ValueError: no checkpoint, a damaged one, or one of another program or a newer version.
+        ValueError: no checkpoint, a damaged one, one of another program or a newer version, or one
+            that holds a linear model.
     """
     description, weights = checkpoint.read(folder)
+    if "linear" in description:
+        raise ValueError(
+            f"'{folder}' holds a linear model, as estimate_bla makes it; "
+            "read it with lfrtorch.LinearModel.load."
+        )
     made = description.get("static")
     built_in = ("Network", "Polynomial")
     if isinstance(made, dict) and made.get("type") not in built_in and static is None:
