@@ -224,6 +224,8 @@ class LinearModel:
     def to_control(self) -> Any:
         """The deviations from the operating point as a ``control.StateSpace``.
 
+        Dots in channel names, which that package does not allow, become underscores.
+
         Raises:
             ImportError: the package ``control`` is not installed.
         """
@@ -235,7 +237,8 @@ class LinearModel:
             ) from error
         return control.ss(
             self.A, self.B, self.C, self.D, 1.0 / self.fs,
-            inputs=[c.name for c in self.inputs], outputs=[c.name for c in self.outputs],
+            inputs=[c.name.replace(".", "_") for c in self.inputs],
+            outputs=[c.name.replace(".", "_") for c in self.outputs],
         )  # fmt: skip
 
     def save(self, folder: str | Path) -> Path:
