@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-Numbers = NDArray[np.intp]
+Indices = NDArray[np.intp]
 
 
 def resolvents(A: Array, B: Array, C: Array, z: Complex) -> tuple[Complex, Complex]:
@@ -47,7 +47,7 @@ def frequency_response(A: Array, B: Array, C: Array, D: Array, z: Complex) -> Co
     return np.asarray(C @ resolvents(A, B, C, z)[0] + D, dtype=np.complex128)
 
 
-def slopes(X: Complex, L: Complex, U: Complex, columns: Numbers | None = None) -> Complex:
+def slopes(X: Complex, L: Complex, U: Complex, columns: Indices | None = None) -> Complex:
     """Slope of G U with the entries of A, B, C, D, each by rows, one after another.
 
     Args:
@@ -68,7 +68,7 @@ def slopes(X: Complex, L: Complex, U: Complex, columns: Numbers | None = None) -
     return left[:, :, None, rows] * right[:, None, :, others]
 
 
-def _places(nx: int, nu: int, ny: int) -> tuple[Numbers, Numbers]:
+def _places(nx: int, nu: int, ny: int) -> tuple[Indices, Indices]:
     """Row and column of every entry of A, B, C, D in [A B; C D]."""
     x, u, y = np.arange(nx), nx + np.arange(nu), nx + np.arange(ny)
     blocks = [np.meshgrid(r, c, indexing="ij") for r, c in ((x, x), (x, u), (y, x), (y, u))]

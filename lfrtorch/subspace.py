@@ -75,8 +75,8 @@ def from_spectra(z: Complex, U: Complex, Y: Complex, nx: int) -> list[Start]:
     centres = [np.median(half), np.average(half, weights=power)]
     warps = [0.0, *(np.clip(np.tan(np.pi / 4 - c), -0.99, 0.99) for c in centres)]
     starts = []
-    # Outputs tell states apart as powers of z do, and better: of order 12 with 3 outputs, a tenth of
-    # the axis, 5 block rows find G to 1e-14, 13 to 1e-6.
+    # Outputs tell states apart as powers of z do, and better: order 12 with 3 outputs is found on a
+    # tenth of the axis to 1e-14 by 5 block rows, to 1e-6 by 13.
     fewest = -(-nx // ny) + 1
     # Few lines: as many block rows as they carry, as long as these tell nx states apart.
     most = 2 * len(z) * m // (U.shape[1] + ny)
