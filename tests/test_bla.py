@@ -165,55 +165,11 @@ def test_given_coordinates_have_the_same_response():
     np.testing.assert_allclose(given.frf(OMEGA), balanced.frf(OMEGA), atol=1e-9)
 
 
-# --- the linear model -----------------------------------------------------------------------
-
-
-@pytest.fixture
-def model() -> LinearModel:
-    channels = (Channel("u1"), Channel("u2")), (Channel("y1"), Channel("y2"))
-    return LinearModel(*random_system(3, 2, 2), 10.0, U0, Y0, *channels)
-
-
-def system_of(model: LinearModel) -> System:
-    return model.A, model.B, model.C, model.D
+# --- refusals -------------------------------------------------------------------------------
 
 
 def some_input(T: int = 300) -> Array:
     return np.random.default_rng(5).normal(size=(T, 2))
-
-
-def test_simulation_from_zero_is_dlsim(model: LinearModel):
-    u = some_input()
-    record = Record(u + U0, u, 10.0)
-    expected = reference.dlsim(system_of(model), u) + Y0
-    np.testing.assert_allclose(model.simulate(record), expected, rtol=0, atol=1e-10)
-
-
-def test_periodic_simulation_is_the_response_in_frequency(model: LinearModel):
-    u = some_input()
-    record = Record(u + U0, u, 10.0, "periodic")
-    expected = reference.periodic_response(system_of(model), u) + Y0
-    np.testing.assert_allclose(model.simulate(record), expected, rtol=0, atol=1e-8)
-
-
-def test_frequency_response_is_its_formula(model: LinearModel):
-    G = model.frf(OMEGA * 10.0 / 2 / np.pi)
-    assert G.shape == (50, 2, 2)
-    np.testing.assert_allclose(G, reference.frf(system_of(model), OMEGA), rtol=0, atol=1e-12)
-
-
-def test_transformed_model_is_the_same_system(model: LinearModel):
-    T = np.random.default_rng(3).normal(size=(3, 3))
-    other = model.transformed(T)
-    np.testing.assert_allclose(other.A @ T, T @ model.A, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(other.frf(OMEGA), model.frf(OMEGA), rtol=0, atol=1e-9)
-
-
-def test_poles_are_the_eigenvalues(model: LinearModel):
-    np.testing.assert_allclose(np.poly(model.poles), np.poly(model.A), atol=1e-12)
-
-
-# --- refusals -------------------------------------------------------------------------------
 
 
 def refused(message: str, record: Record, nx: int = 2, **options):
