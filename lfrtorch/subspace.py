@@ -72,7 +72,7 @@ def from_spectra(z: Complex, U: Complex, Y: Complex, nx: int) -> list[Start]:
     ny, m = Y.shape[1:]
     half = np.angle(z) / 2
     power = (np.abs(Y) ** 2).sum(axis=(1, 2))
-    centres = [np.median(half), np.average(half, weights=power)]
+    centres = [np.median(half), np.average(half, weights=power if power.any() else None)]
     warps = [0.0, *(np.clip(np.tan(np.pi / 4 - c), -0.99, 0.99) for c in centres)]
     starts = []
     # Outputs tell states apart as powers of z do, and better: order 12 with 3 outputs is found on a

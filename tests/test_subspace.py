@@ -208,6 +208,7 @@ def test_static_system(nx: int, nu: int, ny: int):
     lines = lines_of(system, BANDS["all"], 40)
     checked(from_spectra(lines.z, lines.U, lines.Y, nx), nx, ny)
     assert best_error(lines, nx) < 1e-12
+    checked(from_spectra(lines.z, lines.U, 0 * lines.Y, nx), nx, ny)
     u = np.random.default_rng(0).normal(size=(300, nu))
     checked(from_signals([u], [u @ gain.T], nx), nx, ny)
     checked(from_signals([u], [np.zeros((300, ny))], nx), nx, ny)
