@@ -1,4 +1,7 @@
 import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy's, read at its import; see below
+
 from collections.abc import Iterator
 from pathlib import Path
 
