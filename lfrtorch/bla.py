@@ -178,7 +178,7 @@ def estimate_bla(
             iterations=found.iterations,
             reason=found.reason,
             seconds=time.perf_counter() - clock,
-            singular_values=tuple(map(float, start.singular_values / start.singular_values[0])),
+            singular_values=tuple(map(float, start.singular_values)),
             notes=tuple(notes),
         ),
     )
@@ -259,12 +259,12 @@ def _best(
 
 def _findings(problem: LinearLeastSquares, start: Start, found: Refined) -> list[str]:
     """What the subspace and the poles say of data and order."""
-    nx, notes, s = len(found.A), [], start.singular_values / start.singular_values[0]
+    nx, notes, s = len(found.A), [], start.singular_values
     if len(s) >= nx and s[nx - 1] < EMPTY:
         carried = int((s > EMPTY).sum())
         notes.append(
             f"order {nx} is above what the data carry: the subspace has {carried} direction(s) "
-            f"above rounding errors; try nx={carried}."
+            f"above rounding errors; try nx={max(1, carried)}."
         )
     if start.unstable is not None and found.rmse > ROUNDING:
         cost, _ = problem.with_input_matrices(start.unstable, start.C)

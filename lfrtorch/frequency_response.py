@@ -15,36 +15,37 @@ Complex = NDArray[np.complex128]
 Indices = NDArray[np.intp]
 
 
-def resolvents(A: Array, B: Array, C: Array, z: Complex) -> tuple[Complex, Complex]:
-    """X = (zI - A)⁻¹ B and L = C (zI - A)⁻¹.
+def resolvent(A: Array, B: Array, z: Complex) -> Complex:
+    """X = (zI - A)⁻¹ B.
 
     By a Schur form of A, one substitution over all z together: as accurate as a solution for every
     z, where eigenvectors would lose digits at poles that lie close together.
 
     Shape:
-        z: (F,) -> X: (F, nx, nu), L: (F, ny, nx).
+        A: (nx, nx), B: (nx, nu), z: (F,) -> (F, nx, nu).
     """
     T, Q = scipy.linalg.schur(A, output="complex")
-    forced, seen = Q.conj().T @ B, (C @ Q).T
-    nx = len(A)
-    X = np.empty((nx, B.shape[1], len(z)), dtype=complex)
-    L = np.empty((nx, C.shape[0], len(z)), dtype=complex)
-    for i in range(nx):
-        pole = 1.0 / (z - T[i, i])
-        known = np.tensordot(T[:i, i], L[:i], 1) if i else 0.0
-        L[i] = (seen[i][:, None] + known) * pole
-        k = nx - 1 - i
-        pole = 1.0 / (z - T[k, k])
-        known = np.tensordot(T[k, k + 1 :], X[k + 1 :], 1) if i else 0.0
-        X[k] = (forced[k][:, None] + known) * pole
-    X = np.tensordot(Q, X, 1).transpose(2, 0, 1)
-    L = np.tensordot(Q.conj(), L, 1).transpose(2, 1, 0)
-    return X, L
+    forced = Q.conj().T @ B
+    nx, nu, F = len(A), B.shape[1], len(z)
+    X = np.empty((nx, nu * F), dtype=complex)
+    for k in range(nx - 1, -1, -1):
+        known = (T[k, k + 1 :] @ X[k + 1 :]).reshape(nu, F)
+        X[k] = ((forced[k][:, None] + known) / (z - T[k, k])).ravel()
+    return (Q @ X).reshape(nx, nu, F).transpose(2, 0, 1)
+
+
+def resolvents(A: Array, B: Array, C: Array, z: Complex) -> tuple[Complex, Complex]:
+    """X = (zI - A)⁻¹ B and L = C (zI - A)⁻¹.
+
+    Shape:
+        z: (F,) -> X: (F, nx, nu), L: (F, ny, nx).
+    """
+    return resolvent(A, B, z), resolvent(A.T, C.T, z).swapaxes(1, 2)
 
 
 def frequency_response(A: Array, B: Array, C: Array, D: Array, z: Complex) -> Complex:
     """G (F, ny, nu) at z (F,)."""
-    return np.asarray(C @ resolvents(A, B, C, z)[0] + D, dtype=np.complex128)
+    return np.asarray(C @ resolvent(A, B, z) + D, dtype=np.complex128)
 
 
 def slopes(X: Complex, L: Complex, U: Complex, columns: Indices | None = None) -> Complex:

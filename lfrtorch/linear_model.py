@@ -37,8 +37,8 @@ class LinearFit:
         iterations: of the refinement.
         reason: why it ended.
         seconds: duration of the estimation.
-        singular_values: of the subspace, relative to the first: they fall off behind the order
-            that the data carry.
+        singular_values: of the subspace, relative to the size of the outputs: they fall off behind
+            the order that the data carry.
         notes: what a user should know about data and result.
     """
 
@@ -161,6 +161,8 @@ class LinearModel:
     def predict(self, record: Record) -> Array:
         """Output (T, ny) predicted one sample ahead from the outputs before, physical units.
 
+        A record in steady state is predicted from the state that fits best: noise does not repeat.
+
         Raises:
             ValueError: a model without K.
         """
@@ -178,7 +180,11 @@ class LinearModel:
             inputs=(*self.inputs, *self.outputs),
         )
         u = np.hstack([record.u, record.y])
-        return predictor.simulate(replace(record, u=u, inputs=predictor.inputs))
+        start = "estimated" if record.start == "periodic" else record.start
+        driven = replace(
+            record, u=u, inputs=predictor.inputs, start=start, period=None, line_weight=None
+        )
+        return predictor.simulate(driven)
 
     def transformed(self, T: Array, inverse: Array | None = None) -> LinearModel:
         """The same system in the coordinates T x.

@@ -50,7 +50,7 @@ class OrderScan:
 
     @property
     def singular_values(self) -> tuple[float, ...]:
-        """Of the subspace of the largest order, relative to the first."""
+        """Of the subspace of the largest order, relative to the size of the outputs."""
         fit = self.models[-1].fit
         return () if fit is None else fit.singular_values
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lfrtorch.factors import Orthogonal
-from lfrtorch.frequency_response import resolvents, slopes
+from lfrtorch.frequency_response import resolvent, resolvents, slopes
 from lfrtorch.gauge import Reduction, reduction
 from lfrtorch.linear_model import linear_cell
 from lfrtorch.linear_search import TRUNCATION, Matrices, Refined, search
@@ -62,7 +62,7 @@ class ResponseFit:
 
     def state_deviation(self, matrices: Matrices) -> Array:
         """Standard deviation (nx,) of the states over the lines."""
-        X, _ = resolvents(*matrices[:3], self.lines.z)
+        X = resolvent(*matrices[:2], self.lines.z)
         return np.sqrt((np.abs(X @ self.lines.U) ** 2).sum(axis=(0, 2)))
 
     def refined(self, matrices: Matrices, max_iter: int) -> Refined:
@@ -95,7 +95,7 @@ class ResponseError:
         self.lines, self.largest_pole = lines, largest_pole
         nu, ny = lines.U.shape[1], lines.Y.shape[1]
         self.shapes = (nx, nx), (nx, nu), (ny, nx), (ny, nu)
-        self._latest: tuple[Tensor, Complex, Complex] | None = None
+        self._latest: tuple[Tensor, Complex] | None = None
         self._reduced: Reduction | None = None
 
     def matrices(self, theta: Tensor) -> list[Array]:
@@ -109,7 +109,7 @@ class ResponseError:
         A, _, C, D = self.matrices(theta)
         if not np.abs(np.linalg.eigvals(A)).max() < self.largest_pole:
             return torch.full((2 * self.lines.Y.size,), torch.inf, dtype=torch.float64)
-        X, _ = self._resolvents(theta)
+        X = self._states(theta)
         return _real(self.lines.weighted((C @ X + D) @ self.lines.U - self.lines.Y))
 
     def cost(self, residual: Tensor) -> float:
@@ -121,15 +121,17 @@ class ResponseError:
         cell = linear_cell(*self.matrices(theta))
         start = torch.zeros(0, len(cell.A), dtype=torch.float64)
         self._reduced = reduction(cell, start, before=self._reduced)
-        X, L = self._resolvents(theta)
+        A, _, C, _ = self.matrices(theta)
+        X, L = self._states(theta), resolvent(A.T, C.T, self.lines.z).swapaxes(1, 2)
         J = slopes(X, L, self.lines.U, self._reduced.kept.numpy())
         return LinesJacobian(self.lines.weighted(J), self._reduced, self.residual(theta))
 
-    def _resolvents(self, theta: Tensor) -> tuple[Complex, Complex]:
+    def _states(self, theta: Tensor) -> Complex:
+        """(zI - A)⁻¹ B (F, nx, nu), that of the latest θ kept."""
         if self._latest is None or not torch.equal(self._latest[0], theta):
-            A, B, C, _ = self.matrices(theta)
-            self._latest = theta.clone(), *resolvents(A, B, C, self.lines.z)
-        return self._latest[1:]
+            A, B, _, _ = self.matrices(theta)
+            self._latest = theta.clone(), resolvent(A, B, self.lines.z)
+        return self._latest[1]
 
 
 class LinesJacobian:

@@ -46,7 +46,8 @@ class Start(NamedTuple):
     Args:
         A: stable, by moving the poles that are not.
         C: output matrix.
-        singular_values: of the subspace, which fall off behind the order that the data carry.
+        singular_values: of the subspace, relative to the size of the outputs: they fall off behind
+            the order that the data carry.
         unstable: A before poles were moved, where any was.
 
     Shape:
@@ -98,8 +99,8 @@ def from_spectra(z: Complex, U: Complex, Y: Complex, nx: int) -> list[Start]:
             noise += 1e-14 * np.trace(noise) * np.eye(q)
             for root in (np.eye(q), np.linalg.cholesky(noise)):
                 whiten = np.kron(root, np.eye(ny))
-                seen = scipy.linalg.solve_triangular(whiten, L[first:, first:], lower=True)
-                observability, s = _observability(seen, nx)
+                outputs = scipy.linalg.solve_triangular(whiten, L[first:], lower=True)
+                observability, s = _observability(outputs, slice(first, None), nx)
                 A_axis, C = _shift(whiten @ observability, ny)
                 eye = np.eye(nx)
                 try:
@@ -130,7 +131,7 @@ def from_signals(us: Sequence[Array], ys: Sequence[Array], nx: int) -> list[Star
         L = _lower(np.vstack([U[i * nu :], U[: i * nu], Y[: i * ny], Y[i * ny :]]))
         inputs, past_u, past = i * nu, 2 * i * nu, i * (2 * nu + ny)
         for instruments in (past, past_u):
-            observability, s = _observability(L[past:, inputs:instruments], nx)
+            observability, s = _observability(L[past:], slice(inputs, instruments), nx)
             A, C = _shift(observability, ny)
             starts.append(_stable(A, C, s))
     return starts
@@ -149,9 +150,11 @@ def _lower(rows: Array) -> Array:
     return L
 
 
-def _observability(seen: Array, nx: int) -> tuple[Array, Array]:
-    U, s, _ = np.linalg.svd(seen)
-    return U[:, :nx] * np.sqrt(np.pad(s, (0, max(0, nx - len(s))))[:nx]), s
+def _observability(outputs: Array, seen: slice, nx: int) -> tuple[Array, Array]:
+    """Column space of some columns of the outputs, and its singular values relative to all."""
+    U, s, _ = np.linalg.svd(outputs[:, seen])
+    size = max(float(np.linalg.norm(outputs)), np.finfo(float).tiny)
+    return U[:, :nx] * np.sqrt(np.pad(s, (0, max(0, nx - len(s))))[:nx]), s / size
 
 
 def _shift(observability: Array, ny: int) -> tuple[Array, Array]:

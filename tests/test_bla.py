@@ -339,7 +339,7 @@ def test_what_a_response_does_not_know_is_said():
 @pytest.mark.parametrize("refine", ["simulation", "frequency"])
 def test_standard_deviation_of_the_response_is_that_of_many_fits(refine):
     """60 records of periodic data with coloured noise, which changes from line to line."""
-    system, frequencies = random_system(2), np.array([0.3, 1.0, 2.5])
+    system, frequencies = random_system(1), np.array([0.3, 1.0, 2.5])
     found, predicted = [], []
     clean = excited(system, (0.0, 1.0), T=256, R=4)
     for seed in range(60):
@@ -349,7 +349,7 @@ def test_standard_deviation_of_the_response_is_that_of_many_fits(refine):
             e = rng.normal(size=record.y.shape)
             e = 0.05 * (e + 0.8 * np.roll(e, 1, axis=0))
             records.append(replace(record, y=record.y + e))
-        model = estimate_bla(records, 2, refine=refine)
+        model = estimate_bla(records, 1, refine=refine)
         found.append(model.frf(frequencies)[:, 0, 0])
         predicted.append(model.frf_std(frequencies)[:, 0, 0] ** 2)
     variance = np.mean(np.abs(found - np.mean(found, axis=0)) ** 2, axis=0)
@@ -379,7 +379,7 @@ def test_fit_is_described():
     assert fit.notes == ()
     # Two of many singular values stand out: the order.
     s = np.array(fit.singular_values)
-    assert s[0] == 1.0
+    assert 0.1 < s[0] <= 1.0
     assert s[1] > 5 * s[2]
 
 
@@ -394,6 +394,14 @@ def test_order_above_what_the_data_carry():
     assert "order 5 is above what the data carry" in notes_of(record, 5, offset=False)
     assert "try nx=2" in notes_of(record, 5, offset=False)
     assert notes_of(record, 2) == ""
+
+
+def test_static_data_carry_no_order():
+    for seed in range(5):
+        u = np.random.default_rng(seed).normal(size=300)
+        note = notes_of(Record(u, 2.0 * u, start="periodic"), 2)
+        assert note.startswith("order 2 is above what the data carry: the subspace has 0 ")
+        assert "unstable" not in note
 
 
 def test_unstable_data():

@@ -47,10 +47,13 @@ def best_error(lines: Lines, nx: int) -> float:
 @pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 1), (1, 3), (3, 3)])
 @pytest.mark.parametrize("nx", [1, 2, 3, 6, 12])
 def test_response_without_noise_is_found(nx: int, nu: int, ny: int, band: str):
-    """The powers of z lose digits on a narrow band: at most 1e6 of them after the bilinear map."""
+    """The powers of z lose digits on a narrow band: seven to eight of 16 after the bilinear map.
+
+    A refinement gets them back (test_bla).
+    """
     system = random_system(nx, nu, ny)
     lines = lines_of(system, BANDS[band], few_lines(nx, nu, ny))
-    assert best_error(lines, nx) < 1e-8
+    assert best_error(lines, nx) < 1e-7
 
 
 def test_several_outputs_need_fewer_block_rows():
@@ -132,7 +135,7 @@ def test_signals_without_noise_from_any_start_states(nx: int, nu: int, ny: int):
         ys.append(states_before(system, 5.0 * generator.normal(size=nx), u))
     starts = from_signals(us, ys, nx)
     assert starts
-    assert {start.unstable for start in starts} == {0.0}
+    assert all(start.unstable is None for start in starts)
     # Rounding times the condition of the Hankel matrices, up to 1e5 with these inputs.
     assert min(same_outputs(system, start.A, start.C) for start in starts) < 1e-9
 
@@ -179,7 +182,8 @@ def test_unstable_signals(radius: float):
     starts = from_signals([u], [reference.dlsim(system, u)], 2)
     checked(starts, 2, 1)
     # The data grow to 1e10 in 60 samples, which leaves half the digits.
-    assert min(abs(start.unstable - radius) for start in starts) < 1e-6
+    radii = [np.abs(np.linalg.eigvals(s.unstable)).max() for s in starts if s.unstable is not None]
+    assert min(np.abs(np.array(radii) - radius)) < 1e-6
     moved = min(1 / radius, MOVED_POLE)
     poles = [np.sort(np.abs(np.linalg.eigvals(start.A))) for start in starts]
     assert min(np.abs(p - [min(0.5, moved), max(0.5, moved)]).max() for p in poles) < 1e-6
@@ -193,7 +197,9 @@ def test_unstable_response():
     checked(starts, 3, 1)
     radius = np.hypot(1.1, 0.3)
     for start in starts:
-        assert start.unstable == pytest.approx(radius, rel=1e-9)
+        assert start.unstable is not None
+        found = np.abs(np.linalg.eigvals(start.unstable)).max()
+        assert found == pytest.approx(radius, rel=1e-9)
         poles = np.sort_complex(np.linalg.eigvals(start.A))
         expected = np.array([0.5, (1.1 - 0.3j) / radius**2, (1.1 + 0.3j) / radius**2])
         np.testing.assert_allclose(poles, np.sort_complex(expected), rtol=0, atol=1e-9)
