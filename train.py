@@ -13,7 +13,8 @@ import os
 import shlex
 import signal
 import sys
-from contextlib import ExitStack, redirect_stdout
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -88,7 +89,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
     dataset: Dataset = instantiate(cfg.data)
     shown = dataset.validation[0] if dataset.validation else dataset.train[0]
 
-    bla: lfrtorch.LinearModel = instantiate(cfg.bla, dataset.train)
+    bla, _ = linear(cfg, dataset.train, dataset.validation, ranks)
     if cfg.init_from is None:
         model: lfrtorch.Model = instantiate(cfg.init, bla, dataset.train)
     else:
@@ -118,6 +119,39 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
         raise Terminated(f"the fit was terminated; the best model so far is in {best}")
     kept = result.history[result.chosen_iteration]
     return kept.train if math.isnan(kept.validation) else kept.validation
+
+
+def linear(
+    cfg: DictConfig,
+    data: Sequence[lfrtorch.Record] | lfrtorch.FRF,
+    validation: Sequence[lfrtorch.Record],
+    ranks: Ranks,
+) -> tuple[lfrtorch.LinearModel, lfrtorch.OrderScan | None]:
+    """The best linear approximation; with nx=auto of the order that a scan chooses, now ``cfg.nx``.
+
+    What is known of it is printed.
+    """
+    scan: lfrtorch.OrderScan | None = None
+    if cfg.nx == "auto":
+        options = {k: v for k, v in cfg.bla.items() if k not in ("_target_", "nx")}
+        scan = lfrtorch.scan_orders(
+            data, range(1, cfg.nx_max + 1), validation=validation, **options
+        )
+        print(scan.table())
+        # Rounding may differ from machine to machine, and the order must not.
+        cfg.nx = int(ranks.first(torch.tensor(scan.chosen)))
+        bla = scan.models[scan.orders.index(cfg.nx)]
+    else:
+        bla = instantiate(cfg.bla, data)
+    fit = bla.fit
+    assert fit is not None
+    print(
+        f"BLA: order {bla.nx}, {fit.criterion} error {fit.rmse:.3g} (normalised), "
+        f"{fit.iterations} iterations, {fit.reason}, {fit.seconds:.1f} s"
+    )
+    for note in fit.notes:
+        print(f"note: {note}")
+    return bla, scan
 
 
 def write(
@@ -154,13 +188,14 @@ def require(cfg: DictConfig) -> None:
     if cfg.get("data") is None:
         raise ValueError(
             "no data chosen: add +bench=boucwen, or data=file data.path=FILE "
-            "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER."
+            "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER (or nx=auto)."
         )
     if cfg.nx is None:
         raise ValueError(
-            "nx, the number of states, is not set: add nx=2, for example "
+            "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
             "(+bench=boucwen sets it and all else for that benchmark)."
         )
+    integer("nx_max", cfg.nx_max, 1)
     if cfg.threads is not None:
         integer("threads", cfg.threads, 1)
     if cfg.dtype not in ("float32", "float64"):
@@ -201,10 +236,7 @@ def figures(result: lfrtorch.FitResult, bla: lfrtorch.LinearModel, dataset: Data
     drawn = {}
     for record in dataset.tests:
         y_lti, y_hat = bla.simulate(record), model.simulate(record)
-        # Periods with a skip window are no whole periods: their spectrum would leak.
-        whole = record.start == "periodic" and not record.skip
-        draw = plots.spectrum if whole else plots.response
-        drawn[record.name] = draw(record, y_lti, y_hat)
+        drawn[record.name] = plots.errors(record, y_lti, y_hat)
     signals = model.signals(dataset.train[0])
     drawn["static_map"] = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
     unit = model.outputs[0].unit
@@ -224,20 +256,13 @@ def common(folder: Path, ranks: Ranks) -> Path:
     return Path(bytes(ranks.first(name).tolist()).decode())
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
-def main(cfg: DictConfig) -> float:
-    """The command line: user errors end with one message and exit code 1, no traceback."""
-    run, rank = HydraConfig.get(), os.environ.get("RANK", "0")
-    start = ["python"]
-    if WORLD > 1:
-        start = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", str(WORLD))]
-    command = shlex.join([*start, "train.py", *run.overrides.task])
+@contextmanager
+def user_errors(rank: str = "0") -> Iterator[None]:
+    """User errors end the program with one message and exit code 1, no traceback."""
     error = "error" if rank == "0" else f"error on rank {rank}"
     try:
-        with connect(cfg.device, cfg.timeout) as ranks, ExitStack() as silence:
-            if ranks.rank > 0:
-                silence.enter_context(redirect_stdout(silence.enter_context(open(os.devnull, "w"))))
-            return identify(cfg, common(Path(run.runtime.output_dir), ranks), command, ranks)
+        yield
+        return
     except InstantiationException as failed:
         print(f"{error}: {failed.__cause__ or failed}", file=sys.stderr)
     except (ValueError, OSError, ProcessLost) as failed:
@@ -250,6 +275,21 @@ def main(cfg: DictConfig) -> float:
         print("interrupted outside the fit: nothing to keep", file=sys.stderr)
         sys.exit(130)
     sys.exit(1)
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
+def main(cfg: DictConfig) -> float:
+    """The command line."""
+    run, rank = HydraConfig.get(), os.environ.get("RANK", "0")
+    start = ["python"]
+    if WORLD > 1:
+        start = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", str(WORLD))]
+    command = shlex.join([*start, "train.py", *run.overrides.task])
+    with user_errors(rank), connect(cfg.device, cfg.timeout) as ranks, ExitStack() as silence:
+        if ranks.rank > 0:
+            silence.enter_context(redirect_stdout(silence.enter_context(open(os.devnull, "w"))))
+        return identify(cfg, common(Path(run.runtime.output_dir), ranks), command, ranks)
+    raise AssertionError  # user_errors does not return
 
 
 def launch() -> None:

@@ -1,6 +1,7 @@
 """Identification of nonlinear LFR state-space models from input-output data.
 
 records -> estimate_bla -> initialise -> fit -> simulate, save, load
+records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 """
 
 from importlib.metadata import version
@@ -18,6 +19,7 @@ from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
 from lfrtorch.multisine import multisine
 from lfrtorch.nonlinearity import Network, Polynomial
+from lfrtorch.order import OrderScan, scan_orders
 from lfrtorch.records import Channel, Record, Scaler
 from lfrtorch.trainer import FitResult, fit
 
@@ -35,6 +37,7 @@ __all__ = [
     "LinearModel",
     "Model",
     "Network",
+    "OrderScan",
     "Polynomial",
     "Record",
     "Scaler",
@@ -48,4 +51,5 @@ __all__ = [
     "multisine",
     "nrmse",
     "rmse",
+    "scan_orders",
 ]

@@ -21,11 +21,19 @@ MOST_POINTS = 20_000
 """Samples drawn of a long signal as a cloud."""
 
 
-def spectrum(record: Record, y_lti: Array, y_hat: Array) -> Figure:
-    """Magnitude of the measured output and of both errors against frequency, one panel an output.
+def errors(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
+    """The spectrum of whole periods in steady state, and else the response against time."""
+    # Periods with a skip window are no whole periods: their spectrum would leak.
+    whole = record.start == "periodic" and not record.skip
+    return (spectrum if whole else response)(record, y_lti, y_hat)
+
+
+def spectrum(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
+    """Magnitude of the measured output and of the errors against frequency, one panel an output.
 
     Shape:
-        y_lti, y_hat: (T, ny), simulated outputs in physical units.
+        y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
+            is no NL-LFR.
     """
     figure, axes = _panels(record)
     y = record.y[record.skip :]
@@ -41,11 +49,12 @@ def spectrum(record: Record, y_lti: Array, y_hat: Array) -> Figure:
     return figure
 
 
-def response(record: Record, y_lti: Array, y_hat: Array) -> Figure:
-    """Measured output and both errors against time, one panel an output.
+def response(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
+    """Measured output and errors against time, one panel an output.
 
     Shape:
-        y_lti, y_hat: (T, ny), simulated outputs in physical units.
+        y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
+            is no NL-LFR.
     """
     figure, axes = _panels(record)
     t = np.arange(record.skip, record.samples) / record.fs
@@ -118,13 +127,14 @@ def _panels(record: Record) -> tuple[Figure, list[Axes]]:
     return figure, list(figure.subplots(ny, 1, squeeze=False, sharex=True)[:, 0])
 
 
-def _signals(record: Record, y_lti: Array, y_hat: Array, i: int) -> list[tuple[Array, str, str]]:
+def _signals(
+    record: Record, y_lti: Array, y_hat: Array | None, i: int
+) -> list[tuple[Array, str, str]]:
     y = record.y[record.skip :, i]
-    return [
-        (y, "output", OUTPUT),
-        (y - y_lti[record.skip :, i], "LTI error", LTI),
-        (y - y_hat[record.skip :, i], "NL-LFR error", NL_LFR),
-    ]
+    signals = [(y, "output", OUTPUT), (y - y_lti[record.skip :, i], "LTI error", LTI)]
+    if y_hat is not None:
+        signals.append((y - y_hat[record.skip :, i], "NL-LFR error", NL_LFR))
+    return signals
 
 
 def _envelope(t: Array, signal: Array) -> tuple[Array, Array]:
