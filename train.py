@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import hydra
 import torch
@@ -32,6 +32,7 @@ from lfrtorch.checks import integer
 from lfrtorch.datasets import Dataset
 from lfrtorch.distributed import connect
 from lfrtorch.monitor import Checkpoint, ProgressLine, TensorBoard
+from lfrtorch.order import OrderScan
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
 from lfrtorch.trainer import INTERRUPTED, Progress
 
@@ -126,17 +127,16 @@ def linear(
     data: Sequence[lfrtorch.Record] | lfrtorch.FRF,
     validation: Sequence[lfrtorch.Record],
     ranks: Ranks,
-) -> tuple[lfrtorch.LinearModel, lfrtorch.OrderScan | None]:
+) -> tuple[lfrtorch.LinearModel, OrderScan | None]:
     """The best linear approximation; with nx=auto of the order that a scan chooses, now ``cfg.nx``.
 
     What is known of it is printed.
     """
-    scan: lfrtorch.OrderScan | None = None
+    scan: OrderScan | None = None
     if cfg.nx == "auto":
-        options = {k: v for k, v in cfg.bla.items() if k not in ("_target_", "nx")}
-        scan = lfrtorch.scan_orders(
-            data, range(1, cfg.nx_max + 1), validation=validation, **options
-        )
+        options = {k: v for k, v in cfg.bla.items() if k != "nx"}
+        options["_target_"] = partial(lfrtorch.scan_orders, validation=validation)
+        scan = cast(OrderScan, instantiate(options, data, range(1, cfg.nx_max + 1)))
         print(scan.table())
         # Rounding may differ from machine to machine, and the order must not.
         cfg.nx = int(ranks.first(torch.tensor(scan.chosen)))

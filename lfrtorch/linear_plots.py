@@ -34,7 +34,8 @@ RANGE = 120.0
 """Most dB that an axis shows: a zero on a grid point is no information."""
 
 STRETCHES = 200
-"""Of the frequency axis: a variance is drawn as its mean over each. Line by line it hides the dots."""
+"""Of the frequency axis: a variance is drawn as its mean over each. Line by line it hid the dots of
+a record of 50000 samples."""
 
 FAR = 2.0
 """Half width of the z plane that is drawn: sampling puts zeros far out that say little."""

@@ -18,6 +18,7 @@ import hydra
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
@@ -41,7 +42,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     print(f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples")
     frf, notes = response(cfg, dataset.train)
     # A fit to the response takes the one that the figures show.
-    data = frf if frf is not None and cfg.bla.refine == "frequency" else dataset.train
+    data = frf if frf and cfg.bla.refine == "frequency" else dataset.train
     model, scan = linear(cfg, data, dataset.validation, Ranks())
     assert model.fit is not None
     for note in notes:
@@ -64,10 +65,11 @@ def response(
     cfg: DictConfig, records: Sequence[lfrtorch.Record]
 ) -> tuple[lfrtorch.FRF | None, list[str]]:
     """The measured frequency response, where the records give one, and notes."""
+    asked_for = cfg.frf.method != "auto" or cfg.bla.refine == "frequency"
     try:
         frf: lfrtorch.FRF = instantiate(cfg.frf, records)
-    except hydra.errors.InstantiationException as failed:
-        if not isinstance(failed.__cause__, ValueError):
+    except InstantiationException as failed:
+        if asked_for or not isinstance(failed.__cause__, ValueError):
             raise
         return None, [f"no measured frequency response: {failed.__cause__}"]
     return frf, list(frf.notes)
@@ -204,9 +206,9 @@ def table(found: dict[str, Any]) -> str:
     """The numbers of a run for people."""
     fit = found["fit"]
     parts = [f"Linear model of order {found['nx']}, {fit['criterion']} error"]
+    about = "use", "record", "source", "samples", "skip"
     scores = [
-        [s["use"], s["record"], s["source"], s["samples"], s["skip"], o["output"]]
-        + [o["rmse"], o["unit"], None if o["nrmse"] is None else 100 * o["nrmse"]]
+        [*(s[key] for key in about), o["output"], o["rmse"], o["unit"], percent(o["nrmse"])]
         for s in found["scores"]
         for o in s["outputs"]
     ]
@@ -223,13 +225,17 @@ def table(found: dict[str, Any]) -> str:
     parts.append(columns(["operating point", "offset", "unit"], rows))
     if found["response_std"]:
         rows = [
-            [r["channel"], r["std"], None if r["relative"] is None else 100 * r["relative"]]
-            + [r["frequency"]]
+            [r["channel"], r["std"], percent(r["relative"]), r["frequency"]]
             for r in found["response_std"]
         ]
         head = ["response", "largest std", "% of response there", "at (Hz)"]
         parts.append(columns(head, rows))
     return "\n\n".join(parts)
+
+
+def percent(ratio: float | None) -> float | None:
+    """100 times the ratio, where there is one."""
+    return None if ratio is None else 100 * ratio
 
 
 def columns(head: list[str], rows: Iterable[Sequence[Any]]) -> str:

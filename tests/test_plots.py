@@ -31,6 +31,15 @@ def test_spectrum_shows_amplitudes_in_decibel():
     assert first.get_title() == "lab (file)"
 
 
+def test_figures_of_a_linear_model_have_its_error_alone():
+    periodic = Record(T, Y, 100.0, start="periodic")
+    skipped = Record(T, Y, 100.0, start="periodic", skip=1)
+    for record, unit in ((periodic, "Hz"), (skipped, "s"), (RECORD, "s")):
+        figure = plots.errors(record, 0.9 * Y)
+        assert [line.get_label() for line in figure.axes[0].get_lines()] == ["output", "LTI error"]
+        assert f"({unit})" in figure.axes[-1].get_xlabel()
+
+
 def test_response_shows_the_scored_samples():
     record = Record(T, Y, 100.0, skip=100, name="lab")
     ax = plots.response(record, 0.5 * Y, Y).axes[0]
