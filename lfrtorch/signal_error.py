@@ -29,6 +29,9 @@ from lfrtorch.subspace import LARGEST_POLE, Start, from_signals
 
 Array = NDArray[np.float64]
 
+SHORT = 10_000
+"""Samples up to which several starts are refined."""
+
 OBSERVERS = (0.0, 1e-4, 1e-2, 1.0)
 """Variance of the state noise over that of the states, times the output error's, of the innovation
 models that a prediction-error fit may start from."""
@@ -47,8 +50,6 @@ class SignalFit:
         us: of (T, nu), ys: of (T, ny).
     """
 
-    contenders = 1
-
     def __init__(
         self,
         us: Sequence[Array],
@@ -64,6 +65,11 @@ class SignalFit:
         self._records = [self._driven(*signals) for signals in zip(us, ys, records, strict=True)]
         nu, ny = self._records[0].u.shape[1], self.ny
         self._unit = Scaler(np.zeros(nu), np.ones(nu), np.zeros(ny), np.ones(ny))
+
+    @property
+    def contenders(self) -> int:
+        """Starts that are worth a refinement: one of long records, whose starts are good."""
+        return 8 if sum(map(len, self._us)) <= SHORT else 1
 
     def starts(self, nx: int) -> list[Start]:
         """Subspace estimates of A and C."""

@@ -275,3 +275,9 @@ def test_refused_archives(tmp_path, signals):
     with path.open("wb") as stream:
         np.save(stream, signals)
     refused("a.npz' is not a readable .npz file", path, inputs="u")
+
+
+def test_period_reaches_the_records_that_hold_one(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals)
+    assert files.load(path, **USE, period=50).train[0].period == 50
+    refused("has 200 samples and a period of 201; it must hold at least one", path, period=201)

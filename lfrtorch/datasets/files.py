@@ -35,6 +35,7 @@ def load(
     validation: float = 0.2,
     test: float = 0.2,
     skip: int | None = None,
+    period: int | None = None,
 ) -> Dataset:
     """One measurement, cut in time into a training, a validation and a test record.
 
@@ -55,6 +56,8 @@ def load(
         test: fraction of the samples, those at the end.
         skip: samples at the beginning of the file that are left out of the cost, for the transient
             of the start; 5 % of the file where left out.
+        period: samples of one period of the inputs, where they repeat: a frequency response then
+            tells noise from distortion.
 
     Shape:
         u, y of a part: (its samples, inputs), (its samples, outputs), in the file's units.
@@ -84,6 +87,7 @@ def load(
             "name every column once."
         )
     whole = _record(path, signals[: len(u_columns)], signals[len(u_columns) :], fs)
+    whole = replace(whole, period=period)
     skip = round(_WARM_UP * whole.samples) if skip is None else skip
     parts = _split(path, whole.samples, validation, test, skip)
     train, chosen, tests = (
