@@ -25,6 +25,7 @@ from lfrtorch.spectra import (
     spectra_of_periods,
     spectra_of_records,
 )
+from lfrtorch.threads import spread_by_hand
 
 Method = Literal["auto", "robust", "fast", "local_polynomial"]
 
@@ -181,6 +182,7 @@ class FRF:
         )
 
 
+@spread_by_hand()
 def estimate_frf(
     records: Record | Sequence[Record],
     *,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cache
 
 import torch
+from threadpoolctl import ThreadpoolController
 
 _workers: ContextVar[int | None] = ContextVar("workers", default=None)
 
@@ -25,13 +26,15 @@ def spread_by_hand() -> Iterator[None]:
 
     torch's own threads (OpenMP) wait for each other spinning. Where small operations follow each
     other, or another process shares the cores, that costs more than it gives: on two cores a
-    Jacobian that takes 3 ms to set up took 73, and an iteration of 27 ms up to 630.
+    Jacobian that takes 3 ms to set up took 73, and an iteration of 27 ms up to 630. The same holds
+    for the linear algebra of numpy and scipy: a decomposition of 15 ms took 80.
     """
-    count = workers()
+    count, outermost = workers(), _workers.get() is None
     token = _workers.set(count)
     torch.set_num_threads(1)
     try:
-        yield
+        with _blas().limit(limits=1, user_api="blas") if outermost else nullcontext():
+            yield
     finally:
         _workers.reset(token)
         if _workers.get() is None:
@@ -60,6 +63,11 @@ def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
         share(0)
         for other in others:
             other.result()
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 @cache

@@ -6,8 +6,10 @@ import sys
 import time
 from contextlib import nullcontext
 
+import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from lfrtorch.threads import spread, spread_by_hand, workers
 
@@ -83,3 +85,20 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 def test_forked_process_does_not_wait_for_threads_of_its_parent():
     run = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, check=True)
     assert run.stdout.split() == ["7"], "the alarm ended the forked process: it was waiting"
+
+
+def test_linear_algebra_of_numpy_works_on_one_thread_inside():
+    np.linalg.qr(np.eye(3))  # its library is loaded
+
+    def threads() -> set[int]:
+        return {lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"}
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = threads()
+        assert before == {2}
+        with spread_by_hand():
+            assert threads() == {1}
+            with spread_by_hand():
+                assert threads() == {1}
+            assert threads() == {1}
+        assert threads() == before
