@@ -338,10 +338,10 @@ def test_what_a_response_does_not_know_is_said():
 
 @pytest.mark.parametrize("refine", ["simulation", "frequency"])
 def test_standard_deviation_of_the_response_is_that_of_many_fits(refine):
-    """60 records of periodic data with coloured noise, which changes from line to line."""
+    """60 times periodic data with coloured noise, which changes from line to line."""
     system, frequencies = random_system(1), np.array([0.3, 1.0, 2.5])
     found, predicted = [], []
-    clean = excited(system, (0.0, 1.0), T=256, R=4)
+    clean = excited(system, (0.0, 1.0), T=128, R=2)
     for seed in range(60):
         rng = np.random.default_rng([seed, 11])
         records = []

@@ -89,14 +89,12 @@ def test_every_bench_composes(bench: str):
         assert cfg.data[name] == (list(default) if isinstance(default, tuple) else default)
 
 
-@pytest.mark.parametrize("bench", BENCHES)
+ADAM = "init=paper trainer=adam trainer.epochs=2"
+
+
 @pytest.mark.parametrize(
-    "choice",
-    [
-        "init=zero_output trainer.max_iter=2",
-        # 12 states of a rough BLA diverge at Adam's default rate.
-        "init=paper trainer=adam trainer.epochs=2 trainer.learning_rate=1e-4",
-    ],
+    ("bench", "choice"),
+    [*((bench, "init=zero_output trainer.max_iter=2") for bench in BENCHES), ("boucwen", ADAM)],
 )
 def test_every_bench_runs_two_iterations(
     bench: str, choice: str, tmp_path: Path, request: pytest.FixtureRequest
