@@ -1,6 +1,7 @@
 """The linear fit of freq-statespace; runs in its environment, from and to a .npz file.
 
-venv/bin/python peer_bla.py IN.npz OUT.npz: u (N, nu, R, P), y (N, ny, R, P), lines, fs, nx.
+venv/bin/python peer_bla.py IN.npz OUT.npz: u (N, nu, R, P), y (N, ny, R, P), lines, fs, nx, and
+once: only with its default tolerances, one time, 300 iterations at most (its limit is 1000).
 """
 
 import sys
@@ -20,10 +21,12 @@ SOLVERS = {
     "default": {},
     "converged": {"solver": optx.LevenbergMarquardt(rtol=1e-8, atol=1e-10)},
 }
+once = bool(given["once"])
+if once:
+    SOLVERS = {"default": {"max_iter": 300}}
 out = {}
 for name, options in SOLVERS.items():
-    # The first one compiles; the converged one may take minutes and runs once.
-    for turn in ("first", "again") if name == "default" else ("first",):
+    for turn in ("first",) if once else ("first", "again"):  # the first one compiles
         begin = time.perf_counter()
         data = fss.create_data_object(given["u"], given["y"], given["lines"], float(given["fs"]))
         model = fss.lin.subspace_id(data, nx, logging_enabled=False)

@@ -162,14 +162,15 @@ def estimate_bla(
     model = _physical(found, scaler, about)
     model = model.transformed(*_transformation(problem, found.matrices, balanced=balanced))
     rmse = found.rmse
-    if records:
-        errors = [(r.y - model.simulate(r))[r.skip :] for r in records]
-        constant = np.concatenate(errors).mean(axis=0)  # that the fit took off
-        if offset:
-            model = replace(model, y_offset=model.y_offset + constant)
-            errors = [e - constant for e in errors]
+    if found.constant is not None:
+        model = replace(model, y_offset=model.y_offset + scaler.y_scale * found.constant)
+    elif records:
+        errors = np.concatenate([(r.y - model.simulate(r))[r.skip :] for r in records])
+        if offset:  # the constant that lines leave out
+            model = replace(model, y_offset=model.y_offset + errors.mean(axis=0))
+            errors = errors - errors.mean(axis=0)
         if refine == "simulation":
-            rmse = float(np.sqrt(np.mean((np.concatenate(errors) / scaler.y_scale) ** 2)))
+            rmse = float(np.sqrt(np.mean((errors / scaler.y_scale) ** 2)))
     return replace(
         model,
         fit=LinearFit(

@@ -31,6 +31,7 @@ class Refined:
         rmse: root mean squared error at the end.
         iterations: of the search.
         reason: why it ended.
+        constant: output (ny,) at rest, where it was a parameter.
         K: innovation gain, where it was modelled.
         innovation_covariance: of the innovations, where they were modelled.
     """
@@ -43,6 +44,7 @@ class Refined:
     rmse: float
     iterations: int
     reason: str
+    constant: Array | None = None
     K: Array | None = None
     innovation_covariance: Array | None = None
 

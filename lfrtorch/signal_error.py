@@ -117,8 +117,13 @@ class SignalFit:
         A, Bu, C, Dyu = (m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu))
         nu, ny = self.nu, self.ny
         B, D, K = Bu[:, :nu].copy(), Dyu[:, :nu].copy(), np.zeros((len(A), ny))
+        constant = Dyu[:, -1].copy() if self._offset else None
         if self._prediction:
             K = Bu[:, nu : nu + ny].copy()
+            if constant is not None:  # at rest, where the output that enters by K is itself
+                driven = K @ constant + Bu[:, -1]
+                at_rest = np.linalg.solve(np.eye(len(A)) - A - K @ C, driven)
+                constant = np.asarray(constant + C @ at_rest, dtype=np.float64)
         system, _ = problem.linearise(state.theta).system(0.0, TRUNCATION)
         assert isinstance(system, Orthogonal)
         spare = max(1, problem.size - system.rank)
@@ -132,6 +137,7 @@ class SignalFit:
             rmse=math.sqrt(state.cost / problem.size),
             iterations=state.iteration,
             reason=state.reason,
+            constant=constant,
         )
         if not self._prediction:
             return found
@@ -169,6 +175,7 @@ class SignalFit:
             free_B[:, nu : nu + ny] = observed
         if self._offset:
             free_D[:, -1] = True
+            free_B[:, -1] = observed and self._prediction  # what y0 makes of the states by K
         first = self._records[0]
         cell = linear_cell(A - K @ C, Bu, C, Dyu)
         for parameter in (cell.A, cell.Cy):

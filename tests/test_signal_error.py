@@ -56,6 +56,8 @@ def test_refined_simulation_leaves_the_offset_and_the_start_to_the_fit():
     A, B, C, D = system
     found = fit_of([record], offset=True).refined((0.98 * A, B, 1.02 * C, D), 50)
     assert error(found.matrices, system) < 1e-9
+    assert found.constant is not None
+    np.testing.assert_allclose(found.constant, [-2.0], rtol=0, atol=1e-8)
     assert found.K is None
     assert found.rmse < 1e-9
 
@@ -66,12 +68,15 @@ def test_prediction_finds_the_innovation_model(nu: int, ny: int):
     A, _, C, _ = system
     P = scipy.linalg.solve_discrete_are(A.T, C.T, np.eye(2), 0.5 * np.eye(ny))
     K = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + 0.5 * np.eye(ny))
-    record, e = innovations(system, K, 20_000, seed=2, y0=3.0)
+    record, e = innovations(system, K, 20_000, seed=2, y0=0.5)
     found = fit_of([record], offset=True, prediction=True).refined(system, 60)
     # The innovations' rms is known to 1 / √(2 · 20000), and the fit takes off 10 parameters of it.
     assert found.rmse == pytest.approx(np.sqrt(np.mean(e**2)), rel=4 / np.sqrt(2 * e.size) + 1e-3)
     assert found.K is not None
     assert found.innovation_covariance is not None
+    assert found.constant is not None
+    # The mean of 20000 samples, whose noise has a gain of at most 10 and u another.
+    np.testing.assert_allclose(found.constant, np.full(ny, 0.5), rtol=0, atol=0.1)
     noise_model = found.A, found.K, found.C, np.eye(ny)
     # |K e| / |e| is of order 1, and known to about 1 / √20000 = 0.7 % for each parameter.
     assert error(noise_model, (A, K, C, np.eye(ny))) < 0.05
