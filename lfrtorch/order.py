@@ -91,6 +91,7 @@ def scan_orders(
         raise ValueError("orders is empty; give at least one, for example range(1, 13).")
     for nx in orders:
         integer("orders", nx, 1)
+    judges = as_records(validation) if validation else []
     models: list[LinearModel] = []
     for nx in sorted(set(orders)):
         try:
@@ -99,7 +100,6 @@ def scan_orders(
             if not models:
                 raise
             break
-    judges = as_records(validation) if validation else []
     if judges:
         scale = data_scaler(judges, offset=True).y_scale
         scores = [_validation(model, judges, scale) for model in models]

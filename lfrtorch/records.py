@@ -21,7 +21,7 @@ in normalised units. A :class:`Scaler` stands at the two ends.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Literal, NamedTuple, get_args
@@ -208,11 +208,17 @@ def as_records(records: Record | Sequence[Record]) -> list[Record]:
     """One record or several as a list, checked to share channels and sampling frequency.
 
     Raises:
-        ValueError: no record, or records of different channel counts or sampling frequencies.
+        ValueError: no record, something else than records, or records of different channel counts
+            or sampling frequencies.
     """
+    if not isinstance(records, Record | Iterable):
+        raise _no_record(records)
     found = [records] if isinstance(records, Record) else list(records)
     if not found:
         raise ValueError("no record given; at least one is needed.")
+    for record in found:
+        if not isinstance(record, Record):
+            raise _no_record(record)
     first = found[0]
     for record in found[1:]:
         same = record.u.shape[1] == first.u.shape[1] and record.y.shape[1] == first.y.shape[1]
@@ -228,6 +234,13 @@ def as_records(records: Record | Sequence[Record]) -> list[Record]:
                 f"{record.fs} Hz; resample them to one rate."
             )
     return found
+
+
+def _no_record(given: object) -> ValueError:
+    return ValueError(
+        f"the data hold a {type(given).__name__} where a record is expected; "
+        "make one of the signals: lfrtorch.Record(u, y, fs=...)."
+    )
 
 
 def without_coordinates(record: Record) -> Record:

@@ -78,5 +78,8 @@ def test_orders_must_be_given():
         scan_orders(record, [])
     with pytest.raises(ValueError, match="orders is 0; give a whole number of at least 1"):
         scan_orders(record, [0, 1])
+    frf = estimate_frf(record)
+    with pytest.raises(ValueError, match="hold a FRF where a record is expected"):
+        scan_orders(record, [1], validation=frf)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="constant in all records"):
         scan_orders(Record(np.ones(100), np.ones(100)), [1, 2])

@@ -156,6 +156,12 @@ def test_no_record():
         as_records([])
 
 
+@pytest.mark.parametrize("data", [U, (U, Y), [Record(U, Y), None], None, 3])
+def test_something_else_than_records(data):
+    with pytest.raises(ValueError, match="where a record is expected; make one of the signals"):
+        as_records(data)
+
+
 def test_records_of_different_channels():
     others = Record(Y, Y, name="a"), Record(U, U, name="b")
     for other in others:
