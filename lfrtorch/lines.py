@@ -174,6 +174,8 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
                 f"weight has shape {weight.shape}; give finite numbers of at least 0 in the shape "
                 f"of the response, {frf.G.shape}."
             )
+        if not weight.any():
+            raise ValueError("weight is 0 everywhere; give some lines a positive one.")
         return weight.astype(np.float64), False, notes
     variances = {"total": frf.var_total, "noise": frf.var_noise}
     if weight is None:

@@ -313,6 +313,8 @@ def test_weights_decide():
     assert frf_error(estimate_bla(wrong, 2), system) > 0.1
     with pytest.raises(ValueError, match="weight has shape"):
         estimate_bla(frf, 2, weight=weight[1:])
+    with pytest.raises(ValueError, match="weight is 0 everywhere; give some lines a positive"):
+        estimate_bla(frf, 2, weight=0 * weight)
     with pytest.raises(ValueError, match="weight is 'all'; use 'total'"):
         estimate_bla(frf, 2, weight="all")  # pyright: ignore[reportArgumentType]
     once = estimate_frf(noisy(system, R=1, P=1))
