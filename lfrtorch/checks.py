@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
+
+import numpy as np
 
 
 def integer(name: str, value: Any, least: int) -> None:
@@ -12,9 +16,16 @@ def integer(name: str, value: Any, least: int) -> None:
         raise ValueError(f"{name} is {value}; give a whole number of at least {least}.")
 
 
+def band(given: Any) -> None:
+    """Refuse what is not a pair of numbers with a ValueError."""
+    pair = isinstance(given, Sequence | np.ndarray) and len(given) == 2
+    if not pair or not all(isinstance(f, Real) for f in given):
+        raise ValueError(f"band is {given}; give two numbers, the lowest and the highest in Hz.")
+
+
 def number(name: str, value: Any, *, positive: bool = False) -> None:
     """Refuse what is not a real number of at least (``positive``: above) 0 with a ValueError."""
     wanted = "a positive number" if positive else "a number of at least 0"
-    real = isinstance(value, Real) and not isinstance(value, bool)
+    real = isinstance(value, Real) and not isinstance(value, bool) and float(value) < math.inf
     if not real or not (float(value) > 0 if positive else float(value) >= 0):
         raise ValueError(f"{name} is {value}; give {wanted}.")

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfrtorch import checks
 from lfrtorch.checks import integer
 from lfrtorch.local_polynomial import half_width, local_polynomial
 from lfrtorch.records import Channel, Record, as_records
@@ -244,6 +245,8 @@ def estimate_frf(
     integer("order", order, 0)
     if degrees_of_freedom is not None:
         integer("degrees_of_freedom", degrees_of_freedom, 1)
+    if band is not None:
+        checks.band(band)
     if band is not None and not 0 <= band[0] <= band[1]:
         raise ValueError(
             f"the band is {band[0]} to {band[1]} Hz; give a lower and an upper frequency."

@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfrtorch import checks
 from lfrtorch.checks import integer, number
 
 Grid = Literal["full", "odd", "random_odd"]
@@ -108,6 +109,8 @@ def multisine(
     integer("realisations", realisations, 1)
     integer("group", group, 2)
     number("fs", fs, positive=True)
+    if band is not None:
+        checks.band(band)
     generator = np.random.default_rng(seed)
     excited = _on_grid(_candidates(samples, fs, band, lines), grid, group, generator)
     A = _amplitudes(amplitude, samples, nu, excited)
@@ -141,7 +144,7 @@ def _candidates(
                 f"has lines 1 to {last} between 0 and fs / 2: use these, or a longer period."
             )
         return np.unique(given).astype(np.int64)
-    low, high = band or (0.0, fs / 2)
+    low, high = (0.0, fs / 2) if band is None else band
     if not 0 <= low <= high <= fs / 2:
         raise ValueError(
             f"the band is {low} to {high} Hz; give a lower and an upper frequency between 0 and "

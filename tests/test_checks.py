@@ -24,7 +24,7 @@ def test_numbers_pass(value):
     number("ridge", value)
 
 
-@pytest.mark.parametrize("value", [-1, "1", None, True, math.nan])
+@pytest.mark.parametrize("value", [-1, "1", None, True, math.nan, math.inf])
 def test_other_than_numbers_are_named(value):
     with pytest.raises(ValueError, match=f"ridge is {value}; give a number of at least 0"):
         number("ridge", value)

@@ -637,6 +637,11 @@ def twice(u: Array) -> Array:
         (lab(FULL.u[0]), {"method": "etfe"}, "method is 'etfe'; use 'auto', 'robust', 'fast' or"),
         (lab(FULL.u[0]), {"order": -1}, "order is -1; give a whole number of at least 0"),
         (lab(FULL.u[0]), {"degrees_of_freedom": 0}, "degrees_of_freedom is 0; give a whole"),
+        (
+            lab(FULL.u[0]),
+            {"band": 0.2},
+            "band is 0.2; give two numbers, the lowest and the highest",
+        ),
         (lab(FULL.u[0]), {"band": (2, 1)}, "the band is 2 to 1 Hz; give a lower and an upper"),
         (lab(FULL.u[0]), {"band": (0.6, 1)}, "no line from 0.6 to 1 Hz is excited; the excited"),
         (lab(FULL.u[0]), {"lines": [0]}, "the lines go from 0 to 0; there are lines 1 to 29"),

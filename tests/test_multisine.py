@@ -43,6 +43,13 @@ def test_band_in_hertz_takes_its_ends():
     assert power_elsewhere(design) < 1e-13
 
 
+def test_band_may_be_an_array():
+    assert np.array_equal(
+        multisine(64, band=np.array([0.1, 0.2])).lines,  # pyright: ignore[reportArgumentType]
+        multisine(64, band=(0.1, 0.2)).lines,
+    )
+
+
 def test_odd_grid_leaves_the_even_lines():
     design = multisine(64, grid="odd", band=(4 / 64, 10 / 64))
     assert design.lines.tolist() == [5, 7, 9]
@@ -140,6 +147,9 @@ def test_same_seed_same_bits():
         ({"lines": [3, 32]}, "the lines go from 3 to 32; a period of 64 samples has lines 1 to 31"),
         ({"lines": [0, 5]}, "the lines go from 0 to 5; a period of 64 samples"),
         ({"band": (0.3, 0.2)}, "the band is 0.3 to 0.2 Hz; give a lower and an upper frequency"),
+        ({"band": 0.2}, "band is 0.2; give two numbers, the lowest and the highest in Hz"),
+        ({"band": ("a", "b")}, "band is ('a', 'b'); give two numbers"),
+        ({"fs": np.inf}, "fs is inf; give a positive number"),
         ({"band": (0.3, 0.6)}, "between 0 and fs / 2 = 0.5 Hz"),
         ({"band": (0.1, 0.1)}, "the band 0.1 to 0.1 Hz holds no line of a period of 64 samples"),
         ({"grid": "even"}, "grid is 'even'; use 'full', 'odd' or 'random_odd'"),
