@@ -152,11 +152,7 @@ class LinearModel:
 
         A given start state is in other coordinates; the one that fits best takes its place.
         """
-        record = without_coordinates(record)
-        nu, ny = len(self.inputs), len(self.outputs)
-        unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
-        cell = linear_cell(self.A, self.B, self.C, self.D)
-        return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs).simulate(record)
+        return self._model().simulate(without_coordinates(record))
 
     def predict(self, record: Record) -> Array:
         """Output (T, ny) predicted one sample ahead from the outputs before, physical units.
@@ -164,12 +160,13 @@ class LinearModel:
         A record in steady state is predicted from the state that fits best: noise does not repeat.
 
         Raises:
-            ValueError: a model without K.
+            ValueError: a model without K, or a record of other channels or another rate.
         """
         if self.K is None:
             raise ValueError(
                 "this model has no innovation gain K: estimate it with refine='prediction'."
             )
+        self._model().check(without_coordinates(record))
         ny = len(self.outputs)
         predictor = replace(
             self,
@@ -296,6 +293,13 @@ class LinearModel:
             raise ValueError(
                 f"'{folder}' is damaged: its description and weights do not fit ({error})."
             ) from None
+
+    def _model(self) -> Model:
+        """The model of the engine, with unit scales."""
+        nu, ny = len(self.inputs), len(self.outputs)
+        unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
+        cell = linear_cell(self.A, self.B, self.C, self.D)
+        return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs)
 
     def _z(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
         return np.exp(2j * np.pi * np.asarray(frequencies, dtype=np.float64) / self.fs)
