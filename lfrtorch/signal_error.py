@@ -211,7 +211,6 @@ class SignalFit:
         nx, nu, ny, width = len(K), self.nu, self.ny, self._records[0].u.shape[1]
         sizes = [nx * nx, nx * width, ny * nx, ny * width]
         ends = np.cumsum(sizes)
-        change = np.zeros(((nx + ny) * (nx + nu), len(covariance)))
         cells = np.split(np.eye(ends[-1], len(covariance)), ends[:-1])
         Bu = cells[1].reshape(nx, width, -1)
         Dyu = cells[3].reshape(ny, width, -1)[:, :nu].reshape(ny * nu, -1)
