@@ -25,7 +25,7 @@ from lfrtorch.threads import spread_by_hand
 Array = NDArray[np.float64]
 Criterion = Literal["simulation", "prediction", "frequency"]
 
-FIRST_STEPS, FINALISTS = 8, 3
+FIRST_STEPS, FINALISTS = 8, 6
 """Iterations after which the starts are compared, and how many of them go on."""
 
 ALIKE, HOPELESS = 1.001, 10.0
@@ -40,6 +40,9 @@ AT_THE_LIMIT = 1.0 - 1e-4
 ROUNDING = 1e-6
 """Relative error below which a fit is perfect."""
 
+POOR = 0.7
+"""Error relative to the output above which a model explains little: less than half its power."""
+
 BETTER = 0.25
 """Part of the stable models' cost below which the data are those of an unstable one."""
 
@@ -47,9 +50,8 @@ BETTER = 0.25
 class LinearLeastSquares(Protocol):
     """Least squares between data and a linear model, in normalised units."""
 
-    @property
-    def contenders(self) -> int:
-        """Starts that are worth a refinement: all where it takes milliseconds."""
+    def contenders(self, nx: int) -> int:
+        """Starts that are worth a refinement: several where an iteration takes milliseconds."""
         ...
 
     def starts(self, nx: int) -> list[Start]:
@@ -113,8 +115,8 @@ def estimate_bla(
     Returns:
         The model, with states of unit standard deviation over the data (of a response: under an
         input of equal power in all lines), the covariance of its parameters, and notes in ``fit``.
-        The covariance holds for errors of any spectrum where lines are fitted, and for white ones
-        where signals are.
+        The covariance holds for errors of any spectrum, and for white ones where signals are
+        predicted or where there are millions of them.
 
     Raises:
         ValueError: an order below 1, a constant channel, or data that do not reach for the order.
@@ -171,6 +173,12 @@ def estimate_bla(
             errors = errors - errors.mean(axis=0)
         if refine == "simulation":
             rmse = float(np.sqrt(np.mean((errors / scaler.y_scale) ** 2)))
+    if rmse > POOR and refine != "frequency":
+        notes.append(
+            f"the model explains little: {100 * rmse:.0f} % of the output's rms remain. Look "
+            "at the columns (are input and output swapped?), for drift (try offset=False where "
+            "the system integrates), a long delay, strong noise or an even nonlinearity."
+        )
     return replace(
         model,
         fit=LinearFit(
@@ -246,7 +254,7 @@ def _best(
         return sorted(found, key=lambda each: each[1].rmse)
 
     field, last = [], 0.0
-    for cost, start, matrices in starts[: problem.contenders]:
+    for cost, start, matrices in starts[: problem.contenders(len(starts[0][1].A))]:
         if cost > ALIKE * last and (not field or cost < HOPELESS * starts[0][0]):
             field.append((start, matrices))
             last = cost
@@ -303,7 +311,7 @@ def _physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearMode
         outputs=about.outputs,
         K=None if found.K is None else found.K / scaler.y_scale,
         innovation_covariance=None if S is None else by_y * S * scaler.y_scale,
-        covariance=size[:, None] * found.covariance * size,
+        covariance=None if found.covariance is None else size[:, None] * found.covariance * size,
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 def integer(name: str, value: Any, least: int) -> None:
     """Refuse what is not a whole number of at least ``least`` with a ValueError."""
     if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < least:
-        raise ValueError(f"{name} is {value}; give a whole number of at least {least}.")
+        raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}.")
 
 
 def band(given: Any) -> None:
@@ -28,4 +28,4 @@ def number(name: str, value: Any, *, positive: bool = False) -> None:
     wanted = "a positive number" if positive else "a number of at least 0"
     real = isinstance(value, Real) and not isinstance(value, bool) and float(value) < math.inf
     if not real or not (float(value) > 0 if positive else float(value) >= 0):
-        raise ValueError(f"{name} is {value}; give {wanted}.")
+        raise ValueError(f"{name} is {value!r}; give {wanted}.")

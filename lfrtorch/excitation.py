@@ -6,7 +6,7 @@ import numpy as np
 
 from lfrtorch.lines import Lines
 from lfrtorch.records import Record
-from lfrtorch.subspace import shortest
+from lfrtorch.subspace import shortest, suffice
 
 NARROW = 1e-10
 """Relative size of a direction that the input does not excite."""
@@ -31,11 +31,12 @@ def check_signals(records: list[Record]) -> None:
 def check_length(records: list[Record], nx: int) -> None:
     """Refuse records that are too short for a subspace of the order with a ValueError."""
     nu, ny = len(records[0].inputs), len(records[0].outputs)
-    needed, longest = shortest(nx, nu, ny), max(r.samples for r in records)
-    if longest < needed:
+    lengths = [r.samples for r in records]
+    if not suffice(lengths, nx, nu, ny):
         raise ValueError(
-            f"the longest record has {longest} samples; order nx={nx} with {nu} input(s) and "
-            f"{ny} output(s) needs at least {needed}: record more, or lower nx."
+            f"the longest of {len(records)} record(s) has {max(lengths)} samples; order nx={nx} "
+            f"with {nu} input(s) and {ny} output(s) needs one of {shortest(nx, nu, ny)}, or many "
+            "shorter ones: record more, or lower nx."
         )
 
 

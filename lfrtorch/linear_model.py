@@ -147,12 +147,14 @@ class LinearModel:
         variance = np.einsum("foip,pq,foiq->foi", J, self.covariance, J.conj(), optimize=True)
         return np.sqrt(np.maximum(variance.real, 0.0))
 
-    def simulate(self, record: Record) -> Array:
+    def simulate(self, data: Record | ArrayLike) -> Array:
         """Simulated output (T, ny) in physical units, from the record's own start.
 
-        A given start state is in other coordinates; the one that fits best takes its place.
+        A bare input (T, nu) is simulated from rest. A start state that is given is in other
+        coordinates; the one that fits best takes its place.
         """
-        return self._model().simulate(without_coordinates(record))
+        data = without_coordinates(data) if isinstance(data, Record) else data
+        return self._model().simulate(data)
 
     def predict(self, record: Record) -> Array:
         """Output (T, ny) predicted one sample ahead from the outputs before, physical units.
@@ -302,7 +304,10 @@ class LinearModel:
         return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs)
 
     def _z(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
-        return np.exp(2j * np.pi * np.asarray(frequencies, dtype=np.float64) / self.fs)
+        f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+        if f.ndim != 1:
+            raise ValueError(f"the frequencies have shape {f.shape}; give one dimension, in Hz.")
+        return np.exp(2j * np.pi * f / self.fs)
 
 
 _ARRAYS = ("A", "B", "C", "D", "u_offset", "y_offset")

@@ -17,6 +17,9 @@ Matrices = tuple[Array, Array, Array, Array]
 TOLERANCE = 1e-9
 """Relative decrease of the cost that counts as none."""
 
+EXHAUSTED = "maximum number of iterations"
+"""Why a search ended that nothing else ended."""
+
 TRUNCATION = 1e-12
 """Relative singular value that a covariance leaves out as gauge."""
 
@@ -27,7 +30,7 @@ class Refined:
 
     Args:
         A, B, C, D: system matrices.
-        covariance: of their entries, each by rows, one after another.
+        covariance: of their entries, each by rows, one after another; of a start none.
         rmse: root mean squared error at the end.
         iterations: of the search.
         reason: why it ended.
@@ -40,7 +43,7 @@ class Refined:
     B: Array
     C: Array
     D: Array
-    covariance: Array
+    covariance: Array | None
     rmse: float
     iterations: int
     reason: str

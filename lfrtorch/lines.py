@@ -59,8 +59,10 @@ class Lines:
     def equations(self) -> int:
         """Real equations: two a line, one at 0 and fs / 2, for each output and excited column."""
         real = np.abs(self.z.imag) < 1e-12
-        excited = (np.abs(self.U) ** 2).sum(axis=1) > 0
-        return int(self.Y.shape[1] * (excited.sum(1) * np.where(real, 1, 2)).sum())
+        counts = np.broadcast_to((np.abs(self.U) ** 2).sum(axis=1, keepdims=True) > 0, self.Y.shape)
+        if self.weight is not None:
+            counts = counts & (self.weight > 0)
+        return int((counts.sum(axis=(1, 2)) * np.where(real, 1, 2)).sum())
 
 
 def lines_of(
@@ -168,6 +170,8 @@ def lines_of_response(
 def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, bool, list[str]]:
     """Weights (F, ny, nu) of the errors of G, whether they are inverse variances, and notes."""
     notes: list[str] = []
+    if isinstance(weight, list | tuple):
+        weight = np.asarray(weight, dtype=np.float64)
     if isinstance(weight, np.ndarray):
         if weight.shape != frf.G.shape or not (np.isfinite(weight).all() and (weight >= 0).all()):
             raise ValueError(
@@ -202,7 +206,8 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
     if not (variance > 0).any():
         notes.append("the variance is 0 at all lines, so that they count alike in the fit.")
         return None, False, notes
-    smooth = _smoothed(variance, 1 if frf.method == "local_polynomial" else frf.realisations - 1)
+    freedom = frf.realisations - 1 if weight == "total" else frf.experiments * (frf.periods - 1)
+    smooth = _smoothed(variance, 1 if frf.method == "local_polynomial" else freedom)
     return 1.0 / np.maximum(smooth, VANISHING * smooth.max()), True, notes
 
 

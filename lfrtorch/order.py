@@ -17,7 +17,7 @@ from lfrtorch.records import Record, as_records
 ORDERS = range(1, 13)
 
 MARGIN = 0.01
-"""Relative score above the best up to which a lower order is taken."""
+"""Relative validation score above the best up to which a lower order is taken."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class OrderScan:
             output relative to its rms; without them the error over the data fitted, times
             √(1 + p ln M / M) for p parameters and M equations (minimum description length).
         validated: which of the two.
-        chosen: the lowest order whose score is within 1 % of the best.
+        chosen: the lowest order whose validation score is within 1 % of the best; without records
+            for validation that of the best score.
     """
 
     models: tuple[LinearModel, ...]
@@ -106,7 +107,8 @@ def scan_orders(
     else:
         scores = [_description_length(model, data) for model in models]
     best = min(scores)
-    chosen = next(m.nx for m, s in zip(models, scores, strict=True) if s <= (1 + MARGIN) * best)
+    limit = best * (1 + MARGIN) if judges else best
+    chosen = next(m.nx for m, s in zip(models, scores, strict=True) if s <= limit)
     return OrderScan(tuple(models), tuple(scores), bool(judges), chosen)
 
 

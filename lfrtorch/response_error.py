@@ -14,12 +14,16 @@ from lfrtorch.factors import Orthogonal
 from lfrtorch.frequency_response import resolvent, resolvents, slopes
 from lfrtorch.gauge import Reduction, reduction
 from lfrtorch.linear_model import linear_cell
-from lfrtorch.linear_search import TRUNCATION, Matrices, Refined, search
+from lfrtorch.linear_search import EXHAUSTED, TRUNCATION, Matrices, Refined, search
 from lfrtorch.lines import Lines
 from lfrtorch.subspace import LARGEST_POLE, Start, from_spectra
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+
+
+MOST_STARTS, LARGE = 12, 250_000
+"""Starts that are refined, up to so many errors times unknowns."""
 
 
 class ResponseFit:
@@ -30,10 +34,13 @@ class ResponseFit:
         known: whether the weights are the inverse variances of the lines.
     """
 
-    contenders = 12
-
     def __init__(self, lines: Lines, *, known: bool) -> None:
         self.lines, self.known = lines, known
+
+    def contenders(self, nx: int) -> int:
+        """Starts that are worth a refinement: one where there are many equations and unknowns."""
+        nu, ny = self.lines.U.shape[1], self.lines.Y.shape[1]
+        return MOST_STARTS if self.lines.Y.size * nx * (nu + ny) < LARGE else 1
 
     def starts(self, nx: int) -> list[Start]:
         """Subspace estimates of A and C."""
@@ -73,10 +80,10 @@ class ResponseFit:
         jacobian = problem.linearise(state.theta)
         return Refined(
             *problem.matrices(state.theta),
-            covariance=jacobian.covariance(known=self.known),
+            covariance=jacobian.covariance(known=self.known) if state.iteration else None,
             rmse=math.sqrt(state.cost / self.lines.Y.size),
             iterations=state.iteration,
-            reason=state.reason,
+            reason=state.reason or EXHAUSTED,
         )
 
 

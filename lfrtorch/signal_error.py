@@ -20,7 +20,7 @@ from torch import Tensor
 from lfrtorch.factors import Orthogonal
 from lfrtorch.lfr import LFR
 from lfrtorch.linear_model import linear_cell
-from lfrtorch.linear_search import TRUNCATION, Matrices, Refined, search
+from lfrtorch.linear_search import EXHAUSTED, TRUNCATION, Matrices, Refined, search
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler
 from lfrtorch.residual import SimulationError
@@ -29,8 +29,11 @@ from lfrtorch.subspace import LARGEST_POLE, Start, from_signals
 
 Array = NDArray[np.float64]
 
-SHORT = 10_000
-"""Samples up to which several starts are refined."""
+MOST_STARTS, SHORT = 8, 200_000
+"""Starts that are refined, up to so many samples times squared states."""
+
+LARGEST_ROWS = 50_000_000
+"""Entries of a Jacobian that is formed whole for a covariance: 400 MB."""
 
 OBSERVERS = (0.0, 1e-4, 1e-2, 1.0)
 """Variance of the state noise over that of the states, times the output error's, of the innovation
@@ -66,10 +69,9 @@ class SignalFit:
         nu, ny = self._records[0].u.shape[1], self.ny
         self._unit = Scaler(np.zeros(nu), np.ones(nu), np.zeros(ny), np.ones(ny))
 
-    @property
-    def contenders(self) -> int:
+    def contenders(self, nx: int) -> int:
         """Starts that are worth a refinement: one of long records, whose starts are good."""
-        return 8 if sum(map(len, self._us)) <= SHORT else 1
+        return MOST_STARTS if sum(map(len, self._us)) * nx**2 <= SHORT else 1
 
     def starts(self, nx: int) -> list[Start]:
         """Subspace estimates of A and C."""
@@ -126,17 +128,19 @@ class SignalFit:
                 constant = np.asarray(constant + C @ at_rest, dtype=np.float64)
         system, _ = problem.linearise(state.theta).system(0.0, TRUNCATION)
         assert isinstance(system, Orthogonal)
-        spare = max(1, problem.size - system.rank)
-        covariance = system.inverse.numpy() * (state.cost / spare)
+        covariance = None
+        if state.iteration:
+            spread = self._spread(problem, state.theta, state.cost, system)
+            covariance = self._of_system(spread, C, D, K)
         found = Refined(
             A + K @ C,
             B + K @ D,
             C.copy(),
             D,
-            covariance=self._of_system(covariance, C, D, K),
+            covariance=covariance,
             rmse=math.sqrt(state.cost / problem.size),
             iterations=state.iteration,
-            reason=state.reason,
+            reason=state.reason or EXHAUSTED,
             constant=constant,
         )
         if not self._prediction:
@@ -145,6 +149,36 @@ class SignalFit:
         errors = torch.cat([(b.y - t.y)[b.scored.bool()] for b, t in pairs])
         innovations = np.atleast_2d(np.cov(errors.numpy().T, bias=True))
         return replace(found, K=K, innovation_covariance=innovations)
+
+    def _spread(
+        self, problem: SimulationError, theta: Tensor, cost: float, system: Orthogonal
+    ) -> Array:
+        """Covariance of θ: of white innovations, or of simulation errors of any spectrum.
+
+        The lines of a stationary error are all but independent, whatever its spectrum: each counts
+        with its own error (White's estimate), unless rows by all parameters take too much room.
+        """
+        inverse, spare = system.inverse.numpy(), max(1, problem.size - system.rank)
+        if self._prediction or problem.size * len(theta) > LARGEST_ROWS:
+            return inverse * (cost / spare)
+        rows, errors = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
+        meat, first = np.zeros_like(inverse), 0
+        for batch in problem.batches:
+            shape = batch.residual_shape
+            last = first + shape.numel()
+            if batch.spectral:  # lines already
+                scores = (rows[first:last] * errors[first:last, None]).reshape(*shape, -1).sum(2)
+            else:
+                J = np.fft.rfft(rows[first:last].reshape(*shape, -1), axis=1)
+                r = np.fft.rfft(errors[first:last].reshape(shape), axis=1)
+                scores = np.einsum("rfop,rfo->rfp", J.conj(), r).real * (2.0 / shape[1])
+                scores[:, 0] /= 2.0
+                if shape[1] % 2 == 0:
+                    scores[:, -1] /= 2.0
+            flat = scores.reshape(-1, scores.shape[-1])
+            meat += flat.T @ flat
+            first = last
+        return inverse @ meat @ inverse * (problem.size / spare)
 
     def _driven(self, u: Array, y: Array, record: Record) -> Record:
         """The record with all inputs of the cell: u, for a prediction y, and a constant."""

@@ -138,8 +138,14 @@ def from_signals(us: Sequence[Array], ys: Sequence[Array], nx: int) -> list[Star
 
 
 def shortest(nx: int, nu: int, ny: int) -> int:
-    """Samples that a record must have for ``from_signals``."""
+    """Samples that one record must have for ``from_signals``."""
     return 2 * HORIZONS[0] * (nx + 1) * (nu + ny + 1)
+
+
+def suffice(lengths: Sequence[int], nx: int, nu: int, ny: int) -> bool:
+    """Whether records of these lengths together are enough for ``from_signals``."""
+    window = 2 * HORIZONS[0] * (nx + 1)
+    return sum(max(0, T - window + 1) for T in lengths) > window * (nu + ny)
 
 
 def _lower(rows: Array) -> Array:

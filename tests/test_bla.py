@@ -172,7 +172,7 @@ def some_input(T: int = 300) -> Array:
     return np.random.default_rng(5).normal(size=(T, 2))
 
 
-def refused(message: str, record: Record, nx: int = 2, **options):
+def refused(message: str, record: Record | list[Record], nx: int = 2, **options):
     with pytest.raises(ValueError, match=re.escape(message)):
         estimate_bla(record, nx, **options)
 
@@ -187,10 +187,22 @@ def test_constant_signals_are_named():
 def test_record_that_is_too_short():
     u = some_input(35)[:, 0]  # 2 · 2 (nx + 1) (nu + ny + 1) = 36
     refused(
-        "has 35 samples; order nx=2 with 1 input(s) and 1 output(s) needs at least 36", Record(u, u)
+        "the longest of 1 record(s) has 35 samples; order nx=2 with 1 input(s) and 1 output(s) "
+        "needs one of 36, or many shorter ones",
+        Record(u, u),
     )
     u = some_input(36)[:, 0]
     assert np.abs(estimate_bla(Record(u, u), 2).poles).max() < 1
+
+
+def test_many_short_records_do():
+    system, rng = random_system(2), np.random.default_rng(4)
+    records = []
+    for _ in range(6):
+        u = rng.normal(size=(20, 1))
+        records.append(Record(u, reference.dlsim(system, u)))
+    assert frf_error(estimate_bla(records, 2, offset=False), system) < 1e-8
+    refused("the longest of 2 record(s) has 13 samples", [r[:13] for r in records[:2]])
 
 
 @pytest.mark.parametrize("nx", [0, -1])
@@ -410,6 +422,20 @@ def test_unstable_data():
     u = np.random.default_rng(0).normal(size=300)
     y = reference.dlsim((1.03 * ONE, ONE, ONE, 0 * ONE), u)
     assert "come from an unstable system" in notes_of(Record(u, y), 1)
+
+
+def test_model_that_explains_nothing():
+    swapped = Record(NOISE[1], NOISE[0])
+    assert "the model explains little: 9" in notes_of(swapped, 2)
+    system = random_system(2)
+    assert "explains little" not in notes_of(record_of(system, "zero", noise=0.1), 2)
+
+
+def test_start_has_no_covariance_and_says_why_it_ended():
+    model = estimate_bla(record_of(random_system(2), "zero", noise=0.1), 2, max_iter=0)
+    assert model.covariance is None
+    assert model.fit is not None
+    assert model.fit.reason == "maximum number of iterations"
 
 
 def test_narrow_input():

@@ -15,7 +15,7 @@ def test_whole_numbers_pass(value):
 
 @pytest.mark.parametrize("value", [2, 3.0, 2.5, "3", None, True, math.nan])
 def test_anything_else_is_named(value):
-    with pytest.raises(ValueError, match=f"nx is {value}; give a whole number of at least 3"):
+    with pytest.raises(ValueError, match=f"nx is {value!r}; give a whole number of at least 3"):
         integer("nx", value, 3)
 
 
@@ -26,7 +26,7 @@ def test_numbers_pass(value):
 
 @pytest.mark.parametrize("value", [-1, "1", None, True, math.nan, math.inf])
 def test_other_than_numbers_are_named(value):
-    with pytest.raises(ValueError, match=f"ridge is {value}; give a number of at least 0"):
+    with pytest.raises(ValueError, match=f"ridge is {value!r}; give a number of at least 0"):
         number("ridge", value)
 
 

@@ -454,6 +454,19 @@ def same(mine: LinearModel, other: LinearModel):
             assert a == b, field.name
 
 
+def test_bare_input_is_simulated_from_rest(model: LinearModel):
+    u = np.random.default_rng(5).normal(size=(50, len(model.inputs)))
+    y = np.zeros((50, len(model.outputs)))
+    expected = model.simulate(Record(u, y, model.fs))
+    assert np.array_equal(model.simulate(u), expected)
+
+
+def test_response_at_one_frequency(model: LinearModel):
+    assert np.array_equal(model.frf(1.0), model.frf([1.0]))
+    with pytest.raises(ValueError, match=re.escape("frequencies have shape (1, 2); give one")):
+        model.frf([[1.0, 2.0]])
+
+
 def test_saved_model_is_read_to_the_same_bits(observed: LinearModel, tmp_path: Path):
     # Matrices that are transposed in memory keep their order.
     whole = replace(observed, fit=FIT, fs=10 / 3, A=np.asfortranarray(observed.A))

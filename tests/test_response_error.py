@@ -167,6 +167,7 @@ def test_covariance_is_that_of_many_fits(known: bool):
         fit = ResponseFit(Lines(z, U, Y, 1.0 / variance if known else None), known=known)
         found = fit.refined(system, 20)
         poles.append(found.A[0, 0])
+        assert found.covariance is not None
         predicted.append(found.covariance[0, 0])
     # The variance of 200 draws has a relative deviation of √(2 / 199) = 0.1: four of them.
     assert np.mean(predicted) == pytest.approx(np.var(poles, ddof=1), rel=0.4)

@@ -101,16 +101,18 @@ def test_prediction_is_more_precise_than_simulation_where_the_noise_is_coloured(
     assert 1.7 * spread[True] < spread[False]
 
 
-@pytest.mark.parametrize("prediction", [False, True])
-def test_covariance_is_that_of_many_fits(prediction: bool):
-    """The pole of a first-order system, over 60 records with white errors of the criterion."""
+@pytest.mark.parametrize("kind", ["white", "coloured", "prediction"])
+def test_covariance_is_that_of_many_fits(kind: str):
+    """The pole of a first-order system, over 60 records: simulation errors of any spectrum."""
+    prediction = kind == "prediction"
     system = np.array([[0.8]]), np.array([[1.0]]), np.array([[1.0]]), np.array([[0.0]])
-    K = np.array([[0.5 if prediction else 0.0]])
+    K = np.array([[0.0 if kind == "white" else 0.7]])
     poles, predicted = [], []
     for seed in range(60):
         record, _ = innovations(system, K, 300, seed=100 + seed)
         found = fit_of([record], prediction=prediction).refined(system, 15)
         poles.append(found.A[0, 0])
+        assert found.covariance is not None
         predicted.append(found.covariance[0, 0])
     # The gauge of one state scales B and C and leaves A alone; √(2 / 59) = 0.18, four of them.
     assert np.mean(predicted) == pytest.approx(np.var(poles, ddof=1), rel=0.73)
