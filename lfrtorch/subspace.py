@@ -36,7 +36,7 @@ SPECTRAL_HORIZONS = (1, 2)
 HORIZONS = (2, 3, 5, 10)
 """The same, from signals."""
 
-MOST_OPERATIONS = 5e10
+MOST_OPERATIONS = 1e10
 """Multiplications of a decomposition; longer horizons than that allows are left out."""
 
 
