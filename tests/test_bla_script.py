@@ -168,7 +168,7 @@ def test_without_a_response_the_model_is_found_all_the_same(tmp_path: Path, monk
     [
         ("force", ["nx=2"], "has no column 'force'"),
         ("a", [], "nx, the number of states, is not set"),
-        ("a", ["nx=automatic"], "nx is automatic; give a whole number"),
+        ("a", ["nx=automatic"], "nx is 'automatic'; give a whole number"),
         ("a", ["nx=auto", "nx_max=0"], "nx_max is 0; give a whole number"),
         ("a", ["nx=auto", "+bla.speed=3"], "speed"),
         ("a", ["nx=2", "bla.refine=magic"], "refine is 'magic'"),

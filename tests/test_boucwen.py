@@ -343,7 +343,7 @@ def test_refused_damaged_files(tmp_path, damage):
         ({"rms": np.nan}, "data.rms is nan"),
         ({"rms": 1e9}, "integration fails under a force of up to .* smaller"),
         ({"noise_rms": -1e-6}, "data.noise_rms is -1e-06; give"),
-        ({"noise_rms": np.inf}, "noise rms is inf m"),
+        ({"noise_rms": np.inf}, "noise_rms is inf; give a number of at least 0"),
         ({"seed": -1}, "data.seed is -1"),
         (
             {"seed": 3, "validation_seed_offset": -4},
