@@ -79,6 +79,7 @@ def estimate_bla(
     refine: Criterion | None = None,
     weight: Weight | Array | None = None,
     offset: bool = True,
+    feedthrough: bool = True,
     coordinates: Literal["balanced", "given"] = "balanced",
     max_iter: int = 200,
 ) -> LinearModel:
@@ -106,6 +107,8 @@ def estimate_bla(
             ``"none"``, or weights of one's own. Where left out the total variance, or the noise's
             where that is all there is, or none.
         offset: whether constants are removed and stored as operating point.
+        feedthrough: whether the input acts on the output at once; D is 0 otherwise, as it must be
+            for data under feedback, which a prediction fits without bias.
         coordinates: ``"balanced"`` states, or ``"given"`` by the subspace estimate.
         max_iter: iterations of the refinement; 0 leaves the start.
 
@@ -143,13 +146,20 @@ def estimate_bla(
         refine = "frequency"
         about = data if isinstance(data, FRF) else estimate_frf(records)
         lines, scaler, known, more = lines_of_response(about, weight, offset=offset)
-        problem, notes = ResponseFit(lines, known=known), [*about.notes, *more]
+        problem = ResponseFit(lines, known=known, feedthrough=feedthrough)
+        notes += [*about.notes, *more]
     else:
         if weight is not None:
             raise ValueError("weight is that of a response: use refine='frequency'.")
         refine, about = refine or "simulation", records[0]
         scaler = data_scaler(records, offset=offset)
-        problem = _of_records(records, scaler, offset=offset, prediction=refine == "prediction")
+        problem = _of_records(
+            records,
+            scaler,
+            offset=offset,
+            prediction=refine == "prediction",
+            feedthrough=feedthrough,
+        )
     if isinstance(problem, ResponseFit):
         check_lines(problem.lines, nx)
     else:
@@ -206,7 +216,7 @@ def data_scaler(records: list[Record], *, offset: bool) -> Scaler:
 
 
 def _of_records(
-    records: list[Record], scaler: Scaler, *, offset: bool, prediction: bool
+    records: list[Record], scaler: Scaler, *, offset: bool, prediction: bool, feedthrough: bool
 ) -> ResponseFit | SignalFit:
     """By their lines, where that is the same, or by their signals."""
     us = [scaler.normalise_u(r.u) for r in records]
@@ -214,8 +224,8 @@ def _of_records(
     if not prediction:
         lines = lines_of(us, ys, records, offset=offset)
         if lines is not None:
-            return ResponseFit(lines, known=False)
-    return SignalFit(us, ys, records, offset=offset, prediction=prediction)
+            return ResponseFit(lines, known=False, feedthrough=feedthrough)
+    return SignalFit(us, ys, records, offset=offset, prediction=prediction, feedthrough=feedthrough)
 
 
 def _starts(problem: LinearLeastSquares, nx: int) -> list[tuple[float, Start, Matrices]]:

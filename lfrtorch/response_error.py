@@ -32,10 +32,11 @@ class ResponseFit:
     Args:
         lines: what is fitted.
         known: whether the weights are the inverse variances of the lines.
+        feedthrough: whether D is a parameter; it is 0 otherwise.
     """
 
-    def __init__(self, lines: Lines, *, known: bool) -> None:
-        self.lines, self.known = lines, known
+    def __init__(self, lines: Lines, *, known: bool, feedthrough: bool = True) -> None:
+        self.lines, self.known, self.feedthrough = lines, known, feedthrough
 
     def contenders(self, nx: int) -> int:
         """Starts that are worth a refinement: one where there are many equations and unknowns."""
@@ -57,14 +58,15 @@ class ResponseFit:
         X, L = resolvents(*matrices[:3], self.lines.z)
         of_B = nx * nx + np.arange(nx * nu)
         of_D = nx * (nx + nu + ny) + np.arange(ny * nu)
-        columns = np.concatenate([of_B, of_D])
+        columns = np.concatenate([of_B, of_D]) if self.feedthrough else of_B
         J = _real(self.lines.weighted(slopes(X, L, self.lines.U, columns))).numpy()
         r = _real(self.lines.weighted(self.lines.Y)).numpy()
         if not np.isfinite(J).all():
             return np.inf, matrices
         size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
         best = scipy.linalg.lstsq(J / size, r, check_finite=False)[0] / size
-        matrices = A, best[: nx * nu].reshape(nx, nu), C, best[nx * nu :].reshape(ny, nu)
+        D = best[nx * nu :].reshape(ny, nu) if self.feedthrough else matrices[3]
+        matrices = A, best[: nx * nu].reshape(nx, nu), C, D
         return float(np.sum((r - J @ best) ** 2)), matrices
 
     def state_deviation(self, matrices: Matrices) -> Array:
@@ -74,7 +76,9 @@ class ResponseFit:
 
     def refined(self, matrices: Matrices, max_iter: int) -> Refined:
         """Levenberg-Marquardt on A, B, C, D, with the covariance at its end."""
-        problem = ResponseError(self.lines, len(matrices[0]), LARGEST_POLE)
+        problem = ResponseError(
+            self.lines, len(matrices[0]), LARGEST_POLE, feedthrough=self.feedthrough
+        )
         theta = torch.as_tensor(np.concatenate([m.ravel() for m in matrices]))
         state = search(problem, theta, max_iter)
         jacobian = problem.linearise(state.theta)
@@ -96,12 +100,19 @@ class ResponseError:
         lines: what is fitted.
         nx: order.
         largest_pole: radius that no pole may reach; none where left out.
+        feedthrough: whether the entries of D may change.
     """
 
-    def __init__(self, lines: Lines, nx: int, largest_pole: float = np.inf) -> None:
+    def __init__(
+        self, lines: Lines, nx: int, largest_pole: float = np.inf, *, feedthrough: bool = True
+    ) -> None:
         self.lines, self.largest_pole = lines, largest_pole
         nu, ny = lines.U.shape[1], lines.Y.shape[1]
         self.shapes = (nx, nx), (nx, nu), (ny, nx), (ny, nu)
+        self._fixed: Tensor | None = None
+        if not feedthrough:
+            self._fixed = torch.zeros(nx * (nx + nu + ny) + ny * nu, dtype=torch.bool)
+            self._fixed[nx * (nx + nu + ny) :] = True
         self._latest: tuple[Tensor, Complex] | None = None
         self._reduced: Reduction | None = None
 
@@ -127,7 +138,7 @@ class ResponseError:
         """The slope of the residual without the columns that the coordinates of x make."""
         cell = linear_cell(*self.matrices(theta))
         start = torch.zeros(0, len(cell.A), dtype=torch.float64)
-        self._reduced = reduction(cell, start, before=self._reduced)
+        self._reduced = reduction(cell, start, before=self._reduced, fixed=self._fixed)
         A, _, C, _ = self.matrices(theta)
         X, L = self._states(theta), resolvent(A.T, C.T, self.lines.z).swapaxes(1, 2)
         J = slopes(X, L, self.lines.U, self._reduced.kept.numpy())

@@ -48,6 +48,7 @@ class SignalFit:
         records: their starts, windows and weights.
         offset: whether a constant in the output is free.
         prediction: whether the error is that of the one-step-ahead prediction.
+        feedthrough: whether D is a parameter; it is 0 otherwise.
 
     Shape:
         us: of (T, nu), ys: of (T, ny).
@@ -61,10 +62,11 @@ class SignalFit:
         *,
         offset: bool,
         prediction: bool,
+        feedthrough: bool = True,
     ) -> None:
         self._us, self._ys = us, ys
         self.nu, self.ny = us[0].shape[1], ys[0].shape[1]
-        self._offset, self._prediction = offset, prediction
+        self._offset, self._prediction, self._feedthrough = offset, prediction, feedthrough
         self._records = [self._driven(*signals) for signals in zip(us, ys, records, strict=True)]
         nu, ny = self._records[0].u.shape[1], self.ny
         self._unit = Scaler(np.zeros(nu), np.ones(nu), np.zeros(ny), np.ones(ny))
@@ -203,7 +205,7 @@ class SignalFit:
         Bu, Dyu = np.zeros((len(A), width)), np.zeros((ny, width))
         Bu[:, :nu], Dyu[:, :nu] = B - K @ D, D
         free_B, free_D = np.zeros_like(Bu, dtype=bool), np.zeros_like(Dyu, dtype=bool)
-        free_B[:, :nu] = free_D[:, :nu] = True
+        free_B[:, :nu], free_D[:, :nu] = True, self._feedthrough
         if self._prediction:
             Bu[:, nu : nu + ny] = K
             free_B[:, nu : nu + ny] = observed

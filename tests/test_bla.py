@@ -1,5 +1,6 @@
 """The best linear approximation: exact on linear data, stable on any, and what it refuses."""
 
+import itertools
 import re
 from dataclasses import replace
 
@@ -275,6 +276,42 @@ def test_high_orders_are_recovered_from_signals(nx: int, nu: int, ny: int):
     system = random_system(nx, nu, ny)
     model = estimate_bla(record_of(system, "zero", T=1500), nx, offset=False)
     assert frf_error(model, system) < 1e-8
+
+
+# --- feedthrough ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("refine", "start"),
+    [
+        *itertools.product(("simulation", "prediction"), ("zero", "periodic")),
+        ("frequency", "zero"),  # one periodic experiment of two inputs gives no response
+    ],
+)
+def test_without_feedthrough(refine, start: Start):
+    A, B, C, D = random_system(3, 2, 2)
+    record = record_of((A, B, C, 0 * D), start, T=600)
+    model = estimate_bla(record, 3, refine=refine, feedthrough=False)
+    assert not model.D.any()
+    # The response by local polynomials has a bias of the order of (their window)³.
+    limit = 0.05 if refine == "frequency" else 1e-8
+    assert frf_error(model, (A, B, C, 0 * D)) < limit
+
+
+def test_data_under_feedback_are_predicted_without_bias():
+    """u = r - 0.5 y: a regulator that acts at once, around a first-order system with noise."""
+    rng = np.random.default_rng(8)
+    x, u, y = 0.0, np.zeros(20_000), np.zeros(20_000)
+    for k, (r, e) in enumerate(rng.normal(size=(20_000, 2))):
+        y[k] = x + e
+        u[k] = r - 0.5 * y[k]
+        x = 0.9 * x + 0.3 * u[k] + 0.4 * e
+    model = estimate_bla(Record(u, y), 1, refine="prediction", feedthrough=False)
+    # About 1 / √20000 = 0.7 %, four of them.
+    assert model.poles[0].real == pytest.approx(0.9, abs=0.03)
+    assert float(model.C[0, 0] * model.B[0, 0]) == pytest.approx(0.3, abs=0.02)
+    biased = estimate_bla(Record(u, y), 1, refine="prediction")
+    assert abs(float(biased.D[0, 0])) > 0.1
 
 
 # --- nonparametric responses ----------------------------------------------------------------
