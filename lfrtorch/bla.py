@@ -28,6 +28,10 @@ Criterion = Literal["simulation", "prediction", "frequency"]
 FIRST_STEPS, FINALISTS = 8, 6
 """Iterations after which the starts are compared, and how many of them go on."""
 
+SAME, AGREED = 1.0 + 1e-6, 3
+"""Ratio of the errors of two searches up to which they are in the same minimum, and how many of
+them in a row end the race."""
+
 ALIKE, HOPELESS = 1.001, 10.0
 """Starts whose costs differ by a smaller factor count as one; by a larger one, as not worth it."""
 
@@ -256,24 +260,32 @@ def _best(
     Wiener-Hammerstein system to one whose error on other data is 4 % above the best one's.
     """
 
-    def refined(field: list[tuple[Start, Matrices]], steps: int) -> list[tuple[Start, Refined]]:
-        found = [
-            (start, problem.refined(_scaled(problem, matrices, balanced=balanced), steps))
-            for start, matrices in field
-        ]
-        return sorted(found, key=lambda each: each[1].rmse)
+    def refined(start: Start, matrices: Matrices, steps: int) -> tuple[Start, Refined]:
+        return start, problem.refined(_scaled(problem, matrices, balanced=balanced), steps)
 
     field, last = [], 0.0
     for cost, start, matrices in starts[: problem.contenders(len(starts[0][1].A))]:
         if cost > ALIKE * last and (not field or cost < HOPELESS * starts[0][0]):
             field.append((start, matrices))
             last = cost
-    if len(field) > FINALISTS and max_iter > FIRST_STEPS:
-        first = refined(field, FIRST_STEPS)
-        field = [(start, found.matrices) for start, found in first[:FINALISTS]]
+    if len(field) > 1 and max_iter > FIRST_STEPS:
+        first: list[tuple[Start, Refined]] = []
+        for start, matrices in field:
+            first.append(refined(start, matrices, FIRST_STEPS))
+            errors = [found.rmse for _, found in first]
+            if len(errors) >= AGREED and max(errors[-AGREED:]) <= SAME * min(errors):
+                break  # so many in a row went to the best minimum so far: the others would
+        first.sort(key=lambda each: each[1].rmse)
+        errors = [0.0, *(found.rmse for _, found in first)]
+        field = [
+            (start, found.matrices)
+            for (start, found), last in zip(first, errors, strict=False)
+            if found.rmse > SAME * last
+        ]
     elif max_iter <= FIRST_STEPS:
         field = field[:1]
-    return refined(field, max_iter)[0]
+    results = [refined(start, matrices, max_iter) for start, matrices in field[:FINALISTS]]
+    return min(results, key=lambda each: each[1].rmse)
 
 
 def _findings(problem: LinearLeastSquares, start: Start, found: Refined) -> list[str]:
