@@ -8,6 +8,7 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 
 def integer(name: str, value: Any, least: int) -> None:
@@ -21,6 +22,19 @@ def band(given: Any) -> None:
     pair = isinstance(given, Sequence | np.ndarray) and len(given) == 2
     if not pair or not all(isinstance(f, Real) for f in given):
         raise ValueError(f"band is {given}; give two numbers, the lowest and the highest in Hz.")
+
+
+def lines(given: ArrayLike, samples: int) -> NDArray[np.int64]:
+    """DFT lines, rising; refuse all but whole numbers between 0 and samples / 2."""
+    found, last = np.asarray(given), (samples - 1) // 2
+    if found.ndim != 1 or found.size == 0 or found.dtype.kind not in "iu":
+        raise ValueError(f"lines is {given}; give a list of whole numbers, one a line.")
+    if found.min() < 1 or found.max() > last:
+        raise ValueError(
+            f"the lines go from {found.min()} to {found.max()}; {samples} samples have lines 1 to "
+            f"{last} between 0 and fs / 2: use these, or a longer period."
+        )
+    return np.unique(found).astype(np.int64)
 
 
 def number(name: str, value: Any, *, positive: bool = False) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from lfrtorch import checks
 from lfrtorch.checks import integer
+from lfrtorch.checks import lines as checked_lines
 from lfrtorch.local_polynomial import half_width, local_polynomial
 from lfrtorch.records import Channel, Record, as_records
 from lfrtorch.regression import Complex, Regression, covariance, outer, regress
@@ -20,7 +21,6 @@ from lfrtorch.spectra import (
     Removal,
     Spectra,
     excited_lines,
-    given_lines,
     in_band,
     powered_lines,
     spectra_of_periods,
@@ -363,7 +363,7 @@ def _local_polynomial(
         )
     lines = powered_lines(spectra, n)
     if given is not None:
-        chosen = given_lines(given, last)
+        chosen = checked_lines(given, spectra.N)
         missing = np.setdiff1d(chosen, lines)
         if missing.size:
             raise ValueError(

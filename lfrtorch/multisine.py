@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch import checks
 from lfrtorch.checks import integer, number
+from lfrtorch.checks import lines as checked_lines
 
 Grid = Literal["full", "odd", "random_odd"]
 
@@ -135,15 +136,7 @@ def _candidates(
     if lines is not None:
         if band is not None:
             raise ValueError("both lines and band are given; give one of them.")
-        given = np.asarray(lines)
-        if given.ndim != 1 or given.size == 0 or given.dtype.kind not in "iu":
-            raise ValueError(f"lines is {lines}; give a list of whole numbers, one a line.")
-        if given.min() < 1 or given.max() > last:
-            raise ValueError(
-                f"the lines go from {given.min()} to {given.max()}; a period of {samples} samples "
-                f"has lines 1 to {last} between 0 and fs / 2: use these, or a longer period."
-            )
-        return np.unique(given).astype(np.int64)
+        return checked_lines(lines, samples)
     low, high = (0.0, fs / 2) if band is None else band
     if not 0 <= low <= high <= fs / 2:
         raise ValueError(

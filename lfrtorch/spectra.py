@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfrtorch.checks import lines as checked_lines
 from lfrtorch.records import Record
 from lfrtorch.regression import Complex, outer
 
@@ -220,7 +221,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     inputs = data[0].inputs
     power = np.mean(np.abs(spectra.U[1 : last + 1]) ** 2, axis=1)  # (lines, nu), from line 1
     if given is not None:
-        lines = given_lines(given, last)
+        lines = checked_lines(given, spectra.N)
         weak = np.argwhere(power[lines - 1] <= NO_POWER * power.max(axis=0))
         if weak.size:
             line, channel = weak[0]
@@ -258,19 +259,6 @@ def _smooth(power: Array, width: int) -> Array:
     window = np.ones(min(width, len(power)))
     count = np.convolve(np.ones(len(power)), window, "same")
     return np.stack([np.convolve(channel, window, "same") / count for channel in power.T], axis=1)
-
-
-def given_lines(lines: ArrayLike, last: int) -> Lines:
-    """The lines, rising, after a check that they are whole numbers from 1 to ``last``."""
-    given = np.asarray(lines)
-    if given.ndim != 1 or given.size == 0 or given.dtype.kind not in "iu":
-        raise ValueError(f"lines is {lines}; give a list of whole numbers, one a line.")
-    if given.min() < 1 or given.max() > last:
-        raise ValueError(
-            f"the lines go from {given.min()} to {given.max()}; there are lines 1 to {last} "
-            "between 0 and fs / 2."
-        )
-    return np.unique(given).astype(np.int64)
 
 
 def in_band(lines: Lines, resolution: float, band: tuple[float, float] | None) -> Lines:

@@ -644,8 +644,12 @@ def twice(u: Array) -> Array:
         ),
         (lab(FULL.u[0]), {"band": (2, 1)}, "the band is 2 to 1 Hz; give a lower and an upper"),
         (lab(FULL.u[0]), {"band": (0.6, 1)}, "no line from 0.6 to 1 Hz is excited; the excited"),
-        (lab(FULL.u[0]), {"lines": [0]}, "the lines go from 0 to 0; there are lines 1 to 29"),
-        (lab(FULL.u[0]), {"lines": [30]}, "the lines go from 30 to 30; there are lines 1 to 29"),
+        (lab(FULL.u[0]), {"lines": [0]}, "the lines go from 0 to 0; 60 samples have lines 1 to 29"),
+        (
+            lab(FULL.u[0]),
+            {"lines": [30]},
+            "the lines go from 30 to 30; 60 samples have lines 1 to 29",
+        ),
         (lab(FULL.u[0]), {"lines": 3}, "lines is 3; give a list of whole numbers"),
         (lab(ODD.u[0]), {"lines": [3, 4]}, "input 'force' has no power at line 4; give lines"),
         (
