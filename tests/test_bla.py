@@ -387,6 +387,7 @@ def test_what_a_response_does_not_know_is_said():
     assert notes(3, 3) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("refine", ["simulation", "frequency"])
 def test_standard_deviation_of_the_response_is_that_of_many_fits(refine):
     """60 times periodic data with coloured noise, which changes from line to line."""
