@@ -257,7 +257,7 @@ def _best(
     """The best of the minima that the starts lead to: after a few steps the best few go on.
 
     The start that fits best may lead to a poor minimum: at the highest level of the parallel
-    Wiener-Hammerstein system to one whose error on other data is 4 % above the best one's.
+    Wiener-Hammerstein system to one whose error on the data fitted is 4 % above the best one's.
     """
 
     def refined(start: Start, matrices: Matrices, steps: int) -> tuple[Start, Refined]:
