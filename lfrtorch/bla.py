@@ -14,7 +14,7 @@ from lfrtorch.checks import integer
 from lfrtorch.excitation import check_length, check_lines, check_signals, narrow
 from lfrtorch.frf import FRF, estimate_frf
 from lfrtorch.linear_model import LinearFit, LinearModel, balancing
-from lfrtorch.linear_search import Matrices, Refined
+from lfrtorch.linear_search import Matrices, Refined, Search
 from lfrtorch.lines import Weight, lines_of, lines_of_response
 from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
 from lfrtorch.response_error import ResponseFit
@@ -28,8 +28,8 @@ Criterion = Literal["simulation", "prediction", "frequency"]
 FIRST_STEPS, FINALISTS = 8, 6
 """Iterations after which the starts are compared, and how many of them go on."""
 
-SAME, AGREED = 1.0 + 1e-6, 3
-"""Ratio of the errors of two searches up to which they are in the same minimum, and how many of
+SAME, AGREED = 1.0 + 2e-6, 3
+"""Ratio of the costs of two searches up to which they are in the same minimum, and how many of
 them in a row end the race."""
 
 ALIKE, HOPELESS = 1.001, 10.0
@@ -70,8 +70,12 @@ class LinearLeastSquares(Protocol):
         """Standard deviation (nx,) of the states over the data."""
         ...
 
-    def refined(self, matrices: Matrices, max_iter: int) -> Refined:
-        """The minimum near the given system."""
+    def search(self, matrices: Matrices) -> Search:
+        """A search for the minimum near the given system."""
+        ...
+
+    def refined(self, search: Search) -> Refined:
+        """What a search has found."""
         ...
 
 
@@ -260,32 +264,30 @@ def _best(
     Wiener-Hammerstein system to one whose error on the data fitted is 4 % above the best one's.
     """
 
-    def refined(start: Start, matrices: Matrices, steps: int) -> tuple[Start, Refined]:
-        return start, problem.refined(_scaled(problem, matrices, balanced=balanced), steps)
-
     field, last = [], 0.0
     for cost, start, matrices in starts[: problem.contenders(len(starts[0][1].A))]:
         if cost > ALIKE * last and (not field or cost < HOPELESS * starts[0][0]):
             field.append((start, matrices))
             last = cost
-    if len(field) > 1 and max_iter > FIRST_STEPS:
-        first: list[tuple[Start, Refined]] = []
-        for start, matrices in field:
-            first.append(refined(start, matrices, FIRST_STEPS))
-            errors = [found.rmse for _, found in first]
-            if len(errors) >= AGREED and max(errors[-AGREED:]) <= SAME * min(errors):
-                break  # so many in a row went to the best minimum so far: the others would
-        first.sort(key=lambda each: each[1].rmse)
-        errors = [0.0, *(found.rmse for _, found in first)]
-        field = [
-            (start, found.matrices)
-            for (start, found), last in zip(first, errors, strict=False)
-            if found.rmse > SAME * last
-        ]
-    elif max_iter <= FIRST_STEPS:
-        field = field[:1]
-    results = [refined(start, matrices, max_iter) for start, matrices in field[:FINALISTS]]
-    return min(results, key=lambda each: each[1].rmse)
+    searches: list[tuple[Start, Search]] = []
+    for start, matrices in field if max_iter > FIRST_STEPS else field[:1]:
+        search = problem.search(_scaled(problem, matrices, balanced=balanced))
+        searches.append((start, search.advance(min(FIRST_STEPS, max_iter))))
+        costs = [search.state.cost for _, search in searches]
+        if len(costs) >= AGREED and max(costs[-AGREED:]) <= SAME * min(costs):
+            break  # so many in a row went to the best minimum so far: the others would
+    searches.sort(key=lambda each: each[1].state.cost)
+    costs = [0.0, *(search.state.cost for _, search in searches)]
+    distinct = [
+        each
+        for each, last in zip(searches, costs, strict=False)
+        if each[1].state.cost > SAME * last
+    ]
+    finalists = (distinct or searches)[:FINALISTS]
+    for _, search in finalists:
+        search.advance(max_iter)
+    start, search = min(finalists, key=lambda each: each[1].state.cost)
+    return start, problem.refined(search)
 
 
 def _findings(problem: LinearLeastSquares, start: Start, found: Refined) -> list[str]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lfrtorch.levenberg_marquardt import LeastSquares, LevenbergMarquardt, LMState
+from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 
 Array = NDArray[np.float64]
 Matrices = tuple[Array, Array, Array, Array]
@@ -57,14 +59,29 @@ class Refined:
         return self.A, self.B, self.C, self.D
 
 
-def search(problem: LeastSquares, theta: Tensor, max_iter: int) -> LMState:
-    """Levenberg-Marquardt until the cost no longer falls.
+class Search:
+    """Levenberg-Marquardt from one start, in as many instalments as wanted.
 
     Geodesic acceleration halves the iterations: 60 to 80 instead of 150 and more for order 12 at
     the five levels of the parallel Wiener-Hammerstein system.
+
+    Args:
+        problem: what is minimised.
+        theta: start (P,).
     """
-    optimiser = LevenbergMarquardt(max_iter=max_iter, tolerance=TOLERANCE)
-    state = optimiser.init(problem, theta)
-    while not state.reason and state.iteration < max_iter:
-        state = optimiser.step(problem, state)
-    return state
+
+    def __init__(self, problem: Any, theta: Tensor) -> None:
+        self.problem = problem
+        self._optimiser = LevenbergMarquardt(max_iter=sys.maxsize, tolerance=TOLERANCE)
+        self.state = self._optimiser.init(problem, theta)
+
+    def advance(self, max_iter: int) -> Self:
+        """Go on until the cost no longer falls, or to the iteration ``max_iter``."""
+        while not self.state.reason and self.state.iteration < max_iter:
+            self.state = self._optimiser.step(self.problem, self.state)
+        return self
+
+    @property
+    def reason(self) -> str:
+        """Why it ended where it stands."""
+        return self.state.reason or EXHAUSTED

@@ -14,7 +14,7 @@ from lfrtorch.factors import Orthogonal
 from lfrtorch.frequency_response import resolvent, resolvents, slopes
 from lfrtorch.gauge import Reduction, reduction
 from lfrtorch.linear_model import linear_cell
-from lfrtorch.linear_search import EXHAUSTED, TRUNCATION, Matrices, Refined, search
+from lfrtorch.linear_search import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.lines import Lines
 from lfrtorch.subspace import LARGEST_POLE, Start, from_spectra
 
@@ -74,20 +74,23 @@ class ResponseFit:
         X = resolvent(*matrices[:2], self.lines.z)
         return np.sqrt((np.abs(X @ self.lines.U) ** 2).sum(axis=(0, 2)))
 
-    def refined(self, matrices: Matrices, max_iter: int) -> Refined:
-        """Levenberg-Marquardt on A, B, C, D, with the covariance at its end."""
+    def search(self, matrices: Matrices) -> Search:
+        """A search over A, B, C, D from the given ones."""
         problem = ResponseError(
             self.lines, len(matrices[0]), LARGEST_POLE, feedthrough=self.feedthrough
         )
-        theta = torch.as_tensor(np.concatenate([m.ravel() for m in matrices]))
-        state = search(problem, theta, max_iter)
+        return Search(problem, torch.as_tensor(np.concatenate([m.ravel() for m in matrices])))
+
+    def refined(self, search: Search) -> Refined:
+        """Where a search stands, with the covariance there."""
+        problem, state = search.problem, search.state
         jacobian = problem.linearise(state.theta)
         return Refined(
             *problem.matrices(state.theta),
             covariance=jacobian.covariance(known=self.known) if state.iteration else None,
             rmse=math.sqrt(state.cost / self.lines.Y.size),
             iterations=state.iteration,
-            reason=state.reason or EXHAUSTED,
+            reason=search.reason,
         )
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from lfrtorch.factors import Orthogonal
 from lfrtorch.lfr import LFR
 from lfrtorch.linear_model import linear_cell
-from lfrtorch.linear_search import EXHAUSTED, TRUNCATION, Matrices, Refined, search
+from lfrtorch.linear_search import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler
 from lfrtorch.residual import SimulationError
@@ -108,14 +108,18 @@ class SignalFit:
             states.append(model.signals(of_record).x[0, :-1].numpy())
         return np.concatenate(states).std(axis=0)
 
-    def refined(self, matrices: Matrices, max_iter: int) -> Refined:
-        """Levenberg-Marquardt on A, B, C, D and K, with the covariance at its end."""
+    def search(self, matrices: Matrices) -> Search:
+        """A search over A, B, C, D and K from the given ones and the best of some observers."""
         gains = [np.zeros((len(matrices[0]), self.ny))]
         if self._prediction:
             gains = [self._observer(matrices, part) for part in OBSERVERS]
         problems = [self._problem(matrices, K) for K in gains]
         problem = min(problems, key=lambda p: p.cost(p.residual(p.theta)))
-        state = search(problem, problem.theta, max_iter)
+        return Search(problem, problem.theta)
+
+    def refined(self, search: Search) -> Refined:
+        """Where a search stands, with the covariance there."""
+        problem, state = search.problem, search.state
         problem.write(state.theta)
         cell = problem.model.lfr.cell
         A, Bu, C, Dyu = (m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu))
@@ -142,7 +146,7 @@ class SignalFit:
             covariance=covariance,
             rmse=math.sqrt(state.cost / problem.size),
             iterations=state.iteration,
-            reason=state.reason or EXHAUSTED,
+            reason=search.reason,
             constant=constant,
         )
         if not self._prediction:

@@ -14,9 +14,12 @@ from torch.func import functional_call, jacfwd
 
 from lfrtorch.cell import LFRCell
 from lfrtorch.lfr import LFR
+from lfrtorch.linear_search import Refined
 from lfrtorch.model import Model
 from lfrtorch.nonlinearity import Network
 from lfrtorch.records import Channel, Record, Scaler, Start
+from lfrtorch.response_error import ResponseFit
+from lfrtorch.signal_error import SignalFit
 from lfrtorch.simulate import Trajectory
 
 Array = NDArray[np.float64]
@@ -200,3 +203,8 @@ def periodic_response(system: System, u: Array) -> Array:
     omega = np.asarray(2 * np.pi * np.fft.rfftfreq(len(u)), dtype=np.float64)
     Y = np.einsum("fyu,fu->fy", frf(system, omega), np.fft.rfft(u, axis=0))
     return np.fft.irfft(Y, len(u), axis=0)
+
+
+def refined(fit: ResponseFit | SignalFit, system: System, max_iter: int) -> Refined:
+    """What a linear fit finds from one start."""
+    return fit.refined(fit.search(system).advance(max_iter))

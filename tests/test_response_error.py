@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import reference
 import torch
-from reference import System, random_system
+from reference import System, random_system, refined
 
 from lfrtorch.frequency_response import frequency_response
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
@@ -165,7 +165,7 @@ def test_covariance_is_that_of_many_fits(known: bool):
         noise = rng.normal(size=(F, 1, 1)) + 1j * rng.normal(size=(F, 1, 1))
         Y = G + np.sqrt(variance / 2) * noise
         fit = ResponseFit(Lines(z, U, Y, 1.0 / variance if known else None), known=known)
-        found = fit.refined(system, 20)
+        found = refined(fit, system, 20)
         poles.append(found.A[0, 0])
         assert found.covariance is not None
         predicted.append(found.covariance[0, 0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import reference
 import scipy.linalg
-from reference import Array, System, random_system
+from reference import Array, System, random_system, refined
 
 from lfrtorch.records import Record
 from lfrtorch.signal_error import SignalFit
@@ -54,7 +54,7 @@ def test_refined_simulation_leaves_the_offset_and_the_start_to_the_fit():
     u = np.random.default_rng(1).normal(size=(300, 1))
     record = Record(u[40:], reference.dlsim(system, u)[40:] - 2.0, start="estimated")
     A, B, C, D = system
-    found = fit_of([record], offset=True).refined((0.98 * A, B, 1.02 * C, D), 50)
+    found = refined(fit_of([record], offset=True), (0.98 * A, B, 1.02 * C, D), 50)
     assert error(found.matrices, system) < 1e-9
     assert found.constant is not None
     np.testing.assert_allclose(found.constant, [-2.0], rtol=0, atol=1e-8)
@@ -69,7 +69,7 @@ def test_prediction_finds_the_innovation_model(nu: int, ny: int):
     P = scipy.linalg.solve_discrete_are(A.T, C.T, np.eye(2), 0.5 * np.eye(ny))
     K = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + 0.5 * np.eye(ny))
     record, e = innovations(system, K, 20_000, seed=2, y0=0.5)
-    found = fit_of([record], offset=True, prediction=True).refined(system, 60)
+    found = refined(fit_of([record], offset=True, prediction=True), system, 60)
     # The innovations' rms is known to 1 / √(2 · 20000), and the fit takes off 10 parameters of it.
     assert found.rmse == pytest.approx(np.sqrt(np.mean(e**2)), rel=4 / np.sqrt(2 * e.size) + 1e-3)
     assert found.K is not None
@@ -94,7 +94,7 @@ def test_prediction_is_more_precise_than_simulation_where_the_noise_is_coloured(
         poles = []
         for seed in range(12):
             record, _ = innovations(system, K, 500, seed=10 + seed, size=2.0)
-            found = fit_of([record], prediction=prediction).refined(system, 40)
+            found = refined(fit_of([record], prediction=prediction), system, 40)
             poles.append(found.A[0, 0] - 0.9)
         spread[prediction] = np.sqrt(np.mean(np.square(poles)))
     # 1.7 in deviation is a factor of 3 in variance, which 12 runs tell apart (F distribution).
@@ -112,7 +112,7 @@ def test_covariance_is_that_of_many_fits(kind: str):
     poles, predicted = [], []
     for seed in range(60):
         record, _ = innovations(system, K, 300, seed=100 + seed)
-        found = fit_of([record], prediction=prediction).refined(system, 15)
+        found = refined(fit_of([record], prediction=prediction), system, 15)
         poles.append(found.A[0, 0])
         assert found.covariance is not None
         predicted.append(found.covariance[0, 0])
@@ -155,5 +155,5 @@ def test_unstable_system_of_a_stable_predictor_is_refused():
     system = np.array([[1.01]]), np.array([[1.0]]), np.array([[1.0]]), np.array([[0.0]])
     record, _ = innovations(system, np.array([[0.5]]), 300, seed=3)
     inside = np.array([[0.99]]), *system[1:]
-    found = fit_of([record], prediction=True).refined(inside, 50)
+    found = refined(fit_of([record], prediction=True), inside, 50)
     assert abs(found.A[0, 0]) < 1
