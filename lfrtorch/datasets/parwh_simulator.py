@@ -1,0 +1,151 @@
+"""Parallel Wiener-Hammerstein stand-in: a simulated system with the shapes of the official data.
+
+Two Wiener-Hammerstein branches side by side, input u (V), output y (V), 12 states::
+
+    y = 0.84 (H2 f1(H1 u) + 0.7 H4 f2(H3 u))
+
+    H1 Chebyshev I, 0.5 dB, 4.4 kHz         H2 Chebyshev II, 40 dB, 9 kHz
+    H3 Butterworth, 6 kHz                   H4 elliptic, 0.5 dB, 30 dB, 12 kHz      (order 3, all)
+    f1(v) = v - 0.4 s(v - 0.2)              saturates on one side
+    f2(v) = v - 0.4 s(v - 0.2) + 0.4 s(-v - 0.2)      on both
+    s(v)  = 0.05 log(1 + exp(v / 0.05))
+
+The official system is a circuit of this structure; the filters and saturations here are chosen so
+that linear models leave about the errors that are published for it (0.83, 9.46, 19.9, 30.7 and
+37.7 mV).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import butter, cheby1, cheby2, ellip, freqz
+
+from lfrtorch.checks import number
+
+FS = 78125.0
+"""Sampling frequency of the records, Hz."""
+
+PERIOD = 16384
+"""Samples of a period."""
+
+_LINES = slice(1, 4096)  # of rfft, that are excited: 2 to 4096 counted from 1 at DC
+_ARROW_RMS = 1.0  # V, of its last tenth
+
+_H1 = cheby1(3, 0.5, 4.4e3, fs=FS)
+_H2 = cheby2(3, 40, 9e3, fs=FS)
+_H3 = butter(3, 6e3, fs=FS)
+_H4 = ellip(3, 0.5, 30, 12e3, fs=FS)
+
+_USES = ("train", "validation", "level", "arrow")  # first number of a record's seed
+
+Signals = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Input and output, (samples,) each, V."""
+
+
+class StandIn:
+    """Signals of the records, in steady state.
+
+    Args:
+        seed, periods, noise_rms: see :func:`lfrtorch.datasets.parwh.load`.
+    """
+
+    source = "stand-in"
+
+    def __init__(self, *, seed: int, periods: int, noise_rms: float) -> None:
+        self.seed, self.periods, self.noise_rms = seed, periods, noise_rms
+
+    def train(self, level: int, r: int) -> Signals:
+        """Training record r of a level (mV rms)."""
+        return self._multisine("train", level, r, self.periods, self.noise_rms)
+
+    def validation(self, level: int) -> Signals:
+        """The validation record of a level."""
+        return self._multisine("validation", level, 0, self.periods, self.noise_rms)
+
+    def test(self, level: int) -> Signals:
+        """The test record of a level."""
+        return self._multisine("level", level, 0, 1, 0.0)
+
+    def arrow(self) -> Signals:
+        """The test of growing amplitude."""
+        u = _arrow(self._generator("arrow", 0, 0))
+        return u, simulate(u)
+
+    def _multisine(self, use: str, level: int, r: int, periods: int, noise_rms: float) -> Signals:
+        rng = self._generator(use, level, r)
+        u = multisine(rms=1e-3 * level, seed=rng)
+        noise = rng.standard_normal(periods * PERIOD)
+        return np.tile(u, periods), np.tile(simulate(u), periods) + noise_rms * noise
+
+    def _generator(self, use: str, level: int, r: int) -> np.random.Generator:
+        key = (_USES.index(use), level, r)
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
+
+
+def multisine(
+    *, rms: float = 1.0, seed: int | np.random.SeedSequence | np.random.Generator = 0
+) -> NDArray[np.float64]:
+    """One period of a random-phase multisine: lines 1 to 4095 of 4.77 Hz, of equal magnitude.
+
+    Args:
+        rms: V.
+        seed: of the phases, uniform, or a generator to draw them from.
+
+    Shape:
+        (16384,), V.
+
+    Raises:
+        ValueError: an rms that is not positive.
+    """
+    number("rms", rms, positive=True)
+    phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, _LINES.stop - _LINES.start)
+    spectrum = np.zeros(PERIOD // 2 + 1, complex)
+    spectrum[_LINES] = np.exp(1j * phase)
+    u = np.fft.irfft(spectrum, PERIOD)
+    return rms * u / np.sqrt(np.mean(u**2))
+
+
+def simulate(u: ArrayLike) -> NDArray[np.float64]:
+    """Output in the steady state that the input, repeated for ever, leads to; noise free.
+
+    Exact: a filter in steady state multiplies each spectral line by its frequency response, and the
+    saturations act sample by sample.
+
+    Args:
+        u: one period, or several, of any length.
+
+    Shape:
+        u: (T,), V. Returns: (T,), V.
+
+    Raises:
+        ValueError: an input of wrong shape or with NaN.
+    """
+    u = np.asarray(u, dtype=np.float64)
+    if u.ndim != 1 or not u.size or not np.isfinite(u).all():
+        raise ValueError(
+            f"the input has shape {u.shape}; give one dimension of finite numbers, in V."
+        )
+
+    def line_by_line(H: tuple, signal: NDArray[np.float64]) -> NDArray[np.float64]:
+        w = 2 * np.pi * np.fft.rfftfreq(u.size)
+        return np.fft.irfft(freqz(*H, worN=w)[1] * np.fft.rfft(signal), u.size)
+
+    v1, v2 = line_by_line(_H1, u), line_by_line(_H3, u)
+    w1 = v1 - 0.4 * _s(v1 - 0.2)
+    w2 = v2 - 0.4 * _s(v2 - 0.2) + 0.4 * _s(-v2 - 0.2)
+    return 0.84 * (line_by_line(_H2, w1) + 0.7 * line_by_line(_H4, w2))
+
+
+def _s(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A smooth max(v, 0)."""
+    return 0.05 * np.logaddexp(0.0, v / 0.05)
+
+
+def _arrow(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Gaussian noise (16384,) in the multisines' band, growing to 1 V rms in its last tenth."""
+    white = np.fft.rfft(rng.standard_normal(PERIOD))
+    spectrum = np.zeros_like(white)
+    spectrum[_LINES] = white[_LINES]
+    u = np.linspace(0, 1, PERIOD) * np.fft.irfft(spectrum, PERIOD)
+    return _ARROW_RMS * u / np.sqrt(np.mean(u[-PERIOD // 10 :] ** 2))
