@@ -87,7 +87,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
     require(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    dataset: Dataset = instantiate(cfg.data)
+    dataset = loaded(cfg)
     shown = dataset.validation[0] if dataset.validation else dataset.train[0]
 
     bla, _ = linear(cfg, dataset.train, dataset.validation, ranks)
@@ -120,6 +120,14 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
         raise Terminated(f"the fit was terminated; the best model so far is in {best}")
     kept = result.history[result.chosen_iteration]
     return kept.train if math.isnan(kept.validation) else kept.validation
+
+
+def loaded(cfg: DictConfig) -> Dataset:
+    """The records; what is to be known of them is printed."""
+    dataset: Dataset = instantiate(cfg.data)
+    for note in dataset.notes:
+        print(f"note: {note}")
+    return dataset
 
 
 def linear(

@@ -67,6 +67,7 @@ def metrics(
             "samples": sum(record.samples for record in dataset.train),
             "noise_rms": dataset.noise_rms,
             "seed": seed,
+            "notes": list(dataset.notes),
         },
         "fit": {
             "iterations": result.iterations,

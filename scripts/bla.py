@@ -30,7 +30,7 @@ import lfrtorch  # noqa: E402
 from lfrtorch import linear_plots, plots  # noqa: E402
 from lfrtorch.datasets import Dataset  # noqa: E402
 from lfrtorch.ranks import Ranks  # noqa: E402
-from train import CONF, linear, made, require, user_errors  # noqa: E402
+from train import CONF, linear, loaded, made, require, user_errors  # noqa: E402
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
@@ -38,7 +38,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     require(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    dataset: Dataset = instantiate(cfg.data)
+    dataset = loaded(cfg)
     print(f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples")
     frf, notes = response(cfg, dataset.train)
     # A fit to the response takes the one that the figures show.
@@ -50,7 +50,10 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
             print(f"note: {note}")
 
     found = numbers(model, dataset, frf, scan)
-    found |= {"notes": list(dict.fromkeys([*notes, *model.fit.notes])), "command": command}
+    found |= {
+        "notes": list(dict.fromkeys([*dataset.notes, *notes, *model.fit.notes])),
+        "command": command,
+    }
     print(f"\n{table(found)}")
     model.save(folder / "linear")
     text = json.dumps(found, indent=2, allow_nan=False)

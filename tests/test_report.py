@@ -28,7 +28,9 @@ def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:
         Published("small", {"test": 0.25}, "B (2002)", sizes=(1, 1)),
         Published("large", {"test": 0.125}, "C (2003)", sizes=(2, 2)),
     )
-    data = Dataset("saturation", train, validation, test, noise_rms=0.01, published=others)
+    data = Dataset(
+        "saturation", train, validation, test, noise_rms=0.01, published=others, notes=("a note",)
+    )
     bla = lfrtorch.estimate_bla(train, nx=2)
     model = lfrtorch.initialise(bla, train, nz=1, nw=1, nn=3)
     return lfrtorch.fit(model, train, validation, optimiser=lfrtorch.Adam(epochs=2)), bla, data
@@ -50,7 +52,8 @@ def test_metrics_are_what_the_model_scores(result):
     }
     expected = lfrtorch.rmse(validation, fitted.model.simulate(validation))
     assert metrics["validation"]["rmse"] == pytest.approx(expected, rel=1e-12)
-    assert metrics["data"] == {"samples": 300, "noise_rms": 0.01, "seed": 3}
+    expected = {"samples": 300, "noise_rms": 0.01, "seed": 3, "notes": ["a note"]}
+    assert metrics["data"] == expected
     assert metrics["sizes"] == {"nx": 2, "nz": 1, "nw": 1, "nn": 3}
     # A 4, Bu 2, Bw 2, Cz 2, Dzu 1, Cy 2, Dyu 1, Dyw 1, Wz 3, bz 3, Ww 3, bw 1; gauge 4 + 1 + 1.
     assert (metrics["parameters"], metrics["parameters_net"]) == (25, 19)

@@ -36,6 +36,7 @@ class Dataset:
         noise_rms: rms of the measurement noise added to simulated estimation data, output unit;
             ``None`` for measured data.
         published: results of others on the same tests.
+        notes: what a reader of the scores should know of the data, a sentence each.
     """
 
     name: str
@@ -44,3 +45,4 @@ class Dataset:
     tests: list[Record]
     noise_rms: float | None = None
     published: tuple[Published, ...] = field(default_factory=tuple)
+    notes: tuple[str, ...] = ()
