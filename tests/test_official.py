@@ -1,7 +1,10 @@
 """Official files: where they are looked for, what is read from them, how they are cut."""
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -9,6 +12,8 @@ from scipy.io import savemat
 
 from lfrtorch import Record
 from lfrtorch.datasets import official
+
+ARCHIVE = "Bench/Files.zip"
 
 
 def test_cache_folder_of_each_system(monkeypatch):
@@ -47,6 +52,110 @@ def test_a_missing_file_is_named_with_advice(tmp_path, monkeypatch):
             "nonlinear_benchmarks.Loader",
         ):
             assert part in message
+
+
+def test_other_files_do_as_well(tmp_path):
+    def find():
+        return official.find(tmp_path, "Bench/a/x.mat", "Bench", others=["Bench/x.mat", ARCHIVE])
+
+    (tmp_path / "Bench" / "a").mkdir(parents=True)
+    for content in (None, b""):  # an empty archive is a placeholder
+        if content is not None:
+            (tmp_path / ARCHIVE).write_bytes(content)
+        with pytest.raises(FileNotFoundError, match=r"no 'Bench/a/x\.mat'"):
+            find()
+    (tmp_path / ARCHIVE).write_bytes(b"zip")
+    for file in (ARCHIVE, "Bench/x.mat", "Bench/a/x.mat"):  # each before those that were there
+        if file != ARCHIVE:
+            (tmp_path / file).touch()
+        assert find() == tmp_path / file
+
+
+@pytest.fixture
+def package(monkeypatch):
+    """A nonlinear_benchmarks that writes a file, and the folders it was asked to write into."""
+    asked = []
+
+    def Bench(*, data_file_locations: bool, dir_placement: Path):
+        assert data_file_locations
+        asked.append(dir_placement)
+        (dir_placement / "Bench").mkdir()
+        (dir_placement / "Bench" / "x.mat").touch()
+
+    def Broken(**_: Any):
+        raise Exception("Download failed after 5 attempts")
+
+    fake = SimpleNamespace(Bench=Bench, Broken=Broken, Empty=lambda **_: None)
+    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", fake)
+    return asked
+
+
+def test_a_missing_file_is_downloaded_where_it_is_looked_for(tmp_path, monkeypatch, package):
+    monkeypatch.setattr(official, "cache", lambda: tmp_path / "cache")
+    with pytest.raises(FileNotFoundError):
+        official.find(None, "Bench/x.mat", "Bench")
+    assert not package
+    for root, folder in ((None, tmp_path / "cache"), (tmp_path / "a" / "b", tmp_path / "a" / "b")):
+        for _ in range(2):  # the second time it is there
+            found = official.find(root, "Bench/x.mat", "Bench", download=True)
+            assert found == folder / "Bench" / "x.mat"
+        assert package.pop() == folder
+        assert not package
+
+
+def test_a_download_that_fails(tmp_path, package):
+    for loader, kind, message in (
+        ("Broken", OSError, "Broken.. failed .*after 5 attempts.*remove what it left in '{}'"),
+        ("Unknown", OSError, "Unknown.. failed .*AttributeError"),
+        ("Empty", FileNotFoundError, "Empty.. left no 'Bench/x.mat' in .*remove that from '{}'"),
+    ):
+        with pytest.raises(kind, match=message.format(tmp_path / "Bench")):
+            official.find(tmp_path, "Bench/x.mat", loader, download=True)
+
+
+def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", None)  # its import fails
+    with pytest.raises(FileNotFoundError, match=r"no 'Bench/x\.mat' in") as refusal:
+        official.find(tmp_path / "new", "Bench/x.mat", "Bench", download=True)
+    assert "pip install 'lfrtorch[bench]'" in str(refusal.value)
+    assert "data.root=DIR" in str(refusal.value)
+    assert not (tmp_path / "new").exists()
+
+
+def test_arrays_keep_their_axes(tmp_path):
+    whole = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
+    savemat(tmp_path / "x.mat", {"a": whole, "b": whole[0], "other": 1.0})
+    with ZipFile(tmp_path / "x.zip", "w") as archive:
+        archive.writestr("folder/other.mat", "")
+        archive.write(tmp_path / "x.mat", "folder/x.mat")
+    for path in (tmp_path / "x.mat", tmp_path / "x.zip"):
+        found = official.read_arrays(path, {"b": (3, 4), "a": (2, 3, 4)}, "x.mat")
+        assert np.array_equal(found["a"], whole)
+        assert np.array_equal(found["b"], whole[0])
+        assert found["a"].dtype == np.float64
+        for wrong in ({"a": (4, 3, 2)}, {"a": (24,)}, {"a": (2, 12)}):
+            (shape,) = wrong.values()
+            with pytest.raises(ValueError, match=r"'a' has shape \(2, 3, 4\) .* expected") as told:
+                official.read_arrays(path, wrong, "x.mat", "ask Ada.")
+            assert f"expected {shape} and real numbers" in str(told.value)
+            assert str(told.value).startswith(f"'{path}'")
+            assert str(told.value).endswith("ask Ada.")
+    for member in ("y.mat", "folder"):
+        with pytest.raises(ValueError, match=f"no readable '{member}'"):
+            official.read_arrays(tmp_path / "x.zip", {"a": (2, 3, 4)}, member)
+
+
+def test_archive_note(tmp_path):
+    path, known = tmp_path / "x.zip", "900150983cd24fb0d6963f7d28e17f72"  # RFC 1321, of "abc"
+    missing = "no x.zip beside x.mat: its checksum is unknown"
+    assert official.archive_note(path, known, "x.mat") == missing
+    path.touch()
+    assert official.archive_note(path, known, "x.mat") == missing
+    path.write_bytes(b"abc")
+    assert official.archive_note(path, known, "x.mat") == f"x.zip is the known file (md5 {known})"
+    assert official.archive_note(path, "0" * 32, "x.mat") == (
+        f"x.zip is not the known file: md5 {known}, expected {'0' * 32}; scores may not compare"
+    )
 
 
 def test_signals_are_read_in_the_order_of_their_names(tmp_path):

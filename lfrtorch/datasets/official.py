@@ -1,12 +1,16 @@
-"""Official measurements: found on disk, read, and cut in time."""
+"""Official measurements: found on disk or downloaded, read, and cut in time."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib import import_module
+from io import BytesIO
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +18,8 @@ from scipy.io import loadmat
 
 from lfrtorch.checks import number
 from lfrtorch.records import Record
+
+_AGAIN = "download the file again."
 
 
 def cache() -> Path:
@@ -27,31 +33,75 @@ def cache() -> Path:
     return Path(os.path.expanduser(folder))
 
 
-def find(root: str | Path | None, file: str, loader: str) -> Path:
+def folder(root: str | Path | None) -> Path:
+    """The benchmarks' folder: ``root``, or the cache folder where it is left out."""
+    return cache() if root is None else Path(root).expanduser()
+
+
+def find(
+    root: str | Path | None,
+    file: str,
+    loader: str,
+    *,
+    others: Sequence[str] = (),
+    download: bool = False,
+) -> Path:
     """The path of a benchmark's file.
 
     Args:
         root: folder of the benchmarks; the cache folder of nonlinear_benchmarks where left out.
         file: below ``root``, with the benchmark's folder first.
         loader: function of nonlinear_benchmarks that downloads it.
+        others: files that do as well, the zip archive for example; in order of preference. An empty
+            archive is a placeholder and counts as missing.
+        download: whether a missing file is downloaded, by ``loader``.
 
     Raises:
-        FileNotFoundError: it is not there.
+        FileNotFoundError: it is not there, or it cannot be downloaded without nonlinear_benchmarks.
+        OSError: the download fails.
     """
-    folder = cache() if root is None else Path(root).expanduser()
-    path = folder / file
-    if not path.is_file():
+    below = folder(root)
+    path = _present(below, (file, *others))
+    if path is None and download:
+        _download(below, file, loader)
+        path = _present(below, (file, *others))
+        if path is None:
+            raise FileNotFoundError(
+                f"nonlinear_benchmarks.{loader}() left no '{file}' in '{below}'; it downloads "
+                "nothing where an archive is there already, even an empty one: remove that from "
+                f"'{below / file.split('/')[0]}' and try again."
+            )
+    if path is None:
         raise FileNotFoundError(
-            f"there is no '{file}' in '{folder}'. Give the folder that holds "
+            f"there is no '{file}' in '{below}'. Give the folder that holds "
             f"'{file.split('/')[0]}' with data.root=DIR, or download the file into the default "
-            f"folder: pip install nonlinear_benchmarks, then in Python "
+            "folder: pip install 'lfrtorch[bench]', then in Python "
             f"nonlinear_benchmarks.{loader}()."
         )
     return path
 
 
+def archive_note(archive: Path, md5: str, file: str) -> str:
+    """Whether a benchmark's archive is the one that is known, by its checksum.
+
+    Args:
+        archive: as it was downloaded.
+        md5: of the known one, in hexadecimal digits.
+        file: name of the file that was unpacked from it.
+    """
+    if not _there(archive):
+        return f"no {archive.name} beside {file}: its checksum is unknown"
+    with archive.open("rb") as content:
+        found = hashlib.file_digest(content, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
+    if found == md5:
+        return f"{archive.name} is the known file (md5 {md5})"
+    return (
+        f"{archive.name} is not the known file: md5 {found}, expected {md5}; scores may not compare"
+    )
+
+
 def read_mat(
-    path: Path, names: Sequence[str], samples: int, advice: str = "download the file again."
+    path: Path, names: Sequence[str], samples: int, advice: str = _AGAIN
 ) -> list[NDArray[np.float64]]:
     """Signals (samples,) that a .mat file holds as rows or columns, in the order of their names.
 
@@ -64,25 +114,28 @@ def read_mat(
     Raises:
         ValueError: a file that cannot be read, or another shape or type, or NaN.
     """
-    signals = []
-    for name in names:
-        try:
-            signal = np.asarray(loadmat(path, variable_names=[name])[name])
-        except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
-            raise ValueError(
-                f"'{path}' holds no readable '{name}' ({error!r}); {advice}"
-            ) from error
-        if (
-            signal.dtype.kind not in "iuf"
-            or signal.shape not in ((1, samples), (samples, 1))
-            or not np.isfinite(signal).all()
-        ):
-            raise ValueError(
-                f"'{path}': '{name}' has shape {signal.shape} and type {signal.dtype}; expected "
-                f"(1, {samples}) or ({samples}, 1) and real numbers without NaN; {advice}"
-            )
-        signals.append(signal.ravel().astype(np.float64))
-    return signals
+    either = (1, samples), (samples, 1)
+    return [_variable(path, path, name, either, advice).ravel() for name in names]
+
+
+def read_arrays(
+    path: Path, shapes: Mapping[str, tuple[int, ...]], member: str, advice: str = _AGAIN
+) -> dict[str, NDArray[np.float64]]:
+    """Arrays of a .mat file by name.
+
+    Args:
+        path: the file, or a zip archive that holds it.
+        shapes: of the arrays, by name.
+        member: name of the file in the archive, in whatever folder.
+        advice: what to do about a file that cannot be used.
+
+    Raises:
+        ValueError: a file that cannot be read, or another shape or type, or NaN.
+    """
+    content = _unpacked(path, member, advice) if path.suffix == ".zip" else path
+    return {
+        name: _variable(path, content, name, (shape,), advice) for name, shape in shapes.items()
+    }
 
 
 def held_out(samples: int, validation: float, least: int = 1) -> int:
@@ -114,3 +167,63 @@ def part(whole: Record, first: int, last: int, *, warm_up: int, name: str) -> Re
     estimated from outputs that are scored.
     """
     return replace(whole[first - warm_up : last], name=name, skip=warm_up)
+
+
+def _there(path: Path) -> bool:
+    """Whether there is such a file, and no empty archive in its place."""
+    return path.is_file() and (path.suffix != ".zip" or path.stat().st_size > 0)
+
+
+def _present(below: Path, files: Sequence[str]) -> Path | None:
+    return next((below / file for file in files if _there(below / file)), None)
+
+
+def _download(below: Path, file: str, loader: str) -> None:
+    """Have nonlinear_benchmarks fetch and unpack the archive; none of its data is used."""
+    try:
+        package = import_module("nonlinear_benchmarks")
+    except ImportError as error:
+        raise FileNotFoundError(
+            f"there is no '{file}' in '{below}', and the package that downloads it cannot be "
+            f"imported ({error}): pip install 'lfrtorch[bench]'. Or give the folder that holds "
+            f"'{file.split('/')[0]}' with data.root=DIR."
+        ) from error
+    below.mkdir(parents=True, exist_ok=True)
+    try:
+        getattr(package, loader)(data_file_locations=True, dir_placement=below)
+    except Exception as error:  # plain Exceptions among them
+        raise OSError(
+            f"nonlinear_benchmarks.{loader}() failed ({error!r}); remove what it left in "
+            f"'{below / file.split('/')[0]}' and try again, or give the folder that holds "
+            f"'{file.split('/')[0]}' with data.root=DIR."
+        ) from error
+
+
+def _unpacked(path: Path, member: str, advice: str) -> BytesIO:
+    """The content of a file in a zip archive."""
+    try:
+        with ZipFile(path) as archive:
+            (name,) = (n for n in archive.namelist() if n.rpartition("/")[2] == member)
+            return BytesIO(archive.read(name))
+    except Exception as error:  # a damaged archive, too, makes for several kinds
+        raise ValueError(f"'{path}' holds no readable '{member}' ({error!r}); {advice}") from error
+
+
+def _variable(
+    path: Path,
+    content: Path | BytesIO,
+    name: str,
+    shapes: Sequence[tuple[int, ...]],
+    advice: str,
+) -> NDArray[np.float64]:
+    """A variable of a .mat file with one of the shapes."""
+    try:
+        found = np.asarray(loadmat(content, variable_names=[name])[name])
+    except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
+        raise ValueError(f"'{path}' holds no readable '{name}' ({error!r}); {advice}") from error
+    if found.dtype.kind not in "iuf" or found.shape not in shapes or not np.isfinite(found).all():
+        raise ValueError(
+            f"'{path}': '{name}' has shape {found.shape} and type {found.dtype}; expected "
+            f"{' or '.join(map(str, shapes))} and real numbers without NaN; {advice}"
+        )
+    return found.astype(np.float64)
