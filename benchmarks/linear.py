@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ def levels(seeds: int, realisations: int) -> None:
             total = total + np.fft.rfft(parwh.simulate(u))[lines] / np.fft.rfft(u)[lines]
         responses[level] = np.asarray(total) / realisations
     for seed in range(seeds):
-        data = parwh.load(seed=seed)
+        data = parwh.load(source="stand-in", seed=seed)
         floors, found, seconds, ratios = [], [], [], []
         for i, level in enumerate(parwh.LEVELS):
             test = data.tests[i]
@@ -204,10 +205,9 @@ def problems(realisations: int):
         frf = lfrtorch.estimate_frf([hysteretic(10_000 + i, 1, 0.0) for i in range(realisations)])
         yield f"Bouc-Wen, R {R}, P {P}, nx 3", 3, records, frf.G
     for level in (100, 1000):
-        records = parwh.load(levels=(level,), realisations=8, periods=2).train
-        others = parwh.load(
-            seed=10_000, levels=(level,), realisations=realisations, noise_rms=0.0
-        ).train
+        stand_in = partial(parwh.load, source="stand-in", levels=(level,))
+        records = stand_in(realisations=8, periods=2).train
+        others = stand_in(seed=10_000, realisations=realisations, noise_rms=0.0).train
         truth = lfrtorch.estimate_frf(others).G
         yield f"parallel WH stand-in, {level} mV, R 8, P 2, nx 12", 12, records, truth
     yield two_by_two()

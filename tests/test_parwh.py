@@ -1,11 +1,22 @@
-"""Parallel Wiener-Hammerstein stand-in: the system against its equations, inputs, records."""
+"""Parallel Wiener-Hammerstein: the stand-in against its equations, the official file's layout."""
+
+import shutil
+import sys
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.signal import butter, cheby1, cheby2, ellip, lfilter
 
 from lfrtorch import metrics
-from lfrtorch.datasets import parwh
+from lfrtorch.datasets import official, parwh
+
+stand_in = partial(parwh.load, source="stand-in")
 
 FS, PERIOD = 78125.0, 16384
 EXCITED = slice(1, 4096)
@@ -41,7 +52,7 @@ def from_rest(u):
 
 @pytest.fixture(scope="module")
 def data():
-    return parwh.load()
+    return stand_in()
 
 
 # --- the system -----------------------------------------------------------------------------
@@ -164,7 +175,7 @@ def test_default_records(data):
 def test_noise(data):
     """The stated rms, white, Gaussian, another on each record and period; none on the tests."""
     noise = [r.y[:, 0] - parwh.simulate(r.u[:, 0]) for r in (*data.train, *data.validation)]
-    twice = parwh.load(periods=2, levels=[325]).train[0]
+    twice = stand_in(periods=2, levels=[325]).train[0]
     noise += list((twice.y[:, 0] - parwh.simulate(twice.u[:, 0])).reshape(2, PERIOD)[1:])
     samples = np.concatenate(noise)
     assert rms(samples) == pytest.approx(3e-4, rel=4 / np.sqrt(2 * samples.size))
@@ -176,14 +187,14 @@ def test_noise(data):
     assert abs(delayed) < 4 / np.sqrt(samples.size)
     for test in data.tests:
         assert np.abs(test.y[:, 0] - parwh.simulate(test.u[:, 0])).max() == 0
-    assert metrics.rmse(parwh.load(noise_rms=0.0).train[0], data.train[0].y) == pytest.approx(
+    assert metrics.rmse(stand_in(noise_rms=0.0).train[0], data.train[0].y) == pytest.approx(
         3e-4, rel=0.03
     )
 
 
 def test_all_realisations_differ(data):
     records = [*data.train, *data.validation, *data.tests]
-    other = parwh.load(seed=1)
+    other = stand_in(seed=1)
     records += [*other.train, *other.validation, *other.tests]
     inputs = np.corrcoef([record.u[:, 0] for record in records])
     # In a band of 4095 lines the sd of a correlation is 1 / sqrt(2 · 4095) = 0.011.
@@ -191,7 +202,7 @@ def test_all_realisations_differ(data):
 
 
 def test_a_record_depends_on_nothing_but_its_seed(data):
-    many = parwh.load(realisations=3, periods=2, levels=(1000, 100))
+    many = stand_in(realisations=3, periods=2, levels=(1000, 100))
     assert [r.name for r in many.train] == [
         f"train_{a}_{r}" for a in (1000, 100) for r in (1, 2, 3)
     ]
@@ -231,6 +242,7 @@ def test_published(data):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
+        ({"source": "simulated"}, "'simulated'; give one of auto, official, stand-in"),
         ({"seed": -1}, "data.seed is -1"),
         ({"realisations": 0}, "data.realisations is 0; give a whole number of at least 1"),
         ({"realisations": 1.5}, "data.realisations is 1.5"),
@@ -260,3 +272,230 @@ def test_refused_inputs(u):
 def test_refused_rms(level):
     with pytest.raises(ValueError, match="rms is"):
         parwh.multisine(rms=level)
+
+
+# --- the official file ----------------------------------------------------------------------
+
+MAT, ARCHIVE = "ParWH/ParWHFiles/ParWHData.mat", "ParWH/ParWHFiles.zip"
+BASE = {"Est": 0, "Val": 10_000_000, "ValArr": 20_000_000}
+
+
+def numbers(part, level=0, realisation=0, period=0, *, realisations=1):
+    """The inputs of one period: the samples of an array are numbered in MATLAB's order."""
+    first = ((level * realisations + realisation) * 2 + period) * PERIOD
+    return BASE[part] + first + np.arange(PERIOD)
+
+
+estimation = partial(numbers, "Est", realisations=20)
+
+
+@pytest.fixture(scope="module")
+def numbered():
+    """Root of a file of the official layout whose inputs are numbered and whose y is -u."""
+    variables = {"fs": 78125.0}
+    for part, shape in {"Est": (5, 20, 2), "Val": (5, 1, 2), "ValArr": (2,)}.items():
+        u = BASE[part] + np.arange(np.prod(shape) * PERIOD, dtype=np.int32)
+        u = u.reshape(*shape, PERIOD).T
+        variables |= {f"u{part}": u, f"y{part}": -u}
+    with TemporaryDirectory() as folder:  # 28 MB, which pytest would keep
+        root = Path(folder)
+        (root / MAT).parent.mkdir(parents=True)
+        savemat(root / MAT, variables)
+        yield root
+
+
+def test_layout_of_the_numbered_file():
+    """The order is that of the array's indices: samples, periods, realisations, levels."""
+    whole = np.arange(PERIOD * 2 * 20 * 5).reshape(PERIOD, 2, 20, 5, order="F")
+    assert np.array_equal(estimation(3, 17, 1), whole[:, 1, 17, 3])
+
+
+def test_official_records(numbered):
+    data = parwh.load(root=numbered)
+    assert (data.name, data.noise_rms) == ("parwh", None)
+    assert [r.name for r in data.train] == [f"train_{level}" for level in parwh.LEVELS]
+    assert [r.name for r in data.validation] == [f"validation_{level}" for level in parwh.LEVELS]
+    assert [r.name for r in data.tests] == [*(f"level_{a}" for a in parwh.LEVELS), "arrow"]
+    for level in range(5):
+        for record, expected in (
+            (data.train[level], estimation(level, 0, 1)),
+            (data.validation[level], estimation(level, 19, 1)),
+            (data.tests[level], numbers("Val", level, 0, 1)),
+        ):
+            assert np.array_equal(record.u[:, 0], expected)
+    assert np.array_equal(data.tests[-1].u[:, 0], numbers("ValArr", period=1))
+    assert [r.skip for r in data.tests] == [0, 0, 0, 0, 0, 500]
+    for record in (*data.train, *data.validation, *data.tests):
+        assert np.array_equal(record.y, -record.u)
+        assert record.u.dtype == np.float64
+        assert (record.fs, record.start, record.period) == (FS, "periodic", PERIOD)
+        assert record.source == "official"
+        assert [str(c) for c in (*record.inputs, *record.outputs)] == ["u (V)", "y (V)"]
+    stands = stand_in()
+    for mine, theirs in ((data.train, stands.train), (data.tests, stands.tests)):
+        assert [(r.name, r.samples, r.skip) for r in mine] == [
+            (r.name, r.samples, r.skip) for r in theirs
+        ]
+
+
+def test_periods_are_one_after_the_other(numbered):
+    data = parwh.load(root=str(numbered), periods=2, realisations=2, seed=18, levels=(1000, 325))
+    assert [r.name for r in data.train] == [f"train_{a}_{r}" for a in (1000, 325) for r in (1, 2)]
+    asked = [(4, 18), (4, 0), (1, 18), (1, 0), (4, 19), (1, 19)]
+    for record, (level, realisation) in zip((*data.train, *data.validation), asked, strict=True):
+        periods = [estimation(level, realisation, p) for p in (0, 1)]
+        assert np.array_equal(record.u[:, 0], np.concatenate(periods))
+        assert np.array_equal(record.y, -record.u)
+        assert record.period == PERIOD
+    assert [r.samples for r in data.tests] == [PERIOD] * 6
+
+
+@pytest.mark.parametrize("seed", [0, 7])
+def test_all_realisations_but_the_last_can_train(numbered, seed):
+    data = parwh.load(root=numbered, levels=[550], realisations=19, seed=seed)
+    first = [int(r.u[0, 0]) for r in data.train]
+    expected = [int(estimation(2, r, 1)[0]) for r in range(19)]
+    assert first == expected[seed:] + expected[:seed]
+    assert data.validation[0].u[0, 0] not in first
+
+
+def test_the_file_is_read_from_its_archive(numbered, tmp_path):
+    whole = parwh.load(root=numbered, levels=[100])
+    (tmp_path / ARCHIVE).parent.mkdir()
+    with ZipFile(tmp_path / ARCHIVE, "w", ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("ParWHFiles/readme.txt", "text")
+        archive.write(numbered / MAT, "ParWHFiles/ParWHData.mat")
+    data = parwh.load(root=tmp_path, levels=[100])
+    for mine, theirs in ((data.train, whole.train), (data.tests, whole.tests)):
+        for record, same in zip(mine, theirs, strict=True):
+            assert np.array_equal(record.u, same.u)
+            assert np.array_equal(record.y, same.y)
+    assert data.notes[0].startswith("ParWHFiles.zip is not the known file: md5 ")
+    (tmp_path / ARCHIVE).unlink()
+
+
+def test_the_file_may_lie_beside_its_archive(numbered, tmp_path):
+    (tmp_path / "ParWH").mkdir()
+    copied = shutil.copy(numbered / MAT, tmp_path / "ParWH")
+    data = parwh.load(root=tmp_path, levels=[100])
+    Path(copied).unlink()
+    assert np.array_equal(data.tests[1].u[:, 0], numbers("Val", 1, 0, 1))
+
+
+def test_notes_on_the_checksum(numbered, monkeypatch):
+    """Of the bytes "abc": the test suite of RFC 1321."""
+    known = "900150983cd24fb0d6963f7d28e17f72"
+    archive = numbered / ARCHIVE
+
+    def notes():
+        return parwh.load(root=numbered, levels=[100]).notes
+
+    assert notes() == ("no ParWHFiles.zip beside ParWHData.mat: its checksum is unknown",)
+    try:
+        archive.write_bytes(b"")
+        assert notes() == ("no ParWHFiles.zip beside ParWHData.mat: its checksum is unknown",)
+        archive.write_bytes(b"abc")
+        expected = f"md5 {known}, expected 5836dc66b0296b43ba4b8613a032408b"
+        assert notes() == (
+            f"ParWHFiles.zip is not the known file: {expected}; scores may not compare",
+        )
+        monkeypatch.setattr(parwh, "_MD5", known)
+        assert notes() == (f"ParWHFiles.zip is the known file (md5 {known})",)
+    finally:
+        archive.unlink()
+
+
+def test_source_of_the_default_folder(numbered, tmp_path, monkeypatch):
+    def source(**arguments):
+        data = parwh.load(levels=[100], **arguments)
+        (found,) = {r.source for r in (*data.train, *data.validation, *data.tests)}
+        return found, data.notes
+
+    monkeypatch.setattr(official, "cache", lambda: numbered)
+    assert source()[0] == source(source="official")[0] == "official"
+    assert source(source="stand-in") == ("stand-in", ())
+    monkeypatch.setattr(official, "cache", lambda: tmp_path)
+    found, (note,) = source()
+    assert found == "stand-in"
+    assert "simulated stand-in" in note
+    assert "data.source=official" in note
+    (tmp_path / ARCHIVE).parent.mkdir()
+    (tmp_path / ARCHIVE).touch()  # a placeholder
+    assert source()[0] == "stand-in"
+    assert source(source="stand-in", root=tmp_path / "nowhere") == ("stand-in", ())
+
+
+def test_a_missing_file_is_downloaded(numbered, tmp_path, monkeypatch):
+    def ParWH(**arguments):
+        assert arguments == {"data_file_locations": True, "dir_placement": tmp_path / "new"}
+        (tmp_path / "new" / MAT).parent.mkdir(parents=True)
+        shutil.copy(numbered / MAT, tmp_path / "new" / MAT)
+
+    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", SimpleNamespace(ParWH=ParWH))
+    data = parwh.load(source="official", root=tmp_path / "new", levels=[775])
+    assert np.array_equal(data.train[0].u[:, 0], estimation(3, 0, 1))
+    again = parwh.load(source="official", root=tmp_path / "new", levels=[775])  # not downloaded
+    assert np.array_equal(again.train[0].u, data.train[0].u)
+    (tmp_path / "new" / MAT).unlink()
+
+
+@pytest.mark.parametrize("source", ["auto", "official"])
+def test_a_root_without_the_file(tmp_path, monkeypatch, source):
+    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", None)  # its import fails
+    (tmp_path / ARCHIVE).parent.mkdir()
+    (tmp_path / ARCHIVE).touch()  # a placeholder
+    with pytest.raises(FileNotFoundError, match=r"no 'ParWH/ParWHFiles/ParWHData.mat' in") as told:
+        parwh.load(source=source, root=tmp_path)
+    assert "pip install 'lfrtorch[bench]'" in str(told.value)
+    assert "data.root=DIR" in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"realisations": 20}, "data.realisations is 20, .* give 1 to 19"),
+        ({"periods": 3}, "data.periods is 3, .* give 1 to 2 .*stand-in"),
+        ({"seed": -1}, "data.seed is -1"),
+        ({"levels": [200]}, r"data.levels is \[200\]"),
+    ],
+)
+def test_refused_arguments_of_official_data(numbered, arguments, match):
+    with pytest.raises(ValueError, match=match):
+        parwh.load(root=numbered, **arguments)
+
+
+@pytest.mark.parametrize("file", [MAT, ARCHIVE])
+def test_a_damaged_file(tmp_path, file):
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_bytes(b"damaged" * 99)
+    with pytest.raises(ValueError, match="holds no readable") as told:
+        parwh.load(root=tmp_path)
+    assert str(told.value).startswith(f"'{tmp_path / file}'")
+    assert str(told.value).endswith(f"remove '{MAT}' and '{ARCHIVE}', and download them again.")
+
+
+def test_a_file_of_another_shape(tmp_path):
+    (tmp_path / MAT).parent.mkdir(parents=True)
+    savemat(tmp_path / MAT, {"uEst": np.zeros((16384 * 2, 20, 5), np.int8)})
+    match = r"'uEst' has shape \(32768, 20, 5\) .* expected \(16384, 2, 20, 5\)"
+    with pytest.raises(ValueError, match=match):
+        parwh.load(root=tmp_path)
+
+
+@pytest.mark.data
+def test_official_file(benchmark_root):
+    """What the description says of the levels, the lines and the arrow; the two periods agree."""
+    if not any((benchmark_root / file).is_file() for file in (MAT, ARCHIVE)):
+        pytest.skip(f"no folder ParWH in {benchmark_root}")
+    data = parwh.load(source="official", root=benchmark_root, periods=2)
+    assert "not the known file" not in data.notes[0]
+    for records in (data.train, data.validation, data.tests[:-1]):
+        for record, level in zip(records, parwh.LEVELS, strict=True):
+            assert np.std(record.u) == pytest.approx(1e-3 * level, rel=0.05)
+    for record in (*data.train, *data.validation):
+        first, second = record.y.reshape(2, PERIOD)
+        assert rms(first - second) < 0.02 * rms(second)
+        spectrum = np.abs(np.fft.rfft(record.u[:PERIOD, 0]))[1:]
+        assert np.argsort(spectrum)[-4095:].max() < 4096
+    arrow = data.tests[-1].u[:, 0]
+    assert rms(arrow[-2000:]) > 3 * rms(arrow[500:2500])

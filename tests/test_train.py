@@ -19,12 +19,13 @@ from hydra.utils import get_object, instantiate
 
 import lfrtorch
 import train
+from lfrtorch.datasets import official
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
 BENCHES = sorted(path.stem for path in (CONF / "bench").glob("*.yaml"))
 SHORTER = {  # fewer samples and iterations, so that two iterations take seconds
-    "parwh": "data.levels=[325] bla.max_iter=1",
+    "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1",
     "silverbox": "data.validation=0.8 bla.max_iter=1",
     "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1",
 }
@@ -107,6 +108,15 @@ def test_every_bench_runs_two_iterations(
         assert 0 < score["rmse"] < np.inf
         assert score["source"] in ("official", "simulated", "stand-in")
         assert (tmp_path / "figures" / f"{name}.png").is_file()
+
+
+def test_notes_on_the_data_are_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(official, "cache", lambda: tmp_path)  # without files
+    data = train.loaded(configuration("+bench=parwh", "data.levels=[100]"))
+    assert data.tests[0].source == "stand-in"
+    assert capsys.readouterr().out == f"note: {data.notes[0]}\n"
 
 
 @pytest.mark.parametrize("group", ["bla", "data", "init", "trainer"])
@@ -263,6 +273,7 @@ def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, t
         (["+bench=boucwen", "data.samples=ten"], "samples"),
         (["+bench=silverbox", "data.root=/nowhere"], "there is no 'Silverbox/"),
         (["+bench=parwh", "data.levels=[200]"], "data.levels is [200]; give one or more of 100"),
+        (["+bench=parwh", "data.root=/nowhere"], "there is no 'ParWH/ParWHFiles/ParWHData.mat'"),
         (["+bench=boucwen", "init_from=/nowhere"], "'/nowhere' is not a checkpoint"),
         (["+bench=boucwen", "ridge=-1"], "ridge is -1"),
         (["+bench=boucwen", "ridge=abc"], "ridge is 'abc'"),
