@@ -11,10 +11,11 @@ from torch import Tensor
 from torch.nn import Module
 
 from lfrtorch.cell import LFRCell
-from lfrtorch.checks import integer
+from lfrtorch.checks import integer, number
 from lfrtorch.lfr import LFR
 from lfrtorch.linear_model import LinearModel
 from lfrtorch.model import Model
+from lfrtorch.modes import MINOR, without_slow_minor_modes
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
 
@@ -36,9 +37,13 @@ def initialise(
     static: Module | None = None,
     method: Literal["zero_output", "paper"] = "zero_output",
     seed: int = 0,
+    minor: float | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> Model:
     """NL-LFR model whose output is that of the linear model.
+
+    But for modes of the linear model that add next to nothing to the output and are slower than all
+    others: those are made as fast first (:func:`lfrtorch.modes.without_slow_minor_modes`).
 
     Signals and states are scaled to unit standard deviation over the records, and so is every z:
     C*, D* ~ U(-1, 1), then Cz, Dzu = C*, D* over the standard deviation of C* x + D* u. The static
@@ -59,6 +64,8 @@ def initialise(
             module from (..., nz) to (..., nw); nn and activation are then of no use.
         method: which of the two starts.
         seed: of the random weights.
+        minor: what counts as next to nothing: the part of a mode in the output over the model's
+            error; 0 leaves the linear model as it is. Where left out 0 for ``"paper"``, else 1/3.
         dtype: of the weights.
 
     Raises:
@@ -73,7 +80,11 @@ def initialise(
     integer("seed", seed, 0)
     if method not in ("zero_output", "paper"):
         raise ValueError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
+    if minor is None:
+        minor = 0.0 if method == "paper" else MINOR
+    number("minor", minor)
     data = [without_coordinates(record) for record in as_records(records)]
+    bla = without_slow_minor_modes(bla, data, minor) if minor else bla
     scaler = Scaler(
         bla.u_offset,
         rms_scale([r.u for r in data], bla.u_offset),
