@@ -31,7 +31,7 @@ from lfrtorch import plots, report
 from lfrtorch.checks import integer
 from lfrtorch.datasets import Dataset
 from lfrtorch.distributed import connect
-from lfrtorch.monitor import Checkpoint, ProgressLine, TensorBoard
+from lfrtorch.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
 from lfrtorch.order import OrderScan
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
 from lfrtorch.trainer import INTERRUPTED, Progress
@@ -91,28 +91,33 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
     shown = dataset.validation[0] if dataset.validation else dataset.train[0]
 
     bla, _ = linear(cfg, dataset.train, dataset.validation, ranks)
-    if cfg.init_from is None:
-        model: lfrtorch.Model = instantiate(cfg.init, bla, dataset.train)
-    else:
-        model = continued(cfg, dataset)
-    model.lfr.to(device=cfg.device, dtype=getattr(torch, cfg.dtype))
+    models = starts(cfg, bla, dataset)
     print(
         f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples, "
-        f"{model.parameters} parameters ({model.parameters_net} without the gauge directions)"
+        f"{models[0].parameters} parameters "
+        f"({models[0].parameters_net} without the gauge directions), {len(models)} start(s)"
     )
 
-    records = (dataset.train, dataset.validation)
-    optimiser, best = instantiate(cfg.trainer), folder / "model"
-    search = partial(
-        lfrtorch.fit, model, *records, optimiser=optimiser, ridge=cfg.ridge, ranks=ranks
-    )
+    best, several = folder / "model", len(models) > 1
+    settings = {"optimiser": instantiate(cfg.trainer), "ridge": cfg.ridge, "ranks": ranks}
+    search = partial(lfrtorch.fit_starts, models, dataset.train, dataset.validation, **settings)
     with Termination(ranks) as termination:
         if ranks.rank > 0:
-            result = search(monitors=[termination])
+            result = search(monitors=[[termination]] * len(models))
         else:
-            line, board = ProgressLine(), TensorBoard(folder, shown, bla.simulate(shown))
-            result = search(monitors=[line, board, Checkpoint(best), termination])
-            line.close()
+            board, keep = TensorBoard(folder, shown, bla.simulate(shown)), Checkpoint(best)
+            if several:
+                line = StartsLine(len(models), models[0].outputs[0].unit)
+                boards = [TensorBoard(folder / "starts" / str(i)) for i in range(len(models))]
+                monitors = [[line, each, keep, termination] for each in boards]
+                result = search(monitors=monitors, watch=line.round)
+                board.history(result.history)
+                for each in boards:
+                    each.close()
+            else:
+                line = ProgressLine()
+                result = search(monitors=[[line, board, keep, termination]])
+                line.close()
             write(cfg, folder, command, result, bla, dataset, board)
     if result.reason.startswith(LOST):
         raise ProcessLost(f"{result.reason}; the best model so far is in {best}")
@@ -120,6 +125,20 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
         raise Terminated(f"the fit was terminated; the best model so far is in {best}")
     kept = result.history[result.chosen_iteration]
     return kept.train if math.isnan(kept.validation) else kept.validation
+
+
+def starts(cfg: DictConfig, bla: lfrtorch.LinearModel, dataset: Dataset) -> list[lfrtorch.Model]:
+    """The models to start from; that of ``init_from`` is the only one."""
+    if cfg.init_from is None:
+        models = [
+            instantiate(cfg.init, bla, dataset.train, seed=seed)
+            for seed in report.seeds(cfg.seed, cfg.starts)
+        ]
+    else:
+        models = [continued(cfg, dataset)]
+    for model in models:
+        model.lfr.to(device=cfg.device, dtype=getattr(torch, cfg.dtype))
+    return models
 
 
 def loaded(cfg: DictConfig) -> Dataset:
@@ -177,7 +196,16 @@ def write(
         f"{result.seconds:.1f} s, {1e3 * result.seconds_per_iteration:.0f} ms an iteration\n"
     )
     result.model.save(folder / "model")
-    metrics = report.metrics(result, bla, dataset, seed=cfg.data.get("seed"), command=command)
+    metrics = report.metrics(
+        result,
+        bla,
+        dataset,
+        seed=cfg.seed,
+        data_seed=cfg.data.get("seed"),
+        command=command,
+    )
+    if result.starts:
+        print(report.starts_table(metrics) + "\n")
     text = json.dumps(metrics, indent=2, allow_nan=False)
     (folder / "metrics.json").write_text(text + "\n")
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
@@ -204,6 +232,8 @@ def require(cfg: DictConfig) -> None:
             "(+bench=boucwen sets it and all else for that benchmark)."
         )
     integer("nx_max", cfg.nx_max, 1)
+    integer("seed", cfg.seed, 0)
+    integer("starts", cfg.starts, 1)
     if cfg.threads is not None:
         integer("threads", cfg.threads, 1)
     if cfg.dtype not in ("float32", "float64"):

@@ -18,6 +18,7 @@ from lfrtorch.linear_model import LinearFit, LinearModel
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
 from lfrtorch.multisine import multisine
+from lfrtorch.multistart import fit_starts
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.order import OrderScan, scan_orders
 from lfrtorch.records import Channel, Record, Scaler
@@ -46,6 +47,7 @@ __all__ = [
     "estimate_bla",
     "estimate_frf",
     "fit",
+    "fit_starts",
     "initialise",
     "load",
     "multisine",

@@ -77,3 +77,7 @@ class Adam:
         if not torch.isfinite(gradient).all():
             reason = "diverged: lower the learning rate"
         return AdamState(theta, residual, gradient, iteration, reason, optimiser.state_dict())
+
+    def refused(self, before: AdamState, after: AdamState) -> AdamState:
+        """State to go on from where a step might be taken back: its small steps lead out again."""
+        return after

@@ -28,6 +28,9 @@ from lfrtorch.factors import Orthogonal, System
 FASTEST_DECREASE = 0.2
 """Smallest factor on λ after a good step; Nielsen has 1/3."""
 
+TAKEN_BACK = 10.0
+"""Factor on λ after a step that is taken back; what it decreased at the most, and twice more."""
+
 
 class Jacobian(Protocol):
     """The Jacobian J (M, P) of a residual as far as the search needs it: never the whole of it."""
@@ -218,6 +221,19 @@ class LevenbergMarquardt:
             except StopIteration as end:
                 return end.value
             answer = problem.linearise(theta) if wanted is JACOBIAN else problem.residual(theta)
+
+    def refused(self, before: LMState, after: LMState) -> LMState:
+        """State to go on from where a step is taken back: it was too long."""
+        assert after.damping is not None
+        return replace(
+            before,
+            damping=TAKEN_BACK * after.damping,
+            scale=after.scale,
+            iteration=after.iteration,
+            trials=after.trials,
+            rank=after.rank,
+            reason=after.reason,
+        )
 
     def steps(self, stack: ManyLeastSquares, states: Sequence[LMState]) -> list[LMState]:
         """One iteration of each of several searches, evaluated together.

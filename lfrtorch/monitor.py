@@ -5,7 +5,10 @@ from __future__ import annotations
 import copy
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
+from time import monotonic
 from typing import TextIO
 
 from matplotlib.figure import Figure
@@ -13,6 +16,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from lfrtorch import plots
 from lfrtorch.model import Model
+from lfrtorch.multistart import Round
 from lfrtorch.records import Record
 from lfrtorch.simulate import spectral_radius
 from lfrtorch.trainer import Progress
@@ -64,33 +68,78 @@ def progress_text(progress: Progress, unit: str) -> str:
     return "  ".join(parts)
 
 
+class StartsLine:
+    """A line for each round of several starts; on a terminal the count of iterations between.
+
+    Args:
+        starts: how many there are.
+        unit: of the errors.
+        stream: where to write; standard output where left out.
+    """
+
+    def __init__(self, starts: int, unit: str = "", stream: TextIO | None = None) -> None:
+        self.starts, self.unit, self._count = starts, unit, 0
+        self.stream = sys.stdout if stream is None else stream
+
+    def __call__(self, model: Model, progress: Progress) -> None:
+        """Count an iteration of any of the starts."""
+        self._count += 1
+        if self.stream.isatty():
+            self.stream.write(f"\r{self._count} iterations of {self.starts} starts\033[K")
+            self.stream.flush()
+
+    def round(self, ended: Round) -> None:
+        """Show a round that has ended."""
+        errors = [s.train if math.isnan(s.validation) else s.validation for s in ended.starts]
+        numbers = {"best": errors[0], "median": median(errors), "worst": max(errors)}
+        text = (
+            f"round {ended.number} of {ended.count}: {len(errors)} start(s) to iteration "
+            f"{max(s.iterations for s in ended.starts)}, "
+            + ", ".join(f"{name} {value:.3e}" for name, value in numbers.items())
+        )
+        text = f"{text} {self.unit}".rstrip() + f", {ended.seconds:.0f} s"
+        self.stream.write(f"\r{text}\033[K\n" if self.stream.isatty() else text + "\n")
+        self.stream.flush()
+
+
 class TensorBoard:
     """Scalars of every iteration, and figures of the validation record now and then.
 
     Args:
         folder: of the event file.
-        record: record whose spectrum and static map are drawn, usually the validation record.
+        record: record whose spectrum and static map are drawn, usually the validation record; left
+            out for scalars alone.
         y_lti: output of the linear model on it, (T, ny), for the error beside ours.
         every: iterations between figures; they cost about half a second.
     """
 
     def __init__(
-        self, folder: str | Path, record: Record, y_lti: plots.Array, every: int = 50
+        self,
+        folder: str | Path,
+        record: Record | None = None,
+        y_lti: plots.Array | None = None,
+        every: int = 50,
     ) -> None:
         self.writer = SummaryWriter(str(folder))
         self.record, self.y_lti, self.every = record, y_lti, every
 
+    def history(self, history: Sequence[Progress]) -> None:
+        """Log iterations of the past."""
+        for progress in history:
+            step = progress.iteration
+            self.writer.add_scalar("rmse/train", progress.train, step)
+            if not math.isnan(progress.validation):
+                self.writer.add_scalar("rmse/validation", progress.validation, step)
+            for name, value in progress.report.items():
+                self.writer.add_scalar(f"optimiser/{name}", value, step)
+
     def __call__(self, model: Model, progress: Progress) -> None:
         """Log one iteration."""
         step = progress.iteration
-        self.writer.add_scalar("rmse/train", progress.train, step)
-        if not math.isnan(progress.validation):
-            self.writer.add_scalar("rmse/validation", progress.validation, step)
-        for name, value in progress.report.items():
-            self.writer.add_scalar(f"optimiser/{name}", value, step)
+        self.history([progress])
         radius = spectral_radius(model.lfr.cell.A.detach())
         self.writer.add_scalar("model/spectral_radius_A", radius, step)
-        if step % self.every == 0:
+        if self.record is not None and self.y_lti is not None and step % self.every == 0:
             y_hat, signals = model.simulate(self.record), model.signals(self.record)
             self.figure("validation/spectrum", plots.spectrum(self.record, self.y_lti, y_hat), step)
             drawn = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
@@ -112,6 +161,8 @@ class TensorBoard:
 class Checkpoint:
     """The best iterate so far as a checkpoint on disk: what is left of a run that is killed.
 
+    One may be called by several starts of a fit: it keeps the best of all.
+
     Args:
         folder: of the checkpoint.
         every: least seconds between two of them, the first is that of the start.
@@ -119,13 +170,13 @@ class Checkpoint:
 
     def __init__(self, folder: str | Path, every: float = 5.0) -> None:
         self.folder, self.every = Path(folder), every
-        self._due = 0.0
+        self._due, self._least = -math.inf, math.inf
         self._unwritten: Model | None = None
 
     def __call__(self, model: Model, progress: Progress) -> None:
         """Keep the iterate where it is the best; write the best one where it is time."""
-        if progress.best:
-            self._unwritten = copy.deepcopy(model)
-        if self._unwritten is not None and progress.seconds >= self._due:
+        if progress.best and progress.score < self._least:
+            self._unwritten, self._least = copy.deepcopy(model), progress.score
+        if self._unwritten is not None and monotonic() >= self._due:
             self._unwritten.save(self.folder)
-            self._unwritten, self._due = None, progress.seconds + self.every
+            self._unwritten, self._due = None, monotonic() + self.every

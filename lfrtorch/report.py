@@ -16,6 +16,9 @@ from lfrtorch.model import Model
 from lfrtorch.records import Record
 from lfrtorch.trainer import FitResult
 
+SEED_STEP = 1000
+"""Between the seeds of several starts."""
+
 
 @dataclass(frozen=True)
 class Score:
@@ -52,8 +55,19 @@ def score(model: Model, bla: LinearModel, record: Record) -> Score:
     )
 
 
+def seeds(seed: int, starts: int) -> list[int]:
+    """Seeds of several random starts; those of neighbouring seeds have none in common."""
+    return [seed + SEED_STEP * number for number in range(starts)]
+
+
 def metrics(
-    result: FitResult, bla: LinearModel, dataset: Dataset, *, seed: int | None, command: str
+    result: FitResult,
+    bla: LinearModel,
+    dataset: Dataset,
+    *,
+    seed: int,
+    data_seed: int | None,
+    command: str,
 ) -> dict:
     """What ``metrics.json`` holds, scores by test record; None where a number is not finite."""
     model = result.model
@@ -66,7 +80,7 @@ def metrics(
         "data": {
             "samples": sum(record.samples for record in dataset.train),
             "noise_rms": dataset.noise_rms,
-            "seed": seed,
+            "seed": data_seed,
             "notes": list(dataset.notes),
         },
         "fit": {
@@ -78,9 +92,16 @@ def metrics(
         "validation": {
             "rmse": _pooled([s.rmse for s in validation], validation),
             "lti_rmse": _pooled([s.lti_rmse for s in validation], validation),
+            "records": {
+                record.name: asdict(s)
+                for record, s in zip(dataset.validation, validation, strict=True)
+            },
         },
         "chosen_iteration": result.chosen_iteration,
-        "starts": 1,
+        "starts": max(1, len(result.starts)),
+        "ranking": [
+            {"seed": seeds(seed, start.number + 1)[-1], **asdict(start)} for start in result.starts
+        ],
         "command": command,
         "scores": {record.name: asdict(score(model, bla, record)) for record in dataset.tests},
         "versions": {
@@ -103,26 +124,46 @@ def table(result: dict, published: Sequence[Published]) -> str:
         + [_number(p.scores.get(name)) for p in others]
         for name, s in result["scores"].items()
     ]
-    v = result["validation"]
-    if v["rmse"] is not None or v["lti_rmse"] is not None:
-        chosen = ["validation", "not fitted", "", "", _number(v["lti_rmse"]), _number(v["rmse"])]
+    for name, s in result["validation"]["records"].items():
+        chosen = [name, "not fitted", str(s["samples"]), str(s["skip"])]
+        chosen += [_number(s["lti_rmse"]), _number(s["rmse"])]
         rows.append(chosen + [_number(None)] * len(others))
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-
-    def line(row: list[str]) -> str:
-        cells = [
-            cell.ljust(w) if i < 2 else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        ]
-        return "  ".join(cells)
-
+    first, *lines = _aligned([head, *rows], left=(0, 1))
     units = {s["unit"] for s in result["scores"].values()} - {""}
     title = f"Simulation RMSE{f' ({next(iter(units))})' if len(units) == 1 else ''}"
     static = f"degree {sizes['degree']}" if "degree" in sizes else f"{sizes['nn']} neurons"
     title += f", nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
     references = [f"{p.label}: {p.reference}" for p in others]
-    rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
-    return "\n".join([title, rule, line(head), rule, *map(line, rows), rule, *references])
+    rule = "-" * max(map(len, [first, *lines]))
+    return "\n".join([title, rule, first, rule, *lines, rule, *references])
+
+
+def starts_table(result: dict) -> str:
+    """All starts of a fit, the best first."""
+    head = ["seed", "iterations", "training", "validation", ""]
+    rows = [
+        [
+            str(s["seed"]),
+            str(s["iterations"]),
+            _number(s["train"]),
+            _number(s["validation"]),
+            s["reason"],
+        ]
+        for s in result["ranking"]
+    ]
+    return "\n".join(["Starts, the best iterate of each", *_aligned([head, *rows], left=(4,))])
+
+
+def _aligned(rows: Sequence[Sequence[str]], left: Sequence[int]) -> list[str]:
+    """Lines of a table with columns of one width, some of them flush left."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.ljust(w) if i in left else cell.rjust(w)
+            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
 
 
 def _pooled(values: list[float], scores: list[Score]) -> float | None:

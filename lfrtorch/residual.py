@@ -173,6 +173,10 @@ class SimulationError:
         """Take trajectories at θ, one a batch, from elsewhere."""
         self._latest = theta.clone(), trajectories
 
+    def release(self) -> None:
+        """Let go of what would only speed up the next evaluation."""
+        self._latest, self._memory = None, Memory()
+
     def start_of(self, i: int) -> Tensor | None:
         """Start state (R, nx) of a batch where it is given or a parameter."""
         batch = self.batches[i]

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cache
+from typing import TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _workers: ContextVar[int | None] = ContextVar("workers", default=None)
 
@@ -65,6 +69,40 @@ def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
             other.result()
 
 
+def each_alone(
+    work: Callable[[Item], Result], items: Sequence[Item], stop: Callable[[], None]
+) -> list[Result]:
+    """The results of ``work`` on each item, one thread an item, ``workers()`` at a time.
+
+    Args:
+        work: finds its own work spread over one thread.
+        items: what it is called with.
+        stop: called where one fails, or at Ctrl-C: it should make the others end soon.
+    """
+
+    def alone(item: Item) -> Result:
+        token = _workers.set(1)
+        try:
+            return work(item)
+        finally:
+            _workers.reset(token)
+
+    if min(len(items), workers()) == 1:
+        return [alone(item) for item in items]
+    with spread_by_hand(), ThreadPoolExecutor(workers(), "lfrtorch-alone", _one_thread) as pool:
+        begun = [pool.submit(alone, item) for item in items]
+        try:
+            return [each.result() for each in begun]
+        except BaseException:
+            stop()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
 @cache
 def _blas() -> ThreadpoolController:
     return ThreadpoolController()
@@ -72,9 +110,7 @@ def _blas() -> ThreadpoolController:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(
-        os.cpu_count(), "lfrtorch", initializer=torch.set_num_threads, initargs=(1,)
-    )
+    return ThreadPoolExecutor(os.cpu_count(), "lfrtorch", _one_thread)
 
 
 if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads

@@ -6,9 +6,10 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
+import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
@@ -20,6 +21,9 @@ from lfrtorch.residual import Ridge, SimulationError
 from lfrtorch.threads import spread_by_hand
 
 INTERRUPTED = "interrupted"
+
+EXPLOSION = 100.0
+"""Growth of the squared validation error, beyond the start's, in a step that is taken back."""
 
 
 class OptimiserState(Protocol):
@@ -67,6 +71,10 @@ class Optimiser(Protocol):
         """Next state."""
         ...
 
+    def refused(self, before: Any, after: Any) -> Any:
+        """State to go on from where a step led to a model that explodes on validation."""
+        ...
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -80,6 +88,7 @@ class Progress:
         seconds: since the start of the fit.
         best: whether this iterate is the best so far, on validation where there is one.
         report: scalars of the optimiser.
+        score: normalised squared error that chooses: on validation, or on training without it.
     """
 
     iteration: int
@@ -89,6 +98,7 @@ class Progress:
     seconds: float
     best: bool
     report: dict[str, float]
+    score: float
 
     @property
     def seconds_left(self) -> float:
@@ -98,6 +108,24 @@ class Progress:
 
 Monitor = Callable[[Model, Progress], None]
 """Called at the start and after each iteration, the iterate in the model's weights."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """How far one of several starts came.
+
+    Args:
+        number: its place in the order given, from 0.
+        iterations: it had.
+        train, validation: errors of its best iterate, output unit.
+        reason: why it ended.
+    """
+
+    number: int
+    iterations: int
+    train: float
+    validation: float
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -111,6 +139,7 @@ class FitResult:
         seconds: duration of the whole fit.
         seconds_per_iteration: median over the accepted iterations but the first, which may compile.
         reason: why the search ended.
+        starts: of several starts all, the best first.
     """
 
     model: Model
@@ -119,11 +148,158 @@ class FitResult:
     seconds: float
     seconds_per_iteration: float
     reason: str
+    starts: tuple[Start, ...] = ()
 
     @property
     def iterations(self) -> int:
         """Number of iterations."""
         return self.history[-1].iteration
+
+
+class Fit:
+    """A fit that goes on for as many iterations as it is asked for, and keeps the best iterate.
+
+    Args:
+        model, train, validation, optimiser, ridge, ranks: see :func:`fit`.
+
+    Raises:
+        ValueError: see :func:`fit`.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        train: Record | Sequence[Record],
+        validation: Record | Sequence[Record] = (),
+        *,
+        optimiser: Optimiser | None = None,
+        ridge: Ridge = 0.0,
+        ranks: Ranks | None = None,
+    ) -> None:
+        self.model = model
+        self.optimiser = LevenbergMarquardt() if optimiser is None else optimiser
+        self.ranks = ranks = Ranks() if ranks is None else ranks
+        if ranks.world > 1:
+            weights = parameters_to_vector(model.lfr.parameters())
+            vector_to_parameters(ranks.first(weights), model.lfr.parameters())
+        self.problem = SimulationError(model, train, ridge=ridge, ranks=ranks)
+        self.judge = SimulationError(model, validation, solved_starts=True) if validation else None
+        if not math.isfinite(self.problem.cost(self.problem.residual(self.problem.theta))):
+            raise ValueError(
+                "the model diverges on the training records at the start; start from a stable "
+                "model."
+            )
+        self.state: Any = None
+        """The optimiser's; None before the first call of ``advance``."""
+        self.history: list[Progress] = []
+        self.reason = "no iterations asked for"
+        self.best = math.inf
+        """Normalised squared error of the best iterate, on validation where there is one."""
+        self._theta_best, self._chosen = self.problem.theta, 0
+        self._first = self._score = math.inf
+        self._seconds, self._durations = 0.0, []
+
+    @property
+    def kept(self) -> Progress:
+        """The best iterate."""
+        return self.history[self._chosen]
+
+    @property
+    def over(self) -> bool:
+        """Whether there is no more to come."""
+        if not self.history:
+            return False
+        return bool(self.state.reason) or self.state.iteration >= self.optimiser.limit
+
+    @spread_by_hand()
+    def advance(self, until: int | None = None, monitors: Sequence[Monitor] = ()) -> Self:
+        """Go on to an iteration, the optimiser's last where left out; the best is in the model.
+
+        Raises:
+            ProcessLost: before there was an iterate to keep.
+        """
+        until = self.optimiser.limit if until is None else until
+        try:
+            if not self.history:
+                self.begin(monitors)
+            while not self.over and self.state.iteration < until:
+                clock = time.perf_counter()
+                after = self.optimiser.step(self.problem, self.state)
+                self.take(after, time.perf_counter() - clock, monitors)
+        except KeyboardInterrupt:
+            if not self.history:
+                raise
+            self.reason = INTERRUPTED
+        except ProcessLost as lost:
+            if not self.history:
+                raise
+            self.reason = str(lost)
+        finally:
+            self.pause()
+        return self
+
+    def pause(self) -> None:
+        """Put the best iterate into the model, and let go of memory."""
+        self.problem.write(self._theta_best)
+        self.problem.release()
+
+    def begin(self, monitors: Sequence[Monitor] = ()) -> None:
+        """Judge the start."""
+        clock = time.perf_counter()
+        self.state = self.optimiser.init(self.problem, self.problem.theta)
+        self._record(self.state, time.perf_counter() - clock, monitors)
+        self._first = self._score
+
+    def take(self, after: Any, seconds: float, monitors: Sequence[Monitor] = ()) -> None:
+        """Go on from the optimiser's next state, which took so many seconds to find.
+
+        Not where the model there explodes on validation: the search goes back, and treads softly.
+        """
+        before, last = self.state, self._score
+        if after.theta is not before.theta:
+            self._durations.append(seconds)
+        self.state, self.reason = after, after.reason
+        self._record(after, seconds, monitors)
+        if math.isfinite(last) and not self._score <= max(EXPLOSION * last, self._first):
+            self.state, self._score = self.optimiser.refused(before, after), last
+
+    def result(self) -> FitResult:
+        """What was found."""
+        usual = self._durations[1:] or self._durations
+        return FitResult(
+            model=self.model,
+            history=self.history,
+            chosen_iteration=self._chosen,
+            seconds=self._seconds,
+            seconds_per_iteration=float(np.median(usual)) if usual else 0.0,
+            reason=self.reason,
+        )
+
+    def _record(self, state: OptimiserState, seconds: float, monitors: Sequence[Monitor]) -> None:
+        """Judge an iterate, keep it where it is the best, and show it."""
+        clock, problem = time.perf_counter(), self.problem
+        train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")
+        score = problem.cost(state.residual)
+        if self.judge is not None:
+            problem.write(state.theta)
+            theta = self.judge.theta
+            score = self.judge.cost(self.judge.residual(theta))  # every output counts alike
+            # Each process has all of these records, and its own rounding errors.
+            score = float(self.ranks.first(torch.tensor(score, dtype=torch.float64)))
+            validation_rmse = self.judge.rmse(theta)
+        better = score < self.best  # False for the NaN of a model that diverges on validation
+        if better:
+            self._theta_best, self.best, self._chosen = state.theta, score, len(self.history)
+        self._score = score
+        self._seconds += seconds + time.perf_counter() - clock
+        progress = Progress(
+            state.iteration, self.optimiser.limit, train_rmse, validation_rmse, self._seconds,
+            better, state.report, score,
+        )  # fmt: skip
+        self.history.append(progress)
+        problem.write(state.theta)
+        for monitor in monitors:
+            monitor(self.model, progress)
 
 
 @spread_by_hand()
@@ -160,72 +336,5 @@ def fit(
             records than processes.
         ProcessLost: before there was an iterate to keep.
     """
-    optimiser = LevenbergMarquardt() if optimiser is None else optimiser
-    ranks = Ranks() if ranks is None else ranks
-    if ranks.world > 1:
-        weights = parameters_to_vector(model.lfr.parameters())
-        vector_to_parameters(ranks.first(weights), model.lfr.parameters())
-    problem = SimulationError(model, train, ridge=ridge, ranks=ranks)
-    judge = SimulationError(model, validation, solved_starts=True) if validation else None
-    if not math.isfinite(problem.cost(problem.residual(problem.theta))):
-        raise ValueError(
-            "the model diverges on the training records at the start; start from a stable model."
-        )
-    begin = time.perf_counter()
-    history: list[Progress] = []
-    durations: list[float] = []
-    theta_best, best, chosen, reason = problem.theta, float("inf"), 0, "no iterations asked for"
-
-    def record(state: OptimiserState) -> None:
-        nonlocal theta_best, best, chosen
-        train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")
-        score = problem.cost(state.residual)
-        if judge is not None:
-            problem.write(state.theta)
-            theta = judge.theta
-            score = judge.cost(judge.residual(theta))  # normalised: every output counts alike
-            validation_rmse = judge.rmse(theta)
-        better = score < best  # False for the NaN of a model that diverges on validation
-        if better:
-            theta_best, best, chosen = state.theta, score, state.iteration
-        elapsed = time.perf_counter() - begin
-        progress = Progress(
-            state.iteration, optimiser.limit, train_rmse, validation_rmse, elapsed, better,
-            state.report,
-        )  # fmt: skip
-        history.append(progress)
-        problem.write(state.theta)
-        for monitor in monitors:
-            monitor(model, progress)
-
-    try:
-        state = optimiser.init(problem, problem.theta)
-        record(state)
-        while state.iteration < optimiser.limit:
-            before, clock = state.theta, time.perf_counter()
-            state = optimiser.step(problem, state)
-            if state.theta is not before:
-                durations.append(time.perf_counter() - clock)
-            record(state)
-            reason = state.reason
-            if reason:
-                break
-    except KeyboardInterrupt:
-        if not history:
-            raise
-        reason = INTERRUPTED
-    except ProcessLost as lost:
-        if not history:
-            raise
-        reason = str(lost)
-    finally:
-        problem.write(theta_best)
-    usual = durations[1:] or durations
-    return FitResult(
-        model=model,
-        history=history,
-        chosen_iteration=chosen,
-        seconds=time.perf_counter() - begin,
-        seconds_per_iteration=float(np.median(usual)) if usual else 0.0,
-        reason=reason,
-    )
+    begun = Fit(model, train, validation, optimiser=optimiser, ridge=ridge, ranks=ranks)
+    return begun.advance(monitors=monitors).result()

@@ -156,7 +156,10 @@ def test_phases_are_uniform():
 
 
 def test_default_records(simulated):
-    (train,), (validation,) = simulated.train, simulated.validation
+    (train,), (validation, *levels) = simulated.train, simulated.validation
+    assert [record.name for record in levels] == ["validation_25", "validation_10"]
+    assert [np.std(r.u) for r in levels] == pytest.approx([25, 10], rel=1e-4)
+    assert np.array_equal(levels[1].u[:, 0], boucwen.multisine(rms=10.0, seed=1002)[::RATIO])
     for record, seed in ((train, 0), (validation, 1000)):
         assert record.u.shape == record.y.shape == (PERIOD, 1)
         assert (record.fs, record.start, record.skip) == (750.0, "periodic", 0)
@@ -165,7 +168,7 @@ def test_default_records(simulated):
         assert np.array_equal(record.u[:, 0], boucwen.multisine(seed=seed)[::RATIO])
         assert np.std(record.u) == pytest.approx(50, rel=1e-4)
         assert np.std(record.y) == pytest.approx(6.6e-4, rel=0.1)
-    assert (train.name, validation.name) == ("train", "validation")
+    assert (train.name, validation.name) == ("train", "validation_50")
     assert (simulated.name, simulated.noise_rms) == ("boucwen", 8e-6)
 
 
@@ -204,7 +207,7 @@ def test_noise(simulated):
     twice = boucwen.load(noise_rms=16e-6)
     noise = []
     for part in ("train", "validation"):
-        (with_noise,), (without,) = getattr(simulated, part), getattr(clean, part)
+        with_noise, without = getattr(simulated, part)[0], getattr(clean, part)[0]
         assert np.array_equal(with_noise.u, without.u)
         noise.append((with_noise.y - without.y)[:, 0])
         assert difference(getattr(twice, part)[0].y - without.y, 2 * noise[-1]) < 1e-9
@@ -349,8 +352,10 @@ def test_refused_damaged_files(tmp_path, damage):
             {"seed": 3, "validation_seed_offset": -4},
             "data.validation_seed_offset is -4; give a whole number of at least -3",
         ),
-        ({"validation_seed_offset": 0}, "training realisation"),
-        ({"validation_seed_offset": 2000}, "test realisation"),
+        ({"validation_seed_offset": 0}, "none the training or simulated test realisation"),
+        ({"validation_seed_offset": 1999}, "none the training or simulated test realisation"),
+        ({"validation_rms": []}, r"0 level\(s\) of validation_rms: there must be one or more"),
+        ({"validation_rms": [50, 0]}, "data.validation_rms is 0.0; give"),
     ],
 )
 def test_refused_arguments(arguments, match):

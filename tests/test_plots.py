@@ -69,7 +69,7 @@ def test_static_map_has_a_panel_for_each_output(nz: int, panels: int):
 
 
 def test_convergence_marks_the_kept_iterate():
-    history = [Progress(i, 3, 1.0 / (i + 1), 2.0 / (i + 1), 0.0, True, {}) for i in range(4)]
+    history = [Progress(i, 3, 1.0 / (i + 1), 2.0 / (i + 1), 0.0, True, {}, 0.0) for i in range(4)]
     ax = plots.convergence(history, 2, "m").axes[0]
     assert np.allclose(drawn(ax, "training")[:, 1], [1, 1 / 2, 1 / 3, 1 / 4])
     assert drawn(ax, "kept: iteration 2")[0, 0] == 2

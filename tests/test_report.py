@@ -38,7 +38,7 @@ def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:
 
 def test_metrics_are_what_the_model_scores(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, bla, data, seed=3, command="python train.py")
+    metrics = report.metrics(fitted, bla, data, seed=0, data_seed=3, command="python train.py")
     test, validation = data.tests[0], data.validation[0]
     y_hat = fitted.model.simulate(test)
     assert metrics["scores"]["test"] == {
@@ -70,7 +70,7 @@ def test_pooled_validation_weighs_samples():
 
 def test_table_shows_published_results_of_these_sizes_only(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, bla, data, seed=None, command="")
+    metrics = report.metrics(fitted, bla, data, seed=0, data_seed=None, command="")
     lines = report.table(metrics, data.published).splitlines()
     assert lines[0] == "Simulation RMSE (V), nx 2, nz 1, nw 1, 3 neurons"
     head, row = lines[2].split(), lines[4].split()

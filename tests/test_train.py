@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
 BENCHES = sorted(path.stem for path in (CONF / "bench").glob("*.yaml"))
 SHORTER = {  # fewer samples and iterations, so that two iterations take seconds
+    "boucwen": "starts=2",
     "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1",
     "silverbox": "data.validation=0.8 bla.max_iter=1",
     "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1",
@@ -213,7 +214,11 @@ def test_a_resting_test_part_gives_a_score_that_is_null(tmp_path: Path):
 def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
     with subprocess.Popen(
         command(
-            "+bench=boucwen", "trainer.max_iter=100000", "trainer.patience=100000", folder=tmp_path
+            "+bench=boucwen",
+            "starts=1",
+            "trainer.max_iter=100000",
+            "trainer.patience=100000",
+            folder=tmp_path,
         ),
         stdout=subprocess.PIPE,
         text=True,

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch.adam import Adam
-from lfrtorch.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
@@ -80,6 +80,22 @@ class Walk:
             iteration=state.iteration + 1,
             reason=self.reason if last else "",
         )
+
+    def refused(self, before: State, after: State) -> State:
+        return replace(before, iteration=after.iteration, reason=after.reason)
+
+
+class Quadratic:
+    """r = (10 θ1, θ2)."""
+
+    def residual(self, theta: Tensor) -> Tensor:
+        return theta * theta.new_tensor([10.0, 1.0])
+
+    def linearise(self, theta: Tensor) -> DenseJacobian:
+        return DenseJacobian(torch.diag(theta.new_tensor([10.0, 1.0])), self.residual(theta))
+
+    def cost(self, residual: Tensor) -> float:
+        return float(residual @ residual)
 
 
 # --- planted models -------------------------------------------------------------------------
@@ -178,6 +194,37 @@ def test_iterate_that_diverges_on_validation_is_not_kept():
     assert math.isfinite(result.history[1].train)
     assert result.chosen_iteration == 0
     assert torch.equal(theta(model), start)
+
+
+def test_a_step_to_a_model_that_explodes_on_validation_is_taken_back():
+    model, train, _ = planted()
+    long = measure(model, 3000, seed=5)
+    validation = Record(long.u, long.y + 0.1, long.fs)
+    seen: list[Tensor] = []
+    walk = Walk((0.01, 3.0, 0.02))
+    fit(
+        model,
+        train[0][:5],
+        validation,
+        optimiser=walk,
+        monitors=[lambda m, _: seen.append(theta(m))],
+    )
+    moved = [float(each[0] - seen[0][0]) for each in seen]
+    assert moved == pytest.approx([0, 0.01, 3.01, 0.03])
+
+
+def test_a_search_that_goes_back_treads_softly():
+    problem, lm = Quadratic(), LevenbergMarquardt()
+    before = lm.init(problem, torch.ones(2, dtype=torch.float64))
+    after = lm.step(problem, before)
+    back = lm.refused(before, after)
+    again = lm.step(problem, back)
+    assert torch.equal(back.theta, before.theta)
+    assert again.iteration == 2
+    # λ is 1 (0.01 of the largest squared singular value), 0.2 after the good step, then 2; the
+    # second parameter goes 1 / (1 + λ) of the way.
+    assert float(1 - after.theta[1]) == pytest.approx(1 / 2)
+    assert float(1 - again.theta[1]) == pytest.approx(1 / 3)
 
 
 def test_errors_are_in_physical_units():

@@ -15,6 +15,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import ceil, floor, prod
 from numbers import Integral
 from pathlib import Path
@@ -71,22 +72,27 @@ def load(
     validation_seed_offset: int = 1000,
     samples: int = _PERIOD,
     rms: float = 50.0,
+    validation_rms: Sequence[float] = (50.0, 25.0, 10.0),
     noise_rms: float = 8e-6,
     root: str | Path | None = None,
 ) -> Dataset:
     """Simulated estimation data, and the official tests where their files are at hand.
 
-    Training and validation are each one steady-state period of a multisine realisation, with
-    measurement noise. The tests are noise free: ``"multisine"`` is one steady-state period and
+    Training and validation are steady-state periods of multisine realisations, with measurement
+    noise: one at the level of the training, and one more at each level of validation. (Models that
+    do alike at the training's level differ by 2 at small amplitudes, where hysteresis remembers.)
+    The tests are noise free: ``"multisine"`` is one steady-state period and
     ``"sweep"`` starts from rest, its first 2000 samples unscored. A test without its files is
     simulated: the sweep is the official one up to rounding, the multisine is another realisation
     of the official kind (drawn from ``seed + 2000``). ``Record.source`` says which it is.
 
     Args:
         seed: of the training realisation and its noise.
-        validation_seed_offset: added to ``seed`` for the validation realisation.
+        validation_seed_offset: added to ``seed`` for the first validation realisation; those of the
+            other levels follow.
         samples: of one estimation period, at 750 Hz.
-        rms: of the estimation input, N.
+        rms: of the training input, N.
+        validation_rms: of the validation inputs, N.
         noise_rms: of the measurement noise before the decimation, m; the low-pass filters leave
             0.92 of it: 7.35e-6 m of the official 8e-6 m.
         root: folder that holds ``BoucWen/BoucWenFiles/...`` as the package nonlinear_benchmarks
@@ -104,18 +110,25 @@ def load(
     integer("data.validation_seed_offset", validation_seed_offset, -seed)
     number("data.rms", rms, positive=True)
     number("data.noise_rms", noise_rms)
-    if validation_seed_offset in (0, _TEST_OFFSET):
+    levels = [float(level) for level in validation_rms]
+    for level in levels:
+        number("data.validation_rms", level, positive=True)
+    offsets = range(validation_seed_offset, validation_seed_offset + len(levels))
+    if not levels or 0 in offsets or _TEST_OFFSET in offsets:
         raise ValueError(
-            f"validation_seed_offset={validation_seed_offset} makes the validation record the "
-            f"{'simulated test' if validation_seed_offset else 'training'} realisation; "
-            "use another offset, for example 1000."
+            f"validation_seed_offset={validation_seed_offset} and {len(levels)} level(s) of "
+            "validation_rms: there must be one or more, and none the training or simulated test "
+            f"realisation (offsets 0 and {_TEST_OFFSET}); use for example 1000 and [50]."
         )
     folder = _official_folder(root)
-    estimation: dict[str, Any] = {"samples": samples, "rms": rms, "noise_rms": noise_rms}
+    estimation: dict[str, Any] = {"samples": samples, "noise_rms": noise_rms}
     return Dataset(
         name="boucwen",
-        train=[_realisation("train", seed, **estimation)],
-        validation=[_realisation("validation", seed + validation_seed_offset, **estimation)],
+        train=[_realisation("train", seed, rms=rms, **estimation)],
+        validation=[
+            _realisation(f"validation_{level:g}", seed + offset, rms=level, **estimation)
+            for offset, level in zip(offsets, levels, strict=True)
+        ],
         tests=[_multisine_test(folder, seed + _TEST_OFFSET), _sweep_test(folder)],
         noise_rms=noise_rms,
         published=_PUBLISHED,

@@ -1,0 +1,192 @@
+"""Several starts of one fit: who goes on, and that each is what it is alone."""
+
+import math
+import threading
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import torch
+from reference import random_cell, random_model
+from test_trainer import move, planted, theta
+from torch import Tensor
+
+from lfrtorch.adam import Adam
+from lfrtorch.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.model import Model
+from lfrtorch.multistart import LEFT, Round, advance_in_step, fit_starts
+from lfrtorch.ranks import Ranks
+from lfrtorch.records import Record
+from lfrtorch.trainer import INTERRUPTED, Fit, Progress, fit
+
+
+def several(count: int = 5, T: int = 60) -> tuple[list[Model], list[Record], Record]:
+    """Models at growing distances from the true one, training and validation records."""
+    _, train, validation = planted(T)
+    models = []
+    for i in range(count):
+        model = random_model(random_cell(radius=0.7))
+        move(model, 0.05 * (i + 1))
+        models.append(model)
+    return models, train, validation
+
+
+def test_the_better_half_goes_on_round_by_round():
+    models, train, validation = several()
+    rounds: list[Round] = []
+    optimiser = LevenbergMarquardt(max_iter=16, tolerance=0)
+    result = fit_starts(models, train, validation, optimiser=optimiser, watch=rounds.append)
+    assert [(r.number, r.count) for r in rounds] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert [len(r.starts) for r in rounds] == [5, 3, 2, 1]
+    for one, following in pairwise(rounds):
+        kept = {start.number for start in one.starts[: len(following.starts)]}
+        assert {start.number for start in following.starts} == kept
+    for one in rounds:
+        errors = [start.validation for start in one.starts]
+        assert errors == sorted(errors)
+    ends = {start.number: start.iterations for start in result.starts}
+    assert ends == {start.number: start.iterations for one in rounds for start in one.starts}
+    assert sorted(ends.values()) == [2, 2, 4, 8, 16]
+    assert [start.reason == LEFT for start in result.starts].count(True) == 4
+
+
+def test_the_best_start_is_what_it_is_alone():
+    models, train, validation = several()
+    optimiser = LevenbergMarquardt(max_iter=8)
+    result = fit_starts(models, train, validation, optimiser=optimiser)
+    number = result.starts[0].number
+    assert result.model is models[number]
+    (alone,) = several()[0][number : number + 1]
+    expected = fit(alone, train, validation, optimiser=optimiser)
+    assert torch.equal(theta(result.model), theta(alone))
+    assert [p.train for p in result.history] == [p.train for p in expected.history]
+    assert result.chosen_iteration == expected.chosen_iteration
+    assert min(s.validation for s in result.starts) == result.starts[0].validation
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_results_do_not_depend_on_threads(threads: int):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        models, train, validation = several()
+        result = fit_starts(models, train, validation, optimiser=LevenbergMarquardt(max_iter=8))
+        torch.set_num_threads(2)
+        again, *_ = several()
+        expected = fit_starts(again, train, validation, optimiser=LevenbergMarquardt(max_iter=8))
+    finally:
+        torch.set_num_threads(before)
+    # The last start alone has its work spread over all threads, which sum in another order.
+    for one, other in zip(result.starts, expected.starts, strict=True):
+        assert (one.number, one.iterations) == (other.number, other.iterations)
+        assert one.validation == pytest.approx(other.validation, rel=1e-6)
+
+
+def test_one_start_is_a_fit():
+    models, train, validation = several(1)
+    result = fit_starts(models, train, validation, optimiser=LevenbergMarquardt(max_iter=6))
+    (alone,) = several(1)[0]
+    expected = fit(alone, train, validation, optimiser=LevenbergMarquardt(max_iter=6))
+    assert torch.equal(theta(result.model), theta(alone))
+    assert result.reason == expected.reason
+    assert len(result.starts) == 1
+
+
+def test_starts_in_step_are_what_they_are_alone():
+    models, train, validation = several(3)
+    alone = several(3)[0]
+    optimiser = LevenbergMarquardt(max_iter=6)
+    fits = [Fit(m, train, validation, optimiser=optimiser) for m in models]
+    seen: list[int] = []
+    watching: Any = [[lambda _, p, i=i: seen.append(i)] for i in range(3)]
+    advance_in_step(fits, 4, watching)
+    assert [fit.history[-1].iteration for fit in fits] == [4, 4, 4]
+    advance_in_step(fits, 6)
+    for stepped, model in zip(fits, alone, strict=True):
+        expected = fit(model, train, validation, optimiser=optimiser)
+        # Sums in another order, and no gauge columns left out.
+        assert stepped.result().history[-1].train == pytest.approx(
+            expected.history[-1].train, rel=1e-5
+        )
+    assert sorted(seen) == 5 * [0] + 5 * [1] + 5 * [2]
+
+
+def test_starts_without_validation_are_judged_on_training():
+    models, train, _ = several(3)
+    result = fit_starts(models, train, optimiser=Adam(epochs=16, learning_rate=1e-3))
+    assert all(math.isnan(start.validation) for start in result.starts)
+    errors = [start.train for start in result.starts]
+    assert errors == sorted(errors)
+
+
+class Sharing(Ranks):
+    """Claims to be one of two processes, which have the same records."""
+
+    world = 2
+
+    def share(self, items: list) -> list:
+        return items
+
+
+def test_processes_fit_one_start_after_another():
+    models, train, validation = several(2)
+    threads = set()
+    monitors: Any = [[lambda *_: threads.add(threading.get_ident())]] * 2
+    fit_starts(models, train, validation, ranks=Sharing(), monitors=monitors)
+    assert threads == {threading.get_ident()}
+
+
+def test_monitors_are_called_one_at_a_time():
+    models, train, validation = several(4)
+    busy = threading.Lock()
+
+    def watch(model: Model, progress: Progress):
+        assert busy.acquire(blocking=False)
+        busy.release()
+
+    def weights(model: Model, progress: Progress):
+        own = theta(model)
+        assert own.isfinite().all()
+
+    fit_starts(models, train, validation, monitors=[[watch, weights]] * 4)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_ctrl_c_keeps_the_best_of_all(threads: int):
+    models, train, validation = several(3)
+    best: dict[int, tuple[float, Tensor]] = {}
+
+    def watch(model: Model, progress: Progress):
+        if progress.best:
+            best[id(model)] = progress.score, theta(model).clone()
+        if progress.iteration == 3:
+            raise KeyboardInterrupt
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        result = fit_starts(models, train, validation, monitors=[[watch]] * 3)
+    finally:
+        torch.set_num_threads(before)
+    assert result.reason == INTERRUPTED
+    score, weights = min(best.values(), key=lambda each: each[0])
+    assert torch.equal(theta(result.model), weights)
+    assert result.history[result.chosen_iteration].score == score
+
+
+def test_a_failure_ends_all():
+    models, train, validation = several(3)
+
+    def fail(model: Model, progress: Progress):
+        raise RuntimeError("no room on the disk")
+
+    with pytest.raises(RuntimeError, match="no room"):
+        fit_starts(models, train, validation, monitors=[[fail]] * 3)
+
+
+def test_bad_calls_are_refused():
+    models, train, _ = several(2)
+    with pytest.raises(ValueError, match="no model to start from"):
+        fit_starts([], train)
+    with pytest.raises(ValueError, match=r"2 models and 1 lists"):
+        fit_starts(models, train, monitors=[[]])
