@@ -34,6 +34,7 @@ from lfrtorch.distributed import connect
 from lfrtorch.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
 from lfrtorch.order import OrderScan
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
+from lfrtorch.threads import each_alone
 from lfrtorch.trainer import INTERRUPTED, Progress
 
 CONF = Path(__file__).resolve().parent / "conf"
@@ -196,10 +197,12 @@ def write(
         f"{result.seconds:.1f} s, {1e3 * result.seconds_per_iteration:.0f} ms an iteration\n"
     )
     result.model.save(folder / "model")
+    own = own_linear_models(cfg, dataset)
     metrics = report.metrics(
         result,
         bla,
         dataset,
+        own=own,
         seed=cfg.seed,
         data_seed=cfg.data.get("seed"),
         command=command,
@@ -212,7 +215,7 @@ def write(
     table = report.table(metrics, dataset.published)
     print(table)
     board.text("scores", table)
-    for name, figure in figures(result, bla, dataset).items():
+    for name, figure in figures(result, bla, dataset, own).items():
         figure.savefig(made(folder / "figures") / f"{name}.png", dpi=150)
         board.figure(f"result/{name}", figure, result.iterations)
     board.close()
@@ -268,12 +271,29 @@ def continued(cfg: DictConfig, dataset: Dataset) -> lfrtorch.Model:
     return model
 
 
-def figures(result: lfrtorch.FitResult, bla: lfrtorch.LinearModel, dataset: Dataset) -> dict:
+def own_linear_models(cfg: DictConfig, dataset: Dataset) -> dict[str, lfrtorch.LinearModel]:
+    """Linear models of single tests, where their table has them, by the test's name."""
+    records = {record.name: record for record in dataset.train}
+    # Tests that share their records share the model.
+    of = list(dict.fromkeys(dataset.linear.values()))
+    estimate = partial(instantiate, cfg.bla)
+    models = each_alone(estimate, [[records[name] for name in names] for names in of])
+    by_records = dict(zip(of, models, strict=True))
+    return {test: by_records[names] for test, names in dataset.linear.items()}
+
+
+def figures(
+    result: lfrtorch.FitResult,
+    bla: lfrtorch.LinearModel,
+    dataset: Dataset,
+    own: dict[str, lfrtorch.LinearModel],
+) -> dict:
     """All figures of a run by file name: errors of each test, static map, convergence."""
     model = result.model
     drawn = {}
     for record in dataset.tests:
-        y_lti, y_hat = bla.simulate(record), model.simulate(record)
+        y_lti = own.get(record.name, bla).simulate(record)
+        y_hat = model.simulate(record)
         drawn[record.name] = plots.errors(record, y_lti, y_hat)
     signals = model.signals(dataset.train[0])
     drawn["static_map"] = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
@@ -65,11 +65,23 @@ def metrics(
     bla: LinearModel,
     dataset: Dataset,
     *,
+    own: Mapping[str, LinearModel] | None = None,
     seed: int,
     data_seed: int | None,
     command: str,
 ) -> dict:
-    """What ``metrics.json`` holds, scores by test record; None where a number is not finite."""
+    """What ``metrics.json`` holds, scores by test record; None where a number is not finite.
+
+    Args:
+        result: the fit.
+        bla: linear model of all training records.
+        dataset: what was fitted, chosen on and is scored.
+        own: linear models of single tests, by name (see ``Dataset.linear``).
+        seed: of the first random start.
+        data_seed: of simulated data.
+        command: that made it.
+    """
+    own = own or {}
     model = result.model
     validation = [score(model, bla, record) for record in dataset.validation]
     entries = {
@@ -103,7 +115,11 @@ def metrics(
             {"seed": seeds(seed, start.number + 1)[-1], **asdict(start)} for start in result.starts
         ],
         "command": command,
-        "scores": {record.name: asdict(score(model, bla, record)) for record in dataset.tests},
+        "scores": {
+            record.name: asdict(score(model, own.get(record.name, bla), record))
+            for record in dataset.tests
+        },
+        "linear": {name: list(dataset.linear[name]) for name in own},
         "versions": {
             "python": platform.python_version(),
             **{name: version(name) for name in ("lfrtorch", "torch", "numpy", "scipy", "numba")},
@@ -134,6 +150,9 @@ def table(result: dict, published: Sequence[Published]) -> str:
     static = f"degree {sizes['degree']}" if "degree" in sizes else f"{sizes['nn']} neurons"
     title += f", nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
     references = [f"{p.label}: {p.reference}" for p in others]
+    if result["linear"]:
+        models = ", ".join(f"{n} of {'+'.join(r)}" for n, r in result["linear"].items())
+        references.insert(0, f"LTI: a model for each of these: {models}")
     rule = "-" * max(map(len, [first, *lines]))
     return "\n".join([title, rule, first, rule, *lines, rule, *references])
 

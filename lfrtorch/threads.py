@@ -70,7 +70,9 @@ def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
 
 
 def each_alone(
-    work: Callable[[Item], Result], items: Sequence[Item], stop: Callable[[], None]
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    stop: Callable[[], None] = lambda: None,
 ) -> list[Result]:
     """The results of ``work`` on each item, one thread an item, ``workers()`` at a time.
 
@@ -87,7 +89,7 @@ def each_alone(
         finally:
             _workers.reset(token)
 
-    if min(len(items), workers()) == 1:
+    if min(len(items), workers()) <= 1:
         return [alone(item) for item in items]
     with spread_by_hand(), ThreadPoolExecutor(workers(), "lfrtorch-alone", _one_thread) as pool:
         begun = [pool.submit(alone, item) for item in items]

@@ -68,6 +68,17 @@ def test_steady_state_is_what_the_equations_settle_to():
     assert np.abs(y[0] - exact).max() > 1e-2  # the transient
 
 
+def test_linear_models_are_those_of_the_published_table():
+    few = parwh.load(source="stand-in", levels=[325, 1000], realisations=2)
+    ours = ("train_1000_1", "train_1000_2")
+    assert few.linear == {
+        "level_325": ("train_325_1", "train_325_2"), "level_1000": ours, "arrow": ours,
+    }  # fmt: skip
+    names = {record.name for record in few.train}
+    assert all(set(records) <= names for records in few.linear.values())
+    assert parwh.load(source="stand-in", levels=[100]).linear == {"level_100": ("train_100",)}
+
+
 def test_two_periods_of_the_arrow_from_rest_end_in_the_scored_one(data):
     arrow = data.tests[-1]
     second = from_rest(np.tile(arrow.u[:, 0], 2))[PERIOD:]

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,6 +35,20 @@ def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:
     bla = lfrtorch.estimate_bla(train, nx=2)
     model = lfrtorch.initialise(bla, train, nz=1, nw=1, nn=3)
     return lfrtorch.fit(model, train, validation, optimiser=lfrtorch.Adam(epochs=2)), bla, data
+
+
+def test_a_test_may_have_a_linear_model_of_its_own(result):
+    fitted, bla, data = result
+    data = replace(data, linear={"test": ("train",)})
+    own = lfrtorch.estimate_bla(data.train, nx=1)
+    metrics = report.metrics(
+        fitted, bla, data, own={"test": own}, seed=0, data_seed=None, command=""
+    )
+    expected = lfrtorch.rmse(data.tests[0], own.simulate(data.tests[0]))
+    assert metrics["scores"]["test"]["lti_rmse"] == expected
+    assert metrics["linear"] == {"test": ["train"]}
+    text = report.table(metrics, data.published)
+    assert "LTI: a model for each of these: test of train\n" in text
 
 
 def test_metrics_are_what_the_model_scores(result):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from lfrtorch.records import Record
@@ -36,6 +37,8 @@ class Dataset:
         noise_rms: rms of the measurement noise added to simulated estimation data, output unit;
             ``None`` for measured data.
         published: results of others on the same tests.
+        linear: training records that a test's own linear model is estimated from, by the names of
+            test and records; tests without an entry have the linear model of all records.
         notes: what a reader of the scores should know of the data, a sentence each.
     """
 
@@ -46,3 +49,4 @@ class Dataset:
     noise_rms: float | None = None
     published: tuple[Published, ...] = field(default_factory=tuple)
     notes: tuple[str, ...] = ()
+    linear: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

@@ -138,7 +138,6 @@ def load(
         data = _Official(path, seed=seed, realisations=realisations, periods=periods)
         archive = official.folder(root) / _ARCHIVE
         notes = (official.archive_note(archive, _MD5, Path(_FILE).name),)
-    several = realisations > 1
 
     def record(
         name: str, u: NDArray[np.float64], y: NDArray[np.float64], *, skip: int = 0
@@ -159,9 +158,9 @@ def load(
     return Dataset(
         name="parwh",
         train=[
-            record(f"train_{level}" + f"_{r + 1}" * several, *data.train(level, r))
+            record(name, *data.train(level, r))
             for level in chosen
-            for r in range(realisations)
+            for r, name in enumerate(_names(level, realisations))
         ],
         validation=[record(f"validation_{level}", *data.validation(level)) for level in chosen],
         tests=[
@@ -171,7 +170,20 @@ def load(
         noise_rms=noise_rms if path is None else None,
         published=_PUBLISHED,
         notes=notes,
+        linear=_linear(chosen, realisations),
     )
+
+
+def _names(level: int, realisations: int) -> tuple[str, ...]:
+    """Of the training records of a level."""
+    several = realisations > 1
+    return tuple(f"train_{level}" + f"_{r + 1}" * several for r in range(realisations))
+
+
+def _linear(levels: Sequence[int], realisations: int) -> dict[str, tuple[str, ...]]:
+    """The published linear models: of each level, that of 1000 mV for the arrow as well."""
+    of_level = {f"level_{level}": _names(level, realisations) for level in levels}
+    return of_level | ({"arrow": of_level["level_1000"]} if "level_1000" in of_level else {})
 
 
 class _Official:
