@@ -214,6 +214,11 @@ def write(
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
     table = report.table(metrics, dataset.published)
     print(table)
+    if metrics["stable_to"] < max(report.LOUDER):
+        print(
+            f"note: stable on the training inputs {metrics['stable_to']:g} times as loud, and no "
+            "longer on the next louder ones tried; validate at the amplitudes you will use."
+        )
     board.text("scores", table)
     for name, figure in figures(result, bla, dataset, own).items():
         figure.savefig(made(folder / "figures") / f"{name}.png", dpi=150)
