@@ -34,10 +34,10 @@ def several(count: int = 5, T: int = 60) -> tuple[list[Model], list[Record], Rec
 def test_the_better_half_goes_on_round_by_round():
     models, train, validation = several()
     rounds: list[Round] = []
-    optimiser = LevenbergMarquardt(max_iter=16, tolerance=0)
+    optimiser = LevenbergMarquardt(max_iter=32, tolerance=0)
     result = fit_starts(models, train, validation, optimiser=optimiser, watch=rounds.append)
-    assert [(r.number, r.count) for r in rounds] == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    assert [len(r.starts) for r in rounds] == [5, 3, 2, 1]
+    assert [(r.number, r.count) for r in rounds] == [(1, 3), (2, 3), (3, 3)]
+    assert [len(r.starts) for r in rounds] == [5, 3, 2]
     for one, following in pairwise(rounds):
         kept = {start.number for start in one.starts[: len(following.starts)]}
         assert {start.number for start in following.starts} == kept
@@ -46,8 +46,9 @@ def test_the_better_half_goes_on_round_by_round():
         assert errors == sorted(errors)
     ends = {start.number: start.iterations for start in result.starts}
     assert ends == {start.number: start.iterations for one in rounds for start in one.starts}
-    assert sorted(ends.values()) == [2, 2, 4, 8, 16]
-    assert [start.reason == LEFT for start in result.starts].count(True) == 4
+    assert sorted(ends.values())[:3] == [2, 2, 4]
+    assert min(ends[start.number] for start in rounds[-1].starts) > 4
+    assert [start.reason == LEFT for start in result.starts].count(True) == 3
 
 
 def test_the_best_start_is_what_it_is_alone():
