@@ -172,6 +172,15 @@ def test_default_records(simulated):
     assert (simulated.name, simulated.noise_rms) == ("boucwen", 8e-6)
 
 
+def test_several_training_realisations(simulated):
+    first, second, third = boucwen.load(rms=[50, 25, 50]).train
+    assert [r.name for r in (first, second, third)] == ["train", "train_1", "train_2"]
+    assert np.array_equal(first.y, simulated.train[0].y)
+    assert [np.std(r.u) for r in (second, third)] == pytest.approx([25, 50], rel=1e-4)
+    inputs = [r.u[:, 0] for r in (first, second, third, *simulated.validation)]
+    assert np.abs(np.corrcoef(inputs) - np.eye(6)).max() < 0.3
+
+
 def test_tests_are_labelled(simulated):
     multisine, sweep = simulated.tests
     assert (multisine.name, multisine.source, multisine.start) == (
@@ -352,10 +361,14 @@ def test_refused_damaged_files(tmp_path, damage):
             {"seed": 3, "validation_seed_offset": -4},
             "data.validation_seed_offset is -4; give a whole number of at least -3",
         ),
-        ({"validation_seed_offset": 0}, "none the training or simulated test realisation"),
-        ({"validation_seed_offset": 1999}, "none the training or simulated test realisation"),
-        ({"validation_rms": []}, r"0 level\(s\) of validation_rms: there must be one or more"),
-        ({"validation_rms": [50, 0]}, "data.validation_rms is 0.0; give"),
+        ({"validation_seed_offset": 0}, "none may be the training or simulated test realisation"),
+        (
+            {"validation_seed_offset": 1999},
+            "none may be the training or simulated test realisation",
+        ),
+        ({"validation_rms": []}, "data.validation_rms is empty; give"),
+        ({"rms": [50, -1]}, "data.rms is -1; give a positive"),
+        ({"validation_rms": [50, 0]}, "data.validation_rms is 0; give"),
     ],
 )
 def test_refused_arguments(arguments, match):

@@ -71,7 +71,7 @@ def load(
     seed: int = 0,
     validation_seed_offset: int = 1000,
     samples: int = _PERIOD,
-    rms: float = 50.0,
+    rms: float | Sequence[float] = 50.0,
     validation_rms: Sequence[float] = (50.0, 25.0, 10.0),
     noise_rms: float = 8e-6,
     root: str | Path | None = None,
@@ -91,7 +91,7 @@ def load(
         validation_seed_offset: added to ``seed`` for the first validation realisation; those of the
             other levels follow.
         samples: of one estimation period, at 750 Hz.
-        rms: of the training input, N.
+        rms: of the training input, N; of several, a realisation each.
         validation_rms: of the validation inputs, N.
         noise_rms: of the measurement noise before the decimation, m; the low-pass filters leave
             0.92 of it: 7.35e-6 m of the official 8e-6 m.
@@ -108,23 +108,26 @@ def load(
     """
     integer("data.seed", seed, 0)
     integer("data.validation_seed_offset", validation_seed_offset, -seed)
-    number("data.rms", rms, positive=True)
     number("data.noise_rms", noise_rms)
-    levels = [float(level) for level in validation_rms]
-    for level in levels:
-        number("data.validation_rms", level, positive=True)
+    trained = _levels("data.rms", rms)
+    levels = _levels("data.validation_rms", validation_rms)
     offsets = range(validation_seed_offset, validation_seed_offset + len(levels))
-    if not levels or 0 in offsets or _TEST_OFFSET in offsets:
+    if 0 in offsets or _TEST_OFFSET in offsets:
         raise ValueError(
             f"validation_seed_offset={validation_seed_offset} and {len(levels)} level(s) of "
-            "validation_rms: there must be one or more, and none the training or simulated test "
-            f"realisation (offsets 0 and {_TEST_OFFSET}); use for example 1000 and [50]."
+            "validation_rms: none may be the training or simulated test realisation "
+            f"(offsets 0 and {_TEST_OFFSET}); use for example 1000."
         )
     folder = _official_folder(root)
     estimation: dict[str, Any] = {"samples": samples, "noise_rms": noise_rms}
     return Dataset(
         name="boucwen",
-        train=[_realisation("train", seed, rms=rms, **estimation)],
+        train=[
+            _realisation(
+                f"train_{r}" if r else "train", [seed, r] if r else seed, rms=level, **estimation
+            )
+            for r, level in enumerate(trained)
+        ],
         validation=[
             _realisation(f"validation_{level:g}", seed + offset, rms=level, **estimation)
             for offset, level in zip(offsets, levels, strict=True)
@@ -288,7 +291,19 @@ def _decimate(x: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
     return windows @ firwin(_TAPS, 1 / factor, window="hamming")
 
 
-def _realisation(name: str, seed: int, *, samples: int, rms: float, noise_rms: float) -> Record:
+def _levels(name: str, given: float | Sequence[float]) -> list[float]:
+    """One level or several, in N."""
+    levels = list(given) if isinstance(given, Sequence) else [given]
+    if not levels:
+        raise ValueError(f"{name} is empty; give one level or more, in N, for example [50].")
+    for level in levels:
+        number(name, level, positive=True)
+    return [float(level) for level in levels]
+
+
+def _realisation(
+    name: str, seed: int | list[int], *, samples: int, rms: float, noise_rms: float
+) -> Record:
     """One steady-state period by the official procedure, at any length of period.
 
     From rest, the transient dropped: one period of 8192 samples, or as many shorter ones as
