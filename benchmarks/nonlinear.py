@@ -2,9 +2,9 @@
 
     python benchmarks/nonlinear.py --peers DIR [--seeds 1] [--bla-iter 100]
 
-DIR holds an environment ``venv`` with freq-statespace, which runs its whole recipe on the
-same records: best linear approximation, inference and learning, all parameters. It had up to half an
-hour a seed on one core. Ours is a default run on the same core. Prints a table in Markdown.
+DIR holds an environment ``venv`` with freq-statespace, which runs its own recipe on the same
+records: best linear approximation, inference and learning, all parameters. Ours is a default run,
+on the same core. Prints a table in Markdown.
 """
 
 from __future__ import annotations
