@@ -101,7 +101,8 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
 
     best, several = folder / "model", len(models) > 1
     settings = {"optimiser": instantiate(cfg.trainer), "ridge": cfg.ridge, "ranks": ranks}
-    search = partial(lfrtorch.fit_starts, models, dataset.train, dataset.validation, **settings)
+    records = (dataset.train, dataset.validation, dataset.selection)
+    search = partial(lfrtorch.fit_starts, models, *records, **settings)
     with Termination(ranks) as termination:
         if ranks.rank > 0:
             result = search(monitors=[[termination]] * len(models))

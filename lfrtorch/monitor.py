@@ -90,7 +90,8 @@ class StartsLine:
 
     def round(self, ended: Round) -> None:
         """Show a round that has ended."""
-        errors = [s.train if math.isnan(s.validation) else s.validation for s in ended.starts]
+        judged = [(s.selection, s.validation, s.train) for s in ended.starts]
+        errors = [next(e for e in each if not math.isnan(e)) for each in judged]
         numbers = {"best": errors[0], "median": median(errors), "worst": max(errors)}
         text = (
             f"round {ended.number} of {ended.count}: {len(errors)} start(s) to iteration "

@@ -119,6 +119,7 @@ def metrics(
     own = own or {}
     model = result.model
     validation = [score(model, bla, record) for record in dataset.validation]
+    selection = [score(model, bla, record) for record in dataset.selection]
     entries = {
         "bench": dataset.name,
         "sizes": model.sizes,
@@ -141,7 +142,11 @@ def metrics(
             "lti_rmse": _pooled([s.lti_rmse for s in validation], validation),
             "records": {
                 record.name: asdict(s)
-                for record, s in zip(dataset.validation, validation, strict=True)
+                for record, s in zip(
+                    (*dataset.validation, *dataset.selection),
+                    (*validation, *selection),
+                    strict=True,
+                )
             },
         },
         "chosen_iteration": result.chosen_iteration,
@@ -195,18 +200,19 @@ def table(result: dict, published: Sequence[Published]) -> str:
 
 def starts_table(result: dict) -> str:
     """All starts of a fit, the best first."""
-    head = ["seed", "iterations", "training", "validation", ""]
+    head = ["seed", "iterations", "training", "validation", "selection", ""]
     rows = [
         [
             str(s["seed"]),
             str(s["iterations"]),
             _number(s["train"]),
             _number(s["validation"]),
+            _number(s["selection"]),
             s["reason"],
         ]
         for s in result["ranking"]
     ]
-    return "\n".join(["Starts, the best iterate of each", *_aligned([head, *rows], left=(4,))])
+    return "\n".join(["Starts, the best iterate of each", *_aligned([head, *rows], left=(5,))])
 
 
 def _aligned(rows: Sequence[Sequence[str]], left: Sequence[int]) -> list[str]:

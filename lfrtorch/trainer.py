@@ -118,6 +118,7 @@ class Start:
         number: its place in the order given, from 0.
         iterations: it had.
         train, validation: errors of its best iterate, output unit.
+        selection: its error on all records that choose among starts; NaN where there are none.
         reason: why it ended.
     """
 
@@ -125,6 +126,7 @@ class Start:
     iterations: int
     train: float
     validation: float
+    selection: float
     reason: str
 
 

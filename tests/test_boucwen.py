@@ -156,8 +156,8 @@ def test_phases_are_uniform():
 
 
 def test_default_records(simulated):
-    (train,), (validation, *levels) = simulated.train, simulated.validation
-    assert [record.name for record in levels] == ["validation_25", "validation_10"]
+    (train,), (validation,), levels = simulated.train, simulated.validation, simulated.selection
+    assert [record.name for record in levels] == ["selection_25", "selection_10"]
     assert [np.std(r.u) for r in levels] == pytest.approx([25, 10], rel=1e-4)
     assert np.array_equal(levels[1].u[:, 0], boucwen.multisine(rms=10.0, seed=1002)[::RATIO])
     for record, seed in ((train, 0), (validation, 1000)):
@@ -168,7 +168,7 @@ def test_default_records(simulated):
         assert np.array_equal(record.u[:, 0], boucwen.multisine(seed=seed)[::RATIO])
         assert np.std(record.u) == pytest.approx(50, rel=1e-4)
         assert np.std(record.y) == pytest.approx(6.6e-4, rel=0.1)
-    assert (train.name, validation.name) == ("train", "validation_50")
+    assert (train.name, validation.name) == ("train", "validation")
     assert (simulated.name, simulated.noise_rms) == ("boucwen", 8e-6)
 
 
@@ -178,7 +178,7 @@ def test_several_training_realisations(simulated):
     assert np.array_equal(first.y, simulated.train[0].y)
     assert [np.std(r.u) for r in (second, third)] == pytest.approx([25, 50], rel=1e-4)
     inputs = [r.u[:, 0] for r in (first, second, third, *simulated.validation)]
-    assert np.abs(np.corrcoef(inputs) - np.eye(6)).max() < 0.3
+    assert np.abs(np.corrcoef(inputs) - np.eye(4)).max() < 0.3
 
 
 def test_tests_are_labelled(simulated):
@@ -366,9 +366,9 @@ def test_refused_damaged_files(tmp_path, damage):
             {"validation_seed_offset": 1999},
             "none may be the training or simulated test realisation",
         ),
-        ({"validation_rms": []}, "data.validation_rms is empty; give"),
+        ({"rms": []}, "data.rms is empty; give"),
         ({"rms": [50, -1]}, "data.rms is -1; give a positive"),
-        ({"validation_rms": [50, 0]}, "data.validation_rms is 0; give"),
+        ({"selection_rms": [50, 0]}, "data.selection_rms is 0; give"),
     ],
 )
 def test_refused_arguments(arguments, match):

@@ -1,6 +1,7 @@
 """The progress line, the TensorBoard events and the checkpoints of a fit."""
 
 import io
+import math
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +66,7 @@ def test_a_terminal_gets_one_live_line(model: lfrtorch.Model):
 
 
 def test_a_round_of_starts_is_a_line(model: lfrtorch.Model):
-    starts = tuple(Start(i, 25, 1.0, e, "") for i, e in ((3, 1e-3), (0, 2e-3), (1, 5e-3)))
+    starts = tuple(Start(i, 25, 1.0, e, math.nan, "") for i, e in ((3, 1e-3), (0, 2e-3), (1, 5e-3)))
     for stream, live in ((io.StringIO(), False), (Terminal(), True)):
         line = StartsLine(3, "m", stream)
         line(model, step(1))

@@ -7,12 +7,14 @@ from typing import Any
 
 import pytest
 import torch
-from reference import random_cell, random_model
+from reference import measure, random_cell, random_model
 from test_trainer import move, planted, theta
 from torch import Tensor
+from torch.nn.utils import vector_to_parameters
 
 from lfrtorch.adam import Adam
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.multistart import LEFT, Round, advance_in_step, fit_starts
 from lfrtorch.ranks import Ranks
@@ -118,6 +120,29 @@ def test_starts_without_validation_are_judged_on_training():
     assert all(math.isnan(start.validation) for start in result.starts)
     errors = [start.train for start in result.starts]
     assert errors == sorted(errors)
+
+
+def test_selection_chooses_among_starts_and_not_among_iterates():
+    models, train, validation = several(4)
+    odd = random_model(random_cell(radius=0.7))
+    vector_to_parameters(theta(models[2]), odd.lfr.parameters())
+    # A record of the third start as it is: at the start it is the best there.
+    selection = measure(odd, 60, seed=9)
+    options: Any = {"optimiser": LevenbergMarquardt(max_iter=3, tolerance=0)}
+    result = fit_starts(models, train, validation, selection, **options)
+    for start in result.starts:
+        (alone,) = several(4)[0][start.number : start.number + 1]
+        until = LevenbergMarquardt(max_iter=start.iterations, tolerance=0)
+        expected = fit(alone, train, validation, optimiser=until)
+        kept = expected.history[expected.chosen_iteration]
+        assert start.validation == pytest.approx(kept.validation, rel=1e-9)
+        errors = [rmse(record, alone.simulate(record)) for record in (validation, selection)]
+        pooled = math.sqrt((errors[0] ** 2 + errors[1] ** 2) / 2)
+        assert start.selection == pytest.approx(pooled, rel=1e-6)
+    errors = [start.selection for start in result.starts]
+    assert errors == sorted(errors)
+    by_validation = fit_starts(several(4)[0], train, validation, **options)
+    assert all(math.isnan(start.selection) for start in by_validation.starts)
 
 
 class Sharing(Ranks):

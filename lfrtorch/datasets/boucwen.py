@@ -72,27 +72,27 @@ def load(
     validation_seed_offset: int = 1000,
     samples: int = _PERIOD,
     rms: float | Sequence[float] = 50.0,
-    validation_rms: Sequence[float] = (50.0, 25.0, 10.0),
+    selection_rms: Sequence[float] = (25.0, 10.0),
     noise_rms: float = 8e-6,
     root: str | Path | None = None,
 ) -> Dataset:
     """Simulated estimation data, and the official tests where their files are at hand.
 
-    Training and validation are steady-state periods of multisine realisations, with measurement
-    noise: one at the level of the training, and one more at each level of validation. (Models that
-    do alike at the training's level differ by 2 at small amplitudes, where hysteresis remembers.)
-    The tests are noise free: ``"multisine"`` is one steady-state period and
-    ``"sweep"`` starts from rest, its first 2000 samples unscored. A test without its files is
+    Training, validation and selection are steady-state periods of multisine realisations, with
+    measurement noise: validation at the level of the first training record, selection at levels of
+    its own. (Starts that do alike at the training's level differ by a factor of 2 at small
+    amplitudes, and on the sweep.) The tests are noise free: ``"multisine"`` is one steady-state
+    period and ``"sweep"`` starts from rest, its first 2000 samples unscored. A test without its files is
     simulated: the sweep is the official one up to rounding, the multisine is another realisation
     of the official kind (drawn from ``seed + 2000``). ``Record.source`` says which it is.
 
     Args:
         seed: of the training realisation and its noise.
-        validation_seed_offset: added to ``seed`` for the first validation realisation; those of the
-            other levels follow.
+        validation_seed_offset: added to ``seed`` for the validation realisation; those of the
+            selection follow.
         samples: of one estimation period, at 750 Hz.
         rms: of the training input, N; of several, a realisation each.
-        validation_rms: of the validation inputs, N.
+        selection_rms: of the selection inputs, N.
         noise_rms: of the measurement noise before the decimation, m; the low-pass filters leave
             0.92 of it: 7.35e-6 m of the official 8e-6 m.
         root: folder that holds ``BoucWen/BoucWenFiles/...`` as the package nonlinear_benchmarks
@@ -110,16 +110,27 @@ def load(
     integer("data.validation_seed_offset", validation_seed_offset, -seed)
     number("data.noise_rms", noise_rms)
     trained = _levels("data.rms", rms)
-    levels = _levels("data.validation_rms", validation_rms)
+    if not trained:
+        raise ValueError("data.rms is empty; give one level or more, in N, for example [50].")
+    levels = [trained[0], *_levels("data.selection_rms", selection_rms)]
     offsets = range(validation_seed_offset, validation_seed_offset + len(levels))
     if 0 in offsets or _TEST_OFFSET in offsets:
         raise ValueError(
-            f"validation_seed_offset={validation_seed_offset} and {len(levels)} level(s) of "
-            "validation_rms: none may be the training or simulated test realisation "
+            f"validation_seed_offset={validation_seed_offset} and {len(levels) - 1} level(s) of "
+            "selection_rms: none may be the training or simulated test realisation "
             f"(offsets 0 and {_TEST_OFFSET}); use for example 1000."
         )
     folder = _official_folder(root)
     estimation: dict[str, Any] = {"samples": samples, "noise_rms": noise_rms}
+    chosen = [
+        _realisation(
+            "validation" if offset == validation_seed_offset else f"selection_{level:g}",
+            seed + offset,
+            rms=level,
+            **estimation,
+        )
+        for offset, level in zip(offsets, levels, strict=True)
+    ]
     return Dataset(
         name="boucwen",
         train=[
@@ -128,10 +139,8 @@ def load(
             )
             for r, level in enumerate(trained)
         ],
-        validation=[
-            _realisation(f"validation_{level:g}", seed + offset, rms=level, **estimation)
-            for offset, level in zip(offsets, levels, strict=True)
-        ],
+        validation=[chosen[0]],
+        selection=chosen[1:],
         tests=[_multisine_test(folder, seed + _TEST_OFFSET), _sweep_test(folder)],
         noise_rms=noise_rms,
         published=_PUBLISHED,
@@ -292,10 +301,8 @@ def _decimate(x: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
 
 
 def _levels(name: str, given: float | Sequence[float]) -> list[float]:
-    """One level or several, in N."""
+    """One level, or several or none, in N."""
     levels = list(given) if isinstance(given, Sequence) else [given]
-    if not levels:
-        raise ValueError(f"{name} is empty; give one level or more, in N, for example [50].")
     for level in levels:
         number(name, level, positive=True)
     return [float(level) for level in levels]

@@ -33,6 +33,8 @@ class Dataset:
         name: the benchmark's name, or the file's stem.
         train: records that are fitted.
         validation: records that choose among iterates and starts; never fitted.
+        selection: more records that choose among starts, and not among the iterates of one: at
+            other amplitudes, for example.
         tests: records touched by evaluation alone.
         noise_rms: rms of the measurement noise added to simulated estimation data, output unit;
             ``None`` for measured data.
@@ -48,5 +50,6 @@ class Dataset:
     tests: list[Record]
     noise_rms: float | None = None
     published: tuple[Published, ...] = field(default_factory=tuple)
+    selection: list[Record] = field(default_factory=list)
     notes: tuple[str, ...] = ()
     linear: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
