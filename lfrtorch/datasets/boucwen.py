@@ -82,9 +82,9 @@ def load(
     measurement noise: validation at the level of the first training record, selection at levels of
     its own. (Starts that do alike at the training's level differ by a factor of 2 at small
     amplitudes, and on the sweep.) The tests are noise free: ``"multisine"`` is one steady-state
-    period and ``"sweep"`` starts from rest, its first 2000 samples unscored. A test without its files is
-    simulated: the sweep is the official one up to rounding, the multisine is another realisation
-    of the official kind (drawn from ``seed + 2000``). ``Record.source`` says which it is.
+    period and ``"sweep"`` starts from rest, its first 2000 samples unscored. A test without its
+    files is simulated: the sweep is the official one up to rounding, the multisine is another
+    realisation of the official kind (drawn from ``seed + 2000``). ``Record.source`` says which.
 
     Args:
         seed: of the training realisation and its noise.
