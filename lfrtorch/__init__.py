@@ -1,6 +1,6 @@
 """Identification of nonlinear LFR state-space models from input-output data.
 
-records -> estimate_bla -> initialise -> fit -> simulate, save, load
+records -> estimate_bla -> initialise or inference -> fit -> simulate, save, load
 records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 """
 
@@ -11,6 +11,7 @@ from lfrtorch.adam import Adam
 from lfrtorch.bla import estimate_bla
 from lfrtorch.cell import LFRCell
 from lfrtorch.frf import FRF, estimate_frf
+from lfrtorch.inference import inference
 from lfrtorch.initialise import initialise
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.lfr import LFR
@@ -48,6 +49,7 @@ __all__ = [
     "estimate_frf",
     "fit",
     "fit_starts",
+    "inference",
     "initialise",
     "load",
     "multisine",

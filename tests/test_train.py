@@ -92,11 +92,16 @@ def test_every_bench_composes(bench: str):
 
 
 ADAM = "init=paper trainer=adam trainer.epochs=2"
+INFERENCE = "init=inference trainer.max_iter=2"
 
 
 @pytest.mark.parametrize(
     ("bench", "choice"),
-    [*((bench, "init=zero_output trainer.max_iter=2") for bench in BENCHES), ("boucwen", ADAM)],
+    [
+        *((bench, "init=zero_output trainer.max_iter=2") for bench in BENCHES),
+        ("boucwen", ADAM),
+        ("boucwen", INFERENCE),
+    ],
 )
 def test_every_bench_runs_two_iterations(
     bench: str, choice: str, tmp_path: Path, request: pytest.FixtureRequest
