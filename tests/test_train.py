@@ -26,7 +26,7 @@ CONF = ROOT / "conf"
 BENCHES = sorted(path.stem for path in (CONF / "bench").glob("*.yaml"))
 SHORTER = {  # fewer samples and iterations, so that two iterations take seconds
     "boucwen": "starts=2",
-    "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1",
+    "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1 starts=1",
     "silverbox": "data.validation=0.8 bla.max_iter=1",
     "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1",
 }
