@@ -1,6 +1,6 @@
 """The parallel Wiener-Hammerstein stand-in beside freq-statespace: errors and time.
 
-    python benchmarks/nonlinear.py --peers DIR [--seeds 1] [--bla-iter 100]
+    python benchmarks/nonlinear.py --peers DIR [--seeds 1] [--limits 100 50 50]
 
 DIR holds an environment ``venv`` with freq-statespace, which runs its own recipe on the same
 records: best linear approximation, inference and learning, all parameters. Ours is a default run,
@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peers", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--bla-iter", type=int, default=100)
+    parser.add_argument(
+        "--limits", type=int, nargs=3, default=(100, 50, 50), help="iterations of its stages"
+    )
     options = parser.parse_args()
     core = {min(os.sched_getaffinity(0))}  # on several cores the peer was seen to wait for ever
     os.sched_setaffinity(0, core)
@@ -45,7 +48,7 @@ def main() -> int:
     for seed in range(options.seeds):
         data = parwh.load(source="stand-in", seed=seed)
         ours(seed, data)
-        theirs(seed, data, options.peers / "venv" / "bin" / "python", options.bla_iter)
+        theirs(seed, data, options.peers / "venv" / "bin" / "python", options.limits)
     return 0
 
 
@@ -71,7 +74,7 @@ def row(seed: int, label: str, data: Dataset, simulate, iterations, begin: float
     print(f"| {seed} | {label} | {' | '.join(cells)} | {iterations} | {seconds} |", flush=True)
 
 
-def theirs(seed: int, data: Dataset, python: Path, bla_iter: int) -> None:
+def theirs(seed: int, data: Dataset, python: Path, limits: Sequence[int]) -> None:
     """freq-statespace, stage by stage."""
     u, y = (
         np.stack([getattr(r, side) for r in data.train], axis=-1)[..., None] for side in ("u", "y")
@@ -81,7 +84,7 @@ def theirs(seed: int, data: Dataset, python: Path, bla_iter: int) -> None:
         given, found = Path(place) / "given.npz", Path(place) / "found.npz"
         np.savez(
             given, u=u, y=y, lines=np.arange(1, 4096), fs=data.train[0].fs, degree=DEGREE,
-            bla_iter=bla_iter, **SIZES, **tests,
+            limits=limits, **SIZES, **tests,
         )  # fmt: skip
         command = [str(python), str(HERE / "peer_nl.py"), str(given), str(found)]
         environment = os.environ | {"PYTHONHASHSEED": "0"}

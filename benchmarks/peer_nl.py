@@ -1,9 +1,9 @@
 """The whole recipe of freq-statespace; runs in its environment, from and to a .npz file.
 
 venv/bin/python peer_nl.py IN.npz OUT.npz: u, y (N, 1, R, 1) in steady state, lines, fs, nx, nw, nz,
-degree, bla_iter (its limit of 1000 takes 20 minutes at order 12), and u_NAME of tests, which are
-simulated to their steady state. BLA, inference and learning, all parameters by
-Levenberg-Marquardt, each with its defaults but for that limit.
+degree, u_NAME of tests, which are simulated to their steady state, and the most iterations of BLA,
+inference and learning, and all parameters by Levenberg-Marquardt (its own 1000, 1000 and 100 would
+take hours); all else are its defaults.
 """
 
 import json
@@ -42,6 +42,7 @@ def stage(name, work):
     return model
 
 
+limits = [int(limit) for limit in given["limits"]]
 told = {"print_every": -1, "return_solve_details": True}
 data = fss.create_data_object(given["u"], given["y"], given["lines"], float(given["fs"]))
 model = stage(
@@ -51,6 +52,10 @@ model = stage("BLA", lambda: fss.lin.optimize(model, data, max_iter=int(given["b
 phi = fss.static.basis.Polynomial(int(given["nz"]), int(given["degree"]))
 model = stage(
     "inference and learning",
-    lambda: fss.nonlin.inference_and_learning(model, data, phi, int(given["nw"]), **told),
+    lambda: fss.nonlin.inference_and_learning(
+        model, data, phi, int(given["nw"]), max_iter=limits[1], **told
+    ),
 )
-model = stage("all parameters", lambda: fss.nonlin.optimize(model, data, **told))
+model = stage(
+    "all parameters", lambda: fss.nonlin.optimize(model, data, max_iter=limits[2], **told)
+)

@@ -240,6 +240,8 @@ def _finite(entry: Any) -> Any:
     """The same nested entries with None for every number that JSON cannot hold."""
     if isinstance(entry, dict):
         return {key: _finite(value) for key, value in entry.items()}
+    if isinstance(entry, list):
+        return [_finite(value) for value in entry]
     return None if isinstance(entry, float) and not math.isfinite(entry) else entry
 
 

@@ -38,6 +38,27 @@ def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:
     return lfrtorch.fit(model, train, validation, optimiser=lfrtorch.Adam(epochs=2)), bla, data
 
 
+def test_starts_are_ranked_in_files_and_in_a_table(result):
+    _, bla, data = result
+    models = [
+        lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=3, seed=seed)
+        for seed in report.seeds(7, 3)
+    ]
+    fitted = lfrtorch.fit_starts(
+        models, data.train, data.validation, optimiser=lfrtorch.LevenbergMarquardt(max_iter=4)
+    )
+    metrics = report.metrics(fitted, bla, data, seed=7, data_seed=None, command="")
+    assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
+    assert metrics["starts"] == 3
+    assert sorted(start["seed"] for start in metrics["ranking"]) == [7, 1007, 2007]
+    assert {start["selection"] for start in metrics["ranking"]} == {None}
+    assert metrics["ranking"][0]["validation"] == fitted.starts[0].validation
+    lines = report.starts_table(metrics).splitlines()
+    assert lines[1].split() == ["seed", "iterations", "training", "validation", "selection"]
+    assert lines[2].split()[0] == str(metrics["ranking"][0]["seed"])
+    assert lines[3].endswith("others were better")
+
+
 def test_a_test_may_have_a_linear_model_of_its_own(result):
     fitted, bla, data = result
     data = replace(data, linear={"test": ("train",)})
