@@ -1,12 +1,12 @@
 """A fit from several starts: the better half goes on after each of the first rounds.
 
 The rounds end at 1/16 and 1/8 of the iterations; the quarter that is left, two at least, goes to
-the end. From 16 starts 4 do, and all cost as much as 5 fits. It is successive halving whose decisions come early: on
-the Bouc-Wen benchmark (16 starts, 5 realisations, 200 iterations) they lose little, as starts that
-come to nothing show at once, and later ones lose the best. Mean of the smallest squared validation
-error: all to the end 3.37 (3026 iterations), half after 1/16 or 1/8 3.37 (1609, 1696), half after
-1/5 3.45, after 3/10 3.48, quarter after 1/16 and 1/8 3.43 (926), an eighth after 1/8, 1/4 and 1/2
-3.59 (933).
+the end. From 16 starts 4 do, and all cost as much as 5 fits. It is successive halving whose
+decisions come early: on the Bouc-Wen benchmark (16 starts, 5 realisations, 200 iterations) they
+lose little, as starts that come to nothing show at once, and later ones lose the best. Mean of the
+smallest squared validation error: all to the end 3.37 (3026 iterations), half after 1/16 or 1/8
+3.37 (1609, 1696), half after 1/5 3.45, after 3/10 3.48, quarter after 1/16 and 1/8 3.43 (926), an
+eighth after 1/8, 1/4 and 1/2 3.59 (933).
 
 References:
     Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter
@@ -45,8 +45,8 @@ ROUNDS = (1 / 16, 1 / 8)
 """Parts of the iterations after which the worse half is left."""
 
 FINALISTS = 2
-"""Least number of starts that go to the end: of four on the parallel Wiener-Hammerstein stand-in the
-best one after 25 iterations ended in a poor minimum at one of five realisations."""
+"""Least number of starts that go to the end: of four on the parallel Wiener-Hammerstein stand-in
+the best one after 25 iterations ended in a poor minimum at one of five realisations."""
 
 LEFT = "others were better"
 """Reason of a start that was left."""
