@@ -271,7 +271,7 @@ def test_torchrun_makes_one_run(tmp_path: Path):
     assert load(folder).sizes["nx"] == 2
 
 
-@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize("rank", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_killed_process_leaves_the_last_model(rank: int, tmp_path: Path):
     dying = ["trainer._target_=test_distributed.Dying", f"+trainer.rank={rank}"]
     done = torchrun(*dying, folder=tmp_path)
