@@ -103,6 +103,7 @@ def table(done: list[dict]) -> str:
                 if runs:
                     columns = [[r["validation"] for r in runs]]
                     columns += [[r["tests"][name] for r in runs] for name in tests]
+                    columns = [np.nan_to_num(c, nan=np.inf) for c in columns]  # diverged
                     cells = [f"{np.median(c):.3g} ({max(c):.3g})" for c in columns]
                     seconds = np.median([r["seconds"] for r in runs])
                     cells = [variant, str(iterations), str(len(runs)), *cells, f"{seconds:.0f}"]
