@@ -208,7 +208,7 @@ def write(
         data_seed=cfg.data.get("seed"),
         command=command,
     )
-    if result.starts:
+    if len(result.starts) > 1:
         print(report.starts_table(metrics) + "\n")
     text = json.dumps(metrics, indent=2, allow_nan=False)
     (folder / "metrics.json").write_text(text + "\n")

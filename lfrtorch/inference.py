@@ -329,6 +329,8 @@ def inference(
 ) -> Model:
     """NL-LFR model that starts better than the linear model, whose A, Bu, Cy and Dyu it keeps.
 
+    (But for slow modes that explain nothing, see ``initialise``.)
+
     From a random draw of B and N as ``initialise`` makes it, w and the states are inferred from
     what the linear model leaves of periodic records, and a polynomial map from z to w is learnt
     with B and N (see the head of this module). The static map of the model is fitted to the

@@ -3,8 +3,8 @@
 An order above what the linear approximation carries, as nonlinear systems ask for, leaves the
 estimate modes that fit a few lines of the distortion: close to the unit circle, and next to nothing
 of the output. As part of the start of a nonlinear fit they are of huge sensitivity and hold every
-step short: on the parallel Wiener-Hammerstein stand-in three starts of ten got stuck, and with such
-modes pulled in none of twenty-two.
+step short: on the parallel Wiener-Hammerstein stand-in three starts of ten were at 0.6 to 2.5 mV
+after 100 iterations, and with such modes pulled in all of 22 at 0.42 or less after 60.
 """
 
 from __future__ import annotations
