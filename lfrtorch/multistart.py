@@ -117,7 +117,8 @@ def fit_starts(
         Fit(model, train, validation, optimiser=optimiser, ridge=ridge, ranks=ranks)
         for model in models
     ]
-    judge = _Judge(fits, [*as_records(validation), *as_records(selection)] if selection else [])
+    judging = (validation, selection) if selection else ()
+    judge = _Judge(fits, [record for some in judging if some for record in as_records(some)])
     together = _Together(fits, monitors or [()] * len(fits))
     limit, field = fits[0].optimiser.limit, fits
     rounds = ROUNDS if len(fits) > 1 else ()

@@ -141,6 +141,10 @@ def test_selection_chooses_among_starts_and_not_among_iterates():
         assert start.selection == pytest.approx(pooled, rel=1e-6)
     errors = [start.selection for start in result.starts]
     assert errors == sorted(errors)
+    alone = fit_starts(several(4)[0], train, selection=selection, **options)
+    assert alone.starts[0].selection == pytest.approx(
+        rmse(selection, alone.model.simulate(selection)), rel=1e-6
+    )
     by_validation = fit_starts(several(4)[0], train, validation, **options)
     assert all(math.isnan(start.selection) for start in by_validation.starts)
 
