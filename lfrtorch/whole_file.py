@@ -1,0 +1,36 @@
+"""A file that is written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def refuse_existing(path: str | Path, option: str) -> None:
+    """Refuse a path where something is with a ValueError that names the option to replace it."""
+    if Path(path).exists():
+        raise ValueError(f"'{path}' exists; give another name, or {option} to replace it.")
+
+
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """A path beside ``path`` to write to, of the same extension; it takes the place of ``path``.
+
+    Not where the block raises: then nothing is left, and what was at ``path`` stays as it was.
+    """
+    path = Path(path).resolve()  # a link's target is replaced, not the link
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    fresh = Path(name)
+    try:
+        yield fresh
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(fresh, 0o666 & ~mask)  # a temporary file is its owner's alone
+        os.replace(fresh, path)
+    finally:
+        fresh.unlink(missing_ok=True)
