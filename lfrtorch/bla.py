@@ -271,7 +271,10 @@ def _best(
             last = cost
     searches: list[tuple[Start, Search]] = []
     for start, matrices in field if max_iter > FIRST_STEPS else field[:1]:
-        search = problem.search(_scaled(problem, matrices, balanced=balanced))
+        try:
+            search = problem.search(_scaled(problem, matrices, balanced=balanced))
+        except ValueError:  # states that the data hardly move: their scaling is all rounding
+            search = problem.search(matrices)
         searches.append((start, search.advance(min(FIRST_STEPS, max_iter))))
         costs = [search.state.cost for _, search in searches]
         if len(costs) >= AGREED and max(costs[-AGREED:]) <= SAME * min(costs):
