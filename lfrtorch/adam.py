@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from lfrtorch.checks import integer, number
+
+SPENT = "maximum number of epochs"
 
 
 class Differentiable(Protocol):
@@ -29,7 +30,7 @@ class AdamState:
     gradient: Tensor
     iteration: int = 0
     reason: str = ""
-    moments: dict = field(default_factory=dict)
+    moments: dict[str, Tensor] = field(default_factory=dict)
 
     @property
     def report(self) -> dict[str, float]:
@@ -67,16 +68,22 @@ class Adam:
         parameter = torch.nn.Parameter(state.theta.clone())
         optimiser = torch.optim.Adam([parameter], lr=self.learning_rate)
         if state.moments:
-            optimiser.load_state_dict(copy.deepcopy(state.moments))
+            optimiser.state[parameter] = {k: v.clone() for k, v in state.moments.items()}
         parameter.grad = state.gradient
         optimiser.step()
         theta = parameter.detach()
         residual, gradient = problem.gradient(theta)
         iteration = state.iteration + 1
-        reason = "maximum number of epochs" if iteration >= self.epochs else ""
+        reason = SPENT if iteration >= self.epochs else ""
         if not torch.isfinite(gradient).all():
             reason = "diverged: lower the learning rate"
-        return AdamState(theta, residual, gradient, iteration, reason, optimiser.state_dict())
+        moments = dict(optimiser.state[parameter])
+        return AdamState(theta, residual, gradient, iteration, reason, moments)
+
+    def prolonged(self, state: AdamState) -> AdamState:
+        """State to go on from where all epochs were spent and there are more now."""
+        spent = state.reason == SPENT and state.iteration < self.epochs
+        return replace(state, reason="") if spent else state
 
     def refused(self, before: AdamState, after: AdamState) -> AdamState:
         """State to go on from where a step might be taken back: its small steps lead out again."""

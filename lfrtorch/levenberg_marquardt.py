@@ -31,6 +31,8 @@ FASTEST_DECREASE = 0.2
 TAKEN_BACK = 10.0
 """Factor on λ after a step that is taken back; what it decreased at the most, and twice more."""
 
+SPENT = "maximum number of iterations"
+
 
 class Jacobian(Protocol):
     """The Jacobian J (M, P) of a residual as far as the search needs it: never the whole of it."""
@@ -235,6 +237,11 @@ class LevenbergMarquardt:
             reason=after.reason,
         )
 
+    def prolonged(self, state: LMState) -> LMState:
+        """State to go on from where all iterations were spent and there are more now."""
+        spent = state.reason == SPENT and state.iteration < self.max_iter
+        return replace(state, reason="") if spent else state
+
     def steps(self, stack: ManyLeastSquares, states: Sequence[LMState]) -> list[LMState]:
         """One iteration of each of several searches, evaluated together.
 
@@ -314,7 +321,7 @@ class LevenbergMarquardt:
                 if quiet >= self.patience:
                     return replace(accepted, reason="converged: the cost no longer falls")
                 if accepted.iteration >= self.max_iter:
-                    return replace(accepted, reason="maximum number of iterations")
+                    return replace(accepted, reason=SPENT)
                 return accepted
             damping *= growth
             growth *= 2.0

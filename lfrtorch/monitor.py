@@ -167,11 +167,12 @@ class Checkpoint:
     Args:
         folder: of the checkpoint.
         every: least seconds between two of them, the first is that of the start.
+        least: score that an iterate must beat, that of the checkpoint there.
     """
 
-    def __init__(self, folder: str | Path, every: float = 5.0) -> None:
+    def __init__(self, folder: str | Path, every: float = 5.0, least: float = math.inf) -> None:
         self.folder, self.every = Path(folder), every
-        self._due, self._least = -math.inf, math.inf
+        self._due, self._least = -math.inf, least
         self._unwritten: Model | None = None
 
     def __call__(self, model: Model, progress: Progress) -> None:

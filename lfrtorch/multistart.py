@@ -29,6 +29,7 @@ from lfrtorch.model import Model
 from lfrtorch.ranks import LOST, Ranks
 from lfrtorch.records import Record, as_records
 from lfrtorch.residual import Ridge, SimulationError
+from lfrtorch.resume import Snapshots
 from lfrtorch.stack import Stack
 from lfrtorch.threads import each_alone, spread_by_hand
 from lfrtorch.trainer import (
@@ -80,6 +81,7 @@ def fit_starts(
     monitors: Sequence[Sequence[Monitor]] = (),
     watch: Callable[[Round], None] = lambda _: None,
     ranks: Ranks | None = None,
+    snapshots: Snapshots | None = None,
 ) -> FitResult:
     """Minimise the simulation error from several starts, and keep the best.
 
@@ -98,6 +100,8 @@ def fit_starts(
             the first where the model is too small, and worse at the training's level by up to 6 %.)
         monitors: of each start, called one at a time.
         watch: called after each round.
+        snapshots: where the starts are kept as far as they came. Where some are, they go on from
+            there, to the same end as if they had not been interrupted (on as many threads).
 
     Returns:
         The fit of the best start, its duration that of all; ``starts`` has all, the best first.
@@ -113,10 +117,13 @@ def fit_starts(
             "model its own."
         )
     clock = time.perf_counter()
+    snapshots = Snapshots() if snapshots is None else snapshots
+    options = {"optimiser": optimiser, "ridge": ridge, "ranks": ranks}
     fits = [
-        Fit(model, train, validation, optimiser=optimiser, ridge=ridge, ranks=ranks)
-        for model in models
+        Fit(model, train, validation, **options, keep=snapshots.keeper(number))
+        for number, model in enumerate(models)
     ]
+    snapshots.restore(fits)
     judging = (validation, selection) if selection else ()
     judge = _Judge(fits, [record for some in judging if some for record in as_records(some)])
     together = _Together(fits, monitors or [()] * len(fits))
@@ -124,6 +131,9 @@ def fit_starts(
     rounds = ROUNDS if len(fits) > 1 else ()
     ends = sorted({ceil(part * limit) for part in rounds} | {limit})
     for number, until in enumerate(ends, start=1):
+        if number <= len(snapshots.rounds):
+            field = _gone_on(field, [fits[i] for i in snapshots.rounds[number - 1]])
+            continue
         together.advance(field, until)
         field = judge.ranked(field)
         if not field:  # interrupted before there was anything to keep
@@ -134,9 +144,8 @@ def fit_starts(
             break
         if until < limit:
             kept = max(FINALISTS, ceil(len(field) / 2))
-            for fit in field[kept:]:
-                fit.reason = LEFT
-            field = field[:kept]
+            snapshots.decided([judge.number(fit) for fit in field[:kept]])
+            field = _gone_on(field, field[:kept])
     ranked = judge.ranked(fits)
     seconds = time.perf_counter() - clock
     return replace(ranked[0].result(), seconds=seconds, starts=judge.summaries(ranked))
@@ -165,7 +174,7 @@ class _Judge:
         """How far each came."""
         found = []
         for fit in fits:
-            number = self._number(fit)
+            number = self.number(fit)
             error = self._errors[number]
             found.append(
                 Start(
@@ -180,14 +189,15 @@ class _Judge:
         return tuple(found)
 
     def _score(self, fit: Fit) -> float:
-        error = self._errors[self._number(fit)]
+        error = self._errors[self.number(fit)]
         if error is None:
             return fit.best
         score = error.cost(error.residual(error.theta))
         score = float(fit.ranks.first(torch.tensor(score, dtype=torch.float64)))
         return score if math.isfinite(score) else math.inf
 
-    def _number(self, fit: Fit) -> int:
+    def number(self, fit: Fit) -> int:
+        """Its place among all."""
         return next(number for number, other in enumerate(self.fits) if other is fit)
 
 
@@ -256,6 +266,14 @@ def advance_in_step(
     finally:
         for fit in fits:
             fit.pause()
+
+
+def _gone_on(field: list[Fit], kept: list[Fit]) -> list[Fit]:
+    """Those that are kept; the others are left."""
+    for fit in field:
+        if not any(fit is other for other in kept):
+            fit.reason = LEFT
+    return kept
 
 
 def _cut_short(fit: Fit) -> bool:

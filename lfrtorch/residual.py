@@ -16,7 +16,7 @@ from lfrtorch.model import Model
 from lfrtorch.ranks import Ranks
 from lfrtorch.records import Record, as_records
 from lfrtorch.sensitivity import Linearisation
-from lfrtorch.simulate import Trajectory, estimated_start
+from lfrtorch.simulate import Trajectory, estimated_start, is_compiled
 
 Ridge = float | Mapping[str, float]
 
@@ -176,6 +176,36 @@ class SimulationError:
     def release(self) -> None:
         """Let go of what would only speed up the next evaluation."""
         self._latest, self._memory = None, Memory()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What the next evaluations depend on beside θ, the last bit of them included."""
+        tensors = {"start": self._start}
+        cell = self.model.lfr.cell
+        for i, (batch, guess) in enumerate(zip(self.batches, self.guesses, strict=True)):
+            if guess is not None:  # of machine code the start state of a period is of use alone
+                tensors[f"guess.{i}"] = guess[:, :1] if is_compiled(cell, batch.u) else guess
+        if self._reduced is not None:
+            tensors["kept"] = self._reduced.kept
+        return tensors
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take over what the same problem had.
+
+        Raises:
+            ValueError: it is of another problem.
+        """
+        start = tensors["start"]
+        if start.shape != self._start.shape or not torch.allclose(start, self._start, 1e-6, 1e-6):
+            raise ValueError(
+                "the fit that is to go on began elsewhere: the data, the settings or the package "
+                "have changed since. Start a new one, from its best model: init_from=DIR."
+            )
+        self._start = start
+        self.guesses = [tensors.get(f"guess.{i}") for i in range(len(self.batches))]
+        if "kept" in tensors:
+            kept = tensors["kept"]
+            self._reduced = Reduction(kept, start.new_zeros(0, len(start)))
+        self._latest = None
 
     def start_of(self, i: int) -> Tensor | None:
         """Start state (R, nx) of a batch where it is given or a parameter."""

@@ -73,7 +73,7 @@ def simulate(cell: LFRCell, u: Tensor, x0: Tensor, *, guess: Tensor | None = Non
     Shape:
         u: (R, T, nu), x0: (R, nx), guess: (R, T + 1, nx).
     """
-    if _is_compiled(cell, u):
+    if is_compiled(cell, u):
         return _compiled(cell, u, x0, None)
     x = newton(cell, u, x0, guess=guess)
     return _with_loop_where_lost(cell, u, x0, x)
@@ -100,7 +100,7 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
         (R, T + 1, nx), states of a nearby solution.
     """
     x0 = u.new_zeros(len(u), cell.nx) if guess is None else guess
-    compiled = _is_compiled(cell, u)
+    compiled = is_compiled(cell, u)
     if not compiled:
         states = x0 if x0.ndim == 3 else None
         x = newton(cell, u, x0[:, 0] if x0.ndim == 3 else x0, guess=states, periodic=True)
@@ -178,7 +178,8 @@ def estimated_start(cell: LFRCell, u: Tensor, y: Tensor, weight: Tensor) -> Traj
     return best
 
 
-def _is_compiled(cell: LFRCell, u: Tensor) -> bool:
+def is_compiled(cell: LFRCell, u: Tensor) -> bool:
+    """Whether the cell is simulated in machine code, on signals like ``u``."""
     return has_kernels(u) and (cell.static is None or is_network(cell.static))
 
 

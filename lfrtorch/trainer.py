@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from lfrtorch import snapshot
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
 from lfrtorch.ranks import ProcessLost, Ranks
@@ -24,6 +26,9 @@ INTERRUPTED = "interrupted"
 
 EXPLOSION = 100.0
 """Growth of the squared validation error, beyond the start's, in a step that is taken back."""
+
+_KEPT = ("best", "_chosen", "_first", "_score", "_seconds", "_durations")
+"""Numbers of a fit that are saved with it."""
 
 
 class OptimiserState(Protocol):
@@ -75,6 +80,10 @@ class Optimiser(Protocol):
         """State to go on from where a step led to a model that explodes on validation."""
         ...
 
+    def prolonged(self, state: Any) -> Any:
+        """State to go on from where all iterations were spent and there are more now."""
+        ...
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -108,6 +117,9 @@ class Progress:
 
 Monitor = Callable[[Model, Progress], None]
 """Called at the start and after each iteration, the iterate in the model's weights."""
+
+Keep = Callable[["Fit", bool], None]
+"""Called with a fit after each iteration, and where it pauses (then with True)."""
 
 
 @dataclass(frozen=True)
@@ -158,11 +170,17 @@ class FitResult:
         return self.history[-1].iteration
 
 
+def nothing(fit: Fit, paused: bool) -> None:
+    """Keep no fit."""
+
+
 class Fit:
     """A fit that goes on for as many iterations as it is asked for, and keeps the best iterate.
 
     Args:
         model, train, validation, optimiser, ridge, ranks: see :func:`fit`.
+        keep: called with the fit after every iteration, when it may be saved, and with True where
+            it pauses.
 
     Raises:
         ValueError: see :func:`fit`.
@@ -177,8 +195,9 @@ class Fit:
         optimiser: Optimiser | None = None,
         ridge: Ridge = 0.0,
         ranks: Ranks | None = None,
+        keep: Keep = nothing,
     ) -> None:
-        self.model = model
+        self.model, self.keep = model, keep
         self.optimiser = LevenbergMarquardt() if optimiser is None else optimiser
         self.ranks = ranks = Ranks() if ranks is None else ranks
         if ranks.world > 1:
@@ -199,7 +218,8 @@ class Fit:
         """Normalised squared error of the best iterate, on validation where there is one."""
         self._theta_best, self._chosen = self.problem.theta, 0
         self._first = self._score = math.inf
-        self._seconds, self._durations = 0.0, []
+        self._seconds = 0.0
+        self._durations: list[float] = []
 
     @property
     def kept(self) -> Progress:
@@ -244,13 +264,57 @@ class Fit:
         """Put the best iterate into the model, and let go of memory."""
         self.problem.write(self._theta_best)
         self.problem.release()
+        self.keep(self, True)
+
+    def save(self, path: Path) -> None:
+        """Write where the fit stands to a file, from which ``restore`` goes on to the same bits."""
+        state, tensors = snapshot.packed(self.state)
+        problem = self.problem.state_dict()
+        tensors = {f"state.{name}": tensor for name, tensor in tensors.items()}
+        tensors |= {f"problem.{name}": tensor for name, tensor in problem.items()}
+        numbers = {
+            "state": state,
+            "history": [asdict(progress) for progress in self.history],
+            **{name: getattr(self, name) for name in _KEPT},
+        }
+        snapshot.write(path, numbers, tensors | {"best": self._theta_best})
+
+    def restore(self, path: Path) -> None:
+        """Take over where a fit of the same model, records and optimiser stood.
+
+        Raises:
+            ValueError: a damaged file, or another fit.
+        """
+        numbers, tensors = snapshot.read(path)
+        device = self.problem.theta.device
+        self.problem.load_state_dict(snapshot.within("problem.", tensors, device))
+        like = self.optimiser.init(self.problem, self.problem.theta)
+        try:
+            state = snapshot.within("state.", tensors, device)
+            state = snapshot.unpacked(like, numbers["state"], state)
+        except TypeError:
+            raise ValueError(
+                f"'{path}' was left by another optimiser than {type(self.optimiser).__name__}; go "
+                "on with the one that the run had."
+            ) from None
+        if self.ranks.world > 1:  # what was kept is the first one's part
+            state = replace(state, residual=self.problem.residual(state.theta))
+        self.state = self.optimiser.prolonged(state)
+        self.reason = self.state.reason
+        self.history = [Progress(**entry) for entry in numbers["history"]]
+        self._theta_best = tensors["best"].to(device)
+        for name in _KEPT:
+            setattr(self, name, numbers[name])
+        self.problem.write(self._theta_best)
 
     def begin(self, monitors: Sequence[Monitor] = ()) -> None:
         """Judge the start."""
         clock = time.perf_counter()
-        self.state = self.optimiser.init(self.problem, self.problem.theta)
-        self._record(self.state, time.perf_counter() - clock, monitors)
-        self._first = self._score
+        start = self.optimiser.init(self.problem, self.problem.theta)
+        progress = self._judged(start, time.perf_counter() - clock)
+        self._first = progress.score
+        self._enter(start, progress)
+        self._show(progress, monitors)
 
     def take(self, after: Any, seconds: float, monitors: Sequence[Monitor] = ()) -> None:
         """Go on from the optimiser's next state, which took so many seconds to find.
@@ -258,12 +322,15 @@ class Fit:
         Not where the model there explodes on validation: the search goes back, and treads softly.
         """
         before, last = self.state, self._score
+        progress = self._judged(after, seconds)
         if after.theta is not before.theta:
             self._durations.append(seconds)
-        self.state, self.reason = after, after.reason
-        self._record(after, seconds, monitors)
-        if math.isfinite(last) and not self._score <= max(EXPLOSION * last, self._first):
+        self._enter(after, progress)
+        self.reason = after.reason
+        if math.isfinite(last) and not progress.score <= max(EXPLOSION * last, self._first):
             self.state, self._score = self.optimiser.refused(before, after), last
+        self._show(progress, monitors)
+        self.keep(self, False)
 
     def result(self) -> FitResult:
         """What was found."""
@@ -277,8 +344,8 @@ class Fit:
             reason=self.reason,
         )
 
-    def _record(self, state: OptimiserState, seconds: float, monitors: Sequence[Monitor]) -> None:
-        """Judge an iterate, keep it where it is the best, and show it."""
+    def _judged(self, state: OptimiserState, seconds: float) -> Progress:
+        """The progress that an iterate is, which took so many seconds to find."""
         clock, problem = time.perf_counter(), self.problem
         train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")
         score = problem.cost(state.residual)
@@ -290,16 +357,26 @@ class Fit:
             score = float(self.ranks.first(torch.tensor(score, dtype=torch.float64)))
             validation_rmse = self.judge.rmse(theta)
         better = score < self.best  # False for the NaN of a model that diverges on validation
-        if better:
-            self._theta_best, self.best, self._chosen = state.theta, score, len(self.history)
-        self._score = score
-        self._seconds += seconds + time.perf_counter() - clock
-        progress = Progress(
-            state.iteration, self.optimiser.limit, train_rmse, validation_rmse, self._seconds,
-            better, state.report, score,
-        )  # fmt: skip
-        self.history.append(progress)
+        seconds += self._seconds + time.perf_counter() - clock
         problem.write(state.theta)
+        return Progress(
+            state.iteration, self.optimiser.limit, train_rmse, validation_rmse, seconds, better,
+            state.report, score,
+        )  # fmt: skip
+
+    def _enter(self, state: OptimiserState, progress: Progress) -> None:
+        """Note an iterate, and keep it where it is the best."""
+        if progress.best:
+            self._theta_best, self.best, self._chosen = (
+                state.theta,
+                progress.score,
+                len(self.history),
+            )
+        self.state, self._score, self._seconds = state, progress.score, progress.seconds
+        self.history.append(progress)
+
+    def _show(self, progress: Progress, monitors: Sequence[Monitor]) -> None:
+        """Call the monitors, with the latest iterate in the model."""
         for monitor in monitors:
             monitor(self.model, progress)
 
