@@ -1,6 +1,7 @@
 """Identify an NL-LFR model: records -> BLA -> initialisation -> fit -> scores -> files.
 
 python train.py +bench=boucwen
+python train.py resume=runs/boucwen/DATE
 python train.py data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750 nx=3
 torchrun --nproc-per-node 2 train.py ...
 """
@@ -11,6 +12,7 @@ import json
 import math
 import os
 import shlex
+import shutil
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -34,13 +36,18 @@ from lfrtorch.distributed import connect
 from lfrtorch.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
 from lfrtorch.order import OrderScan
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
+from lfrtorch.resume import Snapshots
 from lfrtorch.threads import each_alone
 from lfrtorch.trainer import INTERRUPTED, Progress
+from lfrtorch.whole_file import whole_file
 
 CONF = Path(__file__).resolve().parent / "conf"
 
 WORLD = int(os.environ.get("WORLD_SIZE", "1"))
 """Processes, where torchrun starts them."""
+
+CONFIG, SNAPSHOTS = "config.yaml", "resume"
+"""In the folder of a run: its settings, and its starts as far as they came."""
 
 WITHOUT_FILES = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
 """Of Hydra, for the processes beside the first."""
@@ -88,6 +95,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
     require(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
+    chosen_before(cfg, folder)
     dataset = loaded(cfg)
     shown = dataset.validation[0] if dataset.validation else dataset.train[0]
 
@@ -100,14 +108,22 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
     )
 
     best, several = folder / "model", len(models) > 1
+    if ranks.rank == 0:
+        with whole_file(folder / CONFIG) as fresh:
+            OmegaConf.save(cfg, fresh, resolve=True)
+        if cfg.resume is None:
+            shutil.rmtree(folder / SNAPSHOTS, ignore_errors=True)
+    snapshots = Snapshots(folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None)
     settings = {"optimiser": instantiate(cfg.trainer), "ridge": cfg.ridge, "ranks": ranks}
+    settings["snapshots"] = snapshots
     records = (dataset.train, dataset.validation, dataset.selection)
     search = partial(lfrtorch.fit_starts, models, *records, **settings)
     with Termination(ranks) as termination:
         if ranks.rank > 0:
             result = search(monitors=[[termination]] * len(models))
         else:
-            board, keep = TensorBoard(folder, shown, bla.simulate(shown)), Checkpoint(best)
+            board = TensorBoard(folder, shown, bla.simulate(shown))
+            keep = Checkpoint(best, least=snapshots.least)
             if several:
                 line = StartsLine(len(models), models[0].outputs[0].unit)
                 boards = [TensorBoard(folder / "starts" / str(i)) for i in range(len(models))]
@@ -122,9 +138,11 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
                 line.close()
             write(cfg, folder, command, result, bla, dataset, board)
     if result.reason.startswith(LOST):
-        raise ProcessLost(f"{result.reason}; the best model so far is in {best}")
+        raise ProcessLost(f"{result.reason}; the best model so far is in {best}; {go_on(folder)}")
     if termination.asked == signal.SIGTERM and result.reason == INTERRUPTED:
-        raise Terminated(f"the fit was terminated; the best model so far is in {best}")
+        raise Terminated(
+            f"the fit was terminated; the best model so far is in {best}; {go_on(folder)}"
+        )
     kept = result.history[result.chosen_iteration]
     return kept.train if math.isnan(kept.validation) else kept.validation
 
@@ -211,8 +229,8 @@ def write(
     if len(result.starts) > 1:
         print(report.starts_table(metrics) + "\n")
     text = json.dumps(metrics, indent=2, allow_nan=False)
-    (folder / "metrics.json").write_text(text + "\n")
-    OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+    with whole_file(folder / "metrics.json") as fresh:
+        fresh.write_text(text + "\n")
     table = report.table(metrics, dataset.published)
     print(table)
     if metrics["stable_to"] < max(report.LOUDER):
@@ -226,6 +244,23 @@ def write(
         board.figure(f"result/{name}", figure, result.iterations)
     board.close()
     print(f"\nRun in {folder}\nTensorBoard: tensorboard --logdir {folder}")
+    if result.reason == INTERRUPTED:
+        print(go_on(folder))
+
+
+def go_on(folder: Path) -> str:
+    """How to go on with a run that ended early."""
+    return f"to go on: python train.py resume={folder}"
+
+
+def chosen_before(cfg: DictConfig, folder: Path) -> None:
+    """Take the sizes that the run to go on with chose from the data."""
+    if cfg.resume is None or not (folder / CONFIG).is_file():
+        return
+    before = OmegaConf.load(folder / CONFIG)
+    for name in ("nx", "nz", "nw", "nn", "degree"):
+        if cfg[name] == "auto":
+            cfg[name] = before[name]
 
 
 def require(cfg: DictConfig) -> None:
@@ -321,6 +356,19 @@ def common(folder: Path, ranks: Ranks) -> Path:
 
 
 @contextmanager
+def no_empty_folder(folder: Path) -> Iterator[None]:
+    """A run that fails before it has a model leaves no folder, where nothing else is in it."""
+    try:
+        yield
+    except BaseException:
+        passing = {".hydra", CONFIG, SNAPSHOTS, "starts"}
+        names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        if names and all(name in passing or name.startswith("events.out") for name in names):
+            shutil.rmtree(folder)
+        raise
+
+
+@contextmanager
 def user_errors(rank: str = "0") -> Iterator[None]:
     """User errors end the program with one message and exit code 1, no traceback."""
     error = "error" if rank == "0" else f"error on rank {rank}"
@@ -349,17 +397,53 @@ def main(cfg: DictConfig) -> float:
     if WORLD > 1:
         start = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", str(WORLD))]
     command = shlex.join([*start, "train.py", *run.overrides.task])
-    with user_errors(rank), connect(cfg.device, cfg.timeout) as ranks, ExitStack() as silence:
+    folder = Path(run.runtime.output_dir)
+    with ExitStack() as stack:
+        stack.enter_context(user_errors(rank))
+        if rank == "0":
+            stack.enter_context(no_empty_folder(folder))
+        ranks = stack.enter_context(connect(cfg.device, cfg.timeout))
         if ranks.rank > 0:
-            silence.enter_context(redirect_stdout(silence.enter_context(open(os.devnull, "w"))))
-        return identify(cfg, common(Path(run.runtime.output_dir), ranks), command, ranks)
+            stack.enter_context(redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
+        return identify(cfg, common(folder, ranks), command, ranks)
     raise AssertionError  # user_errors does not return
+
+
+def arguments(given: Sequence[str]) -> list[str]:
+    """The command line with the settings of the run in ``resume=DIR``, if there is one, before it.
+
+    Raises:
+        ValueError: no run there, or a folder given for a new run that holds another one.
+    """
+    values = dict(argument.split("=", 1) for argument in given if "=" in argument)
+    folder = values.get("resume", "null")
+    if folder != "null":
+        overrides = Path(folder) / ".hydra" / "overrides.yaml"
+        if not overrides.is_file():
+            raise ValueError(
+                f"resume is '{folder}', which is not the folder of a run: there is no {overrides}; "
+                "give the folder that train.py named at its end, runs/NAME/DATE."
+            )
+        before = [str(o) for o in OmegaConf.load(overrides) if not str(o).startswith("resume=")]
+        escaped = folder.replace("\\", "\\\\").replace("'", "\\'")
+        return [*before, *given, f"hydra.run.dir='{escaped}'"]
+    for name, mark in (("hydra.run.dir", CONFIG), ("hydra.sweep.dir", "multirun.yaml")):
+        folder = values.get(name, "").strip("'\"")
+        taken = bool(folder) and (Path(folder) / mark).exists()
+        if taken and values.get("overwrite", "").lower() != "true":
+            raise ValueError(
+                f"{name} is '{folder}', which holds a run; give another folder, resume={folder} "
+                "to go on with that run, or overwrite=true to replace it."
+            )
+    return list(given)
 
 
 def launch() -> None:
     """``main``; of several processes the first alone has Hydra write files."""
     if WORLD > 1 and {"-m", "--multirun"} & set(sys.argv):
         sys.exit("error: torchrun shares one fit; start several runs one after another.")
+    with user_errors(os.environ.get("RANK", "0")):
+        sys.argv[1:] = arguments(sys.argv[1:])
     if WORLD > 1 and os.environ["RANK"] != "0":
         sys.argv += WITHOUT_FILES
     main()

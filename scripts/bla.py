@@ -30,7 +30,18 @@ import lfrtorch  # noqa: E402
 from lfrtorch import linear_plots, plots  # noqa: E402
 from lfrtorch.datasets import Dataset  # noqa: E402
 from lfrtorch.ranks import Ranks  # noqa: E402
-from train import CONF, linear, loaded, made, require, user_errors  # noqa: E402
+from lfrtorch.whole_file import whole_file  # noqa: E402
+from train import (  # noqa: E402
+    CONF,
+    CONFIG,
+    arguments,
+    linear,
+    loaded,
+    made,
+    no_empty_folder,
+    require,
+    user_errors,
+)
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
@@ -57,8 +68,10 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     print(f"\n{table(found)}")
     model.save(folder / "linear")
     text = json.dumps(found, indent=2, allow_nan=False)
-    (folder / "linear.json").write_text(text + "\n")
-    OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+    with whole_file(folder / "linear.json") as fresh:
+        fresh.write_text(text + "\n")
+    with whole_file(folder / CONFIG) as fresh:
+        OmegaConf.save(cfg, fresh, resolve=True)
     for name, figure in figures(model, dataset, frf, scan).items():
         figure.savefig(made(folder / "figures") / f"{name}.png", dpi=150)
     print(f"\nRun in {folder}")
@@ -274,9 +287,12 @@ def main(cfg: DictConfig) -> None:
     """The command line."""
     run = HydraConfig.get()
     command = shlex.join(["python", "scripts/bla.py", *run.overrides.task])
-    with user_errors():
-        identify(cfg, Path(run.runtime.output_dir), command)
+    folder = Path(run.runtime.output_dir)
+    with user_errors(), no_empty_folder(folder):
+        identify(cfg, folder, command)
 
 
 if __name__ == "__main__":
+    with user_errors():
+        sys.argv[1:] = arguments(sys.argv[1:])
     main()

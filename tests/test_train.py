@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import get_object, instantiate
 
 import lfrtorch
@@ -272,6 +273,60 @@ def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, t
     assert metrics["scores"]["test"]["rmse"] < metrics["scores"]["test"]["lti_rmse"]
 
 
+def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: Path):
+    settings = [*file_overrides(csv), "nx=1", "starts=2", "trainer.max_iter=8", "threads=1"]
+    cut, whole = tmp_path / "cut", tmp_path / "whole"
+    for folder in (cut, whole):
+        folder.mkdir()
+    train.identify(configuration(*settings), whole)
+    with pytest.raises(train.Terminated, match=f"python train.py resume={cut}"):
+        train.identify(configuration(*settings, "trainer._target_=test_train.Terminated"), cut)
+    assert json.loads((cut / "metrics.json").read_text())["fit"]["reason"] == "interrupted"
+    train.identify(configuration(*settings, f"resume={cut}"), cut)
+    ends = [json.loads((folder / "metrics.json").read_text()) for folder in (cut, whole)]
+    assert ends[0]["scores"] == ends[1]["scores"]
+    assert ends[0]["ranking"] == ends[1]["ranking"]
+    weights = [(f / "model" / "weights.safetensors").read_bytes() for f in (cut, whole)]
+    assert weights[0] == weights[1]
+
+
+def test_a_new_run_forgets_the_one_that_it_replaces(csv: Path, tmp_path: Path):
+    settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=2"]
+    for seed in (0, 1):
+        train.identify(configuration(*settings, f"seed={seed}"), tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["fit"]["iterations"] == 2
+
+
+def test_resume_takes_the_settings_of_the_run(tmp_path: Path):
+    run_folder = tmp_path / "it's a run"
+    (run_folder / ".hydra").mkdir(parents=True)
+    text = "- +bench=boucwen\n- trainer.max_iter=60\n- resume=before\n"
+    (run_folder / ".hydra" / "overrides.yaml").write_text(text)
+    given = [f"resume={run_folder}", "trainer.max_iter=90"]
+    found = train.arguments(given)
+    assert found[:-1] == ["+bench=boucwen", "trainer.max_iter=60", *given]
+    parser = OverridesParser.create()
+    assert parser.parse_override(found[-1]).value() == str(run_folder)
+
+
+def test_resume_needs_a_run(tmp_path: Path):
+    with pytest.raises(ValueError, match="not the folder of a run"):
+        train.arguments([f"resume={tmp_path}"])
+
+
+@pytest.mark.parametrize(
+    ("option", "mark"), [("hydra.run.dir", "config.yaml"), ("hydra.sweep.dir", "multirun.yaml")]
+)
+def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path, option: str, mark: str):
+    given = [f"{option}='{tmp_path}'"]
+    assert train.arguments(given) == given
+    (tmp_path / mark).touch()
+    with pytest.raises(ValueError, match="overwrite=true"):
+        train.arguments(given)
+    assert train.arguments([*given, "overwrite=true"]) == [*given, "overwrite=true"]
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -319,6 +374,7 @@ def test_user_errors_are_one_message(
     assert stop.value.code == 1
     assert message in printed.err
     assert "Traceback" not in printed.err + printed.out
+    assert not (tmp_path / "config.yaml").exists()
 
 
 def test_missing_order_is_one_message_and_exit_code_1(csv: Path, tmp_path: Path):
