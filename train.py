@@ -260,7 +260,7 @@ def chosen_before(cfg: DictConfig, folder: Path) -> None:
     before = OmegaConf.load(folder / CONFIG)
     for name in ("nx", "nz", "nw", "nn", "degree"):
         if cfg[name] == "auto":
-            cfg[name] = before[name]
+            cfg[name] = OmegaConf.select(before, name)
 
 
 def require(cfg: DictConfig) -> None:

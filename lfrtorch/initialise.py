@@ -52,8 +52,8 @@ def initialise(
 
     - ``"paper"``: Bw = Dyw = 0 and Ww ~ U(-1, 1) (Schoukens and Tóth 2020);
     - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021), for a polynomial
-      C = 0. The more reliable one. A module of another class starts as with ``"paper"``, as nothing
-      is known of what makes its output vanish.
+      C = 0. The more reliable one. A module of another class starts so where its output vanishes on
+      the data, with the weights that it has, and else as with ``"paper"``.
 
     Args:
         bla: stable linear model, best in balanced coordinates.
@@ -124,9 +124,9 @@ def initialise(
         spread = _deviation(z)[:, None]
         cell.Cz.div_(spread)
         cell.Dzu.div_(spread)
-        if method == "zero_output" and type(static) in OUTPUT_WEIGHTS:
-            for name in OUTPUT_WEIGHTS[type(static)]:
-                static.get_parameter(name).zero_()
+        for name in OUTPUT_WEIGHTS.get(type(static), ()) if method == "zero_output" else ():
+            static.get_parameter(name).zero_()
+        if method == "zero_output" and not static((z / spread.mT).unsqueeze(0)).any():
             uniform(cell.Bw, OUTPUT_RANGE)
             uniform(cell.Dyw, OUTPUT_RANGE)
     return model

@@ -193,6 +193,17 @@ def test_start_with_a_given_map_is_the_linear_model(bla: LinearModel, name: str,
         assert torch.equal(weight, given[key])
 
 
+@pytest.mark.parametrize("vanishing", [True, False])
+def test_an_own_map_without_an_output_is_let_act_on_the_state(bla: LinearModel, vanishing: bool):
+    """Else neither its weights nor Bw had a slope: the start would be a saddle."""
+    static = Shifted()
+    if vanishing:
+        nn.init.zeros_(static.c)
+    cell = initialise(bla, RECORDS, nz=2, nw=3, static=static).lfr.cell
+    for weight in (cell.Bw, cell.Dyw):
+        assert bool(weight.all()) == bool(weight.any()) == vanishing
+
+
 def test_given_map_changes_nothing_else(bla: LinearModel):
     network = initialise(bla, RECORDS, **SIZES).lfr.state_dict()
     own = initialise(bla, RECORDS, nz=2, nw=3, static=Shifted()).lfr.state_dict()
