@@ -5,7 +5,7 @@ READY := $(VENV)/.ready
 PARTIAL := $(VENV)/.partial
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all check bench clean
+.PHONY: help setup run test test-all check bench docs clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -30,6 +30,10 @@ check: $(READY)  ## format, lint, types, import order
 
 bench: $(READY)  ## costs against what is required (PEERS=DIR, ARGS=--quick)
 	@$(BIN)/python benchmarks/engine.py $(if $(PEERS),--peers "$(PEERS)") $(ARGS)
+
+docs: $(READY)  ## API reference from the docstrings, in site/
+	@$(BIN)/pdoc -d google -o site lfrtorch
+	@echo "Open site/index.html"
 
 clean:  ## remove caches and builds; .venv and runs stay
 	@rm -rf build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
