@@ -23,6 +23,7 @@ from lfrtorch.multistart import fit_starts
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.order import OrderScan, scan_orders
 from lfrtorch.records import Channel, Record, Scaler
+from lfrtorch.sizes import SizeSearch, search_sizes
 from lfrtorch.trainer import FitResult, fit
 
 __version__ = version("lfrtorch")
@@ -43,6 +44,7 @@ __all__ = [
     "Polynomial",
     "Record",
     "Scaler",
+    "SizeSearch",
     "datasets",
     "distributed",
     "estimate_bla",
@@ -56,4 +58,5 @@ __all__ = [
     "nrmse",
     "rmse",
     "scan_orders",
+    "search_sizes",
 ]

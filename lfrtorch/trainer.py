@@ -31,6 +31,10 @@ _KEPT = ("best", "_chosen", "_first", "_score", "_seconds", "_durations")
 """Numbers of a fit that are saved with it."""
 
 
+class StartDiverges(ValueError):
+    """The model diverges on the training records at the start."""
+
+
 class OptimiserState(Protocol):
     """What the loop reads of an optimiser's state."""
 
@@ -206,7 +210,7 @@ class Fit:
         self.problem = SimulationError(model, train, ridge=ridge, ranks=ranks)
         self.judge = SimulationError(model, validation, solved_starts=True) if validation else None
         if not math.isfinite(self.problem.cost(self.problem.residual(self.problem.theta))):
-            raise ValueError(
+            raise StartDiverges(
                 "the model diverges on the training records at the start; start from a stable "
                 "model."
             )
