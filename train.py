@@ -444,6 +444,11 @@ def launch() -> None:
         sys.exit("error: torchrun shares one fit; start several runs one after another.")
     with user_errors(os.environ.get("RANK", "0")):
         sys.argv[1:] = arguments(sys.argv[1:])
+    wrong, right = "trainer.epochs", "trainer.max_iter"
+    if "trainer=adam" in sys.argv:
+        wrong, right = right, wrong
+    if any(word.startswith(f"{wrong}=") for word in sys.argv):
+        sys.exit(f"error: this trainer has no {wrong}; its iterations are {right}.")
     if WORLD > 1 and os.environ["RANK"] != "0":
         sys.argv += WITHOUT_FILES
     main()

@@ -328,6 +328,24 @@ def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path, option
 
 
 @pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["trainer=adam", "trainer.max_iter=5"],
+            "no trainer.max_iter; its iterations are trainer.e",
+        ),
+        (["trainer.epochs=5"], "no trainer.epochs; its iterations are trainer.max_iter"),
+    ],
+)
+def test_iterations_of_the_other_trainer_are_named(
+    words: list[str], message: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sys, "argv", ["train.py", "+bench=boucwen", *words])
+    with pytest.raises(SystemExit, match=message):
+        train.launch()
+
+
+@pytest.mark.parametrize(
     ("overrides", "message"),
     [
         ([], "no data chosen"),
