@@ -30,13 +30,14 @@ from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
 from lfrtorch import plots, report
-from lfrtorch.checks import integer
+from lfrtorch.checks import integer, number
 from lfrtorch.datasets import Dataset
 from lfrtorch.distributed import connect
 from lfrtorch.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
 from lfrtorch.order import OrderScan
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
 from lfrtorch.resume import Snapshots
+from lfrtorch.sizes import SizeSearch
 from lfrtorch.threads import each_alone
 from lfrtorch.trainer import INTERRUPTED, Progress
 from lfrtorch.whole_file import whole_file
@@ -73,8 +74,8 @@ class Termination:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, usual in zip(self._signals, self._usual, strict=True):
-            signal.signal(number, usual)
+        for each, usual in zip(self._signals, self._usual, strict=True):
+            signal.signal(each, usual)
 
     def __call__(self, model: lfrtorch.Model, progress: Progress) -> None:
         """End the fit where that was asked for."""
@@ -100,6 +101,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
     shown = dataset.validation[0] if dataset.validation else dataset.train[0]
 
     bla, _ = linear(cfg, dataset.train, dataset.validation, ranks)
+    chosen = sizes(cfg, bla, dataset, ranks)
     models = starts(cfg, bla, dataset)
     print(
         f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples, "
@@ -136,7 +138,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
                 line = ProgressLine()
                 result = search(monitors=[[line, board, keep, termination]])
                 line.close()
-            write(cfg, folder, command, result, bla, dataset, board)
+            write(cfg, folder, command, result, bla, dataset, board, chosen)
     if result.reason.startswith(LOST):
         raise ProcessLost(f"{result.reason}; the best model so far is in {best}; {go_on(folder)}")
     if termination.asked == signal.SIGTERM and result.reason == INTERRUPTED:
@@ -201,6 +203,57 @@ def linear(
     return bla, scan
 
 
+def sizes(
+    cfg: DictConfig, bla: lfrtorch.LinearModel, dataset: Dataset, ranks: Ranks
+) -> SizeSearch | None:
+    """The search for the sizes that are auto, now those of ``cfg``; None where none is.
+
+    Raises:
+        KeyboardInterrupt, Terminated: it ended early.
+    """
+    names = sizes_of(cfg)
+    if cfg.init_from is not None or not any(cfg[name] == "auto" for name in names):
+        return None
+    options, limit = cfg.sizes_search, "epochs" if "epochs" in cfg.trainer else "max_iter"
+    seeds = report.seeds(cfg.seed, max(2, min(cfg.starts, options.starts)))
+    iterations = math.ceil(options.iterations * cfg.trainer[limit])
+
+    def start(tried: dict[str, Any], seed: int) -> lfrtorch.Model:
+        own = OmegaConf.merge(cfg, tried, {"seed": seed, "starts": 1})
+        return starts(cast(DictConfig, own), bla, dataset)[0]
+
+    print(f"sizes: {len(seeds)} starts of {iterations} iterations for each model", flush=True)
+    with Termination(ranks) as termination:
+        try:
+            search = lfrtorch.search_sizes(
+                start,
+                dataset.train,
+                dataset.validation,
+                **{name: options[name] if cfg[name] == "auto" else cfg[name] for name in names},
+                linear=bla,
+                seeds=seeds,
+                optimiser=instantiate(cfg.trainer, **{limit: iterations}),
+                ridge=cfg.ridge,
+                monitors=[termination],
+                watch=partial(print, flush=True),
+                ranks=ranks,
+            )
+        except KeyboardInterrupt:
+            if termination.asked == signal.SIGTERM:
+                raise Terminated("terminated while sizes were searched: nothing to keep") from None
+            raise KeyboardInterrupt("while sizes were searched") from None
+    print(search.table())
+    for note in search.notes:
+        print(f"note: {note}")
+    cfg.update(search.chosen.sizes)
+    return search
+
+
+def sizes_of(cfg: DictConfig) -> list[str]:
+    """Of the static nonlinearity: nz, nw, and a polynomial's degree or a network's nn."""
+    return ["nz", "nw", "degree" if "static" in cfg.init else "nn"]
+
+
 def write(
     cfg: DictConfig,
     folder: Path,
@@ -209,6 +262,7 @@ def write(
     bla: lfrtorch.LinearModel,
     dataset: Dataset,
     board: TensorBoard,
+    search: SizeSearch | None,
 ) -> None:
     """Print the scores, and write all files of a run."""
     print(
@@ -225,7 +279,10 @@ def write(
         seed=cfg.seed,
         data_seed=cfg.data.get("seed"),
         command=command,
+        search=search,
     )
+    if search is not None:
+        board.text("sizes", search.table())
     if len(result.starts) > 1:
         print(report.starts_table(metrics) + "\n")
     text = json.dumps(metrics, indent=2, allow_nan=False)
@@ -275,6 +332,14 @@ def require(cfg: DictConfig) -> None:
             "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
             "(+bench=boucwen sets it and all else for that benchmark)."
         )
+    for name in ("nx", "nz", "nw", "nn", "degree"):
+        integer(name, cfg[name], 1, word="auto")
+    for name in {"nn", "degree"} - {*sizes_of(cfg)}:
+        if cfg[name] == "auto":
+            used = sizes_of(cfg)[-1]
+            raise ValueError(f"{name} is auto, and this init has none; give {used}=auto.")
+    integer("sizes_search.starts", cfg.sizes_search.starts, 1)
+    number("sizes_search.iterations", cfg.sizes_search.iterations, positive=True)
     integer("nx_max", cfg.nx_max, 1)
     integer("seed", cfg.seed, 0)
     integer("starts", cfg.starts, 1)
@@ -383,8 +448,8 @@ def user_errors(rank: str = "0") -> Iterator[None]:
         if rank == "0":
             print(end, file=sys.stderr)
         sys.exit(128 + signal.SIGTERM)
-    except KeyboardInterrupt:
-        print("interrupted outside the fit: nothing to keep", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"interrupted {str(stop) or 'outside the fit'}: nothing to keep", file=sys.stderr)
         sys.exit(130)
     sys.exit(1)
 

@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-def integer(name: str, value: Any, least: int) -> None:
-    """Refuse what is not a whole number of at least ``least`` with a ValueError."""
+def integer(name: str, value: Any, least: int, *, word: str = "") -> None:
+    """Refuse what is not a whole number of at least ``least``, nor a word, with a ValueError."""
+    if word and value == word:
+        return
     if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < least:
-        raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}.")
+        other = f", or {word}" if word else ""
+        raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}{other}.")
 
 
 def band(given: Any) -> None:

@@ -16,6 +16,7 @@ from lfrtorch.linear_model import LinearModel
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record
+from lfrtorch.sizes import SizeSearch
 from lfrtorch.trainer import FitResult
 
 SEED_STEP = 1000
@@ -104,6 +105,7 @@ def metrics(
     seed: int,
     data_seed: int | None,
     command: str,
+    search: SizeSearch | None = None,
 ) -> dict:
     """What ``metrics.json`` holds, scores by test record; None where a number is not finite.
 
@@ -115,6 +117,7 @@ def metrics(
         seed: of the first random start.
         data_seed: of simulated data.
         command: that made it.
+        search: for the sizes, where they were not given.
     """
     own = own or {}
     model = result.model
@@ -123,6 +126,7 @@ def metrics(
     entries = {
         "bench": dataset.name,
         "sizes": model.sizes,
+        "sizes_search": [] if search is None else search.entries(),
         "parameters": model.parameters,
         "parameters_net": model.parameters_net,
         "data": {

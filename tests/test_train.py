@@ -17,6 +17,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import get_object, instantiate
+from omegaconf import OmegaConf
 
 import lfrtorch
 import train
@@ -200,7 +201,7 @@ def test_init_from_says_which_sizes_it_takes(
         folder.mkdir()
     arguments = [*file_overrides(csv), "nx=1", "trainer.max_iter=1"]
     train.identify(configuration(*arguments, "nz=1", "nn=4"), first)
-    cfg = configuration(*arguments, f"init_from={first}")
+    cfg = configuration(*arguments, "nn=auto", f"init_from={first}")
     train.identify(cfg, second)
     assert (cfg.nz, cfg.nn) == (1, 4)
     assert "nz is 1, that of the model in" in capsys.readouterr().out
@@ -327,6 +328,68 @@ def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path, option
     assert train.arguments([*given, "overwrite=true"]) == [*given, "overwrite=true"]
 
 
+def test_sizes_are_searched_for(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    arguments = ["nx=auto", "nx_max=2", "nz=auto", "nw=1", "nn=auto", "trainer.max_iter=20"]
+    cfg = configuration(*file_overrides(csv), *arguments, "sizes_search.nn=[1,3]")
+    train.identify(cfg, tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    tried = metrics["sizes_search"]
+    assert [(t["nz"], t["nw"], t["nn"]) for t in tried][:2] == [(1, 1, 3), (2, 1, 3)]
+    (chosen,) = (t for t in tried if t["chosen"])
+    assert metrics["sizes"] == {"nx": cfg.nx} | {name: chosen[name] for name in ("nz", "nw", "nn")}
+    assert metrics["parameters_net"] == chosen["parameters_net"]
+    assert chosen["ratio"] < 0.5
+    saved = OmegaConf.load(tmp_path / "config.yaml")
+    assert (saved.nz, saved.init.nn) == (chosen["nz"], chosen["nn"])
+    printed = capsys.readouterr().out
+    assert "2 starts of 5 iterations for each model" in printed
+    assert f"nz {chosen['nz']}, nw 1, nn {chosen['nn']}: {chosen['parameters']} par" in printed
+    assert printed.count("  chosen\n") == 2  # the order, and these
+
+
+def test_degree_is_searched_for_with_adam(csv: Path, tmp_path: Path):
+    arguments = [*file_overrides(csv), "nx=1", "nz=1", "init=polynomial", "degree=auto"]
+    arguments += ["sizes_search.degree=[1,2]", "trainer=adam", "trainer.epochs=4"]
+    cfg = configuration(*arguments)
+    train.identify(cfg, tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert [t["degree"] for t in metrics["sizes_search"]] == [2, 1]
+    assert metrics["sizes"]["degree"] == cfg.degree
+
+
+class Interrupted(lfrtorch.LevenbergMarquardt):
+    """Levenberg-Marquardt with Ctrl-C in its third iteration."""
+
+    def step(self, problem: Any, state: Any) -> Any:
+        if state.iteration == 2:
+            raise KeyboardInterrupt
+        return super().step(problem, state)
+
+
+@pytest.mark.parametrize(
+    ("trainer", "code", "message"),
+    [
+        ("Interrupted", 130, "interrupted while sizes were searched: nothing to keep"),
+        ("Terminated", 143, "terminated while sizes were searched: nothing to keep"),
+    ],
+)
+def test_a_search_for_sizes_that_is_ended_says_so(
+    trainer: str,
+    code: int,
+    message: str,
+    csv: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    words = [*file_overrides(csv), "nx=1", "nn=auto", f"trainer._target_=test_train.{trainer}"]
+    monkeypatch.setattr(sys, "argv", ["train.py", f"hydra.run.dir='{tmp_path}'", *words])
+    with pytest.raises(SystemExit) as stop:
+        train.main()
+    assert stop.value.code == code
+    assert capsys.readouterr().err == f"{message}\n"
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -351,6 +414,11 @@ def test_iterations_of_the_other_trainer_are_named(
         ([], "no data chosen"),
         (["+bench=nonsense"], "nonsense"),
         (["+bench=boucwen", "nz=0"], "nz is 0"),
+        (["+bench=boucwen", "nz=many"], "nz is 'many'; give a whole number of at least 1, or auto"),
+        (["+bench=boucwen", "degree=auto"], "degree is auto, and this init has none; give nn=auto"),
+        (["+bench=boucwen", "nn=auto", "init=polynomial"], "nn is auto, and this init has none"),
+        (["+bench=boucwen", "nn=auto", "sizes_search.nn=[]"], "nn is empty"),
+        (["+bench=boucwen", "sizes_search.starts=0"], "sizes_search.starts is 0"),
         (["+bench=boucwen", "init.method=magic"], "init method is 'magic'"),
         (["+bench=boucwen", "init=polynomial", "degree=0"], "degree is 0"),
         (["+bench=boucwen", "activation=softsign"], "activation is 'softsign'"),
