@@ -1,0 +1,179 @@
+"""A file as a table of channels that is read in blocks."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfrtorch.records import Channel
+
+BLOCK = 65536
+"""Samples that are in memory at once."""
+
+_SCALED = "m|g|s|A|K|mol|cd|Hz|N|Nm|Pa|J|W|VA|V|F|Ω|[Oo]hm|T|H|Wb|S|rad|bar|l|L|eV|C|B"
+_OTHER = "min|h|d|sec|deg|°|°C|°F|deg[CF]|%|rpm|rev|psi|lbf?|in|ft|dB|px|counts?|a\\.u\\.|-|1"
+_ATOM = rf"(?:(?:da|[TGMkhdcmuµμnpf])?(?:{_SCALED})|{_OTHER})(?:\^?-?[0-9²³⁻¹]+)?"
+_UNIT = re.compile(rf"{_ATOM}(?:[/*·. ]{_ATOM})*")
+_BRACKETS = re.compile(r"(.*?)(\s*)[(\[]\s*([^()\[\]]{1,16}?)\s*[)\]]")
+
+
+class Table(ABC):
+    """Channels of one file: consecutive samples (T, columns), NaN where a value is missing.
+
+    Args:
+        path: the file.
+        headers: the columns as the file names them; units stand in them in brackets or behind "/".
+        units: of columns by header, where the file has them apart.
+        arrays: column numbers by the name of an array of several channels.
+        refused: why something in the file is not a channel, by its name.
+    """
+
+    path: Path
+    columns: tuple[Channel, ...]
+
+    def __init__(
+        self,
+        path: Path,
+        headers: Sequence[str],
+        *,
+        units: Mapping[str, str] | None = None,
+        arrays: Mapping[str, tuple[int, ...]] | None = None,
+        refused: Mapping[str, str] | None = None,
+    ) -> None:
+        self.path = path
+        self.headers = tuple(headers)
+        self.columns = channels(headers, units or {})
+        self.arrays = dict(arrays or {})
+        self.refused = dict(refused or {})
+
+    @abstractmethod
+    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[NDArray[np.float64]]:
+        """At most ``samples`` samples at a time, (n, len(columns)).
+
+        Date-times are in seconds since the first of the file.
+
+        Raises:
+            ValueError: a damaged file, columns of different lengths, or text that is no number.
+        """
+
+    def where(self, sample: int) -> str:
+        """What a user finds the sample by."""
+        return f"sample {sample} (from 0)"
+
+    def read(self, columns: Sequence[int]) -> NDArray[np.float64]:
+        """All samples of some columns, (T, len(columns))."""
+        grown = bytearray()  # grows in place, where a list of blocks is twice in memory at its end
+        for block in self.blocks(columns):
+            grown += block.tobytes()
+        return np.frombuffer(grown, np.float64).reshape(-1, len(columns))
+
+    def find(self, wanted: str | int | Sequence[str | int], option: str) -> tuple[int, ...]:
+        """Numbers of the columns that are wanted by name, by header or by number from 0.
+
+        The name of an array of several channels stands for all of them.
+
+        Args:
+            wanted: one or several.
+            option: what messages call it, ``data.inputs`` for example.
+
+        Raises:
+            ValueError: no such column, more than one of the name, or something else than names.
+        """
+        listed = [wanted] if isinstance(wanted, str | int) else wanted
+        if (
+            not isinstance(listed, Sequence)
+            or not listed
+            or not all(isinstance(w, str | int) and not isinstance(w, bool) for w in listed)
+        ):
+            raise ValueError(
+                f"{option} is {wanted!r}; give names of columns or their numbers from 0. "
+                f"'{self.path}' has {self.listed}."
+            )
+        return tuple(column for one in listed for column in self._find(one, option))
+
+    def _find(self, wanted: str | int, option: str) -> tuple[int, ...]:
+        if isinstance(wanted, int):
+            if not 0 <= wanted < len(self.columns):
+                raise ValueError(
+                    f"'{self.path}' has no column number {wanted}, as {option} says; "
+                    f"it has {self.listed}, numbered from 0."
+                )
+            return (wanted,)
+        if wanted in self.arrays:
+            return self.arrays[wanted]
+        for names in (self.headers, [column.name for column in self.columns]):
+            found = [i for i, name in enumerate(names) if name == wanted]
+            if len(found) == 1:
+                return (found[0],)
+            if found:
+                numbers = ", ".join(map(str, found))
+                raise ValueError(
+                    f"'{self.path}' has {len(found)} columns {wanted!r}, as {option} says; "
+                    f"give the number of one: {numbers}."
+                )
+        if wanted in self.refused:
+            raise ValueError(
+                f"'{self.path}': {wanted!r}, as {option} says, {self.refused[wanted]}."
+            )
+        raise ValueError(
+            f"'{self.path}' has no column {wanted!r}, as {option} says; it has {self.listed}."
+        )
+
+    @property
+    def listed(self) -> str:
+        """The columns, for messages."""
+        if not self.columns:
+            why = "; ".join(f"{name!r} {reason}" for name, reason in self.refused.items())
+            return f"no columns of numbers{f' ({why})' if why else ''}"
+        names = [repr(header) for header in self.headers]
+        shown = names if len(names) <= 24 else [*names[:20], "..."]
+        return f"{len(names)} column(s): {', '.join(shown)}"
+
+
+def is_unit(text: str) -> bool:
+    """Whether it is written as a unit, as N, mm or m/s^2."""
+    return _UNIT.fullmatch(text) is not None
+
+
+def bracketed(text: str) -> str | None:
+    """What stands in brackets, where that is all."""
+    found = _BRACKETS.fullmatch(text)
+    return found[3] if found and not found[1] else None
+
+
+def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel, ...]:
+    """Names and units from headers as "force (N)", "force [N]" or "force/N".
+
+    What is in the brackets stays in the name where names would be equal without, and where it
+    follows the name at once and is no unit, as in "y(t)".
+    """
+    found = [
+        Channel(header, units[header]) if units.get(header) else _channel(header)
+        for header in headers
+    ]
+    names = [channel.name for channel in found]
+    return tuple(
+        channel if names.count(channel.name) == 1 else Channel(header, units.get(header, ""))
+        for header, channel in zip(headers, found, strict=True)
+    )
+
+
+def _channel(header: str) -> Channel:
+    found = _BRACKETS.fullmatch(header)
+    if found and found[1] and (found[2] or is_unit(found[3])):
+        return Channel(found[1], found[3])
+    name, slash, unit = header.partition("/")
+    if slash and name.strip() and is_unit(unit.strip()):
+        return Channel(name.strip(), unit.strip())
+    return Channel(header)
+
+
+def seconds(times: NDArray[np.datetime64], first: np.datetime64) -> NDArray[np.float64]:
+    """Seconds since ``first``, NaN where there is no time."""
+    apart = (times.astype("M8[ns]") - first.astype("M8[ns]")).astype("m8[ns]")
+    return np.where(np.isnat(apart), np.nan, apart.astype(np.int64) * 1e-9)
