@@ -1,0 +1,106 @@
+"""Periods of a measured input, and how many of them the output takes to settle."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+_ALIKE = 0.02
+"""Mean square of a repetition's difference, over that of two unrelated signals, that is noise yet.
+Two parts of narrow-band noise come to 0.05 now and then."""
+
+_GROWTH = 3.0
+"""By which it may grow with the number of periods between: 4 is what a period has that is a little
+too long or too short."""
+
+_NEAR = 2.0
+"""The shortest period does as well as the best within this factor: multiples differ in noise."""
+
+_EXACT = 1e-9  # difference of what repeats exactly, far above rounding
+_FASTER = 0.75  # of the record: the largest shift that is looked at
+
+_SETTLED = 2.0
+"""Mean square difference from the last period, over that of noise, of a period in steady state."""
+
+_SMALL = 1e-5  # rms difference over that of the output which is no transient, noise or not
+_TAIL = 4  # of two periods' difference, its last 1 / 4 is taken for noise
+
+
+def find_period(u: NDArray[np.float64]) -> int | None:
+    """The shortest period, in samples, that explains the signals; None where they do not repeat.
+
+    For every shift p up to half the record,
+
+        D(p) = sum (u(k + p) - u(k))^2 / sum (u(k + p)^2 + u(k)^2),  u about its mean,
+
+    is 0 for a period, 1 for unrelated signals and the noise-to-signal ratio for a period in noise.
+    A period is a p whose D is at a minimum and small, and stays as small for 2 p, 3 p, ...
+
+    Args:
+        u: signals that are to repeat together; constant ones are left out.
+
+    Shape:
+        u: (T, nu) or (T,).
+    """
+    u = u.reshape(len(u), -1)
+    deviation = np.std(u, axis=0)
+    moving = deviation > 1e-12 * np.max(np.abs(u), axis=0, initial=0)
+    if not moving.any() or len(u) < 4:
+        return None
+    D = _differences((u[:, moving] - u[:, moving].mean(axis=0)) / deviation[moving])
+    p = np.arange(2, len(u) // 2 + 1)
+    D_next = np.append(D, np.inf)[p + 1]
+    minima = p[(D[p] < D[p - 1]) & (D[p] <= D_next) & (D[p] < _ALIKE)]
+    periods = [i for i in minima if D[i::i].max() < min(_ALIKE, _GROWTH * D[i] + _EXACT)]
+    if not periods:
+        return None
+    best = D[periods].min()
+    shortest = next(i for i in periods if D[i] <= _NEAR * best + _EXACT)
+    # Of a slow signal in noise there are several about the period, and far multiples tell.
+    return int(min((i for i in periods if i < 2 * shortest - 1), key=lambda i: D[i::i].mean()))
+
+
+def _differences(u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """D(p) of the signal that repeats worst, p = 0, 1, ... to three quarters of the record."""
+    T = len(u)
+    last = max(int(_FASTER * T), T // 2)
+    worst = np.zeros(last + 1)
+    for x in u.T:
+        X = fft.rfft(x, fft.next_fast_len(T + last, real=True))
+        products = fft.irfft(X.real**2 + X.imag**2, fft.next_fast_len(T + last, real=True))
+        energy = np.concatenate([[0.0], np.cumsum(x**2)])
+        both = energy[T - last : T + 1][::-1] + energy[T] - energy[: last + 1]
+        both = np.where(both > 0, both, np.inf)  # nothing there is no repetition
+        found = np.where(np.isinf(both), 1.0, 1 - 2 * products[: last + 1] / both)
+        worst = np.maximum(worst, np.maximum(found, 0.0))
+    return worst
+
+
+def find_transient(y: NDArray[np.float64], period: int) -> int:
+    """Samples of the whole first periods in which the outputs have not settled.
+
+    These are the periods, from the first on, that differ from the last one by more than the last
+    two from each other. Of two periods the end of their difference is taken for noise.
+
+    Args:
+        y: outputs, from the start of the first period on.
+        period: of the inputs, in samples.
+
+    Shape:
+        y: (T, ny) or (T,).
+
+    Returns:
+        A whole number of periods; the last whole one is never in it.
+    """
+    y = y.reshape(len(y), -1)
+    count = len(y) // period
+    if count < 2:
+        return 0
+    periods = y[: count * period].reshape(count, period, -1)
+    difference = (periods[:-1] - periods[-1]) ** 2  # (count - 1, period, ny)
+    size = difference.mean(axis=1)
+    noise = size[-1] if count > 2 else difference[0, -(period // _TAIL) - 1 :].mean(axis=0)
+    least = (_SMALL * np.std(y, axis=0)) ** 2
+    unsettled = (size > np.maximum(_SETTLED * noise, least)).any(axis=1)
+    return period * int(np.argmin(np.append(unsettled, False)))
