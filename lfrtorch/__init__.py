@@ -10,6 +10,7 @@ from lfrtorch import datasets, distributed
 from lfrtorch.adam import Adam
 from lfrtorch.bla import estimate_bla
 from lfrtorch.cell import LFRCell
+from lfrtorch.datasets.files import load_records
 from lfrtorch.frf import FRF, estimate_frf
 from lfrtorch.inference import inference
 from lfrtorch.initialise import initialise
@@ -54,6 +55,7 @@ __all__ = [
     "inference",
     "initialise",
     "load",
+    "load_records",
     "multisine",
     "nrmse",
     "rmse",

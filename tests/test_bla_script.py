@@ -79,9 +79,7 @@ def test_numbers_are_those_of_the_system(csv: Path, tmp_path: Path, monkeypatch)
     assert [(s["use"], s["record"]) for s in found["scores"]] == [
         ("train", "train"), ("validation", "validation"), ("test", "test"),
     ]  # fmt: skip
-    dataset = lfrtorch.datasets.files.load(
-        csv, inputs=["a", "b"], outputs=["x", "phi"], fs=FS, skip=SKIP
-    )
+    dataset = lfrtorch.load_records(csv, inputs=["a", "b"], outputs=["x", "phi"], fs=FS, skip=SKIP)
     model = lfrtorch.LinearModel.load(tmp_path / "linear")
     for score, record in zip(
         found["scores"], (*dataset.train, *dataset.validation, *dataset.tests), strict=True

@@ -54,7 +54,7 @@ def test_other_periodic_signals():
     assert find_period(np.resize(scipy.signal.max_len_seq(7)[0] * 1.0, 900)) == 127
     assert find_period(np.repeat(np.resize(scipy.signal.max_len_seq(6)[0], 300), 5) * 1.0) == 315
     assert find_period(np.resize(scipy.signal.chirp(np.arange(500), 0.01, 499, 0.2), 1600)) == 500
-    printed = np.round(np.resize(multi(), 4 * N), 3)
+    printed = np.asarray(np.round(np.resize(multi(), 4 * N), 3), np.float64)
     assert find_period(printed) == N
 
 

@@ -1,278 +1,413 @@
-"""One's own measurement as records: a table in a text file, or the arrays of a .npz file."""
+"""One's own measurements as records by use: one file or many, of any format."""
 
 from __future__ import annotations
 
-import csv
-import math
-from collections.abc import Sequence
-from dataclasses import replace
+import glob
+import re
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Literal, cast, get_args
 
 from lfrtorch.checks import integer, number
 from lfrtorch.datasets import Dataset
-from lfrtorch.records import Channel, Record
+from lfrtorch.datasets.measurement import (
+    Columns,
+    Gaps,
+    Measurement,
+    Stretch,
+    Wanted,
+    read_measurement,
+)
+from lfrtorch.datasets.parts import SHORTEST, TooShort, cut
+from lfrtorch.datasets.table import NoColumn
+from lfrtorch.datasets.tables import similar
+from lfrtorch.periods import find_period, find_transient
+from lfrtorch.records import Record
 
-__all__ = ["load"]
+__all__ = ["load_records"]
 
-_TEXT = (".csv", ".tsv", ".txt")
-_DELIMITERS = "\t;,"  # the first of these that the first line has
-_SHORTEST = 10  # scored samples of a part
-_WARM_UP = 0.05  # of the file: default of skip
+Paths = str | Path | Sequence[str | Path]
+Use = float | str | Path | Sequence[str | Path] | None
 
-Columns = str | int | Sequence[str | int]
-Signal = tuple[str, NDArray[np.float64]]  # name, (T, channels)
+Start = Literal["zero", "estimated", "periodic"]
+Period = int | Literal["auto"] | None
+
+_WARM_UP = 0.05  # of a record: default of skip
+_LONGEST_TRANSIENT = 1 / 3  # of a record; beyond it, leaving it out costs more than it helps
+_LEFT_OUT = "left out, as it is too short"
+_SAME = 1e-4  # relative, of sampling frequencies: what printed time stamps leave open
 
 
-def load(
-    path: str | Path,
+@dataclass(frozen=True)
+class _Whole:
+    """A file's record, or that of a stretch between its gaps, before it has a use."""
+
+    record: Record
+    path: Path
+    stem: str  # of all stretches of the file
+    stretch: bool
+
+
+def load_records(
+    path: Paths,
     *,
     inputs: Columns | None = None,
     outputs: Columns | None = None,
     fs: float | None = None,
-    validation: float = 0.2,
-    test: float = 0.2,
-    skip: int | None = None,
-    period: int | None = None,
+    time: str | int | None = None,
+    units: Mapping[str, str] | None = None,
+    validation: Use = 0.2,
+    test: Use = 0.2,
+    start: Start = "zero",
+    period: Period = "auto",
+    skip: int | Literal["auto"] | None = None,
+    gaps: Gaps = "error",
 ) -> Dataset:
-    """One measurement, cut in time into a training, a validation and a test record.
+    """Measurements from files, each a record, by use: training, validation and test.
 
-    A text file (.csv, .tsv, .txt) has one line a sample: numbers with a decimal point, separated
-    by tabs, semicolons or commas. Its first line names the columns; it may be missing where
-    ``inputs`` and ``outputs`` are column numbers. In a .npz file every array has a name; one of
-    shape (T, channels) is several channels.
+    Text (.csv, .tsv, .txt, .dat, .lvm, also .gz) with or without header, units line and preamble;
+    MATLAB (.mat), .npz, .npy, HDF5 (.h5, .hdf5) and Parquet.
 
-    Every record begins where the file begins and is simulated from there, from zero state: only its
-    own part is scored, so that the transient of the start reaches neither validation nor test.
+    What is cut off by a fraction begins where its record begins and is simulated from there: only
+    its own part is scored, so that the transient of the start reaches neither validation nor test.
 
     Args:
-        path: the file.
-        inputs: one or several names of columns or arrays, or column numbers from 0.
+        path: a file, a pattern as ``"runs/*.csv"``, or a list of these.
+        inputs: one or several names of columns or arrays, or column numbers from 0. An array of
+            several channels is several inputs.
         outputs: likewise.
-        fs: sampling frequency in Hz.
-        validation: fraction of the samples, those after the training part.
-        test: fraction of the samples, those at the end.
-        skip: samples at the beginning of the file that are left out of the cost, for the transient
-            of the start; 5 % of the file where left out.
-        period: samples of one period of the inputs, where they repeat: a frequency response then
-            tells noise from distortion.
+        fs: sampling frequency in Hz; it may be left out where there is ``time``.
+        time: the column of time stamps, in seconds or as ISO date-times, evenly spaced.
+        units: of the channels by name, in place of those in the file's header.
+        validation: records that choose among iterates and are not fitted: a fraction below 1 of
+            every record, the part after that for training; a number of records, the last ones;
+            names of records of ``path``, which are those of the files without extension; or other
+            files, as for ``path``. 0 for none.
+        test: records that are scored, likewise: of a fraction the last part, of a number the last
+            records.
+        start: ``"zero"`` (at rest), ``"estimated"`` (amid the measurement), or ``"periodic"``:
+            every record is cut to whole periods in steady state.
+        period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
+        skip: samples at the beginning of every record that are left out of cost and score. Where
+            left out they are the periods that the output takes to settle, and 5 % of the record
+            where the input does not repeat.
+        gaps: ``"error"`` refuses missing values and missing time stamps, ``"split"`` makes a record
+            of every stretch between them.
 
     Shape:
-        u, y of a part: (its samples, inputs), (its samples, outputs), in the file's units.
+        u, y of a record: (its samples, inputs), (its samples, outputs), in the file's units.
+
+    Returns:
+        The records; ``notes`` say what was found of periods, transients, time and gaps.
 
     Raises:
-        ValueError: a file, column or number that cannot be used, or a part too short to score.
+        ValueError: a file, column or setting that cannot be used, files that do not belong
+            together, or a part too short to score.
         FileNotFoundError: no such file.
     """
-    path = Path(path).expanduser()
-    u_columns, y_columns = _listed(inputs, "inputs"), _listed(outputs, "outputs")
-    if fs is None:
-        raise ValueError("the sampling frequency is not given; say it in Hz with data.fs.")
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file '{path}'; give the path of a .csv or .npz file.")
-    if path.suffix.lower() not in (*_TEXT, ".npz"):
-        raise ValueError(
-            f"'{path}' has the unknown extension '{path.suffix}'; give a text file "
-            f"({', '.join(_TEXT)}) or a .npz file (numpy.savez writes one)."
-        )
-    read = _arrays if path.suffix.lower() == ".npz" else _table
-    signals = read(path, [*u_columns, *y_columns])
-    names = [name for name, _ in signals]
-    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
-    if twice:
-        raise ValueError(
-            f"'{path}': {_quoted(twice)} stands twice in data.inputs and data.outputs; "
-            "name every column once."
-        )
-    whole = _record(path, signals[: len(u_columns)], signals[len(u_columns) :], fs)
-    whole = replace(whole, period=period)
-    skip = round(_WARM_UP * whole.samples) if skip is None else skip
-    parts = _split(path, whole.samples, validation, test, skip)
-    train, chosen, tests = (
-        [replace(whole[: scored.stop], name=name, skip=scored.start)]
-        for name, scored in parts.items()
+    reader = _Reader(
+        Wanted(inputs, outputs, fs, time, dict(units or {}), gaps),
+        start,
+        period,
+        None if skip == "auto" else skip,
     )
-    return Dataset(path.stem, train, chosen, tests)
-
-
-def _listed(columns: Columns | None, what: str) -> list[str | int]:
-    given = [columns] if isinstance(columns, str | int) else list(columns or [])
-    if not given or not all(isinstance(column, str | int) for column in given):
+    paths = _found(path, "data.path")
+    left = reader.read(paths)
+    tests, left, tested = _taken("data.test", test, left, reader)
+    chosen, left, validated = _taken("data.validation", validation, left, reader)
+    if not left:
         raise ValueError(
-            f"the {what} are {columns!r}; say which columns they are, by names or numbers from 0, "
-            f"with data.{what}."
+            f"data.validation={validation} and data.test={test} leave no record for training; "
+            f"data.path has {len(reader.all)} in all."
         )
-    return given
+    if validated + tested >= 1:
+        raise ValueError(
+            f"the fractions are validation={validation} and test={test}; they must leave something "
+            "for training, for example 0.2 and 0.2."
+        )
+    parts: dict[str, list[Record]] = {"train": [], "validation": chosen, "test": tests}
+    short = None
+    for whole in left:
+        try:
+            for use, record in cut(whole.record, validated, tested).items():
+                parts[use].append(record)
+        except TooShort as error:
+            if not whole.stretch:
+                raise ValueError(f"'{whole.path}': {error}") from error
+            short = error
+            reader.note(whole.record.name, _LEFT_OUT)
+    if not parts["train"]:
+        raise ValueError(f"'{left[0].path}': no stretch between gaps is long enough: {short}")
+    if (validated or tested) and any(whole.record.period for whole in left):
+        reader.note(
+            "",
+            "the parts of a record have the same input in every period: validation and test show "
+            "noise rather than how the model does on other inputs; give them records of their own",
+        )
+    for use, records in parts.items():
+        if len(records) == 1:
+            parts[use] = [replace(records[0], name=use)]
+    return Dataset(
+        _name(paths), parts["train"], parts["validation"], parts["test"], notes=reader.notes
+    )
 
 
-def _quoted(names: Sequence[str]) -> str:
-    return ", ".join(map(repr, names))
+class _Reader:
+    """Reads files into whole records, all of one kind, and keeps what was found."""
 
+    def __init__(self, wanted: Wanted, start: Start, period: Period, skip: int | None) -> None:
+        if start not in get_args(Start):
+            raise ValueError(f"data.start is {start!r}; use 'zero', 'estimated' or 'periodic'.")
+        if period not in (None, "auto"):
+            integer("data.period", period, 1)
+        if skip is not None:
+            integer("data.skip", skip, 0)
+        self.wanted, self.period, self.skip = wanted, period, skip
+        self.start: Start = start
+        self.all: list[_Whole] = []
+        self._first: Measurement | None = None
+        self._notes: dict[str, list[str]] = {}
 
-def _record(path: Path, u: list[Signal], y: list[Signal], fs: float) -> Record:
-    """The whole measurement as one record."""
-    lengths = {name: len(array) for name, array in (*u, *y)}
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{name!r} has {length}" for name, length in lengths.items())
-        raise ValueError(f"'{path}': {listed} samples; give arrays of one length.")
+    def note(self, name: str, text: str) -> None:
+        """Keep what is to be known of a record, or of all where the name is empty."""
+        self._notes.setdefault(text, []).append(name)
 
-    def channels(signals: list[Signal]) -> tuple[Channel, ...]:
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence each, with the records it is about where that is not clear."""
         return tuple(
-            Channel(name if array.shape[1] == 1 else f"{name}{i + 1}")
-            for name, array in signals
-            for i in range(array.shape[1])
+            text if len(self.all) == 1 or names == [""] else f"{_some(names)}: {text}"
+            for text, names in self._notes.items()
         )
 
-    return Record(
-        np.hstack([array for _, array in u]),
-        np.hstack([array for _, array in y]),
-        fs=fs,
-        name=path.stem,
-        source="file",
-        inputs=channels(u),
-        outputs=channels(y),
-    )
+    def read(self, paths: Sequence[Path]) -> list[_Whole]:
+        """The records of some files."""
+        found = []
+        stems = _stems(paths, {whole.stem for whole in self.all})
+        for path, stem in zip(paths, stems, strict=True):
+            measured = self._measured(path)
+            several = len(measured.stretches) > 1
+            self._note_all(stem, measured.notes)
+            if several:
+                self.note(stem, f"{len(measured.stretches)} stretches between gaps, a record each")
+            before = len(found)
+            for i, stretch in enumerate(measured.stretches, 1):
+                name = f"{stem}_{i}" if several else stem
+                try:
+                    record, notes = self._record(name, measured, stretch)
+                except TooShort as error:
+                    if not several:
+                        raise ValueError(f"'{path}': {error}") from error
+                    self.note(name, _LEFT_OUT)
+                else:
+                    self._note_all(name, notes)
+                    found.append(_Whole(record, path, stem, several))
+            if len(found) == before:
+                raise ValueError(f"'{path}': no stretch between its gaps is long enough to score.")
+        self.all += found
+        return found
+
+    def _note_all(self, name: str, texts: Iterable[str]) -> None:
+        for text in texts:
+            self.note(name, text)
+
+    def _measured(self, path: Path) -> Measurement:
+        """What a file measured, checked to be of a kind with the first."""
+        try:
+            measured = read_measurement(path, self.wanted)
+        except NoColumn as error:
+            if self._first is None:
+                raise
+            raise ValueError(f"{error} '{self._first.path}' has it.") from error
+        if self._first is None:
+            self._first = measured
+        first = self._first
+        for side in ("inputs", "outputs"):
+            here, there = getattr(measured, side), getattr(first, side)
+            if here != there:
+                raise ValueError(
+                    f"the {side} of '{path}' are {', '.join(map(str, here))} and those of "
+                    f"'{first.path}' {', '.join(map(str, there))}; give files of the same columns "
+                    "and units."
+                )
+        if abs(measured.fs / first.fs - 1) > _SAME:
+            raise ValueError(
+                f"'{path}' is sampled at {measured.fs:g} Hz and '{first.path}' at {first.fs:g} Hz; "
+                "resample them to one rate."
+            )
+        return replace(measured, fs=first.fs)
+
+    def _record(
+        self, name: str, measured: Measurement, stretch: Stretch
+    ) -> tuple[Record, list[str]]:
+        """The record of a stretch, and what was found of its period."""
+        u, y, T = stretch.u, stretch.y, len(stretch.u)
+        automatic = self.period == "auto"
+        N = find_period(u) if automatic else cast("int | None", self.period)
+        settling = 0 if N is None or self.skip is not None else find_transient(y, N)
+        start: Start = self.start
+        if start == "periodic":
+            if N is None:
+                raise ValueError(
+                    f"data.start is periodic and the input of '{measured.path}' does not repeat; "
+                    "give data.period in samples, or data.start=zero."
+                )
+            begin = settling if self.skip is None else self.skip
+            if T - begin < N:
+                raise TooShort(
+                    f"record '{name}' has no whole period of {N} samples: {T} samples, of which "
+                    f"{begin} are left out at the start."
+                )
+            kept, skip = slice(begin, begin + (T - begin) // N * N), 0
+        else:
+            if settling > _LONGEST_TRANSIENT * T:
+                settling = 0
+            kept = slice(0, T)
+            skip = (settling or round(_WARM_UP * T)) if self.skip is None else self.skip
+            start = "estimated" if stretch.first else start
+            if T - skip < SHORTEST:
+                raise TooShort(
+                    f"record '{name}' has {max(T - skip, 0)} scored samples of {T}, with "
+                    f"skip={skip}; it needs {SHORTEST}."
+                )
+        notes = []
+        if N is not None and (automatic or settling):
+            said = f"the input repeats every {N} samples, {T / N:.3g} times"
+            count = settling // N
+            if count == 1:
+                said += "; the first period is the transient and is not fitted"
+            elif count:
+                said += f"; the first {count} periods are the transient and are not fitted"
+            elif start == "zero" and self.skip is None and not find_transient(y, N):
+                said += "; the output is settled from the first sample on: use data.start=periodic"
+            notes.append(said)
+        record = Record(
+            u[kept],
+            y[kept],
+            fs=measured.fs,
+            start=start,
+            skip=skip,
+            name=name,
+            source="file",
+            inputs=measured.inputs,
+            outputs=measured.outputs,
+            period=N,
+        )
+        return record, notes
 
 
-def _split(path: Path, samples: int, validation: float, test: float, skip: int) -> dict[str, slice]:
-    """The scored samples of each record by its name."""
-    number("data.validation", validation)
-    number("data.test", test)
-    if not (0 < validation < 1 and 0 < test < 1 and validation + test < 1):
+def _found(given: Paths | None, option: str) -> list[Path]:
+    """The files of paths and patterns, those of a pattern in the order of people's counting."""
+    listed = [given] if isinstance(given, str | Path) else list(given or [])
+    if not listed or not all(isinstance(path, str | Path) for path in listed):
         raise ValueError(
-            f"the fractions are validation={validation} and test={test}; both must be above 0 "
-            "and leave something for training, for example 0.2 and 0.2."
+            f"{option} is {given!r}; give the path of a file, a pattern as 'runs/*.csv', or a list "
+            "of these."
         )
-    integer("data.skip", skip, 0)
-    ends = [0, samples - round(samples * validation) - round(samples * test)]
-    ends += [samples - round(samples * test), samples]
-    parts = {}
-    for i, name in enumerate(("train", "validation", "test")):
-        first = max(ends[i], skip)
-        scored = ends[i + 1] - first
-        if scored < _SHORTEST:
-            raise ValueError(
-                f"'{path}': the {name} part has {scored} scored samples of {samples}, with "
-                f"skip={skip}; it needs {_SHORTEST}. Change the fractions or skip, or give a "
-                "longer file."
-            )
-        parts[name] = slice(first, ends[i + 1])
-    return parts
+    found: list[Path] = []
+    for entry in listed:
+        path = Path(entry).expanduser()
+        if path.exists() or not glob.has_magic(str(path)):
+            found.append(path)
+            continue
+        matches = [Path(p) for p in glob.glob(str(path), recursive=True) if Path(p).is_file()]
+        if not matches:
+            raise FileNotFoundError(f"no file is as '{path}', {option}, says{similar(path)}.")
+        found += sorted(matches, key=lambda p: _counting(str(p)))
+    return list({path.resolve(): path for path in found}.values())
 
 
-def _table(path: Path, wanted: list[str | int]) -> list[Signal]:
-    """Columns of a text file, in the order wanted."""
-    rows = _rows(path)
-    first = rows[0][1]
-    numbered = [column for column in wanted if isinstance(column, int)]
-    for column in numbered:
-        if not 0 <= column < len(first):
-            raise ValueError(
-                f"'{path}' has no column number {column}: its {len(first)} columns are numbered "
-                f"from 0, and its first line says {_quoted(first)}."
-            )
-    # A first line with a number in a wanted column is a sample, unless columns go by name.
-    headed = len(numbered) < len(wanted) or not any(_is_number(first[i]) for i in numbered)
-    names = [
-        name if headed and name and first.count(name) == 1 else f"column {i}"
-        for i, name in enumerate(first)
+def _counting(text: str) -> list[tuple[int, str]]:
+    """A key that sorts run2 before run10."""
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)
     ]
-    if headed:
-        rows = rows[1:]
-    if not rows:
-        raise ValueError(f"'{path}' has a header line but no samples; give a file with data.")
-    signals = []
-    for column in wanted:
-        name = names[column] if isinstance(column, int) else column
-        if name not in names:
-            found = f"{first.count(name)} columns" if name in first else "no column"
-            raise ValueError(
-                f"'{path}' has {found} {name!r}; its first line says {_quoted(first)}. Give the "
-                "name of one column, or its number from 0."
-            )
-        i = names.index(name)
-        values = [[_number(path, line, name, row[i])] for line, row in rows]
-        signals.append((name, np.array(values)))
-    return signals
 
 
-def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Line number and cells of every line that is not blank; as many cells in each."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # Excel begins its UTF-8 with a mark
-        lines = text.splitlines()
-        first = next((line for line in lines if line.strip()), "")
-        delimiter = next((d for d in _DELIMITERS if d in first), ",")
-        reader = csv.reader(lines, delimiter=delimiter)
-        rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-        rows = [(line, row) for line, row in rows if len(row) > 1 or any(row)]  # not blank
-    except (UnicodeDecodeError, csv.Error) as error:
+def _stem(path: Path) -> str:
+    name = path.name
+    return Path(name[:-3] if name.lower().endswith(".gz") else name).stem
+
+
+def _stems(paths: Sequence[Path], taken: Container[str]) -> list[str]:
+    """Names of files, with as many of their folders as make them unlike one another."""
+    full = [path.resolve() for path in paths]
+    names = []
+    for depth in range(1, max(len(path.parts) for path in full) + 1):
+        names = ["_".join([*path.parts[-depth:-1], _stem(path)]).lstrip("/") for path in full]
+        if len(set(names)) == len(names) and not any(name in taken for name in names):
+            return names
+    return [f"{name}{path.suffix}" for name, path in zip(names, paths, strict=True)]
+
+
+def _name(paths: Sequence[Path]) -> str:
+    """Of a data set: its file's, or what its files' names begin with."""
+    if len(paths) == 1:
+        return _stem(paths[0])
+    letters = zip(*map(_stem, paths), strict=False)
+    common = "".join(some[0] for some in takewhile(lambda some: len(set(some)) == 1, letters))
+    return common.rstrip("0123456789_-. ") or paths[0].resolve().parent.name or "files"
+
+
+def _some(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:4])
+    return shown if len(names) <= 4 else f"{shown} and {len(names) - 4} more"
+
+
+def _taken(
+    option: str, use: Use, wholes: list[_Whole], reader: _Reader
+) -> tuple[list[Record], list[_Whole], float]:
+    """Records for a use, those that are left, and the fraction of these that is for it, too."""
+    if use is None:
+        return [], wholes, 0.0
+    if isinstance(use, str | Path | Sequence):
+        return *_named(option, [use] if isinstance(use, str | Path) else use, wholes, reader), 0.0
+    number(option, use)
+    if use < 1:
+        return [], wholes, float(use)
+    if use != int(use):
         raise ValueError(
-            f"'{path}' is not a readable table ({error}); save it as UTF-8 text, one line a sample."
-        ) from error
-    if not rows:
-        raise ValueError(f"'{path}' is empty; give a file with data.")
-    start, header = rows[0]
-    header[0] = header[0].lstrip("#% ")  # as numpy.savetxt marks a header
-    for line, row in rows:
-        if len(row) != len(header):
-            raise ValueError(
-                f"'{path}', line {line}: {len(row)} column(s), where line {start} has "
-                f"{len(header)}; give every line the same columns."
-            )
-    return rows
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _number(path: Path, line: int, name: str, cell: str) -> float:
-    value = float(cell) if _is_number(cell) else math.nan
-    if not math.isfinite(value):
-        raise ValueError(
-            f"'{path}', line {line}: {cell!r} in column {name!r} is not a finite number; write "
-            "numbers with a decimal point, and cut or interpolate gaps."
+            f"{option} is {use}; give a fraction below 1, a whole number of records, or names of "
+            "records or files."
         )
-    return value
-
-
-def _arrays(path: Path, wanted: list[str | int]) -> list[Signal]:
-    """Arrays of a .npz file, in the order wanted."""
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            names = file.files
-            arrays = {name: np.asarray(file[name]) for name in names if name in wanted}
-    except Exception as error:  # a damaged archive raises any of half a dozen kinds
+    count = int(use)
+    if count >= len(wholes):
         raise ValueError(
-            f"'{path}' is not a readable .npz file ({error}); write it again with numpy.savez, "
-            "arrays of numbers only."
-        ) from error
-    signals = []
-    for name in wanted:
-        if not isinstance(name, str) or name not in arrays:
+            f"{option}={count} takes the last {count} of the {len(wholes)} record(s) there are, "
+            "which leaves none for training; give more files, or a fraction below 1."
+        )
+    return [whole.record for whole in wholes[-count:]], wholes[:-count], 0.0
+
+
+def _named(
+    option: str, names: Sequence[str | Path], wholes: list[_Whole], reader: _Reader
+) -> tuple[list[Record], list[_Whole]]:
+    """Records by their names, or of other files, and those that are left."""
+    left, records = list(wholes), []
+    known = list(reader.all)
+    for name in names:
+        found = [whole for whole in known if str(name) in (whole.record.name, whole.stem)]
+        if not found:
+            path = Path(name).expanduser()
+            if not (path.exists() or path.suffix or glob.has_magic(str(name))):
+                raise ValueError(
+                    f"{option} names {str(name)!r}, which is neither a file nor one of the "
+                    f"records: {', '.join(whole.record.name for whole in known)}."
+                )
+            paths = _found(name, option)
+            same = {path.resolve() for path in paths}
+            found = [whole for whole in known if whole.path.resolve() in same]
+            own = [p for p in paths if p.resolve() not in {w.path.resolve() for w in found}]
+            fresh = reader.read(own) if own else []
+            records += [whole.record for whole in fresh]
+        used = [whole.record.name for whole in found if whole not in left]
+        if used:
             raise ValueError(
-                f"'{path}' has no array {name!r}: it has {_quoted(names) or 'none'}. Name one "
-                "that is there."
+                f"{option} names {', '.join(map(repr, used))}, which has a use already; name every "
+                "record once in data.validation and data.test."
             )
-        array = arrays[name]
-        array = array[:, None] if array.ndim == 1 else array
-        if array.dtype.kind not in "biuf" or array.ndim != 2 or array.shape[0] < array.shape[1]:
-            raise ValueError(
-                f"'{path}': array {name!r} has shape {arrays[name].shape} and type {array.dtype}; "
-                "give real numbers of shape (samples,) or (samples, channels)."
-            )
-        bad = ~np.isfinite(array).all(axis=1)
-        if bad.any():
-            raise ValueError(
-                f"'{path}': array {name!r} has NaN or infinite values in {bad.sum()} sample(s), "
-                f"the first at index {np.argmax(bad)}; cut or interpolate them."
-            )
-        signals.append((name, array.astype(np.float64)))
-    return signals
+        records += [whole.record for whole in found]
+        left = [whole for whole in left if whole not in found]
+    return records, left

@@ -22,6 +22,10 @@ _UNIT = re.compile(rf"{_ATOM}(?:[/*·. ]{_ATOM})*")
 _BRACKETS = re.compile(r"(.*?)(\s*)[(\[]\s*([^()\[\]]{1,16}?)\s*[)\]]")
 
 
+class NoColumn(ValueError):
+    """A file that has no such column."""
+
+
 class Table(ABC):
     """Channels of one file: consecutive samples (T, columns), NaN where a value is missing.
 
@@ -72,7 +76,7 @@ class Table(ABC):
             grown += block.tobytes()
         return np.frombuffer(grown, np.float64).reshape(-1, len(columns))
 
-    def find(self, wanted: str | int | Sequence[str | int], option: str) -> tuple[int, ...]:
+    def find(self, wanted: str | int | Sequence[str | int] | None, option: str) -> tuple[int, ...]:
         """Numbers of the columns that are wanted by name, by header or by number from 0.
 
         The name of an array of several channels stands for all of them.
@@ -99,7 +103,7 @@ class Table(ABC):
     def _find(self, wanted: str | int, option: str) -> tuple[int, ...]:
         if isinstance(wanted, int):
             if not 0 <= wanted < len(self.columns):
-                raise ValueError(
+                raise NoColumn(
                     f"'{self.path}' has no column number {wanted}, as {option} says; "
                     f"it has {self.listed}, numbered from 0."
                 )
@@ -120,7 +124,7 @@ class Table(ABC):
             raise ValueError(
                 f"'{self.path}': {wanted!r}, as {option} says, {self.refused[wanted]}."
             )
-        raise ValueError(
+        raise NoColumn(
             f"'{self.path}' has no column {wanted!r}, as {option} says; it has {self.listed}."
         )
 

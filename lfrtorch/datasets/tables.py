@@ -53,7 +53,7 @@ def open_table(path: str | Path) -> Table:
             + (f": {', '.join(inside[:_SHOWN])}." if inside else ", it has none of a known format.")
         )
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file '{path}'{_similar(path)}.")
+        raise FileNotFoundError(f"there is no file '{path}'{similar(path)}.")
     kind = extension(path)
     if kind not in FORMATS:
         instead = _INSTEAD.get(path.suffix.lower(), "convert it")
@@ -75,7 +75,8 @@ def extension(path: Path) -> str:
     return text if FORMATS.get(text) is TextTable else kind
 
 
-def _similar(path: Path) -> str:
+def similar(path: Path) -> str:
+    """What there is in place of a file that is not there, as the end of a message."""
     folder = path.parent
     while not folder.is_dir() and folder != folder.parent:
         folder = folder.parent

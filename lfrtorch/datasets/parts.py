@@ -1,0 +1,60 @@
+"""One record cut in time into a training, a validation and a test record."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lfrtorch.records import Record
+
+SHORTEST = 10
+"""Scored samples of a part."""
+
+
+class TooShort(ValueError):
+    """A record that leaves a part too few samples."""
+
+
+def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
+    """The parts by use; one whose fraction is 0 is left out.
+
+    Every part begins where the record begins and is simulated from there: only its own samples are
+    scored, so that the transient of the start reaches neither validation nor test. A record in
+    steady state is cut into whole periods, at least one each, which are in steady state themselves.
+
+    Args:
+        record: the whole measurement.
+        validation: fraction of the samples, those after the training part.
+        test: fraction of the samples, those at the end.
+
+    Raises:
+        TooShort: a part of fewer scored samples than ``SHORTEST``, or of no period.
+    """
+    names = ["train", *["validation"] * bool(validation), *["test"] * bool(test)]
+    steady = record.start == "periodic"
+    unit = (record.period or record.samples) if steady else 1
+    total = record.samples // unit
+    held = [max(1, round(total * f)) for f in (validation, test) if f]
+    if steady and total - sum(held) < 1:
+        raise TooShort(
+            f"record '{record.name}' has {total} whole period(s) after the transient, and "
+            f"{', '.join(names)} need one each; give a longer record, set data.validation or "
+            "data.test to 0, or use data.start=zero."
+        )
+    ends = [total - sum(held)]
+    for count in held:
+        ends.append(ends[-1] + count)
+    parts, begin = {}, 0
+    for name, end in zip(names, ends, strict=True):
+        if steady:
+            part = replace(record[begin * unit : end * unit], start="periodic", period=unit)
+        else:
+            first = max(begin, record.skip)
+            if end - first < SHORTEST:
+                raise TooShort(
+                    f"record '{record.name}': the {name} part has {max(end - first, 0)} scored "
+                    f"samples of {total}, with skip={record.skip}; it needs {SHORTEST}. Change the "
+                    "fractions or skip, or give a longer file."
+                )
+            part = replace(record[:end], start=record.start, skip=first)
+        parts[name], begin = part, end
+    return parts
