@@ -190,10 +190,13 @@ def table(result: dict, published: Sequence[Published]) -> str:
         chosen += [_number(s["lti_rmse"]), _number(s["rmse"])]
         rows.append(chosen + [_number(None)] * len(others))
     first, *lines = _aligned([head, *rows], left=(0, 1))
-    units = {s["unit"] for s in result["scores"].values()} - {""}
+    scored = {**result["validation"]["records"], **result["scores"]}
+    units = {s["unit"] for s in scored.values()} - {""}
     title = f"Simulation RMSE{f' ({next(iter(units))})' if len(units) == 1 else ''}"
     static = f"degree {sizes['degree']}" if "degree" in sizes else f"{sizes['nn']} neurons"
     title += f", nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
+    if not rows:
+        return f"{title}: nothing is scored, as there is no test and no validation record"
     references = [f"{p.label}: {p.reference}" for p in others]
     if result["linear"]:
         models = ", ".join(f"{n} of {'+'.join(r)}" for n, r in result["linear"].items())

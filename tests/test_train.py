@@ -223,6 +223,18 @@ def test_a_resting_test_part_gives_a_score_that_is_null(tmp_path: Path):
     assert score["rmse"] >= 0
 
 
+def test_a_run_without_test_and_validation_records(tmp_path: Path, capsys):
+    u = np.random.default_rng(0).standard_normal(300)
+    y = np.convolve(u, [0.0, 0.5, 0.3])[: len(u)]
+    np.savez(tmp_path / "all.npz", u=u, y=y)
+    overrides = ["data=file", f"data.path={tmp_path / 'all.npz'}", "data.inputs=[u]"]
+    overrides += ["data.outputs=[y]", "data.fs=1", "nx=1", "trainer.max_iter=1"]
+    train.identify(configuration(*overrides, "data.test=0", "data.validation=0"), tmp_path)
+    assert "nothing is scored" in capsys.readouterr().out
+    assert json.loads((tmp_path / "metrics.json").read_text())["scores"] == {}
+    assert (tmp_path / "figures" / "convergence.png").is_file()
+
+
 def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
     with subprocess.Popen(
         command(
@@ -443,7 +455,7 @@ def test_iterations_of_the_other_trainer_are_named(
         (["+bench=boucwen", "seed=a"], "seed is 'a'"),
         (["+bench=boucwen", "data.seed=x"], "data.seed is 'x'"),
         (["data=boucwen"], "+bench=boucwen"),
-        (["data=file", "data.path=/nowhere.csv", "nx=1"], "data.inputs"),
+        (["data=file", "data.path=/nowhere.csv", "nx=1"], "there is no file '/nowhere.csv'"),
     ],
 )
 def test_user_errors_are_one_message(
