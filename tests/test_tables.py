@@ -112,6 +112,36 @@ def test_labview_measurement(tmp_path):
     assert np.array_equal(whole(table, ["X_Value", "Voltage", "Voltage_0"]), SIGNALS)
 
 
+@pytest.mark.parametrize(
+    ("head", "columns"),
+    [
+        ('"Time","Load"\n"(sec)","(N)"\n', [("Time", "sec"), ("Load", "N")]),  # testing machine
+        ("Time,Channel A\n(ms),(V)\n\n", [("Time", "ms"), ("Channel A", "V")]),  # oscilloscopes
+        ("X,CH1,\nVolt,Volt,\n", [("X", ""), ("CH1", "")]),
+        (
+            "LECROYWS,123,Waveform\nSegments,1\n#1,01-Jan,0\nTime,Ampl\n",
+            [("Time", ""), ("Ampl", "")],
+        ),
+        (",y\n", [("column 0", ""), ("y", "")]),  # an index without a name
+    ],
+)
+def test_heads_of_instruments(tmp_path, head, columns):
+    table = table_of(tmp_path, head + text(U))
+    assert [tuple(column) for column in table.columns] == columns
+    assert np.array_equal(table.read([0, 1]), U)
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+def test_blanks_and_line_ends(tmp_path, newline):
+    rows = ["  u , y", " 1.5 , +2 ", '"3e2" ,-.5', "Infinity,Null", "0x1,1"]
+    table = table_of(tmp_path, newline.join(rows[:4]) + newline)
+    assert names(table) == ["u", "y"]
+    expected = [[1.5, 2], [300, -0.5], [np.inf, np.nan]]
+    assert np.array_equal(table.read([0, 1]), expected, equal_nan=True)
+    with pytest.raises(ValueError, match="line 5: '0x1' in column 'u' is not a number"):
+        table_of(tmp_path, newline.join(rows)).read([0])
+
+
 @pytest.mark.parametrize("mark", ["# ", "%", "#\t"])
 def test_header_in_a_comment(tmp_path, mark):
     content = f"{mark}made by a program\n{mark}u1,u2,y\n" + text()
@@ -163,10 +193,12 @@ def test_date_times_are_seconds(tmp_path):
     stamps = np.datetime64("2024-02-28T23:59:59.5") + np.arange(T) * np.timedelta64(250, "ms")
     for form in (str, lambda t: str(t).replace("T", " "), lambda t: f"{t}+01:00"):
         rows = "".join(f"{form(t)};{y}\n" for t, y in zip(stamps, Y, strict=True))
+        rows = rows.replace(form(stamps[0]), "", 1)  # a time that is missing
         table = table_of(tmp_path, "when;y\n" + rows)
         parts = list(table.blocks([1, 0], samples=7))
         assert [len(part) for part in parts] == [7] * 5 + [5]
-        assert np.allclose(np.concatenate(parts)[:, 1], np.arange(T) / 4, atol=1e-12)
+        expected = np.append(np.nan, np.arange(T - 1) / 4)
+        assert np.allclose(np.concatenate(parts)[:, 1], expected, atol=1e-12, equal_nan=True)
 
 
 def test_lines_count_comments_and_blanks(tmp_path):

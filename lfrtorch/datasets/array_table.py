@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch.datasets.table import BLOCK, Table, seconds
+from lfrtorch.datasets.table import BLOCK, Clock, Table
 
 _REAL, _TIMES = "biuf", "M"
 
@@ -108,7 +108,7 @@ class ArrayTable(Table):
             listed = ", ".join(f"{name!r} has {length}" for name, length in lengths.items())
             raise ValueError(f"'{self.path}': {listed} samples; give arrays of one length.")
         T = next(iter(lengths.values()))
-        first: dict[str, Any] = {}
+        clocks = {name: Clock() for name in lengths}
         with self._stored(self.path) as stored:
             for start in range(0, T, samples):
                 stop = min(start + samples, T)
@@ -121,7 +121,7 @@ class ArrayTable(Table):
                         raise _damaged(self.path, error) from error
                     part = np.asarray(part.T if signal.transposed else part)
                     if part.dtype.kind in _TIMES:
-                        part = seconds(part, first.setdefault(name, part.reshape(-1)[0]))
+                        part = clocks[name](part)
                     parts[name] = part.reshape(stop - start, -1)
                 yield np.stack([parts[name][:, i] for name, i in chosen], axis=1, dtype=np.float64)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfrtorch.datasets.array_table import optional
-from lfrtorch.datasets.table import BLOCK, Table, seconds
+from lfrtorch.datasets.table import BLOCK, Clock, Table
 
 
 class ParquetTable(Table):
@@ -41,7 +41,7 @@ class ParquetTable(Table):
         """See :meth:`Table.blocks`."""
         pa, pq = optional("pyarrow"), optional("pyarrow.parquet")
         names = [self.headers[column] for column in columns]
-        first: dict[str, np.datetime64] = {}
+        clocks = {name: Clock() for name in names}
         try:
             with pq.ParquetFile(self.path) as file:
                 for batch in file.iter_batches(samples, columns=list(dict.fromkeys(names))):
@@ -50,7 +50,7 @@ class ParquetTable(Table):
                         values = batch.column(batch.schema.get_field_index(name))
                         if pa.types.is_timestamp(values.type):
                             times = values.cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False)
-                            found[:, i] = seconds(times, first.setdefault(name, times[0]))
+                            found[:, i] = clocks[name](times)
                         else:
                             numbers = values.cast(pa.float64(), safe=False)
                             found[:, i] = numbers.to_numpy(zero_copy_only=False)

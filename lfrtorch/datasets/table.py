@@ -177,7 +177,19 @@ def _channel(header: str) -> Channel:
     return Channel(header)
 
 
-def seconds(times: NDArray[np.datetime64], first: np.datetime64) -> NDArray[np.float64]:
-    """Seconds since ``first``, NaN where there is no time."""
-    apart = (times.astype("M8[ns]") - first.astype("M8[ns]")).astype("m8[ns]")
-    return np.where(np.isnat(apart), np.nan, apart.astype(np.int64) * 1e-9)
+class Clock:
+    """Seconds since the first of date-times that come in blocks; NaN where there is none."""
+
+    def __init__(self) -> None:
+        self._first: np.datetime64 | None = None
+
+    def __call__(self, times: NDArray[np.datetime64]) -> NDArray[np.float64]:
+        """Seconds of a block."""
+        times = times.astype("M8[ns]")
+        known = ~np.isnat(times)
+        if self._first is None and known.any():
+            self._first = times[known][0]
+        since = np.full(times.shape, np.nan)
+        if self._first is not None:
+            since[known] = (times[known] - self._first).astype(np.int64) * 1e-9
+        return since

@@ -18,15 +18,15 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch.datasets.table import BLOCK, Table, bracketed, is_unit, seconds
+from lfrtorch.datasets.table import BLOCK, Clock, Table, bracketed, is_unit
 
 _HEAD = 1 << 18  # characters that tell the layout
 _DELIMITERS = ("\t", ";", ",", "|", " ")  # " ": any blanks; the first of those that do as well
 _MARKS = "#%"  # of comment lines
 _COMMENT = re.compile(r"^[ \t]*[#%](?!N/?A\b|[A-Z]+/?0?[!?]).*(?:\n|$)", re.MULTILINE)  # no #N/A
 _MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-nan", "<na>", "#na", "-")
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE)
-_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")  # a number with a decimal comma
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE)
+_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")  # a number with a decimal comma
 _DATE = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?(Z|[+-]\d\d:?\d\d)?")
 
 _DAMAGED = (OSError, EOFError, zlib.error, UnicodeError)
@@ -70,7 +70,7 @@ class TextTable(Table):
 
         layout, beyond = self.layout, len(self.columns)
         dates = layout.dates.intersection(columns)
-        first: np.datetime64 | None = None
+        clocks = {column: Clock() for column in dates}
         try:
             with _Samples(self.path, layout) as stream, warnings.catch_warnings():
                 # A line of more cells than names; it is refused below.
@@ -84,7 +84,11 @@ class TextTable(Table):
                     usecols=sorted({*columns, beyond}),
                     index_col=False,
                     dtype=dict.fromkeys(columns, np.float64) | dict.fromkeys((*dates, beyond), str),
-                    na_values=list(_MISSING) + [name.upper() for name in _MISSING],
+                    na_values=[
+                        *_MISSING,
+                        *map(str.upper, _MISSING),
+                        *map(str.capitalize, _MISSING),
+                    ],
                     skipinitialspace=layout.delimiter != " ",
                     chunksize=samples,
                     **_exact(pd.__version__),
@@ -96,14 +100,7 @@ class TextTable(Table):
                     found = np.empty((len(part), len(columns)))
                     for i, column in enumerate(columns):
                         values = part[column]
-                        if column in dates:
-                            times = _times(values)
-                            if first is None and len(times):
-                                first = times[0]
-                            assert first is not None
-                            found[:, i] = seconds(times, first)
-                        else:
-                            found[:, i] = values
+                        found[:, i] = clocks[column](_times(values)) if column in dates else values
                     yield found
         except (ValueError, *_DAMAGED) as error:  # pandas says which cell, and not where
             if str(error).startswith(f"'{self.path}'"):
@@ -337,7 +334,7 @@ def _found(path: Path, encoding: str, delimiter: str, lines: list[_Line]) -> _La
         above = [line.cells for line in lines[:start] if len(line.cells) >= width]
     headers, units = _names(above, width)
     first = lines[start]
-    dates = frozenset(i for i, cell in enumerate(first.cells[: len(headers)]) if _is_date(cell))
+    dates = frozenset(i for i in range(width) if any(_is_date(cells[i]) for cells in whole))
     comma = decimal and any(_COMMA.fullmatch(c) for cells in whole for c in cells)
     return _Layout(encoding, delimiter, comma, first.number, headers, units, dates)
 
@@ -356,6 +353,8 @@ def _names(above: list[list[str]], width: int) -> tuple[tuple[str, ...], dict[st
     units: list[str] = []
     if len(above) > 1 and all(not c or is_unit(c) or bracketed(c) for c in above[-1]):
         *above, units = above
+    if len(above) > 1 and _doubled(above[-1]) and not _doubled(above[-2]):
+        above.pop()  # words for units, as "Volt, Volt"
     names = above[-1] if above else []
     names = names[: max([width, *(i + 1 for i, name in enumerate(names) if name)])]
     headers = tuple(name or f"column {i}" for i, name in enumerate(names)) or tuple(
@@ -366,6 +365,10 @@ def _names(above: list[list[str]], width: int) -> tuple[tuple[str, ...], dict[st
         for header, unit in zip(headers, units, strict=False)
         if unit
     }
+
+
+def _doubled(names: list[str]) -> bool:
+    return len(set(names)) < len(names)
 
 
 def _is_number(cell: str, comma: bool) -> bool:
