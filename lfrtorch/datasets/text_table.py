@@ -72,9 +72,7 @@ class TextTable(Table):
         dates = layout.dates.intersection(columns)
         clocks = {column: Clock() for column in dates}
         try:
-            with _Samples(self.path, layout) as stream, warnings.catch_warnings():
-                # A line of more cells than names; it is refused below.
-                warnings.simplefilter("ignore", pd.errors.ParserWarning)
+            with _Samples(self.path, layout) as stream:
                 reader = pd.read_csv(
                     stream,
                     sep=r"\s+" if layout.delimiter == " " else layout.delimiter,
@@ -94,7 +92,7 @@ class TextTable(Table):
                     **_exact(pd.__version__),
                 )
                 reader.get_chunk(1)  # of no sample
-                for part in reader:
+                while (part := _next(reader)) is not None:
                     if part[beyond].notna().any():
                         self._explain(columns)
                     found = np.empty((len(part), len(columns)))
@@ -149,6 +147,13 @@ class TextTable(Table):
 
     def _is_number(self, cell: str) -> bool:
         return _is_number(cell, self.layout.comma)
+
+
+def _next(reader: Any) -> Any:
+    """The next block; a line of more cells than names is no warning, but refused later."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return next(reader, None)
 
 
 def _exact(version: str) -> dict[str, Any]:
