@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from torch import Tensor
 FORMAT = "lfrtorch"
 VERSION = 1
 DESCRIPTION, WEIGHTS = "model.json", "weights.safetensors"
+
+CODE = (".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".joblib", ".py", ".pyc", ".so")
+"""Extensions of files that may carry code: none of them belongs to a checkpoint."""
 
 
 def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Tensor]) -> Path:
@@ -50,24 +54,27 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
     return folder
 
 
-def read(folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Description and weights of a checkpoint folder, or of a run's folder that holds ``model/``.
+def read(
+    folder: str | Path, inside: Sequence[str] = ("model", "linear")
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Description and weights of a checkpoint folder, or of a run's folder that holds one.
+
+    Args:
+        folder: the checkpoint, or the run.
+        inside: where in a run's folder, the first that is there.
 
     Raises:
-        ValueError: no checkpoint there, a damaged one, or one of another program or newer version.
+        ValueError: no checkpoint there, a damaged one, one of another program or newer version, or
+            files that may carry code, which are never opened.
     """
-    folder = Path(folder)
-    if not (folder / DESCRIPTION).is_file() and (folder / "model" / DESCRIPTION).is_file():
-        folder = folder / "model"
-    if not (folder / DESCRIPTION).is_file():
-        raise ValueError(
-            f"'{folder}' is not a checkpoint: no {DESCRIPTION} in it or in its model/ folder; "
-            "give the folder of a run or of a saved model."
-        )
+    folder = _located(Path(folder), inside)
     try:
         description = json.loads((folder / DESCRIPTION).read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"'{folder / DESCRIPTION}' is damaged ({error}); save it anew.") from None
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(
+            f"'{folder / DESCRIPTION}' is damaged or cut off ({error}); "
+            "copy the checkpoint again from where it was saved, or train anew."
+        ) from None
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise ValueError(f"'{folder / DESCRIPTION}' was not written by {FORMAT}.")
     if not isinstance(description.get("version"), int) or description["version"] > VERSION:
@@ -79,9 +86,37 @@ def read(folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         weights = load_file(folder / WEIGHTS)
     except (SafetensorError, OSError) as error:
         raise ValueError(
-            f"'{folder / WEIGHTS}' is damaged or missing ({error}); restore it or train anew."
+            f"'{folder / WEIGHTS}' is damaged or missing ({error}); "
+            "copy the checkpoint again from where it was saved, or train anew."
         ) from None
     return description, weights
+
+
+def _located(folder: Path, inside: Sequence[str]) -> Path:
+    """The folder that holds the description; refuse all else, code above all."""
+    if folder.is_file():
+        raise ValueError(
+            f"'{folder}' is a file, and a checkpoint is a folder with {DESCRIPTION} and {WEIGHTS}; "
+            f"give that folder, or the folder of a run. Other files ({', '.join(CODE[:4])}) may "
+            "carry code and are never opened."
+        )
+    places = [folder, *(folder / name for name in inside)]
+    found = next((place for place in places if (place / DESCRIPTION).is_file()), None)
+    looked_in = folder if found is None else found
+    code = sorted(p.name for p in looked_in.glob("*") if p.suffix.lower() in CODE)
+    if found is None:
+        raise ValueError(
+            f"'{folder}' is not a checkpoint: no {DESCRIPTION} in it or in its "
+            f"{' or '.join(f'{name}/' for name in inside)} folder; "
+            "give the folder of a run or of a saved model."
+            + (f" {', '.join(code)} may carry code and is never opened." if code else "")
+        )
+    if code:
+        raise ValueError(
+            f"'{found}' holds {', '.join(code)} beside the model: a checkpoint carries no code; "
+            "move the file away if you know where it comes from, or do not trust this folder."
+        )
+    return found
 
 
 def _holds(folder: Path, description: str) -> bool:

@@ -154,7 +154,7 @@ class LinearModel:
         coordinates; the one that fits best takes its place.
         """
         data = without_coordinates(data) if isinstance(data, Record) else data
-        return self._model().simulate(data)
+        return self.to_model().simulate(data)
 
     def predict(self, record: Record) -> Array:
         """Output (T, ny) predicted one sample ahead from the outputs before, physical units.
@@ -168,7 +168,7 @@ class LinearModel:
             raise ValueError(
                 "this model has no innovation gain K: estimate it with refine='prediction'."
             )
-        self._model().check(without_coordinates(record))
+        self.to_model().check(without_coordinates(record))
         ny = len(self.outputs)
         predictor = replace(
             self,
@@ -222,6 +222,13 @@ class LinearModel:
             ):
                 weight.copy_(torch.as_tensor(np.ascontiguousarray(value)))
 
+    def to_model(self) -> Model:
+        """The same as a ``Model`` without static nonlinearity, in the same coordinates."""
+        nu, ny = len(self.inputs), len(self.outputs)
+        unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
+        cell = linear_cell(self.A, self.B, self.C, self.D)
+        return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs)
+
     def to_scipy(self) -> scipy.signal.StateSpace:
         """The deviations from the operating point as a ``scipy.signal.StateSpace``."""
         return scipy.signal.StateSpace(self.A, self.B, self.C, self.D, dt=1.0 / self.fs)
@@ -259,12 +266,12 @@ class LinearModel:
 
     @classmethod
     def load(cls, folder: str | Path) -> LinearModel:
-        """The linear model in a checkpoint folder.
+        """The linear model in a checkpoint folder, or in the ``linear/`` folder of a run's folder.
 
         Raises:
             ValueError: no checkpoint, a damaged one, or one that holds another kind of model.
         """
-        description, weights = checkpoint.read(folder)
+        description, weights = checkpoint.read(folder, ("linear", "model"))
         if "linear" not in description:
             raise ValueError(f"'{folder}' holds no linear model; lfrtorch.load reads an NL-LFR.")
         try:
@@ -295,13 +302,6 @@ class LinearModel:
             raise ValueError(
                 f"'{folder}' is damaged: its description and weights do not fit ({error})."
             ) from None
-
-    def _model(self) -> Model:
-        """The model of the engine, with unit scales."""
-        nu, ny = len(self.inputs), len(self.outputs)
-        unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
-        cell = linear_cell(self.A, self.B, self.C, self.D)
-        return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs)
 
     def _z(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
         f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -172,8 +173,8 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             checkpoint holds weights, never code).
 
     Raises:
-        ValueError: no checkpoint, a damaged one, one of another program or a newer version, or one
-            that holds a linear model.
+        ValueError: no checkpoint, a damaged one, one of another program or a newer version, one
+            that holds a linear model, or a file that may carry code (it is not opened).
     """
     description, weights = checkpoint.read(folder)
     if "linear" in description:
@@ -191,6 +192,8 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
     try:
         sizes = description["sizes"]
         dtype = getattr(torch, description["dtype"])
+        if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
+            raise ValueError(f"dtype is {description['dtype']}")
         scaler = Scaler(
             *(
                 weights.pop(f"scaler.{name}").numpy()
@@ -207,7 +210,13 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         channels = [
             tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")
         ]
-        return Model(LFR(cell), scaler, float(description["fs"]), *channels)
+        fs = float(description["fs"])
+        widths = [s.shape for s in vars(scaler).values()] + [(len(c),) for c in channels]
+        if widths != [(size,) for size in 2 * [cell.nu] + 2 * [cell.ny] + [cell.nu, cell.ny]]:
+            raise ValueError("scales or channels are more or fewer than inputs and outputs")
+        if not (math.isfinite(fs) and fs > 0):
+            raise ValueError(f"fs is {fs}")
+        return Model(LFR(cell), scaler, fs, *channels)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise ValueError(
             f"'{folder}' is damaged: its description and weights do not fit ({error})."

@@ -1,6 +1,7 @@
 """Saved and loaded to the same bits; everything else is refused with nothing lost."""
 
 import json
+import pickle
 import re
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 from reference import random_cell, random_model
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+import lfrtorch
 from lfrtorch import checkpoint
 from lfrtorch.model import Model, load
 from lfrtorch.nonlinearity import Network, Polynomial
@@ -156,7 +159,7 @@ def test_no_checkpoint(tmp_path: Path):
     refused(tmp_path, "is not a checkpoint")
 
 
-@pytest.mark.parametrize("text", [b"", b'{"format": "lfrt', b"\xff\xfe\x00", b"{]"])
+@pytest.mark.parametrize("text", [b"", b'{"format": "lfrt', b"\xff\xfe\x00", b"{]", b"[" * 100_000])
 def test_damaged_description(saved: Path, text: bytes):
     (saved / "model.json").write_bytes(text)
     refused(saved, "is damaged")
@@ -198,6 +201,12 @@ def test_description_that_lacks_an_entry(saved: Path, entry: str):
         {"dtype": "float65"},
         {"fs": []},
         {"inputs": [{"label": "u"}]},
+        {"inputs": [{"name": "u1", "unit": ""}]},
+        {"outputs": [{"name": f"y{i}", "unit": ""} for i in range(3)]},
+        {"dtype": "load"},
+        {"dtype": "int64"},
+        {"fs": 0.0},
+        {"fs": float("nan")},
     ],
 )
 def test_description_that_does_not_fit_the_weights(saved: Path, change: dict):
@@ -216,6 +225,91 @@ def test_truncated_weights(saved: Path, kept: float):
 def test_missing_weights(saved: Path):
     (saved / "weights.safetensors").unlink()
     refused(saved, "is damaged or missing")
+
+
+def test_scales_of_another_model(saved: Path):
+    for sizes in ((1, 2), (2, 1)):
+        other = random_model(random_cell(*sizes, 3, 2, 1, 4)).save(saved.with_name("other"))
+        mixed = load_file(saved / "weights.safetensors")
+        scales = load_file(other / "weights.safetensors").items()
+        mixed |= {name: scale for name, scale in scales if name.startswith("scaler.")}
+        save_file(mixed, saved / "weights.safetensors")
+        refused(saved, "scales or channels are more or fewer than inputs and outputs")
+
+
+# --- code is never run ----------------------------------------------------------------------
+
+
+class Trap:
+    """Makes a folder where it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.mkdir, (self.path,)
+
+
+@pytest.fixture
+def trap(tmp_path: Path) -> Path:
+    """Files that run code where they are unpickled: trap.pkl and the zip archive trap.pt."""
+    sprung = tmp_path / "sprung"
+    (tmp_path / "trap.pkl").write_bytes(pickle.dumps(Trap(sprung)))
+    torch.save(Trap(sprung), tmp_path / "trap.pt")
+    with pytest.raises(FileNotFoundError):  # so the trap works, where its folder is
+        pickle.loads(pickle.dumps(Trap(sprung / "deeper")))
+    return sprung
+
+
+@pytest.mark.parametrize("name", ["trap.pkl", "trap.pt"])
+def test_pickle_given_as_checkpoint_is_not_opened(trap: Path, name: str):
+    refused(trap.with_name(name), "carry code and are never opened")
+    with pytest.raises(ValueError, match="is a file, and a checkpoint is a folder"):
+        lfrtorch.LinearModel.load(trap.with_name(name))
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("name", ["trap.pkl", "trap.pt"])
+def test_pickle_in_the_place_of_the_weights_is_not_opened(trap: Path, saved: Path, name: str):
+    (saved / "weights.safetensors").write_bytes(trap.with_name(name).read_bytes())
+    refused(saved, "is damaged or missing")
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("name", ["trap.pkl", "trap.pt"])
+def test_pickle_beside_the_model_is_refused(trap: Path, saved: Path, name: str):
+    trap.with_name(name).rename(saved / name)
+    refused(saved, f"holds {name} beside the model: a checkpoint carries no code")
+    assert not trap.exists()
+
+
+def test_folder_of_pickles(trap: Path, tmp_path: Path):
+    refused(tmp_path, "is not a checkpoint: no model.json in it or in its model/ or linear/ folder")
+    refused(tmp_path, "trap.pkl, trap.pt may carry code and is never opened")
+    assert not trap.exists()
+
+
+def test_file_of_a_checkpoint_is_not_the_checkpoint(saved: Path):
+    with pytest.raises(ValueError, match="is a file, and a checkpoint is a folder"):
+        load(saved / "model.json")
+
+
+# --- the two models of a run ----------------------------------------------------------------
+
+
+def test_each_kind_of_model_is_found_in_a_run(tmp_path: Path):
+    model, run = random_model(random_cell(2, 1, 3, 0, 0)), tmp_path / "run"
+    linear = lfrtorch.LinearModel(
+        *(getattr(model.lfr.cell, name).detach().numpy() for name in ("A", "Bu", "Cy", "Dyu")),
+        fs=1.0, u_offset=np.zeros(2), y_offset=np.zeros(1),
+        inputs=model.inputs, outputs=model.outputs,
+    )  # fmt: skip
+    linear.save(run / "linear")
+    refused(run, "holds a linear model")
+    model.save(run / "model")
+    assert np.array_equal(lfrtorch.LinearModel.load(run).simulate(U), linear.simulate(U))
+    assert np.array_equal(load(run).simulate(U), model.simulate(U))
+    assert np.array_equal(linear.to_model().simulate(U), linear.simulate(U))
 
 
 # --- refusals of save -----------------------------------------------------------------------
