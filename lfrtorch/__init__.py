@@ -25,6 +25,7 @@ from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.order import OrderScan, scan_orders
 from lfrtorch.records import Channel, Record, Scaler
 from lfrtorch.sizes import SizeSearch, search_sizes
+from lfrtorch.stream import simulate_blocks
 from lfrtorch.trainer import FitResult, fit
 
 __version__ = version("lfrtorch")
@@ -61,4 +62,5 @@ __all__ = [
     "rmse",
     "scan_orders",
     "search_sizes",
+    "simulate_blocks",
 ]

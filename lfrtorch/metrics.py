@@ -30,3 +30,55 @@ def nrmse(record: Record, y_hat: NDArray[np.float64]) -> float:
     """
     deviation = float(np.sqrt(np.mean(np.var(record.y[record.skip :], axis=0))))
     return rmse(record, y_hat) / deviation if deviation > 0 else float("nan")
+
+
+class BlockScores:
+    """Scores of each output over blocks of samples, of which sums alone are kept.
+
+    A sample without a measurement (NaN) does not count.
+
+    Args:
+        ny: outputs.
+        skip: samples at the beginning that do not count.
+
+    Shape:
+        samples, rmse, nrmse: (ny,).
+    """
+
+    def __init__(self, ny: int, skip: int = 0) -> None:
+        self.samples = np.zeros(ny, dtype=np.int64)
+        """Samples that count."""
+        self._skip = skip
+        self._mean, self._spread, self._errors = np.zeros((3, ny))
+
+    def add(self, y: NDArray[np.float64], y_hat: NDArray[np.float64]) -> None:
+        """Take in the next samples (n, ny), measured and simulated."""
+        left_out = min(self._skip, len(y))
+        self._skip -= left_out
+        y, y_hat = y[left_out:], y_hat[left_out:]
+        there = np.isfinite(y)
+        added = there.sum(axis=0)
+        whole = np.maximum(self.samples + added, 1)
+        y = np.where(there, y, self._mean)
+        # About the mean so far, by the update of Chan, Golub and LeVeque (1983): exact, and
+        # without the cancellation of a sum of squares.
+        shift = (y - self._mean).sum(axis=0) / np.maximum(added, 1)
+        self._spread += np.where(there, (y - self._mean - shift) ** 2, 0.0).sum(axis=0)
+        self._spread += shift**2 * self.samples * added / whole
+        self._mean += shift * added / whole
+        self._errors += np.where(there, (y - y_hat) ** 2, 0.0).sum(axis=0)
+        self.samples += added
+
+    @property
+    def rmse(self) -> NDArray[np.float64]:
+        """Root mean squared errors, NaN where no sample counts."""
+        return np.sqrt(self._mean_of(self._errors))
+
+    @property
+    def nrmse(self) -> NDArray[np.float64]:
+        """RMSE over the standard deviation of the measured output, NaN for a constant one."""
+        deviation = np.sqrt(self._mean_of(self._spread))
+        return self.rmse / np.where(deviation > 0, deviation, np.nan)
+
+    def _mean_of(self, total: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.where(self.samples > 0, total / np.maximum(self.samples, 1), np.nan)

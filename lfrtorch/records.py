@@ -301,13 +301,16 @@ def _channels(given: tuple[Channel, ...], signal: ArrayLike, letter: str) -> tup
     return tuple(Channel(*c) for c in given)
 
 
-def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str) -> NDArray[np.float64]:
+def as_signal(
+    x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: int = 0
+) -> NDArray[np.float64]:
     """A signal (T, channels) of finite real numbers from (T, channels) or (T,), not writeable.
 
     Args:
         x: the samples.
         channels: their names.
         what: what an error message calls the signal.
+        first: number of the first sample in an error message.
 
     Raises:
         ValueError: another type or shape, no sample, NaN or infinite samples.
@@ -340,7 +343,7 @@ def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str) -> NDArray
         k, channel = np.argwhere(bad)[0]
         raise ValueError(
             f"{what} '{channels[channel].name}' has {bad.sum()} NaN or infinite sample(s), the "
-            f"first at index {k}; cut the record there or interpolate the gap."
+            f"first at index {first + k}; cut the record there or interpolate the gap."
         )
     array.flags.writeable = False
     return array
