@@ -270,6 +270,7 @@ def write(
         f"{result.seconds:.1f} s, {1e3 * result.seconds_per_iteration:.0f} ms an iteration\n"
     )
     result.model.save(folder / "model")
+    bla.save(folder / "linear")
     own = own_linear_models(cfg, dataset)
     metrics = report.metrics(
         result,
@@ -322,11 +323,7 @@ def chosen_before(cfg: DictConfig, folder: Path) -> None:
 
 def require(cfg: DictConfig) -> None:
     """Say what is missing from the command line before anything is computed."""
-    if cfg.get("data") is None:
-        raise ValueError(
-            "no data chosen: add +bench=boucwen, or data=file data.path=FILE "
-            "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER (or nx=auto)."
-        )
+    require_data(cfg)
     if cfg.nx is None:
         raise ValueError(
             "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
@@ -357,24 +354,37 @@ def require(cfg: DictConfig) -> None:
         ) from None
 
 
+def require_data(cfg: DictConfig) -> None:
+    """Say how data are chosen where none are."""
+    if cfg.get("data") is None:
+        raise ValueError(
+            "no data chosen: add +bench=boucwen, or data=file data.path=FILE "
+            "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER (or nx=auto)."
+        )
+
+
 def continued(cfg: DictConfig, dataset: Dataset) -> lfrtorch.Model:
     """The model of ``init_from``; its sizes replace those of the configuration."""
     model = lfrtorch.load(cfg.init_from)
-    record = dataset.train[0]
+    same_channels(model, dataset.train[0], cfg.init_from)
+    for name, size in model.sizes.items():
+        if cfg[name] != size:
+            print(f"{name} is {size}, that of the model in '{cfg.init_from}', not {cfg[name]}")
+            cfg[name] = size
+    return model
+
+
+def same_channels(model: lfrtorch.Model, record: lfrtorch.Record, folder: str) -> None:
+    """Refuse data of other channels than those of the model in ``folder`` with a ValueError."""
     for side, channels, found in (
         ("inputs", model.inputs, record.inputs),
         ("outputs", model.outputs, record.outputs),
     ):
         if channels != found:
             raise ValueError(
-                f"the model in '{cfg.init_from}' has the {side} {', '.join(map(str, channels))} "
-                f"and the data {', '.join(map(str, found))}; continue on data of the same channels."
+                f"the model in '{folder}' has the {side} {', '.join(map(str, channels))} "
+                f"and the data {', '.join(map(str, found))}; give data of the same channels."
             )
-    for name, size in model.sizes.items():
-        if cfg[name] != size:
-            print(f"{name} is {size}, that of the model in '{cfg.init_from}', not {cfg[name]}")
-            cfg[name] = size
-    return model
 
 
 def own_linear_models(cfg: DictConfig, dataset: Dataset) -> dict[str, lfrtorch.LinearModel]:

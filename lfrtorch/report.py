@@ -35,7 +35,7 @@ class Score:
     """Simulation errors on one record, after its skip window.
 
     Args:
-        rmse, lti_rmse: of the model and of the linear model, in ``unit``.
+        rmse, lti_rmse: of the model and of the linear model, in ``unit``; None without the latter.
         nrmse: rmse over the standard deviation of the measured output.
         unit: of the outputs.
         source: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
@@ -43,7 +43,7 @@ class Score:
     """
 
     rmse: float
-    lti_rmse: float
+    lti_rmse: float | None
     nrmse: float
     unit: str
     source: str
@@ -51,12 +51,12 @@ class Score:
     skip: int
 
 
-def score(model: Model, bla: LinearModel, record: Record) -> Score:
-    """Scores of the model and of the linear model on one record."""
+def score(model: Model, bla: LinearModel | None, record: Record) -> Score:
+    """Scores of the model and of the linear model, where there is one, on one record."""
     y_hat = model.simulate(record)
     return Score(
         rmse=rmse(record, y_hat),
-        lti_rmse=rmse(record, bla.simulate(record)),
+        lti_rmse=None if bla is None else rmse(record, bla.simulate(record)),
         nrmse=nrmse(record, y_hat),
         unit=", ".join(dict.fromkeys(c.unit for c in record.outputs)),
         source=record.source,
@@ -119,28 +119,53 @@ def metrics(
         command: that made it.
         search: for the sizes, where they were not given.
     """
-    own = own or {}
     model = result.model
-    validation = [score(model, bla, record) for record in dataset.validation]
-    selection = [score(model, bla, record) for record in dataset.selection]
-    entries = {
-        "bench": dataset.name,
-        "sizes": model.sizes,
+    entries = evaluation(model, bla, dataset, own=own, command=command)
+    entries["data"] |= {
+        "samples": sum(record.samples for record in dataset.train),
+        "seed": data_seed,
+    }
+    entries |= {
         "sizes_search": [] if search is None else search.entries(),
-        "parameters": model.parameters,
-        "parameters_net": model.parameters_net,
-        "data": {
-            "samples": sum(record.samples for record in dataset.train),
-            "noise_rms": dataset.noise_rms,
-            "seed": data_seed,
-            "notes": list(dataset.notes),
-        },
         "fit": {
             "iterations": result.iterations,
             "seconds": result.seconds,
             "seconds_per_iteration": result.seconds_per_iteration,
             "reason": result.reason,
         },
+        "chosen_iteration": result.chosen_iteration,
+        "stable_to": loudest(model, dataset.train),
+        "starts": max(1, len(result.starts)),
+        "ranking": [
+            {"seed": seeds(seed, start.number + 1)[-1], **asdict(start)} for start in result.starts
+        ],
+    }
+    return _finite(entries)
+
+
+def evaluation(
+    model: Model,
+    bla: LinearModel | None,
+    dataset: Dataset,
+    *,
+    own: Mapping[str, LinearModel] | None = None,
+    command: str,
+) -> dict:
+    """What ``metrics`` has without a fit: a model, beside a linear one where there is one, on data.
+
+    Args:
+        model, bla: what is scored.
+        dataset, own, command: see :func:`metrics`.
+    """
+    own = own or {}
+    validation = [score(model, bla, record) for record in dataset.validation]
+    selection = [score(model, bla, record) for record in dataset.selection]
+    entries = {
+        "bench": dataset.name,
+        "sizes": model.sizes,
+        "parameters": model.parameters,
+        "parameters_net": model.parameters_net,
+        "data": {"noise_rms": dataset.noise_rms, "notes": list(dataset.notes)},
         "validation": {
             "rmse": _pooled([s.rmse for s in validation], validation),
             "lti_rmse": _pooled([s.lti_rmse for s in validation], validation),
@@ -153,18 +178,12 @@ def metrics(
                 )
             },
         },
-        "chosen_iteration": result.chosen_iteration,
-        "stable_to": loudest(model, dataset.train),
-        "starts": max(1, len(result.starts)),
-        "ranking": [
-            {"seed": seeds(seed, start.number + 1)[-1], **asdict(start)} for start in result.starts
-        ],
-        "command": command,
         "scores": {
             record.name: asdict(score(model, own.get(record.name, bla), record))
             for record in dataset.tests
         },
         "linear": {name: list(dataset.linear[name]) for name in own},
+        "command": command,
         "versions": {
             "python": platform.python_version(),
             **{name: version(name) for name in ("lfrtorch", "torch", "numpy", "scipy", "numba")},
@@ -234,13 +253,11 @@ def _aligned(rows: Sequence[Sequence[str]], left: Sequence[int]) -> list[str]:
     ]
 
 
-def _pooled(values: list[float], scores: list[Score]) -> float | None:
+def _pooled(values: list[float | None], scores: list[Score]) -> float | None:
     """RMSE over several records, each with the weight of its scored samples."""
-    if not scores:
-        return None
     counts = [s.samples - s.skip for s in scores]
-    squares = sum(n * v**2 for n, v in zip(counts, values, strict=True))
-    return (squares / sum(counts)) ** 0.5
+    squares = [n * v**2 for n, v in zip(counts, values, strict=True) if v is not None]
+    return (sum(squares) / sum(counts)) ** 0.5 if squares else None
 
 
 def _finite(entry: Any) -> Any:
