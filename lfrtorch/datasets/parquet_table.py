@@ -43,7 +43,8 @@ class ParquetTable(Table):
         names = [self.headers[column] for column in columns]
         clocks = {name: Clock() for name in names}
         try:
-            with pq.ParquetFile(self.path) as file:
+            # Read ahead, the whole file would come to be in memory.
+            with pq.ParquetFile(self.path, pre_buffer=False) as file:
                 for batch in file.iter_batches(samples, columns=list(dict.fromkeys(names))):
                     found = np.empty((batch.num_rows, len(names)))
                     for i, name in enumerate(names):
