@@ -113,7 +113,7 @@ def load_records(
         period,
         None if skip == "auto" else skip,
     )
-    paths = _found(path, "data.path")
+    paths = listed_files(path, "data.path")
     left = reader.read(paths)
     tests, left, tested = _taken("data.test", test, left, reader)
     chosen, left, validated = _taken("data.validation", validation, left, reader)
@@ -298,7 +298,7 @@ class _Reader:
         return record, notes
 
 
-def _found(given: Paths | None, option: str) -> list[Path]:
+def listed_files(given: Paths | None, option: str) -> list[Path]:
     """The files of paths and patterns, those of a pattern in the order of people's counting."""
     listed = [given] if isinstance(given, str | Path) else list(given or [])
     if not listed or not all(isinstance(path, str | Path) for path in listed):
@@ -396,7 +396,7 @@ def _named(
                     f"{option} names {str(name)!r}, which is neither a file nor one of the "
                     f"records: {', '.join(whole.record.name for whole in known)}."
                 )
-            paths = _found(name, option)
+            paths = listed_files(name, option)
             same = {path.resolve() for path in paths}
             found = [whole for whole in known if whole.path.resolve() in same]
             own = [p for p in paths if p.resolve() not in {w.path.resolve() for w in found}]

@@ -1,0 +1,242 @@
+"""A trained model on new inputs: checkpoint and files -> simulated outputs, scores.
+
+python scripts/simulate.py checkpoint=runs/run/DATE data.path=new.csv out=predicted.csv
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import hydra
+import numpy as np
+from numpy.typing import NDArray
+from omegaconf import DictConfig, ListConfig
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
+
+import lfrtorch  # noqa: E402
+from lfrtorch import checkpoint  # noqa: E402
+from lfrtorch.checks import integer, number  # noqa: E402
+from lfrtorch.datasets.file_stream import Block, FileStream  # noqa: E402
+from lfrtorch.datasets.files import listed_files  # noqa: E402
+from lfrtorch.datasets.table_writer import FORMATS, table_writer  # noqa: E402
+from lfrtorch.metrics import BlockScores  # noqa: E402
+from lfrtorch.whole_file import refuse_existing, whole_file  # noqa: E402
+from scripts.bla import columns, finite, percent  # noqa: E402
+from train import CONF, user_errors  # noqa: E402
+
+Array = NDArray[np.float64]
+
+
+def simulate(cfg: DictConfig) -> None:
+    """Simulate every file, write what comes out, and print the scores."""
+    require(cfg)
+    pairs = targets(cfg)
+    model = opened(str(cfg.checkpoint))
+    sizes = ", ".join(f"{name} {size}" for name, size in model.sizes.items() if size)
+    u, y = (", ".join(map(str, channels)) for channels in (model.inputs, model.outputs))
+    print(f"{cfg.checkpoint}: {u} -> {y} at {model.fs:g} Hz, {sizes}")
+    check_rate(cfg, model)
+    rows = []
+    for path, out in pairs:
+        clock = time.perf_counter()
+        with about(path):
+            stream = FileStream(
+                path, model.inputs, model.outputs, model.fs,
+                u=cfg.data.inputs, y=cfg.data.outputs, times=cfg.data.time,
+            )  # fmt: skip
+            if not stream.y:
+                missing = ", ".join(stream.missing)
+                print(f"note: '{path}' has no column {missing}, so nothing is scored")
+            x0 = start_state(cfg, model, stream)
+            samples, scores = written(model, stream, x0, out, cfg.skip)
+        print(f"{out}: {samples} samples, {time.perf_counter() - clock:.1f} s")
+        rows += scored(path, model, scores, cfg.skip) if stream.y else []
+    if rows:
+        head = ["file", "output", "unit", "samples", "skip", "RMSE", "NRMSE (%)"]
+        print(f"\n{columns(head, rows)}")
+
+
+def written(
+    model: lfrtorch.Model, stream: FileStream, x0: Array | None, out: Path, skip: int
+) -> tuple[int, BlockScores]:
+    """Simulate a file block by block into another: samples, and scores of measured outputs."""
+    names = [channel.name for channel in model.outputs]
+    scores, first = BlockScores(len(names), skip), 0
+    read: list[Block] = []
+
+    def inputs() -> Iterator[Array]:
+        for block in stream.blocks():
+            read[:] = [block]
+            yield block.u
+
+    with whole_file(out) as fresh, table_writer(fresh) as write:
+        for y_hat in lfrtorch.simulate_blocks(model, inputs(), x0=x0):
+            (block,) = read
+            numbers = np.arange(first, first + len(y_hat))
+            found = {stream.clock.name: block.times[:, 0] if stream.times else numbers}
+            for i, name in enumerate(names):
+                found[f"{name}_hat"] = y_hat[:, i]
+                if stream.y:
+                    found[name] = block.y[:, i]
+                    found[f"{name}_error"] = block.y[:, i] - y_hat[:, i]
+            if stream.y:
+                scores.add(block.y, y_hat)
+            write(found)
+            first += len(y_hat)
+        if not first:
+            raise ValueError("there are no samples; give a file with data.")
+    return first, scores
+
+
+def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
+    """Refuse another sampling frequency than the model's; say where none is known."""
+    if cfg.data.fs is not None and not np.isclose(cfg.data.fs, model.fs):
+        raise ValueError(
+            f"data.fs is {cfg.data.fs} Hz and the model's sampling frequency {model.fs:g} Hz; "
+            "resample the file."
+        )
+    if cfg.data.fs is None and cfg.data.time is None:
+        print(
+            "note: neither data.time nor data.fs says how the file is sampled; the model's "
+            f"{model.fs:g} Hz is taken"
+        )
+
+
+def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> Array | None:
+    """The state to start from; None for zero. How one was estimated is printed."""
+    if cfg.start == "given":
+        return np.array(cfg.x0, dtype=np.float64)
+    if cfg.start == "zero":
+        return None
+    if not stream.y:
+        raise ValueError(
+            "start=estimated needs measured outputs; name their columns with data.outputs=[...], "
+            "or use start=zero."
+        )
+    parts, count = [], 0
+    for block in stream.blocks(cfg.estimate):
+        parts.append(block)
+        count += len(block.u)
+        if count >= cfg.estimate:
+            break
+    if not parts:
+        return None
+    u, y = (np.concatenate(part)[: cfg.estimate] for part in list(zip(*parts, strict=True))[1:])
+    record = lfrtorch.Record(u, y, fs=model.fs, start="estimated", name=stream.table.path.name)
+    trajectory = model.signals(record)
+    fitted = lfrtorch.rmse(record, model.scaler.restore_y(trajectory.y[0].double().numpy()))
+    print(
+        f"start: the state is estimated from the first {len(u)} samples of '{record.name}'; RMSE "
+        f"there {fitted:.3g}, from zero state {lfrtorch.rmse(record, model.simulate(u)):.3g}"
+        + (f" (skip={len(u)} leaves them out of the scores)" if cfg.skip < len(u) else "")
+    )
+    return trajectory.x[0, 0].numpy()
+
+
+def scored(path: Path, model: lfrtorch.Model, scores: BlockScores, skip: int) -> list[list]:
+    """Rows of the table of scores, one an output."""
+    return [
+        [
+            path.name,
+            channel.name,
+            channel.unit,
+            int(scores.samples[i]),
+            skip,
+            finite(scores.rmse[i]),
+            percent(finite(scores.nrmse[i])),
+        ]
+        for i, channel in enumerate(model.outputs)
+    ]
+
+
+def opened(folder: str) -> lfrtorch.Model:
+    """The model of a checkpoint, a linear one as an NL-LFR without static nonlinearity."""
+    description, _ = checkpoint.read(folder)
+    if "linear" in description:
+        return lfrtorch.LinearModel.load(folder).to_model()
+    return lfrtorch.load(folder)
+
+
+def require(cfg: DictConfig) -> None:
+    """Say what is missing or wrong on the command line before anything is read."""
+    for option, value, example in (
+        ("checkpoint", cfg.checkpoint, "DIR, the folder of a run or of a saved model"),
+        ("data.path", cfg.data.path, "FILE, the file of inputs"),
+        ("out", cfg.out, "FILE.csv, which is written"),
+    ):
+        if value is None:
+            raise ValueError(f"{option} is not set: add {option}={example}.")
+    if cfg.start not in ("zero", "given", "estimated"):
+        raise ValueError(f"start is {cfg.start!r}; give zero, given (with x0=[...]) or estimated.")
+    if (cfg.start == "given") != (cfg.x0 is not None):
+        raise ValueError(
+            f"start is {cfg.start!r} and x0 is {cfg.x0}; "
+            "a start state goes with start=given, and only with it."
+        )
+    x0 = cfg.x0 if isinstance(cfg.x0, ListConfig | None) else [None]
+    if not all(isinstance(x, int | float) and np.isfinite(x) for x in x0 or []):
+        raise ValueError(f"x0 is {cfg.x0}; give a list of finite numbers, one a state.")
+    integer("estimate", cfg.estimate, 1)
+    integer("skip", cfg.skip, 0)
+    if cfg.data.fs is not None:
+        number("data.fs", cfg.data.fs, positive=True)
+    if f".{cfg.format}" not in FORMATS:
+        raise ValueError(f"format is {cfg.format!r}; give csv, npz or parquet.")
+
+
+def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
+    """Each file that is read with that which is written."""
+    paths = listed_files(cfg.data.path, "data.path")
+    out = Path(cfg.out).expanduser()
+    if out.is_dir() or not out.suffix:
+        # Of a compressed file the name within.
+        stems = [Path(path.name.removesuffix(".gz")).stem for path in paths]
+        twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+        if twice is not None:
+            raise ValueError(
+                f"several files are called '{twice}', and would be written to one in '{out}'; "
+                "simulate them one by one."
+            )
+        pairs = [
+            (path, out / f"{stem}.{cfg.format}") for path, stem in zip(paths, stems, strict=True)
+        ]
+    elif out.suffix.lower() not in FORMATS:
+        raise ValueError(f"out is '{out}'; give a file of {', '.join(FORMATS)}, or a folder.")
+    elif len(paths) > 1:
+        raise ValueError(f"{len(paths)} files cannot be written to one, '{out}'; give a folder.")
+    else:
+        pairs = [(paths[0], out)]
+    for path, file in pairs:
+        if file.resolve() == path.resolve():
+            raise ValueError(f"'{file}' is the file that is read; give another name to out.")
+        if not cfg.overwrite:
+            refuse_existing(file, "overwrite=true")
+    return pairs
+
+
+@contextmanager
+def about(path: Path) -> Iterator[None]:
+    """Name the file in a message that does not."""
+    try:
+        yield
+    except ValueError as error:
+        if f"'{path}'" in str(error):
+            raise
+        raise ValueError(f"'{path}': {error}") from error
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="simulate")
+def main(cfg: DictConfig) -> None:
+    """The command line."""
+    with user_errors():
+        simulate(cfg)
+
+
+if __name__ == "__main__":
+    main()
