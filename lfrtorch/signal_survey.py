@@ -1,0 +1,175 @@
+"""Numbers of one measured signal: its level, range, gaps, band, and noise."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+
+from lfrtorch.periods import find_transient
+from lfrtorch.records import Channel
+
+Array = NDArray[np.float64]
+
+IN_BAND = 0.99
+"""Share of the power about the mean that lies in the band; the rest is half below, half above."""
+
+LEAST = 16
+"""Samples from which on there is a spectrum."""
+
+QUIET = 0.2
+"""Share of the spectrum, its quietest, at whose upper end the level of white noise is read."""
+
+LOUD = 0.5
+"""A spectrum whose quietest part is white noise of more than this times the signal's rms tells no
+noise from signal."""
+
+SEGMENTS, LONGEST = 8, 4096
+"""Of the averaged spectrum: at least so many segments, of at most so many samples."""
+
+CLIPPED_SAMPLES, CLIPPED_RUN, CLIPPED_RATIO, NEIGHBOURS = 5, 3, 5, 5
+"""A signal is clipped where it is at an extreme for so many samples, so many of them in a row, and
+so many times as often as at any of the next values. (A sine in coarse steps has a ratio of 2.4.)"""
+
+LEVELS = 16
+"""A signal of no more values was made of levels, as a binary one: it is not clipped."""
+
+
+class Extreme(NamedTuple):
+    """The smallest or largest value: how many samples have it, and how many in a row."""
+
+    value: float
+    samples: int
+    run: int
+    clipped: bool
+
+
+class SignalSurvey(NamedTuple):
+    """What a signal of T samples is like; numbers are NaN where it has no values.
+
+    Args:
+        channel: its name and unit.
+        samples: T.
+        missing: how many of them are NaN.
+        gap: how many of them in a row.
+        mean, rms: of the signal, and about its mean.
+        minimum, maximum: its extremes.
+        values: how many different ones there are.
+        step: smallest difference of two of them.
+        band: frequencies in Hz between which ``IN_BAND`` of the power about the mean lies.
+        period: samples of a period, where it repeats.
+        noise: its rms, estimated, where it can be.
+        method: of the noise. ``"periods"``: the scatter of whole periods in steady state;
+            ``"spectrum"``: a guess, the level of the quietest part of the spectrum as if of white
+            noise; more where signal is everywhere, less where a filter took noise away.
+    """
+
+    channel: Channel
+    samples: int
+    missing: int
+    gap: int
+    mean: float
+    rms: float
+    minimum: Extreme
+    maximum: Extreme
+    values: int
+    step: float
+    band: tuple[float, float] | None
+    period: int | None
+    noise: float | None
+    method: str
+
+    @property
+    def clipped(self) -> tuple[Extreme, ...]:
+        """The extremes that it is clipped at."""
+        return tuple(end for end in (self.minimum, self.maximum) if end.clipped)
+
+
+def survey_signal(
+    signal: Array, whole: Array, channel: Channel, *, fs: float = 1.0, period: int | None = None
+) -> SignalSurvey:
+    """The numbers of a signal.
+
+    Args:
+        signal: as measured, NaN where a sample is missing.
+        whole: a part of it without gaps, for the spectrum.
+        channel: its name and unit.
+        fs: sampling frequency in Hz.
+        period: samples of a period, where it repeats.
+
+    Shape:
+        signal: (T,), whole: (up to T,).
+    """
+    missing = ~np.isfinite(signal)
+    known = signal[~missing] if missing.any() else signal
+    values, counts = np.unique(known, return_counts=True)
+    some = len(values) > 0
+    noise, method = None, ""
+    if len(values) > 1:
+        noise, method = _noise(whole, period)
+    return SignalSurvey(
+        channel,
+        samples=len(signal),
+        missing=int(missing.sum()),
+        gap=longest_run(missing)[1],
+        mean=float(known.mean()) if some else np.nan,
+        rms=float(known.std()) if len(values) > 1 else 0.0 if some else np.nan,
+        minimum=_extreme(signal, values, counts),
+        maximum=_extreme(signal, values[::-1], counts[::-1]),
+        values=len(values),
+        step=float(np.diff(values).min()) if len(values) > 1 else np.nan,
+        band=band(whole, fs),
+        period=period,
+        noise=noise,
+        method=method,
+    )
+
+
+def longest_run(holds: NDArray[np.bool_]) -> tuple[int, int]:
+    """First sample and length of the longest run of samples for which a condition (T,) holds."""
+    ends = np.flatnonzero(np.diff(holds.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    if not len(ends):
+        return 0, 0
+    first, last = ends[np.argmax(ends[:, 1] - ends[:, 0])]
+    return int(first), int(last - first)
+
+
+def band(signal: Array, fs: float = 1.0) -> tuple[float, float] | None:
+    """Frequencies in Hz between which ``IN_BAND`` of the power about the mean lies; else None."""
+    if len(signal) < LEAST or np.ptp(signal) == 0:
+        return None
+    f, power = scipy.signal.periodogram(signal, fs, window="hann")
+    share = np.cumsum(power[1:])
+    outside = (1 - IN_BAND) / 2
+    low, high = np.searchsorted(share, share[-1] * np.array([outside, 1 - outside]))
+    return float(f[1 + low]), float(f[1 + high])
+
+
+def _extreme(signal: Array, values: Array, counts: NDArray[np.intp]) -> Extreme:
+    """The first of the values, and whether the signal is clipped at it."""
+    if not len(values):
+        return Extreme(np.nan, 0, 0, False)
+    samples, run = int(counts[0]), longest_run(signal == values[0])[1]
+    clipped = (
+        len(values) > LEVELS
+        and samples >= max(CLIPPED_SAMPLES, CLIPPED_RATIO * counts[1 : 1 + NEIGHBOURS].max())
+        and run >= CLIPPED_RUN
+    )
+    return Extreme(float(values[0]), samples, run, bool(clipped))
+
+
+def _noise(signal: Array, period: int | None) -> tuple[float | None, str]:
+    """Its rms, and the method."""
+    if period is not None:
+        count = (len(signal) - find_transient(signal[:, None], period)) // period
+        if count > 1:
+            periods = signal[len(signal) - count * period :].reshape(count, period)
+            return float(np.sqrt(np.mean(np.var(periods, axis=0, ddof=1)))), "periods"
+    length = min(len(signal) // SEGMENTS, LONGEST)
+    if length < LEAST or np.ptp(signal) == 0:
+        return None, ""
+    _, density = scipy.signal.welch(signal, nperseg=length)  # one-sided, over 0 .. 1/2
+    noise = float(np.sqrt(np.quantile(density[1:-1], QUIET) / 2))
+    return (noise, "spectrum") if noise < LOUD * signal.std() else (None, "")
