@@ -60,7 +60,7 @@ def response(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure
     t = np.arange(record.skip, record.samples) / record.fs
     for i, ax in enumerate(axes):
         for signal, label, colour in _signals(record, y_lti, y_hat, i):
-            ax.plot(*_envelope(t, signal), lw=0.5, color=colour, label=label)
+            ax.plot(*envelope(t, signal), lw=0.5, color=colour, label=label)
         ax.set(ylabel=str(record.outputs[i]), xlim=(t[0], t[-1]))
         legend = ax.legend(loc="upper right")
         for handle in legend.get_lines():
@@ -137,7 +137,7 @@ def _signals(
     return signals
 
 
-def _envelope(t: Array, signal: Array) -> tuple[Array, Array]:
+def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
     """A long signal as the smallest and largest sample of each of many short stretches."""
     stretch = len(signal) // (MOST_POINTS // 2)
     if stretch < 2:
