@@ -33,6 +33,7 @@ from lfrtorch import plots, report
 from lfrtorch.checks import integer, number
 from lfrtorch.datasets import Dataset
 from lfrtorch.distributed import connect
+from lfrtorch.findings import findings
 from lfrtorch.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
 from lfrtorch.order import OrderScan
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
@@ -166,7 +167,8 @@ def starts(cfg: DictConfig, bla: lfrtorch.LinearModel, dataset: Dataset) -> list
 def loaded(cfg: DictConfig) -> Dataset:
     """The records; what is to be known of them is printed."""
     dataset: Dataset = instantiate(cfg.data)
-    for note in dataset.notes:
+    measured = [record for record in dataset.train if record.source == "file"]
+    for note in (*dataset.notes, *(findings(measured) if measured else ())):
         print(f"note: {note}")
     return dataset
 
