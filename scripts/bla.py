@@ -20,7 +20,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -30,6 +29,7 @@ import lfrtorch  # noqa: E402
 from lfrtorch import linear_plots, plots  # noqa: E402
 from lfrtorch.datasets import Dataset  # noqa: E402
 from lfrtorch.ranks import Ranks  # noqa: E402
+from lfrtorch.roots import roots  # noqa: E402
 from lfrtorch.whole_file import whole_file  # noqa: E402
 from train import (  # noqa: E402
     CONF,
@@ -176,26 +176,6 @@ def score(model: lfrtorch.LinearModel, record: lfrtorch.Record, use: str) -> dic
             for i, channel in enumerate(record.outputs)
         ],
     }
-
-
-def roots(values: NDArray[np.complex128], fs: float) -> list[dict[str, float | None]]:
-    """Poles or zeros z = exp(s / fs), one of each pair: |s| in Hz, damping ratio, radius of z."""
-    listed = []
-    for z in sorted(values[values.imag >= 0], key=lambda z: (abs(np.angle(z)), abs(z))):
-        radius = float(abs(z))
-        s = complex(math.log(radius), np.angle(z)) * fs if radius > 0 else complex(-math.inf)
-        frequency = abs(s) / (2 * math.pi)
-        damping = 1.0 if math.isinf(frequency) else -s.real / abs(s) if s else None
-        listed.append(
-            {
-                "real": float(z.real),
-                "imag": float(z.imag),
-                "frequency": finite(frequency),
-                "damping": damping,
-                "radius": radius,
-            }
-        )
-    return listed
 
 
 def uncertainty(model: lfrtorch.LinearModel, frf: lfrtorch.FRF | None) -> list[dict[str, Any]]:
