@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 
 import numpy as np
+import scipy.signal
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -17,15 +19,30 @@ Array = NDArray[np.float64]
 OUTPUT, LTI, NL_LFR = "tab:blue", "tab:red", "tab:green"
 """Colours of the measured output, the linear model's error and the NL-LFR's, as in the paper."""
 
+DPI = 150
+"""Of a figure that is written."""
+
 MOST_POINTS = 20_000
 """Samples drawn of a long signal as a cloud."""
+
+CLOSE_UP = 500
+"""Samples of a close-up: some periods of what the model follows."""
+
+SEGMENT, SHORTEST = 4096, 16
+"""Most and fewest samples of a segment that a power spectral density is averaged over."""
 
 
 def errors(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
     """The spectrum of whole periods in steady state, and else the response against time."""
-    # Periods with a skip window are no whole periods: their spectrum would leak.
-    whole = record.start == "periodic" and not record.skip
-    return (spectrum if whole else response)(record, y_lti, y_hat)
+    return (spectrum if is_whole(record) else response)(record, y_lti, y_hat)
+
+
+def is_whole(record: Record) -> bool:
+    """Whether the scored samples are whole periods in steady state, whose spectrum has no leakage.
+
+    Periods with a skip window are no whole periods.
+    """
+    return record.start == "periodic" and not record.skip
 
 
 def spectrum(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
@@ -49,8 +66,34 @@ def spectrum(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure
     return figure
 
 
+def density(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
+    """Power spectral density of the measured output and of the errors, one panel an output.
+
+    By Welch's method: for records that are no whole periods.
+
+    Shape:
+        y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
+            is no NL-LFR.
+    """
+    figure, axes = _panels(record)
+    scored = record.samples - record.skip
+    segment = min(SEGMENT, scored, max(SHORTEST, scored // 8))
+    for i, ax in enumerate(axes):
+        for signal, label, colour in _signals(record, y_lti, y_hat, i):
+            f, power = scipy.signal.welch(signal, record.fs, nperseg=segment)
+            level = 10.0 * np.log10(np.maximum(power, np.finfo(float).tiny))
+            ax.plot(f[1:], level[1:], lw=0.8, color=colour, label=label)
+        unit = record.outputs[i].unit or "1"
+        per = f"{unit}²/Hz" if record.fs != 1.0 else f"{unit}²"
+        ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {per})", xlim=(0, record.fs / 2))
+        _legend(ax)
+    axes[0].set_title(_title(record))
+    axes[-1].set_xlabel("frequency (Hz)" if record.fs != 1.0 else "frequency (1/sample)")
+    return figure
+
+
 def response(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
-    """Measured output and errors against time, one panel an output.
+    """Measured output and errors against time in the record, one panel an output.
 
     Shape:
         y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
@@ -62,11 +105,41 @@ def response(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure
         for signal, label, colour in _signals(record, y_lti, y_hat, i):
             ax.plot(*envelope(t, signal), lw=0.5, color=colour, label=label)
         ax.set(ylabel=str(record.outputs[i]), xlim=(t[0], t[-1]))
-        legend = ax.legend(loc="upper right")
-        for handle in legend.get_lines():
-            handle.set_linewidth(2)
+        _legend(ax)
     axes[0].set_title(_title(record))
-    axes[-1].set_xlabel("time (s)" if record.fs != 1.0 else "sample")
+    _time_axis(record, axes[-1])
+    return figure
+
+
+def close_up(record: Record, y_lti: Array, y_hat: Array) -> Figure:
+    """The response about the largest error of the NL-LFR, and below it this error alone.
+
+    Errors of several outputs are compared relative to the deviation of each. Where the model
+    diverges it is where it does so first.
+
+    Shape:
+        y_lti, y_hat: (T, ny), simulated outputs in physical units.
+    """
+    y = record.y[record.skip :]
+    deviation = np.std(y, axis=0)
+    error = np.abs(y - y_hat[record.skip :]) / np.where(deviation > 0, deviation, 1.0)
+    worst = int(np.argmax(np.where(np.isfinite(error), error, np.inf).max(axis=1)))
+    first = max(0, min(worst - CLOSE_UP // 2, len(y) - CLOSE_UP))
+    window = slice(first, first + CLOSE_UP)
+    t = (record.skip + np.arange(len(y))[window]) / record.fs
+    ny = len(record.outputs)
+    figure = Figure(figsize=(8, 1.5 + 4.5 * ny), layout="constrained")
+    axes = list(figure.subplots(2 * ny, 1, sharex=True, height_ratios=[2, 1] * ny))
+    for i, output in enumerate(record.outputs):
+        signals = _signals(record, y_lti, y_hat, i)
+        for ax, drawn in ((axes[2 * i], signals), (axes[2 * i + 1], signals[-1:])):
+            for signal, label, colour in drawn:
+                ax.plot(t, signal[window], lw=1.0, color=colour, label=label)
+            ax.set(ylabel=str(output))
+            ax.margins(x=0)
+            _legend(ax)
+    axes[0].set_title(_title(record))
+    _time_axis(record, axes[-1])
     return figure
 
 
@@ -121,6 +194,13 @@ def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Fig
     return figure
 
 
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG file."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=DPI)
+    return stream.getvalue()
+
+
 def _panels(record: Record) -> tuple[Figure, list[Axes]]:
     ny = record.y.shape[1]
     figure = Figure(figsize=(8, 1.5 + 3.0 * ny), layout="constrained")
@@ -145,6 +225,16 @@ def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
     pieces = signal[: len(signal) // stretch * stretch].reshape(-1, stretch)
     ends = np.column_stack([pieces.min(axis=1), pieces.max(axis=1)])
     return np.repeat(t[::stretch][: len(pieces)], 2), ends.ravel()
+
+
+def _time_axis(record: Record, ax: Axes) -> None:
+    ax.set_xlabel("time in the record (s)" if record.fs != 1.0 else "sample of the record")
+
+
+def _legend(ax: Axes) -> None:
+    """With lines that are seen."""
+    for handle in ax.legend(loc="upper right").get_lines():
+        handle.set_linewidth(2)
 
 
 def _title(record: Record) -> str:

@@ -49,6 +49,37 @@ def test_response_shows_the_scored_samples():
     assert not drawn(ax, "NL-LFR error")[:, 1].any()
 
 
+def test_density_integrates_to_the_power():
+    rng = np.random.default_rng(0)
+    y = rng.standard_normal((20_000, 1))
+    record = Record(y, y, 100.0, name="lab", outputs=(Channel("a", "m"),))
+    ax = plots.density(record, 0.9 * y, 0.5 * y).axes[0]
+    for label, scale in (("output", 1.0), ("LTI error", 0.1), ("NL-LFR error", 0.5)):
+        line = drawn(ax, label)
+        # White: one sided, 2 / fs; a standard deviation of 1.4 % over the band, 4 σ.
+        level = 10 * np.log10(np.mean(10 ** (line[:, 1] / 10)))
+        assert level == pytest.approx(10 * np.log10(scale**2 * 2 / 100), abs=0.25)
+    assert "dB, re 1 m²/Hz" in ax.get_ylabel()
+    short = Record(y[:10], y[:10], skip=5)
+    assert len(drawn(plots.density(short, 0 * y[:10], y[:10]).axes[0], "output")) == 2
+
+
+def test_close_up_is_about_the_largest_error():
+    y_hat = Y.copy()
+    y_hat[300, 1] += 2.0
+    long = Record(np.tile(T, 10), np.tile(Y, (10, 1)), 100.0, skip=50, name="lab")
+    figure = plots.close_up(long, 0 * long.y, np.vstack([*[Y] * 5, y_hat, *[Y] * 4]))
+    assert len(figure.axes) == 4  # two outputs, and the error alone below each
+    for ax, labels in zip(figure.axes, (3, 1, 3, 1), strict=True):
+        line = drawn(ax, "NL-LFR error")
+        assert len(ax.get_lines()) == labels
+        assert line[[0, -1], 0] == pytest.approx([20.5, 25.49])  # 23.00 s is in the middle
+    assert drawn(figure.axes[3], "NL-LFR error")[250] == pytest.approx([23.0, -2.0])
+    lost = np.where(np.arange(400)[:, None] < 100, Y, np.nan)
+    line = drawn(plots.close_up(RECORD, 0 * Y, lost).axes[0], "output")
+    assert len(line) == 400
+
+
 def test_long_signals_keep_their_extremes():
     y = np.sin(np.arange(100_000))
     y[77_777] = 5.0
