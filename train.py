@@ -29,14 +29,17 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
-from lfrtorch import plots, report
+from lfrtorch import html_report, linear_plots, plots, report
+from lfrtorch.advice import advise
 from lfrtorch.checks import integer, number
 from lfrtorch.datasets import Dataset
 from lfrtorch.distributed import connect
+from lfrtorch.evidence import evidence
 from lfrtorch.findings import findings
 from lfrtorch.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
 from lfrtorch.order import OrderScan
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
+from lfrtorch.responses import Response
 from lfrtorch.resume import Snapshots
 from lfrtorch.sizes import SizeSearch
 from lfrtorch.threads import each_alone
@@ -50,6 +53,12 @@ WORLD = int(os.environ.get("WORLD_SIZE", "1"))
 
 CONFIG, SNAPSHOTS = "config.yaml", "resume"
 """In the folder of a run: its settings, and its starts as far as they came."""
+
+MOST_MEASURED = 500_000
+"""Training samples up to which a nonparametric response is estimated for the report: 3 s."""
+
+PRINTED = 3
+"""Most lines of advice that are printed; the report has all."""
 
 WITHOUT_FILES = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
 """Of Hydra, for the processes beside the first."""
@@ -299,11 +308,35 @@ def write(
             "longer on the next louder ones tried; validate at the amplitudes you will use."
         )
     board.text("scores", table)
-    for name, figure in figures(result, bla, dataset, own).items():
-        figure.savefig(made(folder / "figures") / f"{name}.png", dpi=150)
+    simulated = responses(result.model, bla, dataset, own)
+    drawn = figures(result, bla, dataset, simulated)
+    images = {name: plots.png(figure) for name, figure in drawn.items()}
+    for name, figure in drawn.items():
+        (made(folder / "figures") / f"{name}.png").write_bytes(images[name])
         board.figure(f"result/{name}", figure, result.iterations)
     board.close()
-    print(f"\nRun in {folder}\nTensorBoard: tensorboard --logdir {folder}")
+    advice = advise(
+        evidence(
+            result,
+            simulated,
+            noise_rms=dataset.noise_rms,
+            limit="trainer.epochs" if "epochs" in cfg.trainer else "trainer.max_iter",
+            continued=cfg.init_from is not None,
+            ridge=cfg.ridge != 0.0,
+        )
+    )
+    more, views = views_of_tests(simulated)
+    images |= {name: plots.png(figure) for name, figure in more.items()}
+    page = html_report.render(
+        metrics, result, bla, dataset, simulated, images, advice,
+        views=views, config=OmegaConf.to_yaml(cfg, resolve=True),
+    )  # fmt: skip
+    with whole_file(folder / "report.html") as path:
+        path.write_text(page, encoding="utf-8")
+    for item in advice[:PRINTED]:
+        print(f"next: {item}")
+    print(f"\nRun in {folder}, its report in {folder / 'report.html'}")
+    print(f"TensorBoard: tensorboard --logdir {folder}")
     if result.reason == INTERRUPTED:
         print(go_on(folder))
 
@@ -400,24 +433,79 @@ def own_linear_models(cfg: DictConfig, dataset: Dataset) -> dict[str, lfrtorch.L
     return {test: by_records[names] for test, names in dataset.linear.items()}
 
 
+def responses(
+    model: lfrtorch.Model,
+    bla: lfrtorch.LinearModel,
+    dataset: Dataset,
+    own: dict[str, lfrtorch.LinearModel],
+) -> list[Response]:
+    """All records beside their simulations; tests with linear models of their own have those."""
+    used = {
+        "train": dataset.train,
+        "validation": dataset.validation,
+        "selection": dataset.selection,
+        "test": dataset.tests,
+    }
+    found = []
+    for use, records in used.items():
+        for record in records:
+            lti = own.get(record.name, bla) if use == "test" else bla
+            found.append(Response(record, use, lti.simulate(record), model.simulate(record)))
+    return found
+
+
 def figures(
     result: lfrtorch.FitResult,
     bla: lfrtorch.LinearModel,
     dataset: Dataset,
-    own: dict[str, lfrtorch.LinearModel],
+    simulated: Sequence[Response],
 ) -> dict:
-    """All figures of a run by file name: errors of each test, static map, convergence."""
+    """All figures of a run's folder by file name."""
     model = result.model
     drawn = {}
-    for record in dataset.tests:
-        y_lti = own.get(record.name, bla).simulate(record)
-        y_hat = model.simulate(record)
-        drawn[record.name] = plots.errors(record, y_lti, y_hat)
+    for shown in simulated:
+        if shown.use == "test":
+            drawn[shown.record.name] = plots.errors(shown.record, shown.y_lti, shown.y_hat)
     signals = model.signals(dataset.train[0])
     drawn["static_map"] = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
     unit = model.outputs[0].unit
     drawn["convergence"] = plots.convergence(result.history, result.chosen_iteration, unit)
+    drawn["frequency_response"] = linear_plots.frequency_response(bla, measured(dataset.train))
+    drawn["poles_and_zeros"] = linear_plots.poles_and_zeros(bla)
     return drawn
+
+
+def views_of_tests(simulated: Sequence[Response]) -> tuple[dict, dict[str, dict[str, str]]]:
+    """What the report shows of tests beside ``figures``, and of each test all with captions."""
+    drawn, views = {}, {}
+    for shown in simulated:
+        if shown.use != "test":
+            continue
+        record, signals = shown.record, (shown.record, shown.y_lti, shown.y_hat)
+        name, other, near = record.name, f"{record.name}_other", f"{record.name}_near"
+        drawn[near] = plots.close_up(*signals)
+        if plots.is_whole(record):
+            drawn[other] = plots.response(*signals)
+            response, spectrum, of = other, name, "Spectrum over whole periods."
+        else:
+            drawn[other] = plots.density(*signals)
+            response, spectrum, of = name, other, "Power spectral density."
+        views[name] = {
+            response: "Measured output and errors against time.",
+            near: "The same about the largest error of the NL-LFR.",
+            spectrum: of,
+        }
+    return drawn, views
+
+
+def measured(records: Sequence[lfrtorch.Record]) -> lfrtorch.FRF | None:
+    """The nonparametric frequency response, where the records give one in seconds."""
+    if sum(record.samples for record in records) > MOST_MEASURED:
+        return None
+    try:
+        return lfrtorch.estimate_frf(records)
+    except ValueError:
+        return None
 
 
 def made(folder: Path) -> Path:

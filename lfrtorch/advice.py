@@ -298,9 +298,10 @@ def noise_unknown(e: Evidence) -> Advice | None:
     """No telling whether the error is noise."""
     if e.noise is not None or e.train is None:
         return None
+    static = "degree=auto" if e.sizes.get("degree") else "nn=auto"
     return Advice(
-        "Whether this is the noise is not known: measure two periods of a periodic input, or raise "
-        "nx, nz, nw and nn one at a time as long as validation falls.",
+        "Whether this is the noise is not known: measure two periods of a periodic input, or let "
+        f"validation choose the sizes: nx=auto nz=auto nw=auto {static}.",
         f"training error {_percent(e.train)} of the output's standard deviation, no repeated "
         "periods",
     )
