@@ -210,8 +210,10 @@ def linear_part_incomplete(e: Evidence) -> Advice | None:
 
 
 def hardly_better(e: Evidence) -> Advice | None:
-    """No gain over the linear model."""
+    """No gain over the linear model, of which no states are missing."""
     error, lti, which = e.judged
+    if e.linear is not None and e.linear > LINEAR:
+        return None
     if error is None or not lti or error <= USELESS * lti:
         return None
     gain = f"{which} error {_percent(error)}, of the linear model {_percent(lti)}"
@@ -296,7 +298,8 @@ def tests_are_louder(e: Evidence) -> Advice | None:
 
 def noise_unknown(e: Evidence) -> Advice | None:
     """No telling whether the error is noise."""
-    if e.noise is not None or e.train is None:
+    structure = (e.linear or 0.0) > LINEAR or (e.nonlinear or 0.0) > NONLINEAR  # no noise
+    if e.noise is not None or e.train is None or structure:
         return None
     static = "degree=auto" if e.sizes.get("degree") else "nn=auto"
     return Advice(

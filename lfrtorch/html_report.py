@@ -231,7 +231,7 @@ def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
     train = dataset.train
     fs, samples = train[0].fs, sum(record.samples for record in train)
     summary = f"{_count(len(train), 'training record')}, {samples} samples"
-    summary += f", sampled at {number(fs)} Hz: {number(samples / fs)} s." if fs != 1.0 else "."
+    summary += f", sampled at {fs:g} Hz: {number(samples / fs)} s." if fs != 1.0 else "."
     if dataset.noise_rms is not None:
         noise = f"{number(dataset.noise_rms)} {train[0].outputs[0].unit}".strip()
         summary += f" Noise of {noise} rms was added."

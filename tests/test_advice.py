@@ -98,6 +98,13 @@ def test_at_the_noise_nothing_larger_is_advised():
     )
 
 
+def test_missing_states_come_before_a_larger_map():
+    useless = replace(GOOD, train=0.2, validation=0.2, linear=0.9, outputs={}, noise=None)
+    assert [item.text for item in advise(useless)] == [
+        "The linear part is incomplete: nx=4, nx=5 or nx=auto."
+    ]
+
+
 def test_what_spoils_the_linear_model_as_much_is_no_overfit():
     assert advice.overfits(replace(GOOD, validation=0.06, lti_validation=0.6)) is None
 

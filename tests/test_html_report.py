@@ -133,7 +133,7 @@ def test_page_has_the_numbers_and_no_address_outside(single: Run):
         "else: A <i>(2001)",
         "a note",
         "a close-up",
-        "sampled at 10.0 Hz: 30.0 s",
+        "sampled at 10 Hz: 30.0 s",
         "25 parameters, 19 without the directions",
         "train.py a=1",
         "nx: 2",
