@@ -29,7 +29,8 @@ def measured(samples: int, seed: int) -> lfrtorch.Record:
     """What stands for a measurement: a mass of 4 g, sampled at 500 Hz, 20 µm rms of noise."""
     rng = np.random.default_rng(seed)
     fs, mass, damping, stiffness, cubic = 500.0, 4e-3, 0.08, 40.0, 4e5
-    force = np.convolve(0.3 * rng.standard_normal(samples), np.ones(8) / np.sqrt(8), mode="same")
+    white = 0.3 * rng.standard_normal(samples)
+    force = np.convolve(white, np.ones(8) / np.sqrt(8), mode="same").astype(np.float64)
     x = v = 0.0
     displacement = []
     for f in force:

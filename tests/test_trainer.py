@@ -81,6 +81,9 @@ class Walk:
             reason=self.reason if last else "",
         )
 
+    def prolonged(self, state: State) -> State:
+        return state
+
     def refused(self, before: State, after: State) -> State:
         return replace(before, iteration=after.iteration, reason=after.reason)
 

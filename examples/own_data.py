@@ -1,0 +1,66 @@
+"""From a measurement file to a model in use, in the order of the README.
+
+The file stands for yours: a pump fills a tank that empties through a hole, u the pump's voltage and
+y the level, every 0.5 s.
+
+    python examples/own_data.py
+
+On the command line the same is
+
+    python scripts/preview.py tank.csv --inputs pump --outputs level
+    python train.py data=file data.path=tank.csv data.inputs=[pump] data.outputs=[level] data.fs=2 nx=1 nz=1 nw=1 nn=5
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+import lfrtorch
+from lfrtorch.findings import findings
+
+
+def write_measurement(path: Path) -> None:
+    """Torricelli's law, the level read with 5 mm rms of noise."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0.5, 3.0, 250), 12)
+    level, levels = 1.0, []
+    for voltage in u:
+        levels.append(level)
+        level += 0.5 * (0.05 * voltage - 0.06 * np.sqrt(max(level, 0.0)))
+    y = np.array(levels) + 0.005 * rng.standard_normal(len(u))
+    lines = [f"{a:.6g};{b:.6g}" for a, b in zip(u, y, strict=True)]
+    path.write_text("\n".join(["pump (V);level (m)", *lines]) + "\n")
+
+
+def main() -> None:
+    """Look, fit, judge, save, use."""
+    path = Path("tank.csv")
+    write_measurement(path)
+
+    data = lfrtorch.load_records(path, inputs="pump", outputs="level", fs=2, start="estimated")
+    for sentence in (*data.notes, *findings(data.train)):
+        print("note:", sentence)
+
+    bla = lfrtorch.estimate_bla(data.train, nx=1)
+    starts = [
+        lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=5, seed=seed) for seed in range(4)
+    ]
+    optimiser = lfrtorch.LevenbergMarquardt(max_iter=60)
+    result = lfrtorch.fit_starts(starts, data.train, data.validation, optimiser=optimiser)
+    print(f"{result.iterations} iterations, {result.seconds:.0f} s: {result.reason}")
+
+    (test,) = data.tests
+    for name, model in (("linear model", bla), ("NL-LFR", result.model)):
+        error = lfrtorch.rmse(test, model.simulate(test))
+        print(f"{name:13} {1e3 * error:6.2f} mm rms on the test, of which noise 5 mm")
+
+    result.model.save("runs/tank")
+    tank = lfrtorch.load("runs/tank")
+    level = tank.simulate(np.full(600, 2.0))  # from rest at the mean level, at 2 V
+    print(
+        f"{tank.outputs[0]} at 2 V: {level[-1, 0]:.2f}, by Torricelli's law {(5 / 6 * 2) ** 2:.2f}"
+    )
+
+
+if __name__ == "__main__":
+    main()
