@@ -311,9 +311,9 @@ def write(
     simulated = responses(result.model, bla, dataset, own)
     drawn = figures(result, bla, dataset, simulated)
     images = {name: plots.png(figure) for name, figure in drawn.items()}
-    for name, figure in drawn.items():
+    for name in drawn:
         (made(folder / "figures") / f"{name}.png").write_bytes(images[name])
-        board.figure(f"result/{name}", figure, result.iterations)
+        board.image(f"result/{name}", images[name], result.iterations)
     board.close()
     advice = advise(
         evidence(
@@ -323,6 +323,7 @@ def write(
             limit="trainer.epochs" if "epochs" in cfg.trainer else "trainer.max_iter",
             continued=cfg.init_from is not None,
             ridge=cfg.ridge != 0.0,
+            searched=search is not None,
         )
     )
     more, views = views_of_tests(simulated)

@@ -76,6 +76,7 @@ class Evidence:
         started: number of starts.
         continued: whether the fit went on from a model, so that there are no other starts.
         sizes: nx, nz, nw, and nn or degree.
+        searched: whether validation chose them.
         ridge: whether there was one.
         louder: largest test input over the largest in training, by test.
         diverged: tests on which the NL-LFR diverges.
@@ -97,6 +98,7 @@ class Evidence:
     started: int = 1
     continued: bool = False
     sizes: Mapping[str, int] = field(default_factory=dict)
+    searched: bool = False
     ridge: bool = False
     louder: Mapping[str, float] = field(default_factory=dict)
     diverged: Sequence[str] = ()
@@ -219,6 +221,12 @@ def hardly_better(e: Evidence) -> Advice | None:
     gain = f"{which} error {_percent(error)}, of the linear model {_percent(lti)}"
     if e.lti_train and e.noise and e.lti_train <= NOISE_LIMITED * e.noise:
         return Advice("The system is linear at this level: the linear model is enough.", gain)
+    if e.searched:
+        return Advice(
+            "Hardly better than the linear model at any of the sizes that were searched: the "
+            "system is linear at this level, or what is left is no static map of a few signals.",
+            gain,
+        )
     return Advice(
         "Hardly better than the linear model: the system is linear at this level, or the search "
         f"or the sizes are too small: {_more_starts(e)}{_larger(e)}.",
@@ -302,9 +310,10 @@ def noise_unknown(e: Evidence) -> Advice | None:
     if e.noise is not None or e.train is None or structure:
         return None
     static = "degree=auto" if e.sizes.get("degree") else "nn=auto"
+    choose = f", or let validation choose the sizes: nx=auto nz=auto nw=auto {static}"
     return Advice(
-        "Whether this is the noise is not known: measure two periods of a periodic input, or let "
-        f"validation choose the sizes: nx=auto nz=auto nw=auto {static}.",
+        "Whether this is the noise is not known: measure two periods of a periodic input"
+        f"{'' if e.searched else choose}.",
         f"training error {_percent(e.train)} of the output's standard deviation, no repeated "
         "periods",
     )

@@ -29,6 +29,7 @@ class Batch:
         scored: (R, T), 1 where a sample counts in the score.
         weight: (R, T, ny), or by spectral line (R, F, ny), F = T // 2 + 1: the factors of the
             errors, 0 where a sample or a line does not count.
+        start_weight: (R, T, ny), the same where the start state of a given model is estimated.
     """
 
     u: Tensor
@@ -37,6 +38,7 @@ class Batch:
     estimated: Tensor | None
     scored: Tensor
     weight: Tensor
+    start_weight: Tensor | None
     spectral: bool
     start: Start
 
@@ -101,6 +103,9 @@ def batches_of(model: Model, records: list[Record], ranks: Ranks) -> list[Batch]
                 estimated=torch.tensor(estimated[kind]) if start == "estimated" else None,
                 scored=stacked([np.arange(record.samples) >= record.skip for record in group]),
                 weight=stacked([_factors(record) for record in group]),
+                start_weight=stacked([record.start_factors for record in group])
+                if start == "estimated"
+                else None,
                 spectral=spectral,
                 start=start,
             )

@@ -36,6 +36,7 @@ def evidence(
     limit: str = "trainer.max_iter",
     continued: bool = False,
     ridge: bool = False,
+    searched: bool = False,
 ) -> Evidence:
     """The numbers that advice rests on.
 
@@ -46,6 +47,7 @@ def evidence(
         limit: setting of the most iterations.
         continued: whether the fit went on from a model.
         ridge: whether it had one.
+        searched: whether validation chose the sizes.
     """
     train, validation, tests = (
         [response for response in responses if response.use == use]
@@ -76,6 +78,7 @@ def evidence(
         started=max(1, len(result.starts)),
         continued=continued,
         sizes=result.model.sizes,
+        searched=searched,
         ridge=ridge,
         louder={
             test.record.name: float(

@@ -77,7 +77,8 @@ class Model:
             start: ``"zero"`` (x = 0: at rest at the input's offset, exactly so for the linear model
                 and the start of a fit, later up to the network's bias), ``"given"`` (x0),
                 ``"periodic"``, or ``"estimated"``: from the state that fits the record's output
-                best. Where left out, the record's own, and ``"zero"`` for a bare input.
+                best, in the samples it skips, or in all if it skips none. Where left
+                out, the record's own, and ``"zero"`` for a bare input.
             x0: start state in the model's coordinates, for ``start="given"``.
 
         Shape:
@@ -110,7 +111,7 @@ class Model:
             if not isinstance(data, Record):
                 raise ValueError("start='estimated' needs a record: the state is fitted to its y.")
             y = torch.as_tensor(self.scaler.normalise_y(data.y)).to(like).unsqueeze(0)
-            weight = torch.as_tensor(np.array(data.factors)).to(like).unsqueeze(0)
+            weight = torch.as_tensor(np.array(data.start_factors)).to(like).unsqueeze(0)
             trajectory = estimated_start(self.lfr.cell, v, y, weight)
         else:
             trajectory = self.lfr.trajectory(v, state, start)

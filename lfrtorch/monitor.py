@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import math
 import sys
 from collections.abc import Sequence
@@ -11,7 +12,9 @@ from statistics import median
 from time import monotonic
 from typing import TextIO
 
+import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
 from lfrtorch import plots
@@ -149,6 +152,11 @@ class TensorBoard:
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """Add a figure."""
         self.writer.add_figure(name, figure, step, close=False)
+
+    def image(self, name: str, png: bytes, step: int) -> None:
+        """Add a figure that is drawn already."""
+        pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+        self.writer.add_image(name, pixels, step, dataformats="HWC")
 
     def text(self, name: str, text: str) -> None:
         """Add a text in a fixed-width font."""

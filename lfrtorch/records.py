@@ -56,8 +56,10 @@ class Record:
         y: output, physical units. A one-dimensional array is one channel.
         fs: sampling frequency in Hz.
         start: ``"zero"`` simulates from x = 0 (at rest at the input's offset), ``"given"`` from
-            ``x0``; ``"estimated"`` fits the start state to the record, too; ``"periodic"`` says
-            that the record is a whole number of periods in steady state.
+            ``x0``; ``"estimated"`` fits the start state to the record, too: with the parameters in
+            a fit, and where a model is simulated or judged to the skipped samples, so that no
+            scored sample has a part in it (to all where none is skipped); ``"periodic"`` says that
+            the record is a whole number of periods in steady state.
         skip: samples at the beginning that are left out of cost and score.
         x0: the given start state, in the coordinates of the model.
         weight: of the squared normalised errors in a fit, one number or one for each output.
@@ -180,6 +182,14 @@ class Record:
     def factors(self) -> NDArray[np.float64]:
         """What the errors (T, ny) are multiplied by in a fit: √weight, 0 in the skipped samples."""
         counts = np.arange(len(self.y))[:, None] >= self.skip
+        return np.broadcast_to(np.sqrt(self.weight) * counts, self.y.shape)
+
+    @property
+    def start_factors(self) -> NDArray[np.float64]:
+        """The same for an estimated start of a given model: √weight, 0 in the scored samples."""
+        if not self.skip:
+            return self.factors
+        counts = np.arange(len(self.y))[:, None] < self.skip
         return np.broadcast_to(np.sqrt(self.weight) * counts, self.y.shape)
 
     @property

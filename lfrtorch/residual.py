@@ -213,7 +213,9 @@ class SimulationError:
         if batch.estimated is None:
             return batch.x0
         if self._solved:
-            return estimated_start(self.model.lfr.cell, batch.u, batch.y, batch.weight).x[:, 0]
+            assert batch.start_weight is not None
+            cell = self.model.lfr.cell
+            return estimated_start(cell, batch.u, batch.y, batch.start_weight).x[:, 0]
         return self._starts[batch.estimated]
 
     def _trajectory(self, i: int) -> Trajectory:

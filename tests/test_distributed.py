@@ -255,7 +255,6 @@ def run_folder(folder: Path) -> Path:
     assert [p.name for p in (folder / "runs").iterdir()] == ["several"]
     (found,) = (folder / "runs" / "several").iterdir()
     assert len(list(found.glob("events.out.tfevents.*"))) == 1
-    assert len(list(found.glob("*.log"))) == 1
     assert not list(found.glob(".model*"))
     return found
 
@@ -271,14 +270,15 @@ def test_torchrun_makes_one_run(tmp_path: Path):
     assert load(folder).sizes["nx"] == 2
 
 
-@pytest.mark.parametrize("rank", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("rank", [0, 1])
 def test_a_killed_process_leaves_the_last_model(rank: int, tmp_path: Path):
     dying = ["trainer._target_=test_distributed.Dying", f"+trainer.rank={rank}"]
     done = torchrun(*dying, folder=tmp_path)
     assert done.returncode != 0
     folder = run_folder(tmp_path)
     assert f"rank {1 - rank} of 2 has no answer from rank {rank} (" in done.stderr
-    assert f"the best model so far is in {folder / 'model'}\n" in done.stderr
+    assert f"the best model so far is in {folder / 'model'}; to go on: " in done.stderr
     assert load(folder).sizes["nx"] == 2
     if rank == 1:  # the first process goes on to score what there is
         metrics = json.loads((folder / "metrics.json").read_text())

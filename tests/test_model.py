@@ -12,9 +12,11 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.cell import LFRCell
+from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Record
+from lfrtorch.residual import SimulationError
 from lfrtorch.sensitivity import Linearisation, output_jacobian
 from lfrtorch.simulate import simulate, steady_state
 
@@ -205,6 +207,16 @@ def test_record_from_the_state_that_fits_best(model: Model):
     whole = measure(model, 200)
     part = replace(whole[20:], start="estimated")
     np.testing.assert_allclose(model.simulate(part), part.y, rtol=0, atol=1e-8)
+
+
+def test_scored_samples_have_no_part_in_the_start(model: Model):
+    whole = measure(model, 200)
+    part = replace(whole[20:], start="estimated", skip=100)
+    other = replace(part, y=np.concatenate([part.y[:100], -part.y[100:]]))
+    for record in (part, other):
+        np.testing.assert_allclose(model.simulate(record), part.y, rtol=0, atol=1e-8)
+    judge = SimulationError(model, other, solved_starts=True)
+    assert judge.rmse(judge.theta) == pytest.approx(rmse(other, part.y), rel=1e-8)
 
 
 def test_starts_that_lack_what_they_need(model: Model):
