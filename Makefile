@@ -3,6 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 PARTIAL := $(VENV)/.partial
+PARALLEL := -n auto --maxprocesses 4 --dist loadgroup
 
 .DEFAULT_GOAL := help
 .PHONY: help setup run test test-all check bench docs clean
@@ -17,10 +18,10 @@ run: $(READY)  ## identify the Bouc-Wen benchmark (ARGS="seed=1 ..." is passed o
 	@$(BIN)/python train.py +bench=boucwen $(ARGS)
 
 test: $(READY)  ## fast tests (ARGS="-k name ..." is passed on)
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 test-all: $(READY)  ## all tests, the slow ones too
-	@$(BIN)/python -m pytest -m "" $(ARGS)
+	@$(BIN)/python -m pytest -m "" $(PARALLEL) $(ARGS)
 
 check: $(READY)  ## format, lint, types, import order
 	@$(BIN)/ruff format --check .

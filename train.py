@@ -134,7 +134,8 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
         if ranks.rank > 0:
             result = search(monitors=[[termination]] * len(models))
         else:
-            board = TensorBoard(folder, shown, bla.simulate(shown))
+            drawn = shown if cfg.figures else None
+            board = TensorBoard(folder, drawn, bla.simulate(shown))
             keep = Checkpoint(best, least=snapshots.least)
             if several:
                 line = StartsLine(len(models), models[0].outputs[0].unit)
@@ -309,12 +310,6 @@ def write(
         )
     board.text("scores", table)
     simulated = responses(result.model, bla, dataset, own)
-    drawn = figures(result, bla, dataset, simulated)
-    images = {name: plots.png(figure) for name, figure in drawn.items()}
-    for name in drawn:
-        (made(folder / "figures") / f"{name}.png").write_bytes(images[name])
-        board.image(f"result/{name}", images[name], result.iterations)
-    board.close()
     advice = advise(
         evidence(
             result,
@@ -326,17 +321,24 @@ def write(
             searched=search is not None,
         )
     )
-    more, views = views_of_tests(simulated)
-    images |= {name: plots.png(figure) for name, figure in more.items()}
-    page = html_report.render(
-        metrics, result, bla, dataset, simulated, images, advice,
-        views=views, config=OmegaConf.to_yaml(cfg, resolve=True),
-    )  # fmt: skip
-    with whole_file(folder / "report.html") as path:
-        path.write_text(page, encoding="utf-8")
+    if cfg.figures:
+        drawn = figures(result, bla, dataset, simulated)
+        images = {name: plots.png(figure) for name, figure in drawn.items()}
+        for name, image in images.items():
+            (made(folder / "figures") / f"{name}.png").write_bytes(image)
+            board.image(f"result/{name}", image, result.iterations)
+        more, views = views_of_tests(simulated)
+        images |= {name: plots.png(figure) for name, figure in more.items()}
+        page = html_report.render(
+            metrics, result, bla, dataset, simulated, images, advice,
+            views=views, config=OmegaConf.to_yaml(cfg, resolve=True),
+        )  # fmt: skip
+        with whole_file(folder / "report.html") as path:
+            path.write_text(page, encoding="utf-8")
+    board.close()
     for item in advice[:PRINTED]:
         print(f"next: {item}")
-    print(f"\nRun in {folder}, its report in {folder / 'report.html'}")
+    print(f"\nRun in {folder}" + f", its report in {folder / 'report.html'}" * cfg.figures)
     print(f"TensorBoard: tensorboard --logdir {folder}")
     if result.reason == INTERRUPTED:
         print(go_on(folder))

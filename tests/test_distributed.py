@@ -39,6 +39,8 @@ from lfrtorch.trainer import FitResult, fit
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = Path(__file__).resolve().parent
 
+pytestmark = pytest.mark.xdist_group("distributed")  # its fixture takes seconds: once
+
 
 def case() -> tuple[Model, list[Record], Record]:
     """A model some way off, records of three lengths and starts of the true one, and another."""
@@ -242,6 +244,7 @@ def torchrun(*overrides: str, folder: Path) -> subprocess.CompletedProcess[str]:
     path = os.pathsep.join([str(TESTS), str(ROOT), os.environ.get("PYTHONPATH", "")])
     command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     settings = ["+data._target_=test_distributed.dataset", "name=several", "nx=2", "nn=3"]
+    settings += ["figures=false"]
     return subprocess.run(
         [sys.executable, *command, str(ROOT / "train.py"), *settings, *overrides],
         capture_output=True, text=True, check=False, cwd=folder, timeout=100,

@@ -150,6 +150,7 @@ def test_search_finds_the_system_of_the_lines():
     assert state.reason == "converged: the residual vanishes"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 def test_covariance_is_that_of_many_fits(known: bool):
     """200 fits of a first-order system to lines of unequal noise: pole and gains."""

@@ -101,9 +101,8 @@ def test_prediction_is_more_precise_than_simulation_where_the_noise_is_coloured(
     assert 1.7 * spread[True] < spread[False]
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param("white", marks=pytest.mark.slow), "coloured", "prediction"]
-)
+@pytest.mark.parametrize("kind", ["white", "coloured", "prediction"])
+@pytest.mark.slow
 def test_covariance_is_that_of_many_fits(kind: str):
     """The pole of a first-order system, over 60 records: simulation errors of any spectrum."""
     prediction = kind == "prediction"

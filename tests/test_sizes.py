@@ -33,6 +33,8 @@ from lfrtorch.trainer import Progress
 
 OPTIMISER = LevenbergMarquardt(max_iter=10)
 
+pytestmark = pytest.mark.xdist_group("sizes")  # its fixture takes seconds: once
+
 
 Planted = tuple[list[Record], list[Record], LinearModel]
 
