@@ -24,6 +24,7 @@ from lfrtorch.multistart import fit_starts
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.order import OrderScan, scan_orders
 from lfrtorch.records import Channel, Record, Scaler
+from lfrtorch.resume import Snapshots
 from lfrtorch.sizes import SizeSearch, search_sizes
 from lfrtorch.stream import simulate_blocks
 from lfrtorch.trainer import FitResult, fit
@@ -47,6 +48,7 @@ __all__ = [
     "Record",
     "Scaler",
     "SizeSearch",
+    "Snapshots",
     "datasets",
     "distributed",
     "estimate_bla",
