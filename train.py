@@ -362,6 +362,8 @@ def chosen_before(cfg: DictConfig, folder: Path) -> None:
 def require(cfg: DictConfig) -> None:
     """Say what is missing from the command line before anything is computed."""
     require_data(cfg)
+    if cfg.nx is None and cfg.init_from is not None:
+        cfg.nx = lfrtorch.load(cfg.init_from).sizes["nx"]
     if cfg.nx is None:
         raise ValueError(
             "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
@@ -407,7 +409,9 @@ def continued(cfg: DictConfig, dataset: Dataset) -> lfrtorch.Model:
     same_channels(model, dataset.train[0], cfg.init_from)
     for name, size in model.sizes.items():
         if cfg[name] != size:
-            print(f"{name} is {size}, that of the model in '{cfg.init_from}', not {cfg[name]}")
+            print(
+                f"note: {name} is {size}, that of the model in '{cfg.init_from}', not {cfg[name]}"
+            )
             cfg[name] = size
     return model
 

@@ -153,8 +153,8 @@ def starts_in_a_transient(e: Evidence) -> Advice | None:
     if e.transient is None or e.transient <= TRANSIENT:
         return None
     return Advice(
-        "The records do not begin at rest: skip more samples (data.skip=N), or give records "
-        "start='estimated'.",
+        "The records do not begin at rest: skip more samples (data.skip=N), or estimate "
+        "their starts (data.start=estimated).",
         f"in their first twentieth the training error is {e.transient:.2g} times that of the rest",
     )
 

@@ -301,6 +301,11 @@ class Fit:
                 f"'{path}' was left by another optimiser than {type(self.optimiser).__name__}; go "
                 "on with the one that the run had."
             ) from None
+        if state.iteration > self.optimiser.limit:
+            raise ValueError(
+                f"the fit that is to go on has had {state.iteration} iterations, more than the "
+                f"{self.optimiser.limit} asked for; ask for more."
+            )
         if self.ranks.world > 1:  # what was kept is the first one's part
             state = replace(state, residual=self.problem.residual(state.theta))
         self.state = self.optimiser.prolonged(state)

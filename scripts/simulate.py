@@ -25,6 +25,8 @@ from lfrtorch.checks import integer, number  # noqa: E402
 from lfrtorch.datasets.file_stream import Block, FileStream  # noqa: E402
 from lfrtorch.datasets.files import listed_files  # noqa: E402
 from lfrtorch.datasets.table_writer import FORMATS, table_writer  # noqa: E402
+from lfrtorch.datasets.tables import open_table  # noqa: E402
+from lfrtorch.datasets.time_stamps import is_time  # noqa: E402
 from lfrtorch.metrics import BlockScores  # noqa: E402
 from lfrtorch.whole_file import refuse_existing, whole_file  # noqa: E402
 from scripts.bla import columns, finite, percent  # noqa: E402
@@ -48,7 +50,7 @@ def simulate(cfg: DictConfig) -> None:
         with about(path):
             stream = FileStream(
                 path, model.inputs, model.outputs, model.fs,
-                u=cfg.data.inputs, y=cfg.data.outputs, times=cfg.data.time,
+                u=cfg.data.inputs, y=cfg.data.outputs, times=time_column(cfg, model, path),
             )  # fmt: skip
             if not stream.y:
                 missing = ", ".join(stream.missing)
@@ -95,17 +97,30 @@ def written(
 
 
 def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
-    """Refuse another sampling frequency than the model's; say where none is known."""
+    """Refuse another sampling frequency than the model's."""
     if cfg.data.fs is not None and not np.isclose(cfg.data.fs, model.fs):
         raise ValueError(
             f"data.fs is {cfg.data.fs} Hz and the model's sampling frequency {model.fs:g} Hz; "
             "resample the file."
         )
-    if cfg.data.fs is None and cfg.data.time is None:
+
+
+def time_column(cfg: DictConfig, model: lfrtorch.Model, path: Path) -> str | int | None:
+    """The column of the time: where nothing says how the file is sampled, the one named like it."""
+    if cfg.data.time is not None or cfg.data.fs is not None:
+        return cfg.data.time
+    named = [column.name for column in open_table(path).columns if is_time(column)]
+    if len(named) == 1:
         print(
-            "note: neither data.time nor data.fs says how the file is sampled; the model's "
-            f"{model.fs:g} Hz is taken"
+            f"note: the column {named[0]!r} of '{path}' is taken for the time; "
+            f"data.fs={model.fs:g} instead leaves it unread"
         )
+        return named[0]
+    print(
+        f"note: neither data.time nor data.fs says how '{path}' is sampled; the model's "
+        f"{model.fs:g} Hz is taken"
+    )
+    return None
 
 
 def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> Array | None:
@@ -168,7 +183,7 @@ def require(cfg: DictConfig) -> None:
     for option, value, example in (
         ("checkpoint", cfg.checkpoint, "DIR, the folder of a run or of a saved model"),
         ("data.path", cfg.data.path, "FILE, the file of inputs"),
-        ("out", cfg.out, "FILE.csv, which is written"),
+        ("out", cfg.out, "FILE.csv, which is written, or for several files a FOLDER"),
     ):
         if value is None:
             raise ValueError(f"{option} is not set: add {option}={example}.")

@@ -279,6 +279,8 @@ def test_refused_time(tmp_path):
     timed(path, jitter)
     message = refused("'t' is not evenly spaced.* at line", path, use=TIMED)
     assert f"from {np.diff(jitter).min():.4g} s to {np.diff(jitter).max():.4g} s" in message
+    timed(path, even + 0.004 * (np.arange(300) >= 200))
+    refused("from 0.01 s to 0.014 s, at line 202", path, use=TIMED)
     timed(path, np.concatenate([even[:100], even[:200]]))
     refused("does not rise: 0.99 s is followed by 0 s, at line 102", path, use=TIMED)
     timed(path, np.concatenate([even[:150], even[150:] * 2]))

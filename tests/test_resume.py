@@ -191,6 +191,12 @@ def test_another_start(tmp_path: Path):
         run(starts(2)[1:], records(), tmp_path)
 
 
+def test_fewer_iterations_than_it_has_had(tmp_path: Path):
+    run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=3))
+    with pytest.raises(ValueError, match="has had 3 iterations, more than the 2 asked for"):
+        run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=2))
+
+
 def test_another_optimiser(tmp_path: Path):
     run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
     with pytest.raises(ValueError, match="another optimiser than Adam"):

@@ -79,9 +79,21 @@ def test_outputs_of_inputs_alone(extension: str, folder: Path, monkeypatch, caps
     printed = capsys.readouterr()
     assert printed.err == ""
     assert "model: u1 (N), u2 (N) -> y1 (mm), y2 (mm) at 50 Hz, nx 3, nz 2, nw 1" in printed.out
-    assert "note: neither data.time nor data.fs says how the file is sampled" in printed.out
+    assert "note: neither data.time nor data.fs says how 'inputs.csv' is sampled" in printed.out
     assert "has no column y1, y2, so nothing is scored" in printed.out
     assert "RMSE" not in printed.out
+
+
+def test_a_column_named_like_time_is_the_time(folder: Path, monkeypatch, capsys):
+    """A file at another rate is not simulated as if it were at the model's."""
+    run(monkeypatch, folder, "data.path=both.csv", "out=x.csv")
+    assert next(iter(columns(folder / "x.csv"))) == "t"
+    assert "note: the column 't' of 'both.csv' is taken for the time" in capsys.readouterr().out
+    slow = columns(folder / "both.csv")
+    csv(folder / "slow.csv", **slow | {"t": 2 * slow["t"]})
+    message = refused(monkeypatch, capsys, folder, "data.path=slow.csv", "out=y.csv")
+    assert "says 25 Hz and the model runs at 50 Hz" in message
+    run(monkeypatch, folder, "data.path=slow.csv", "data.fs=50", "out=y.csv")  # as it is told
 
 
 def test_measured_outputs_are_scored(folder: Path, monkeypatch, capsys):

@@ -103,9 +103,11 @@ def _grid(t: NDArray[np.float64], digit: float, gaps: NDArray[np.int64]) -> Samp
     away = np.abs(t - np.repeat(t[starts], lengths) - place * mean)
     far = away > _JITTER * mean + 1.01 * digit
     if far.any():
+        odd = np.abs(steps - np.median(steps))
+        odd[gaps - 1] = 0.0
         raise Uneven(
             f"is not evenly spaced: its steps go from {steps.min():.4g} s to {steps.max():.4g} s",
-            int(np.argmax(far)),
+            int(np.argmax(odd)) + 1,
         )
     rounding = 4 * float(np.spacing(np.abs(t).max()))
     if np.ptp(within) > 2 * rounding:  # else the digits hold the step exactly
