@@ -69,15 +69,17 @@ class Terminated(Exception):
 
 
 class Termination:
-    """SIGTERM as a monitor: the fit ends as by Ctrl-C, after an iteration, and files are written.
+    """Ctrl-C and SIGTERM as a monitor: the fit ends after an iteration, and files are written.
 
-    A batch system sends it before it kills, and torchrun to the processes that are left. Several
-    processes end together where one is asked to, and by Ctrl-C as well.
+    So no write is torn; a second Ctrl-C ends it at once. A batch system sends SIGTERM before it
+    kills, and torchrun to the processes that are left: several end together where one is asked to.
     """
 
     def __init__(self, ranks: Ranks) -> None:
         self.ranks, self.asked = ranks, 0
-        self._signals = [signal.SIGTERM, *[signal.SIGINT] * (ranks.world > 1)]
+        self._signals = [signal.SIGTERM]
+        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background job
+            self._signals.append(signal.SIGINT)
 
     def __enter__(self) -> Self:
         self._usual = [signal.signal(number, self._note) for number in self._signals]
@@ -93,6 +95,10 @@ class Termination:
             raise KeyboardInterrupt
 
     def _note(self, number: int, _: Any) -> None:
+        if number == signal.SIGINT:
+            if self.asked == number:
+                raise KeyboardInterrupt
+            print("\nending after this iteration; Ctrl-C again: at once", file=sys.stderr)
         self.asked = number
 
 
