@@ -140,7 +140,10 @@ def fit_starts(
             raise KeyboardInterrupt
         starts = judge.summaries(field)
         watch(Round(number, len(ends), starts, time.perf_counter() - clock))
-        if any(_cut_short(fit) for fit in field):
+        cut = next((fit.reason for fit in field if _cut_short(fit)), "")
+        if cut:
+            for fit in field:
+                fit.reason = fit.reason or cut  # of those that had come to the end of the round
             break
         if until < limit:
             kept = max(FINALISTS, ceil(len(field) / 2))

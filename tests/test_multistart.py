@@ -204,6 +204,18 @@ def test_ctrl_c_keeps_the_best_of_all(threads: int):
     assert result.history[result.chosen_iteration].score == score
 
 
+def test_a_stop_after_some_have_come_to_the_end_of_their_round():
+    models, train, validation = several(3)
+
+    def stop(model: Model, progress: Progress):
+        if model is models[2]:
+            raise KeyboardInterrupt
+
+    result = fit_starts(models, train, validation, monitors=[[stop]] * 3)
+    assert result.reason == INTERRUPTED
+    assert {start.reason for start in result.starts} == {INTERRUPTED}
+
+
 def test_a_failure_ends_all():
     models, train, validation = several(3)
 
