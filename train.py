@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import hydra
 import torch
@@ -29,7 +29,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
-from lfrtorch import html_report, linear_plots, plots, report
+from lfrtorch import figures, html_report, plots, report
 from lfrtorch.advice import advise
 from lfrtorch.checks import integer, number
 from lfrtorch.datasets import Dataset
@@ -39,11 +39,12 @@ from lfrtorch.findings import findings
 from lfrtorch.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
 from lfrtorch.order import OrderScan
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
-from lfrtorch.responses import Response
+from lfrtorch.responses import respond
 from lfrtorch.resume import Snapshots
 from lfrtorch.sizes import SizeSearch
+from lfrtorch.termination import Terminated, Termination
 from lfrtorch.threads import each_alone
-from lfrtorch.trainer import INTERRUPTED, Progress
+from lfrtorch.trainer import INTERRUPTED
 from lfrtorch.whole_file import whole_file
 
 CONF = Path(__file__).resolve().parent / "conf"
@@ -54,52 +55,11 @@ WORLD = int(os.environ.get("WORLD_SIZE", "1"))
 CONFIG, SNAPSHOTS = "config.yaml", "resume"
 """In the folder of a run: its settings, and its starts as far as they came."""
 
-MOST_MEASURED = 500_000
-"""Training samples up to which a nonparametric response is estimated for the report: 3 s."""
-
 PRINTED = 3
 """Most lines of advice that are printed; the report has all."""
 
 WITHOUT_FILES = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
 """Of Hydra, for the processes beside the first."""
-
-
-class Terminated(Exception):
-    """SIGTERM ended the fit; what it had found is written."""
-
-
-class Termination:
-    """Ctrl-C and SIGTERM as a monitor: the fit ends after an iteration, and files are written.
-
-    So no write is torn; a second Ctrl-C ends it at once. A batch system sends SIGTERM before it
-    kills, and torchrun to the processes that are left: several end together where one is asked to.
-    """
-
-    def __init__(self, ranks: Ranks) -> None:
-        self.ranks, self.asked = ranks, 0
-        self._signals = [signal.SIGTERM]
-        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background job
-            self._signals.append(signal.SIGINT)
-
-    def __enter__(self) -> Self:
-        self._usual = [signal.signal(number, self._note) for number in self._signals]
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for each, usual in zip(self._signals, self._usual, strict=True):
-            signal.signal(each, usual)
-
-    def __call__(self, model: lfrtorch.Model, progress: Progress) -> None:
-        """End the fit where that was asked for."""
-        if self.ranks.sum(torch.tensor(self.asked)):
-            raise KeyboardInterrupt
-
-    def _note(self, number: int, _: Any) -> None:
-        if number == signal.SIGINT:
-            if self.asked == number:
-                raise KeyboardInterrupt
-            print("\nending after this iteration; Ctrl-C again: at once", file=sys.stderr)
-        self.asked = number
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = None) -> float:
@@ -315,7 +275,7 @@ def write(
             "longer on the next louder ones tried; validate at the amplitudes you will use."
         )
     board.text("scores", table)
-    simulated = responses(result.model, bla, dataset, own)
+    simulated = respond(result.model, bla, dataset, own)
     advice = advise(
         evidence(
             result,
@@ -328,12 +288,12 @@ def write(
         )
     )
     if cfg.figures:
-        drawn = figures(result, bla, dataset, simulated)
+        drawn = figures.of_run(result, bla, dataset, simulated)
         images = {name: plots.png(figure) for name, figure in drawn.items()}
         for name, image in images.items():
             (made(folder / "figures") / f"{name}.png").write_bytes(image)
             board.image(f"result/{name}", image, result.iterations)
-        more, views = views_of_tests(simulated)
+        more, views = figures.of_tests(simulated)
         images |= {name: plots.png(figure) for name, figure in more.items()}
         page = html_report.render(
             metrics, result, bla, dataset, simulated, images, advice,
@@ -444,81 +404,6 @@ def own_linear_models(cfg: DictConfig, dataset: Dataset) -> dict[str, lfrtorch.L
     models = each_alone(estimate, [[records[name] for name in names] for names in of])
     by_records = dict(zip(of, models, strict=True))
     return {test: by_records[names] for test, names in dataset.linear.items()}
-
-
-def responses(
-    model: lfrtorch.Model,
-    bla: lfrtorch.LinearModel,
-    dataset: Dataset,
-    own: dict[str, lfrtorch.LinearModel],
-) -> list[Response]:
-    """All records beside their simulations; tests with linear models of their own have those."""
-    used = {
-        "train": dataset.train,
-        "validation": dataset.validation,
-        "selection": dataset.selection,
-        "test": dataset.tests,
-    }
-    found = []
-    for use, records in used.items():
-        for record in records:
-            lti = own.get(record.name, bla) if use == "test" else bla
-            found.append(Response(record, use, lti.simulate(record), model.simulate(record)))
-    return found
-
-
-def figures(
-    result: lfrtorch.FitResult,
-    bla: lfrtorch.LinearModel,
-    dataset: Dataset,
-    simulated: Sequence[Response],
-) -> dict:
-    """All figures of a run's folder by file name."""
-    model = result.model
-    drawn = {}
-    for shown in simulated:
-        if shown.use == "test":
-            drawn[shown.record.name] = plots.errors(shown.record, shown.y_lti, shown.y_hat)
-    signals = model.signals(dataset.train[0])
-    drawn["static_map"] = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
-    unit = model.outputs[0].unit
-    drawn["convergence"] = plots.convergence(result.history, result.chosen_iteration, unit)
-    drawn["frequency_response"] = linear_plots.frequency_response(bla, measured(dataset.train))
-    drawn["poles_and_zeros"] = linear_plots.poles_and_zeros(bla)
-    return drawn
-
-
-def views_of_tests(simulated: Sequence[Response]) -> tuple[dict, dict[str, dict[str, str]]]:
-    """What the report shows of tests beside ``figures``, and of each test all with captions."""
-    drawn, views = {}, {}
-    for shown in simulated:
-        if shown.use != "test":
-            continue
-        record, signals = shown.record, (shown.record, shown.y_lti, shown.y_hat)
-        name, other, near = record.name, f"{record.name}_other", f"{record.name}_near"
-        drawn[near] = plots.close_up(*signals)
-        if plots.is_whole(record):
-            drawn[other] = plots.response(*signals)
-            response, spectrum, of = other, name, "Spectrum over whole periods."
-        else:
-            drawn[other] = plots.density(*signals)
-            response, spectrum, of = name, other, "Power spectral density."
-        views[name] = {
-            response: "Measured output and errors against time.",
-            near: "The same about the largest error of the NL-LFR.",
-            spectrum: of,
-        }
-    return drawn, views
-
-
-def measured(records: Sequence[lfrtorch.Record]) -> lfrtorch.FRF | None:
-    """The nonparametric frequency response, where the records give one in seconds."""
-    if sum(record.samples for record in records) > MOST_MEASURED:
-        return None
-    try:
-        return lfrtorch.estimate_frf(records)
-    except ValueError:
-        return None
 
 
 def made(folder: Path) -> Path:

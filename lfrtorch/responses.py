@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfrtorch.datasets import Dataset
+from lfrtorch.linear_model import LinearModel
+from lfrtorch.model import Model
 from lfrtorch.records import Record
 
 Array = NDArray[np.float64]
@@ -49,6 +53,27 @@ class Response:
     def diverged(self) -> bool:
         """Whether the NL-LFR's output has samples that are not finite."""
         return not bool(np.isfinite(self.y_hat).all())
+
+
+def respond(
+    model: Model,
+    bla: LinearModel,
+    dataset: Dataset,
+    own: Mapping[str, LinearModel],
+) -> list[Response]:
+    """All records beside their simulations; tests with linear models of their own have those."""
+    used = {
+        "train": dataset.train,
+        "validation": dataset.validation,
+        "selection": dataset.selection,
+        "test": dataset.tests,
+    }
+    found = []
+    for use, records in used.items():
+        for record in records:
+            lti = own.get(record.name, bla) if use == "test" else bla
+            found.append(Response(record, use, lti.simulate(record), model.simulate(record)))
+    return found
 
 
 def rms(signal: Array) -> Array:

@@ -1,0 +1,73 @@
+"""The figures of a run: errors on the tests, the static map, convergence, the linear model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+
+from lfrtorch import linear_plots, plots
+from lfrtorch.datasets import Dataset
+from lfrtorch.frf import FRF, estimate_frf
+from lfrtorch.linear_model import LinearModel
+from lfrtorch.records import Record
+from lfrtorch.responses import Response
+from lfrtorch.trainer import FitResult
+
+MOST_MEASURED = 500_000
+"""Training samples up to which a nonparametric response is estimated for the report: 3 s."""
+
+
+def of_run(
+    result: FitResult,
+    bla: LinearModel,
+    dataset: Dataset,
+    simulated: Sequence[Response],
+) -> dict[str, Figure]:
+    """All figures of a run's folder by file name."""
+    model = result.model
+    drawn: dict[str, Figure] = {}
+    for shown in simulated:
+        if shown.use == "test":
+            drawn[shown.record.name] = plots.errors(shown.record, shown.y_lti, shown.y_hat)
+    signals = model.signals(dataset.train[0])
+    drawn["static_map"] = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
+    unit = model.outputs[0].unit
+    drawn["convergence"] = plots.convergence(result.history, result.chosen_iteration, unit)
+    drawn["frequency_response"] = linear_plots.frequency_response(bla, measured(dataset.train))
+    drawn["poles_and_zeros"] = linear_plots.poles_and_zeros(bla)
+    return drawn
+
+
+def of_tests(simulated: Sequence[Response]) -> tuple[dict[str, Figure], dict[str, dict[str, str]]]:
+    """What the report shows of tests beside those, and of each test all with captions."""
+    drawn: dict[str, Figure] = {}
+    views: dict[str, dict[str, str]] = {}
+    for shown in simulated:
+        if shown.use != "test":
+            continue
+        record, signals = shown.record, (shown.record, shown.y_lti, shown.y_hat)
+        name, other, near = record.name, f"{record.name}_other", f"{record.name}_near"
+        drawn[near] = plots.close_up(*signals)
+        if plots.is_whole(record):
+            drawn[other] = plots.response(*signals)
+            response, spectrum, of = other, name, "Spectrum over whole periods."
+        else:
+            drawn[other] = plots.density(*signals)
+            response, spectrum, of = name, other, "Power spectral density."
+        views[name] = {
+            response: "Measured output and errors against time.",
+            near: "The same about the largest error of the NL-LFR.",
+            spectrum: of,
+        }
+    return drawn, views
+
+
+def measured(records: Sequence[Record]) -> FRF | None:
+    """The nonparametric frequency response, where the records give one in seconds."""
+    if sum(record.samples for record in records) > MOST_MEASURED:
+        return None
+    try:
+        return estimate_frf(records)
+    except ValueError:
+        return None
