@@ -312,10 +312,10 @@ def noise_unknown(e: Evidence) -> Advice | None:
     static = "degree=auto" if e.sizes.get("degree") else "nn=auto"
     choose = f", or let validation choose the sizes: nx=auto nz=auto nw=auto {static}"
     return Advice(
-        "Whether this is the noise is not known: measure two periods of a periodic input"
+        "Whether this is the noise is not known: give two periods of a periodic input for training"
         f"{'' if e.searched else choose}.",
         f"training error {_percent(e.train)} of the output's standard deviation, no repeated "
-        "periods",
+        "periods in the training records",
     )
 
 

@@ -104,6 +104,10 @@ def _located(folder: Path, inside: Sequence[str]) -> Path:
     found = next((place for place in places if (place / DESCRIPTION).is_file()), None)
     looked_in = folder if found is None else found
     code = sorted(p.name for p in looked_in.glob("*") if p.suffix.lower() in CODE)
+    if not folder.exists():
+        raise ValueError(
+            f"there is no '{folder}'; give the folder of a run or of a saved model, a checkpoint."
+        )
     if found is None:
         raise ValueError(
             f"'{folder}' is not a checkpoint: no {DESCRIPTION} in it or in its "

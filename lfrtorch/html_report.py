@@ -95,6 +95,7 @@ def render(
         ],
         linear=_linear(bla, result),
         fit=_fit(metrics, bool(dataset.validation)),
+        search=_search(metrics["sizes_search"]),
         parameters=_parameters(metrics, result),
         stability=_stability(metrics["stable_to"]),
         run=_run(metrics, result, bla, config),
@@ -301,6 +302,20 @@ def _fit(metrics: Mapping[str, Any], validated: bool) -> dict[str, Any]:
     if len(ranking) > 1:
         summary += f" The best of {len(ranking)} starts."
     return {"summary": summary, "starts": starts}
+
+
+def _search(tried: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The sizes that were tried, by rising number of net parameters."""
+    rising = sorted(tried, key=lambda entry: entry["parameters_net"])
+    sizes = [name for name in ("nz", "nw", "nn", "degree") if tried and name in tried[0]]
+    rows = [
+        [str(entry[name]) for name in (*sizes, "parameters", "parameters_net")]
+        + [number(entry[name]) for name in ("seconds", "error", "error_std", "ratio")]
+        + [number(entry["standard_errors_above"]), "chosen" if entry["chosen"] else ""]
+        for entry in rising
+    ]
+    head = [*sizes, "parameters", "net", "seconds", "validation error", "±", "/ LTI", "above", ""]
+    return {"head": head, "rows": rows}
 
 
 def _parameters(metrics: Mapping[str, Any], result: FitResult) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import hydra
 import numpy as np
@@ -34,6 +35,15 @@ from train import CONF, user_errors  # noqa: E402
 
 Array = NDArray[np.float64]
 
+BEGINNING = 100
+"""Samples in which the transient of a wrong start state would be seen."""
+
+TRANSIENT = 3.0
+"""Error there over that of the rest above which it is."""
+
+FAR = 6.0
+"""Standard deviations of the training input that Gaussian noise and most signals stay within."""
+
 
 def simulate(cfg: DictConfig) -> None:
     """Simulate every file, write what comes out, and print the scores."""
@@ -56,20 +66,40 @@ def simulate(cfg: DictConfig) -> None:
                 missing = ", ".join(stream.missing)
                 print(f"note: '{path}' has no column {missing}, so nothing is scored")
             x0 = start_state(cfg, model, stream)
-            samples, scores = written(model, stream, x0, out, cfg.skip)
-        print(f"{out}: {samples} samples, {time.perf_counter() - clock:.1f} s")
-        rows += scored(path, model, scores, cfg.skip) if stream.y else []
+            result = written(model, stream, x0, out, cfg.skip)
+        print(f"{out}: {result.samples} samples, {time.perf_counter() - clock:.1f} s")
+        for note in noted(result, model, cfg):
+            print(f"note: {note}")
+        rows += scored(path, model, result.scores, cfg.skip) if stream.y else []
     if rows:
         head = ["file", "output", "unit", "samples", "skip", "RMSE", "NRMSE (%)"]
         print(f"\n{columns(head, rows)}")
 
 
+class Written(NamedTuple):
+    """What is known of a file that was simulated.
+
+    Args:
+        samples: written.
+        scores: of measured outputs after the skipped samples.
+        settled: the same without the first ``BEGINNING`` of those, either.
+        peaks: largest inputs about the operating point, in standard deviations of the model's
+            training inputs, (nu,).
+    """
+
+    samples: int
+    scores: BlockScores
+    settled: BlockScores
+    peaks: Array
+
+
 def written(
     model: lfrtorch.Model, stream: FileStream, x0: Array | None, out: Path, skip: int
-) -> tuple[int, BlockScores]:
-    """Simulate a file block by block into another: samples, and scores of measured outputs."""
+) -> Written:
+    """Simulate a file block by block into another."""
     names = [channel.name for channel in model.outputs]
-    scores, first = BlockScores(len(names), skip), 0
+    scores, settled = (BlockScores(len(names), skip + more) for more in (0, BEGINNING))
+    first, peaks = 0, np.zeros(len(model.inputs))
     read: list[Block] = []
 
     def inputs() -> Iterator[Array]:
@@ -89,11 +119,36 @@ def written(
                     found[f"{name}_error"] = block.y[:, i] - y_hat[:, i]
             if stream.y:
                 scores.add(block.y, y_hat)
+                settled.add(block.y, y_hat)
+            peaks = np.maximum(peaks, np.abs(model.scaler.normalise_u(block.u)).max(axis=0))
             write(found)
             first += len(y_hat)
         if not first:
             raise ValueError("there are no samples; give a file with data.")
-    return first, scores
+    return Written(first, scores, settled, peaks)
+
+
+def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
+    """What a user should know before the outputs are used."""
+    notes = [
+        f"the input {channel.name} goes {peak:.3g} standard deviations of the training input away "
+        "from its mean: the model extrapolates there"
+        for channel, peak in zip(model.inputs, result.peaks, strict=True)
+        if peak > FAR
+    ]
+    scores, settled = result.scores, result.settled
+    with np.errstate(invalid="ignore"):
+        before = scores.samples * scores.rmse**2 - settled.samples * settled.rmse**2
+        beginning = np.sqrt(before / (scores.samples - settled.samples))
+        transient = (settled.samples >= BEGINNING) & (beginning > TRANSIENT * settled.rmse)
+    if cfg.start != "estimated" and transient.any():
+        ratio = (beginning / settled.rmse)[transient].max()
+        notes.append(
+            f"the error over the first {BEGINNING} scored samples is {ratio:.3g} times that of the "
+            "rest: start=estimated finds the state that the file starts from, skip=N leaves out "
+            "the transient"
+        )
+    return notes
 
 
 def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:

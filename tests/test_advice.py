@@ -53,7 +53,11 @@ GOOD = Evidence(
         (advice.one_start, {"started": 1}, "starts=8"),
         (advice.tests_are_louder, {"louder": {"arrow": 1.5}}, "train on inputs as loud"),
         (advice.noise_unknown, {"noise": None}, "or let validation choose the sizes"),
-        (advice.noise_unknown, {"noise": None, "searched": True}, "of a periodic input."),
+        (
+            advice.noise_unknown,
+            {"noise": None, "searched": True},
+            "of a periodic input for training.",
+        ),
         (advice.hardly_better, {"validation": 0.199, "searched": True}, "sizes that were searched"),
         (advice.at_the_noise, {"train": 0.0105, "validation": 0.011}, "nothing to gain"),
     ],

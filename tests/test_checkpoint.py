@@ -155,7 +155,7 @@ def test_own_class_that_is_called_like_the_network(tmp_path: Path):
 
 
 def test_no_checkpoint(tmp_path: Path):
-    refused(tmp_path / "nowhere", "is not a checkpoint: no model.json")
+    refused(tmp_path / "nowhere", "nowhere'; give the folder of a run")
     refused(tmp_path, "is not a checkpoint")
 
 

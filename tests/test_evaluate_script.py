@@ -119,7 +119,7 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
     ("words", "message"),
     [
         ([DATA], "no model chosen: add checkpoint=DIR"),
-        (["checkpoint=/nowhere", DATA], "'/nowhere' is not a checkpoint"),
+        (["checkpoint=/nowhere", DATA], "there is no '/nowhere'; give the folder of a run"),
         (["checkpoint=RUN"], "no data chosen: add +bench=boucwen"),
         (["checkpoint=RUN", DATA, "out=scores.txt"], "the scores are JSON: name it FILE.json"),
         (["checkpoint=RUN", DATA, "out=RUN/there.json"], "there.json' exists; give another name"),

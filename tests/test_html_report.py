@@ -75,10 +75,11 @@ class Run:
             for record in records
         ]
 
-    def page(self, advice: tuple[Advice, ...] = (), **options) -> Page:
+    def page(self, advice: tuple[Advice, ...] = (), search=(), **options) -> Page:
         metrics = report.metrics(
             self.result, self.bla, self.dataset, seed=0, data_seed=None, command="train.py a=1"
         )
+        metrics["sizes_search"] = search
         images = {"convergence": b"PNG 1", "near": b"PNG 2"}
         views = {record.name: {"near": "a close-up"} for record in self.dataset.tests}
         html = html_report.render(
@@ -142,6 +143,15 @@ def test_page_has_the_numbers_and_no_address_outside(single: Run):
         assert words in page.text
     order = [page.text.index(word) for word in ("What to try next", "Scores", "Data", "Best lin")]
     assert order == sorted(order)
+
+
+def test_sizes_that_were_tried(single: Run):
+    entry = {"nz": 1, "nw": 1, "parameters": 25, "parameters_net": 19, "seconds": 2.0}
+    entry |= {"error": 0.02, "error_std": 0.001, "ratio": 0.5, "standard_errors_above": 0.0}
+    large = entry | {"nn": 9, "parameters_net": 37, "chosen": False}
+    page = single.page(search=[large, entry | {"nn": 3, "chosen": True, "error": 0.03}])
+    assert "1 1 3 25 19 2.00 0.0300 0.00100 0.500 0 chosen 1 1 9 25 37 2.00 0.0200" in page.text
+    assert "Sizes" not in single.page().text
 
 
 def test_what_users_named_is_escaped(single: Run):

@@ -19,7 +19,7 @@ from scripts import simulate
 
 MODEL = random_model(random_cell(2, 2, 3, 2, 1, 4), fs=50.0)
 T = 300
-U = np.random.default_rng(0).normal(size=(T, 2))
+U = np.random.default_rng(0).normal(MODEL.scaler.u_offset, MODEL.scaler.u_scale, size=(T, 2))
 NOISE = 0.1 * np.random.default_rng(1).normal(size=(T, 2))
 Y = MODEL.simulate(U) + NOISE
 
@@ -123,6 +123,27 @@ def test_columns_of_other_names(folder: Path, monkeypatch, capsys):
     assert np.array_equal(found["y1_hat"], MODEL.simulate(U)[:, 0])
     assert np.array_equal(found["y1"], Y[:, 0])
     assert "note" not in capsys.readouterr().out
+
+
+def test_inputs_beyond_those_of_training_are_said(folder: Path, monkeypatch, capsys):
+    loud = np.array(U)
+    loud[7, 1] = MODEL.scaler.u_offset[1] - 8.0 * MODEL.scaler.u_scale[1]
+    csv(folder / "loud.csv", u1=U[:, 0], u2=loud[:, 1])
+    run(monkeypatch, folder, "data.path=loud.csv", "data.fs=50", "out=x.csv")
+    said = [line for line in capsys.readouterr().out.splitlines() if "extrapolates" in line]
+    assert len(said) == 1
+    assert said[0].startswith("note: the input u2 goes 8 standard deviations of the training input")
+
+
+def test_a_wrong_start_state_is_said(folder: Path, monkeypatch, capsys):
+    y = Y.copy()
+    y[: simulate.BEGINNING, 1] += 10.0
+    csv(folder / "late.csv", u1=U[:, 0], u2=U[:, 1], y1=Y[:, 0], y2=y[:, 1])
+    words = ["data.path=late.csv", "data.fs=50", "out=x.csv", "overwrite=true"]
+    run(monkeypatch, folder, *words)
+    assert "the error over the first 100 scored samples is 1" in capsys.readouterr().out
+    run(monkeypatch, folder, *words, "skip=100")
+    assert "scored samples" not in capsys.readouterr().out
 
 
 def test_missing_outputs_are_left_out_of_the_scores(folder: Path, monkeypatch, capsys):

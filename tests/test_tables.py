@@ -476,6 +476,13 @@ def test_find(tmp_path):
         refused(table, nothing, "data.inputs is .*give names of columns or their numbers.*'v'")
 
 
+def test_a_name_that_is_nearly_right(tmp_path):
+    table = table_of(tmp_path, "exp.force,position,w\n1,2,3\n1,2,3\n")
+    refused(table, "force", r"'w'\. Did you mean 'exp\.force'\?$")
+    refused(table, "positon", r"Did you mean 'position'\?$")
+    refused(table, "voltage", r"'w'\.$")
+
+
 def test_no_columns(tmp_path):
     np.savez(tmp_path / "a.npz", fs=3.0)
     refused(open_table(tmp_path / "a.npz"), "u", r"no columns of numbers \('fs' has one number")

@@ -21,6 +21,7 @@ from omegaconf import OmegaConf
 
 import lfrtorch
 import train
+from lfrtorch import termination
 from lfrtorch.datasets import official
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -286,7 +287,7 @@ class Terminated(lfrtorch.LevenbergMarquardt):
 def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, tmp_path: Path):
     usual = signal.getsignal(signal.SIGTERM)
     cfg = configuration(*file_overrides(csv), "nx=1", "trainer._target_=test_train.Terminated")
-    with pytest.raises(train.Terminated, match="the best model so far is in"):
+    with pytest.raises(termination.Terminated, match="the best model so far is in"):
         train.identify(cfg, tmp_path)
     assert signal.getsignal(signal.SIGTERM) == usual
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -301,7 +302,7 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
     for folder in (cut, whole):
         folder.mkdir()
     train.identify(configuration(*settings), whole)
-    with pytest.raises(train.Terminated, match=f"python train.py resume={cut}"):
+    with pytest.raises(termination.Terminated, match=f"python train.py resume={cut}"):
         train.identify(configuration(*settings, "trainer._target_=test_train.Terminated"), cut)
     assert json.loads((cut / "metrics.json").read_text())["fit"]["reason"] == "interrupted"
     train.identify(configuration(*settings, f"resume={cut}"), cut)
@@ -451,7 +452,10 @@ def test_iterations_of_the_other_trainer_are_named(
         (["+bench=silverbox", "data.root=/nowhere"], "there is no 'Silverbox/"),
         (["+bench=parwh", "data.levels=[200]"], "data.levels is [200]; give one or more of 100"),
         (["+bench=parwh", "data.root=/nowhere"], "there is no 'ParWH/ParWHFiles/ParWHData.mat'"),
-        (["+bench=boucwen", "init_from=/nowhere"], "'/nowhere' is not a checkpoint"),
+        (
+            ["+bench=boucwen", "init_from=/nowhere"],
+            "there is no '/nowhere'; give the folder of a run",
+        ),
         (["+bench=boucwen", "ridge=-1"], "ridge is -1"),
         (["+bench=boucwen", "ridge=abc"], "ridge is 'abc'"),
         (["+bench=boucwen", "threads=0"], "threads is 0"),

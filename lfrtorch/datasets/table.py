@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,6 +15,9 @@ from lfrtorch.records import Channel
 
 BLOCK = 65536
 """Samples that are in memory at once."""
+
+CLOSE = 0.75
+"""Similarity of names from which on one may be meant for the other."""
 
 _SCALED = "m|g|s|A|K|mol|cd|Hz|N|Nm|Pa|J|W|VA|V|F|Ω|[Oo]hm|T|H|Wb|S|rad|bar|l|L|eV|C|B"
 _OTHER = "min|h|d|sec|deg|°|°C|°F|deg[CF]|%|rpm|rev|psi|lbf?|in|ft|dB|px|counts?|a\\.u\\.|-|1"
@@ -124,8 +128,13 @@ class Table(ABC):
             raise ValueError(
                 f"'{self.path}': {wanted!r}, as {option} says, {self.refused[wanted]}."
             )
+        close = difflib.get_close_matches(wanted, self.headers, n=1, cutoff=CLOSE) or [
+            header for header in self.headers if re.split(r"\W+", header)[-1] == wanted
+        ]
+        meant = f" Did you mean {close[0]!r}?" if len(close) == 1 else ""
         raise NoColumn(
             f"'{self.path}' has no column {wanted!r}, as {option} says; it has {self.listed}."
+            f"{meant}"
         )
 
     @property
