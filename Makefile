@@ -6,10 +6,10 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadgroup
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all check bench docs clean
+.PHONY: help setup run test test-all check bench reproduce docs clean
 
 help:  ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
 
 setup: $(READY)  ## create .venv and install lfrtorch with its tools (PYTHON=python3.12 to choose)
 	@echo "Ready: $(BIN)/python"
@@ -31,6 +31,9 @@ check: $(READY)  ## format, lint, types, import order
 
 bench: $(READY)  ## costs against what is required (PEERS=DIR, ARGS=--quick)
 	@$(BIN)/python benchmarks/engine.py $(if $(PEERS),--peers "$(PEERS)") $(ARGS)
+
+reproduce: $(READY)  ## the public benchmarks at hand -> RESULTS.md (ARGS="silverbox data.root=DIR")
+	@$(BIN)/python scripts/reproduce.py $(ARGS)
 
 docs: $(READY)  ## API reference from the docstrings, in site/
 	@$(BIN)/pdoc -d google -o site lfrtorch

@@ -48,7 +48,7 @@ data = fss.create_data_object(given["u"], given["y"], given["lines"], float(give
 model = stage(
     "subspace", lambda: fss.lin.subspace_id(data, int(given["nx"]), logging_enabled=False)
 )
-model = stage("BLA", lambda: fss.lin.optimize(model, data, max_iter=int(given["bla_iter"]), **told))
+model = stage("BLA", lambda: fss.lin.optimize(model, data, max_iter=limits[0], **told))
 phi = fss.static.basis.Polynomial(int(given["nz"]), int(given["degree"]))
 model = stage(
     "inference and learning",

@@ -1,84 +1,346 @@
-"""The paper's Bouc-Wen table as medians over seeds, from runs of train.py.
+"""All benchmarks whose data are at hand: runs of train.py -> RESULTS.md, figures, leaderboard.
 
-    python scripts/reproduce.py data.root=DIR
-    python scripts/reproduce.py --seeds 2 --init paper -- trainer.max_iter=100
+python scripts/reproduce.py [NAME ...] [data.root=DIR]
+python scripts/reproduce.py silverbox --seeds 2 --out runs/try --results runs/try/RESULTS.md
+python scripts/reproduce.py --quick data.root=DIR
 
-Each run has a folder of its own below --out and is not repeated where a run of the same command
-came to its end there (remove the folder after a change of the package).
-Words with an equals sign are passed on to train.py.
+Each run is ``python train.py +bench=NAME seed=S`` (and data.seed=S where data are simulated), S = 0
+.. SEEDS - 1, in a folder of its own below --out, and is not repeated where one of the same command
+came to its end there (remove the folder after a change of the package). Words with an equals sign
+are settings passed on to train.py. RESULTS.md has all that is in --out.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import platform
 import shlex
+import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
 
 ROOT = Path(__file__).resolve().parents[1]
-STARTS = ["zero_output", "paper"]
-CASES = ((1, 1), (2, 1), (2, 2))
-"""(nz, nw) of the paper's three columns."""
+sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
+
+import lfrtorch  # noqa: E402
+from lfrtorch import leaderboard  # noqa: E402
+from lfrtorch.datasets import Dataset  # noqa: E402
+from lfrtorch.whole_file import whole_file  # noqa: E402
+from train import CONF  # noqa: E402
+
+CASES = {
+    "boucwen": ["+bench=boucwen"],
+    "boucwen_nz1": ["+bench=boucwen", "nz=1"],
+    "boucwen_record": ["+bench=boucwen_record"],
+    "parwh": ["+bench=parwh"],
+    "wiener_hammerstein": ["+bench=wiener_hammerstein"],
+    "silverbox": ["+bench=silverbox"],
+    "cascaded_tanks": ["+bench=cascaded_tanks"],
+    "ced": ["+bench=ced"],
+    "emps": ["+bench=emps"],
+    "f16": ["+bench=f16"],
+    "wh_process_noise": ["+bench=wh_process_noise"],
+}
+"""Settings of train.py by name."""
+
+QUICK = ["starts=1", "trainer.max_iter=10"]
+FIGURES = ("static_map", "convergence", "frequency_response")
+"""In the gallery beside those of the tests."""
+
+RUN = "run.json"
+"""In the folder of a run: the time that the command took."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A benchmark and its runs; ``missing`` says why there are none."""
+
+    name: str
+    dataset: Dataset | None
+    runs: Sequence[dict[str, Any]] = ()
+    folders: Sequence[Path] = ()
+    missing: str = ""
+
+    @property
+    def chosen(self) -> int:
+        """Number of the run that is best on validation, or else on training."""
+        judged = [run["validation"]["rmse"] for run in self.runs]
+        if any(error is None for error in judged):
+            judged = [run["ranking"][0]["train"] if run["ranking"] else 0.0 for run in self.runs]
+        return int(np.argmin(judged))
 
 
 def main() -> int:
-    """Run what is missing, then print the medians."""
+    """Run what is missing, then write the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, default=5, help="seed = data.seed = 0 .. SEEDS - 1")
-    parser.add_argument("--init", nargs="+", choices=STARTS, default=STARTS)
-    parser.add_argument("--out", type=Path, default=ROOT / "runs" / "reproduce")
-    parser.add_argument("overrides", nargs="*", help="settings for train.py, name=value")
+    parser.add_argument(
+        "words", nargs="*", metavar="NAME | SETTING", help=f"of {', '.join(CASES)}; all by default"
+    )
+    parser.add_argument("--seeds", type=int, default=5, help="runs of each (5)")
+    parser.add_argument(
+        "--quick", action="store_true", help="one run of one start and few iterations: a try"
+    )
+    parser.add_argument("--out", type=Path, help="of the runs (runs/reproduce, runs/quick)")
+    parser.add_argument("--results", type=Path, help="the file (RESULTS.md, or in --out if quick)")
     options = parser.parse_intermixed_args()
+    settings = [word for word in options.words if "=" in word]
+    names = [word for word in options.words if "=" not in word] or list(CASES)
+    if unknown := [name for name in names if name not in CASES]:
+        parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(CASES)}")
     if options.seeds < 1:
         parser.error(f"--seeds is {options.seeds}; at least one run is needed")
+    seeds = 1 if options.quick else options.seeds
+    out = (options.out or ROOT / "runs" / ("quick" if options.quick else "reproduce")).resolve()
+    results = options.results or (out if options.quick else ROOT) / "RESULTS.md"
 
-    print(f"{'init':12} nz nw  {'record':10} {'source':10} {'median':>9} {'best':>9} {'worst':>9}")
-    out = options.out.resolve()
-    for init in options.init:
-        for nz, nw in CASES:
-            runs = [
-                run(out, seed, [f"init={init}", f"nz={nz}", f"nw={nw}", *options.overrides])
-                for seed in range(options.seeds)
-            ]
-            for name in runs[0]["scores"]:
-                show(f"{init:12} {nz:2} {nw:2}", name, [r["scores"][name] for r in runs], "rmse")
-            if nz == CASES[-1][0] and nw == CASES[-1][1]:
-                for name in runs[0]["scores"]:
-                    show(f"{'LTI':18}", name, [r["scores"][name] for r in runs], "lti_rmse")
-            seconds = np.median([r["fit"]["seconds"] for r in runs])
-            each = np.median([r["fit"]["seconds_per_iteration"] for r in runs])
-            print(f"{'':19} fit {seconds:.1f} s, {1e3 * each:.0f} ms an iteration (medians)")
+    cases = []
+    for name in CASES:
+        words = [*CASES[name], *(QUICK if options.quick else []), *settings]
+        cases.append(case(name, words, out, seeds, start=name in names))
+    page = results.resolve()
+    made = gallery(cases, page.parent / "results", page.parent)
+    board = leaderboard.table(entries(cases))
+    with whole_file(page) as file:
+        file.write_text(written(cases, made, quick=options.quick), encoding="utf-8")
+    with whole_file(page.parent / "results" / "leaderboard.csv") as file:
+        file.write_text(board, encoding="utf-8")
+    print(f"\nTables in {page}")
     return 0
 
 
-def run(out: Path, seed: int, settings: list[str]) -> dict:
-    """metrics.json of one run of train.py, which is started where it is missing."""
-    words = ["+bench=boucwen", *settings, f"seed={seed}", f"data.seed={seed}"]
-    folder = out / "_".join(settings[:3]) / f"seed={seed}"
-    file = folder / "metrics.json"
-    if file.is_file():
-        found = json.loads(file.read_text())
-        same = found["command"] == shlex.join(["python", "train.py", *words])
-        if same and found["fit"]["reason"] != "interrupted":
-            return found
+def case(name: str, words: list[str], out: Path, seeds: int, *, start: bool) -> Case:
+    """The runs of a benchmark; those that are not there yet are started, if ``start``."""
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        cfg = compose("config", words)
+    try:
+        dataset: Dataset = instantiate(cfg.data)
+    except (FileNotFoundError, InstantiationException) as error:
+        cause = error.__cause__ or error
+        if not isinstance(cause, FileNotFoundError):
+            raise
+        print(f"{name}: no data. {cause}", flush=True)
+        return Case(name, None, missing="no data at hand")
+    runs, folders = [], []
+    for seed in range(seeds):
+        own = [*words, f"seed={seed}", *([f"data.seed={seed}"] if "seed" in cfg.data else [])]
+        folder = out / name / f"seed={seed}"
+        found = run(own, folder, start=start)
+        if found is not None:
+            runs.append(found)
+            folders.append(folder)
+    if not runs:
+        return Case(name, dataset, missing="not run")
+    return Case(name, dataset, runs, folders)
+
+
+def run(words: list[str], folder: Path, *, start: bool) -> dict[str, Any] | None:
+    """metrics.json of one run of train.py and the ``seconds`` that the whole command took."""
+    shown = shlex.join(["python", "train.py", *words])
+    files = folder / "metrics.json", folder / RUN
+    if all(file.is_file() for file in files):
+        metrics, about = (json.loads(file.read_text()) for file in files)
+        if metrics["command"] == shown and metrics["fit"]["reason"] != "interrupted":
+            return metrics | about
+    if not start:
+        return None
+    print(shown, flush=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    clock = time.perf_counter()
     command = [sys.executable, str(ROOT / "train.py"), *words, f"hydra.run.dir='{folder}'"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
-        sys.exit(f"failed: {shlex.join(command)}\n{done.stderr}")
-    return json.loads(file.read_text())
+        sys.exit(f"failed: {shown}\n{done.stderr}")
+    about = {"seconds": time.perf_counter() - clock, "machine": machine()}
+    with whole_file(folder / RUN) as file:
+        file.write_text(json.dumps(about) + "\n")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    for name, score in metrics["scores"].items():
+        print(f"    {name}: {shown_in(score['rmse'], score['unit'])}", flush=True)
+    return metrics | about
 
 
-def show(label: str, record: str, scores: list[dict], key: str) -> None:
-    """One line of the table."""
-    values = [score[key] for score in scores]
-    figures = " ".join(f"{v:9.2e}" for v in (np.median(values), min(values), max(values)))
-    print(f"{label}  {record:10} {scores[0]['source']:10} {figures}", flush=True)
+def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: bool) -> str:
+    """RESULTS.md."""
+    lines = [
+        "# Results",
+        "",
+        "Simulation RMSE on the test records, written by `python scripts/reproduce.py "
+        "data.root=DIR`. *chosen* is the run that is best on validation, then the median and the "
+        "range of all runs (seeds 0, 1, ...); LTI is the linear model that they start from. "
+        "*seconds* are those of the whole command, the linear model, all starts, scores and "
+        "figures included (median).",
+        "",
+    ]
+    if quick:
+        lines += [f"**A quick try ({' '.join(QUICK)}, one run): no result to quote.**", ""]
+    lines += [
+        "| benchmark | test | source | unit | LTI | **chosen** | median | best .. worst | runs "
+        "| best published | samples - skip |",
+        "|---" * 11 + "|",
+    ]
+    for each in cases:
+        lines += rows(each)
+    lines += [
+        "",
+        "| benchmark | nx, nz, nw, nn | parameters (net) | samples | starts | iterations "
+        "| seconds | ms an iteration | command |",
+        "|---" * 9 + "|",
+    ]
+    lines += [costs(each) for each in cases if each.runs]
+    lines += ["", *references(cases), "", *(f"- {line}" for line in machines(cases)), ""]
+    for each in cases:
+        if figures.get(each.name):
+            lines += [f"## {each.name}", ""]
+            lines += [f"![{path.stem}]({path.as_posix()})" for path in figures[each.name]]
+            lines += [""]
+    return "\n".join(lines)
+
+
+def rows(each: Case) -> list[str]:
+    """Of the table of errors, one a test record."""
+    if not each.runs or each.dataset is None:
+        return [f"| {each.name} | {each.missing} |" + " |" * 9]
+    found = []
+    for name, score in each.runs[each.chosen]["scores"].items():
+        values = [run["scores"][name]["rmse"] for run in each.runs]
+        values = [np.inf if value is None else value for value in values]
+        best = published(each.dataset, name)
+        unit, scale = prefixed(score["unit"], min(values))
+        cells = [score["lti_rmse"], values[each.chosen], np.median(values)]
+        cells = [number(value, scale) for value in cells]
+        cells[1] = f"**{cells[1]}**"
+        spread = f"{number(min(values), scale)} .. {number(max(values), scale)}"
+        other = "-" if best is None else f"{number(best[1], scale)} ({best[0]})"
+        window = f"{score['samples']} - {score['skip']}"
+        head = [each.name, name, score["source"], unit]
+        found.append(
+            " | ".join(["|", *head, *cells, spread, str(len(values)), other, window, "|"]).strip()
+        )
+    return [line.replace("| |", "|", 1).replace(" | |", " |") for line in found]
+
+
+def costs(each: Case) -> str:
+    """What the runs of a benchmark take, as a line of the table."""
+    run = each.runs[each.chosen]
+    sizes = ", ".join(
+        str(run["sizes"][name])
+        for name in ("nx", "nz", "nw", "nn", "degree")
+        if name in run["sizes"]
+    )
+    iteration = np.median([r["fit"]["seconds_per_iteration"] for r in each.runs])
+    cells = [
+        each.name,
+        sizes,
+        f"{run['parameters']} ({run['parameters_net']})",
+        str(run["data"]["samples"]),
+        str(run["starts"]),
+        str(run["fit"]["iterations"]),
+        f"{np.median([r['seconds'] for r in each.runs]):.0f}",
+        f"{1e3 * iteration:.0f}",
+        f"`{run['command']}`",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def published(dataset: Dataset, test: str) -> tuple[str, float] | None:
+    """Label and RMSE of the best published result on a test record."""
+    known = [(p.label, p.scores[test]) for p in dataset.published if test in p.scores]
+    return min(known, key=lambda entry: entry[1], default=None)
+
+
+def references(cases: Sequence[Case]) -> list[str]:
+    """Where the published numbers stand."""
+    lines = []
+    for each in cases:
+        if each.dataset is None or not each.runs:
+            continue
+        for test in each.runs[0]["scores"]:
+            best = published(each.dataset, test)
+            if best is not None:
+                source = next(p.reference for p in each.dataset.published if p.label == best[0])
+                lines.append(f"- {each.name}, {best[0]}: {source}")
+        lines += [f"- {each.name}: {note}" for note in each.dataset.notes]
+    return list(dict.fromkeys(lines))
+
+
+def entries(cases: Sequence[Case]) -> list[leaderboard.Entry]:
+    """Of the leaderboard: the chosen models on the records as the benchmarks' package cuts them."""
+    return [
+        leaderboard.entry(
+            each.name,
+            lfrtorch.load(each.folders[each.chosen]),
+            each.dataset.leaderboard,
+            seconds=each.runs[each.chosen]["seconds"],
+            command=each.runs[each.chosen]["command"],
+        )
+        for each in cases
+        if each.runs and each.dataset is not None and each.dataset.leaderboard
+    ]
+
+
+def gallery(cases: Sequence[Case], folder: Path, start: Path) -> dict[str, list[Path]]:
+    """Figures of the chosen runs, copied; their paths from ``start`` by benchmark."""
+    folder.mkdir(parents=True, exist_ok=True)
+    copied = {}
+    for each in cases:
+        if not each.runs:
+            continue
+        drawn = each.folders[each.chosen] / "figures"
+        for name in (*each.runs[each.chosen]["scores"], *FIGURES):
+            if (drawn / f"{name}.png").is_file():
+                target = folder / f"{each.name}_{name}.png"
+                shutil.copyfile(drawn / f"{name}.png", target)
+                copied.setdefault(each.name, []).append(target.relative_to(start))
+    return copied
+
+
+def machines(cases: Sequence[Case]) -> list[str]:
+    """What the runs ran on."""
+    return list(dict.fromkeys(f"{run['machine']}" for each in cases for run in each.runs))
+
+
+def machine() -> str:
+    """Processor, cores, system and versions."""
+    cpuinfo = Path("/proc/cpuinfo")
+    names = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    model = next((n.split(":")[1].strip() for n in names if n.startswith("model name")), "")
+    versions = f"Python {platform.python_version()}, lfrtorch {lfrtorch.__version__}"
+    return f"{model or platform.machine()}, {os.cpu_count()} cores, {platform.system()}, {versions}"
+
+
+def prefixed(unit: str, value: float) -> tuple[str, float]:
+    """The unit with the prefix that makes the value readable, and what to multiply by."""
+    for prefix, scale in (("", 1.0), ("m", 1e3), ("µ", 1e6)):
+        if unit not in ("V", "m") or value * scale >= 0.1 or prefix == "µ":
+            return f"{prefix}{unit}", scale
+    raise AssertionError
+
+
+def number(value: float | None, scale: float = 1.0) -> str:
+    """Three digits."""
+    if value is None or not np.isfinite(value):
+        return "diverges"
+    return f"{scale * value:.3g}"
+
+
+def shown_in(value: float | None, unit: str) -> str:
+    """Value and unit."""
+    prefix, scale = prefixed(unit, value or 1.0)
+    return f"{number(value, scale)} {prefix}".strip()
 
 
 if __name__ == "__main__":

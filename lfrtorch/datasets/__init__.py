@@ -2,6 +2,22 @@
 
 from lfrtorch.datasets.dataset import Dataset, Published  # first: the others import it from here
 
-from lfrtorch.datasets import boucwen, files, parwh, silverbox, wiener_hammerstein  # isort: skip
+from lfrtorch.datasets import (  # isort: skip
+    boucwen,
+    cascaded_tanks,
+    files,
+    parwh,
+    silverbox,
+    wiener_hammerstein,
+)
 
-__all__ = ["Dataset", "Published", "boucwen", "files", "parwh", "silverbox", "wiener_hammerstein"]
+__all__ = [
+    "Dataset",
+    "Published",
+    "boucwen",
+    "cascaded_tanks",
+    "files",
+    "parwh",
+    "silverbox",
+    "wiener_hammerstein",
+]

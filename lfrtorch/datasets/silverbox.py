@@ -16,6 +16,7 @@ References:
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from lfrtorch.checks import integer
@@ -100,4 +101,12 @@ def load(*, validation: float = 0.2, warm_up: int = 500, root: str | Path | None
             ),
         ],
         published=_PUBLISHED,
+        leaderboard=[
+            replace(whole[first:last], start="estimated", skip=_SKIP, name=name)
+            for name, (first, last) in (
+                ("multisine", _MULTISINE),
+                ("arrow", _ARROW),
+                ("arrow_no_extrapolation", _ARROW_INSIDE),
+            )
+        ],
     )

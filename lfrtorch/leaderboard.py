@@ -1,0 +1,82 @@
+"""What nonlinearbenchmark.org asks for: the RMSE of a model as the benchmarks' package has it.
+
+The site's templates score ``y[n:]`` of test records cut by the package nonlinear_benchmarks, with a
+model that sees the inputs and ``y[:n]`` of those records alone. So the records of
+``Dataset.leaderboard`` have an estimated start and ``skip`` n, and nothing before them is used.
+Cut and window may differ from those of the usual tables (see the datasets).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields
+
+import numpy as np
+
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+UNITS = {"V": ("mV", 1e3), "m": ("mm", 1e3)}
+"""That the site reports in, where it is not that of the record; volts of the tanks stay volts."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of the file; ``rmse_to_submit`` is written as the site's templates print it."""
+
+    benchmark: str
+    rmse_to_submit: str
+    unit: str
+    records: str
+    samples_for_the_start: str
+    model_class: str
+    parameters: int
+    seconds: str
+    command: str
+
+
+def entry(
+    benchmark: str, model: Model, records: Sequence[Record], *, seconds: float, command: str
+) -> Entry:
+    """The line of a model.
+
+    Args:
+        benchmark: its name.
+        model: what is submitted.
+        records: as the package cuts them, ``skip`` the samples that the start may be fitted to.
+        seconds: of all the training.
+        command: that made the model.
+    """
+    unit = records[0].outputs[0].unit
+    shown, scale = (unit, 1.0) if benchmark == "cascaded_tanks" else UNITS.get(unit, (unit, 1.0))
+    errors = [error for record in records for error in errors_of(model, record)]
+    listed = "; ".join(f"{scale * error:.3g}" for error in errors)
+    sizes = ", ".join(f"{name} {size}" for name, size in model.sizes.items() if size)
+    return Entry(
+        benchmark,
+        f"[{listed}]" if len(errors) > 1 else listed,
+        shown,
+        "; ".join(record.name for record in records),
+        "; ".join(str(record.skip) for record in records),
+        f"NL-LFR state space ({sizes}), from the best linear approximation",
+        model.parameters,
+        f"{seconds:.0f}",
+        command,
+    )
+
+
+def errors_of(model: Model, record: Record) -> list[float]:
+    """RMSE of each output after the samples that are skipped."""
+    error = (record.y - model.simulate(record))[record.skip :]
+    return [float(value) for value in np.sqrt(np.mean(error**2, axis=0))]
+
+
+def table(entries: Sequence[Entry]) -> str:
+    """The lines as CSV with a header."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(field.name for field in fields(Entry))
+    writer.writerows(astuple(line) for line in entries)
+    return text.getvalue()

@@ -1,0 +1,99 @@
+"""Cascaded tanks benchmark: the official split, and the file."""
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from lfrtorch.datasets import cascaded_tanks, official
+
+FILE = "Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat"
+
+
+@pytest.fixture
+def numbered(tmp_path):
+    """Root of a file of the official layout: sample numbers from 1, the test's from 2001."""
+    path = tmp_path / FILE
+    path.parent.mkdir(parents=True)
+    number = np.arange(1.0, 1025.0)[:, None]
+    signals = {"uEst": number, "yEst": -number, "uVal": 2000 + number, "yVal": -2000 - number}
+    savemat(path, signals | {"Ts": np.array([[4]], np.uint8)})
+    return tmp_path
+
+
+def scored(record):
+    """First and last scored sample."""
+    return int(record.u[record.skip, 0]), int(record.u[-1, 0])
+
+
+def test_official_split(numbered):
+    data = cascaded_tanks.load(root=numbered)
+    (train,), (validation,), (test,) = data.train, data.validation, data.tests
+    assert (data.name, [r.name for r in (train, validation, test)]) == (
+        "cascaded_tanks",
+        ["train", "validation", "test"],
+    )
+    assert scored(train) == (1, 768)
+    assert scored(validation) == (769, 1024)
+    assert scored(test) == (2051, 3024)
+    assert (validation.samples, test.samples) == (1024, 1024)
+    for record in (train, validation, test):
+        assert np.array_equal(record.y, -record.u)
+        assert (record.fs, record.start, record.source) == (0.25, "estimated", "official")
+        assert [str(c) for c in (*record.inputs, *record.outputs)] == ["u (V)", "y (V)"]
+    assert all(set(p.scores) == {"test"} for p in data.published)
+    (submitted,) = data.leaderboard
+    assert (scored(submitted), submitted.skip) == ((2051, 3024), 50)
+
+
+def test_the_rules_of_the_cuts(numbered):
+    data = cascaded_tanks.load(root=str(numbered), validation=0.5, skip=5)
+    assert scored(data.train[0]) == (1, 512)
+    assert scored(data.validation[0]) == (513, 1024)
+    assert scored(data.tests[0]) == (2006, 3024)
+    assert data.leaderboard[0].skip == 50
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"validation": 0}, "data.validation is 0"),
+        ({"validation": 1.0}, "leaves 0 of the 1024"),
+        ({"skip": 0}, "data.skip is 0"),
+    ],
+)
+def test_refused_arguments(arguments, match):
+    with pytest.raises(ValueError, match=match):
+        cascaded_tanks.load(**arguments)
+
+
+def test_a_missing_file_is_one_message(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no 'Cascaded_Tanks/Cascaded.*data.root=DIR"):
+        cascaded_tanks.load(root=tmp_path)
+
+
+def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered, monkeypatch):
+    root = tmp_path / "fresh"
+
+    def download(below, file, loader):
+        assert (below, file, loader) == (root, FILE, "Cascaded_Tanks")
+        (root / FILE).parent.mkdir(parents=True)
+        (root / FILE).write_bytes((numbered / FILE).read_bytes())
+
+    monkeypatch.setattr(official, "_download", download)
+    assert scored(cascaded_tanks.load(root=root, download=True).train[0]) == (1, 768)
+
+
+def test_a_file_of_another_length_is_refused(numbered):
+    savemat(numbered / FILE, dict.fromkeys(("uEst", "yEst", "uVal", "yVal"), np.zeros((9, 1))))
+    with pytest.raises(ValueError, match=r"'uEst' has shape \(9, 1\)"):
+        cascaded_tanks.load(root=numbered)
+
+
+@pytest.mark.data
+def test_official_file(benchmark_root):
+    data = cascaded_tanks.load(root=benchmark_root)
+    (validation,), (test,) = data.validation, data.tests
+    for record in (validation, test):
+        assert record.y.max() == pytest.approx(10.0, abs=0.01)  # the sensor's end
+        assert np.count_nonzero(record.y > 9.9) > 40
+    assert validation.y[0, 0] == pytest.approx(test.y[0, 0], abs=0.2)  # one start state
