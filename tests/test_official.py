@@ -113,6 +113,15 @@ def test_a_download_that_fails(tmp_path, package):
             official.find(tmp_path, "Bench/x.mat", loader, download=True)
 
 
+def test_a_loader_in_a_submodule(tmp_path, monkeypatch, package):
+    submodule = SimpleNamespace(Bench=sys.modules["nonlinear_benchmarks"].Bench)
+    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks.more", submodule)
+    found = official.find(tmp_path, "Bench/x.mat", "more.Bench", download=True)
+    assert found == tmp_path / "Bench" / "x.mat"
+    with pytest.raises(OSError, match=r"nonlinear_benchmarks\.more\.Unknown\(\) failed"):
+        official.find(tmp_path, "Bench/y.mat", "more.Unknown", download=True)
+
+
 def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", None)  # its import fails
     with pytest.raises(FileNotFoundError, match=r"no 'Bench/x\.mat' in") as refusal:
@@ -190,6 +199,48 @@ def test_refused_signals(tmp_path, content, match):
         savemat(path, content)
     with pytest.raises(ValueError, match=match) as refusal:
         official.read_mat(path, ["a"], 5, "ask Ada.")
+    assert str(refusal.value).startswith(f"'{path}'")
+    assert str(refusal.value).endswith("ask Ada.")
+
+
+def test_fields_of_a_struct_are_read_in_the_order_of_their_names(tmp_path):
+    a = np.arange(12, dtype=np.int16).reshape(4, 3)
+    savemat(tmp_path / "x.mat", {"s": {"b": a + 0.5, "a": a, "fs": 5.0}, "a": 1.0})
+    for fields, expected in ((("a", "b"), (a, a + 0.5)), (("b", "a"), (a + 0.5, a))):
+        found = official.read_struct(tmp_path / "x.mat", "s", fields)
+        for matrix, known in zip(found, expected, strict=True):
+            assert matrix.dtype == np.float64
+            assert np.array_equal(matrix, known)
+    (column,) = official.read_struct(tmp_path / "x.mat", "s", ["fs"])
+    assert column.shape == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        ({"t": {"a": np.zeros((4, 3))}}, r"no readable struct 's' with a and b \(KeyError"),
+        ({"s": np.zeros((4, 3))}, "no readable struct 's'"),
+        ({"s": 1.0}, "no readable struct 's'"),
+        ({"s": "words"}, "no readable struct 's'"),
+        ({"s": [{"a": 1.0, "b": 1.0}, {"a": 1.0, "b": 1.0}]}, "no readable struct 's'"),
+        ({"s": {"a": np.zeros((4, 3))}}, "no readable struct 's' with a and b"),
+        ({"s": {"a": np.zeros((4, 3)), "b": np.zeros((3, 4))}}, r"'s\.b' .* expected \(4, 3\)"),
+        ({"s": {"a": np.zeros((4, 3, 2)), "b": 1.0}}, r"'s\.a' .*\(4, 3, 2\); expected \(samp"),
+        ({"s": {"a": np.zeros((0, 0)), "b": 1.0}}, r"'s\.a' .*\(0, 0\); expected \(samples, rec"),
+        ({"s": {"a": np.ones((4, 3)), "b": np.full((4, 3), np.inf)}}, r"'s\.b' .*without NaN"),
+        ({"s": {"a": np.full((4, 3), 1j), "b": np.ones((4, 3))}}, r"'s\.a' .*type complex128"),
+        (b"", "no readable struct 's'"),
+        (b"text " * 99, "no readable struct 's'"),
+    ],
+)
+def test_refused_structs(tmp_path, content, match):
+    path: Path = tmp_path / "x.mat"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        savemat(path, content)
+    with pytest.raises(ValueError, match=match) as refusal:
+        official.read_struct(path, "s", ["a", "b"], "ask Ada.")
     assert str(refusal.value).startswith(f"'{path}'")
     assert str(refusal.value).endswith("ask Ada.")
 

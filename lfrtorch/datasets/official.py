@@ -10,6 +10,7 @@ from dataclasses import replace
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
@@ -51,7 +52,8 @@ def find(
     Args:
         root: folder of the benchmarks; the cache folder of nonlinear_benchmarks where left out.
         file: below ``root``, with the benchmark's folder first.
-        loader: function of nonlinear_benchmarks that downloads it.
+        loader: function of nonlinear_benchmarks that downloads it, after its submodule and a dot
+            where it is in one.
         others: files that do as well, the zip archive for example; in order of preference. An empty
             archive is a placeholder and counts as missing.
         download: whether a missing file is downloaded, by ``loader``.
@@ -138,6 +140,41 @@ def read_arrays(
     }
 
 
+def read_struct(
+    path: Path, name: str, fields: Sequence[str], advice: str = _AGAIN
+) -> list[NDArray[np.float64]]:
+    """Matrices of one shape, (samples, records), in a struct of a .mat file, in the order named.
+
+    Args:
+        path: the file.
+        name: of the struct.
+        fields: of the struct, that hold the matrices.
+        advice: what to do about a file that cannot be used.
+
+    Raises:
+        ValueError: a file that cannot be read, or fields that are missing, empty, no matrices, of
+            different shapes or another type, or NaN.
+    """
+    try:
+        (struct,) = loadmat(path, variable_names=[name])[name].ravel()
+        matrices = [np.asarray(struct[field]) for field in fields]
+    except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
+        raise ValueError(
+            f"'{path}' holds no readable struct '{name}' with {' and '.join(fields)} ({error!r}); "
+            f"{advice}"
+        ) from error
+    shape = matrices[0].shape
+    if len(shape) != 2 or 0 in shape:
+        raise ValueError(
+            f"'{path}': '{name}.{fields[0]}' has shape {shape}; expected (samples, records); "
+            f"{advice}"
+        )
+    return [
+        _numbers(path, f"{name}.{field}", matrix, (shape,), advice)
+        for field, matrix in zip(fields, matrices, strict=True)
+    ]
+
+
 def held_out(samples: int, validation: float, least: int = 1) -> int:
     """How many of the estimation samples, the last of them, validate.
 
@@ -180,8 +217,9 @@ def _present(below: Path, files: Sequence[str]) -> Path | None:
 
 def _download(below: Path, file: str, loader: str) -> None:
     """Have nonlinear_benchmarks fetch and unpack the archive; none of its data is used."""
+    module, _, function = f"nonlinear_benchmarks.{loader}".rpartition(".")
     try:
-        package = import_module("nonlinear_benchmarks")
+        package = import_module(module)
     except ImportError as error:
         raise FileNotFoundError(
             f"there is no '{file}' in '{below}', and the package that downloads it cannot be "
@@ -190,7 +228,7 @@ def _download(below: Path, file: str, loader: str) -> None:
         ) from error
     below.mkdir(parents=True, exist_ok=True)
     try:
-        getattr(package, loader)(data_file_locations=True, dir_placement=below)
+        getattr(package, function)(data_file_locations=True, dir_placement=below)
     except Exception as error:  # plain Exceptions among them
         raise OSError(
             f"nonlinear_benchmarks.{loader}() failed ({error!r}); remove what it left in "
@@ -221,6 +259,17 @@ def _variable(
         found = np.asarray(loadmat(content, variable_names=[name])[name])
     except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
         raise ValueError(f"'{path}' holds no readable '{name}' ({error!r}); {advice}") from error
+    return _numbers(path, name, found, shapes, advice)
+
+
+def _numbers(
+    path: Path,
+    name: str,
+    found: NDArray[Any],
+    shapes: Sequence[tuple[int, ...]],
+    advice: str,
+) -> NDArray[np.float64]:
+    """What was found of a name, where it has one of the shapes and is real and finite."""
     if found.dtype.kind not in "iuf" or found.shape not in shapes or not np.isfinite(found).all():
         raise ValueError(
             f"'{path}': '{name}' has shape {found.shape} and type {found.dtype}; expected "
