@@ -30,11 +30,16 @@ BENCHES = sorted(path.stem for path in (CONF / "bench").glob("*.yaml"))
 SHORTER = {  # fewer samples and iterations, so that two iterations take seconds
     "boucwen": "starts=2",
     "boucwen_record": "data.rms=[50,25] nn=15",
+    "f16": "data.levels=[3] nx=6 bla.max_iter=1 starts=1",
     "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1 starts=1",
     "silverbox": "data.validation=0.8 bla.max_iter=1",
     "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1",
 }
-MEASURED = {"silverbox": "Silverbox", "wiener_hammerstein": "WienerHammerBenchMark"}  # and folders
+MEASURED = {  # and their folders
+    "f16": "F16",
+    "silverbox": "Silverbox",
+    "wiener_hammerstein": "WienerHammerBenchMark",
+}
 
 
 def configuration(*overrides: str):

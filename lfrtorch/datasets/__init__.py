@@ -5,6 +5,7 @@ from lfrtorch.datasets.dataset import Dataset, Published  # first: the others im
 from lfrtorch.datasets import (  # isort: skip
     boucwen,
     cascaded_tanks,
+    f16,
     files,
     parwh,
     silverbox,
@@ -16,6 +17,7 @@ __all__ = [
     "Published",
     "boucwen",
     "cascaded_tanks",
+    "f16",
     "files",
     "parwh",
     "silverbox",
