@@ -33,11 +33,13 @@ SHORTER = {  # fewer samples and iterations, so that two iterations take seconds
     "f16": "data.levels=[3] nx=6 bla.max_iter=1 starts=1",
     "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1 starts=1",
     "silverbox": "data.validation=0.8 bla.max_iter=1",
+    "wh_process_noise": "bla.max_iter=1 starts=1",
     "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1",
 }
 MEASURED = {  # and their folders
     "f16": "F16",
     "silverbox": "Silverbox",
+    "wh_process_noise": "WienHammer",
     "wiener_hammerstein": "WienerHammerBenchMark",
 }
 

@@ -9,6 +9,7 @@ from lfrtorch.datasets import (  # isort: skip
     files,
     parwh,
     silverbox,
+    wh_process_noise,
     wiener_hammerstein,
 )
 
@@ -21,5 +22,6 @@ __all__ = [
     "files",
     "parwh",
     "silverbox",
+    "wh_process_noise",
     "wiener_hammerstein",
 ]

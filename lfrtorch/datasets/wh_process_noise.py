@@ -1,0 +1,131 @@
+"""Wiener-Hammerstein benchmark with process noise: measurements of an electronic circuit.
+
+Input u, output y (V), both measured, at 78125 Hz. A third-order low-pass filter, a saturating diode
+network and an inverse Chebyshev filter (5 kHz, with a transmission zero in the band) follow one
+another, and filtered Gaussian noise is added to the saturation's input. A file ``WH_*.mat`` holds
+the struct ``dataMeas`` with a column for each record in its fields r (the generator's signal, not
+used here), u and y. ``WH_EstimationExample.mat`` (10 records) is for estimation.
+``WH_TestDataset.mat`` has the two tests, a random-phase multisine and a swept sine up to 15 kHz,
+16384 samples and 0.71 V rms each, measured *without* process noise.
+
+That is what the benchmark is about: noise before a nonlinearity is not noise at the output. The
+simulation error on records that have it has a large floor, and the fit that makes it least tends to
+the mean output given the input, E f(x + e) in place of f(x). That is a smoother saturation than the
+one of the tests, a bias which does not fade with more data. So errors on training and validation
+are no measure of those on the tests, neither in size nor, near the floor, in order.
+
+What to know of the files and of the package nonlinear_benchmarks, which downloads them (all of it
+from the package and from public code that reads the files, none of it checked on them):
+
+- Its function is in the submodule ``not_splitted_benchmarks``: there is no official split. It
+  returns the records of all files without names, and has no window. (Gedon et al. fit one of the
+  two records of ``WH_MultisineFadeOut`` and validate on the other; identibench fits those of all
+  files, validates on those of ``WH_CombinedZeroMultisineSinesweep``, and leaves the first 100
+  samples of the tests unscored, as is done here.)
+- The readme in the archive is reported to speak of a shift by possibly one sample between
+  channels; none is corrected here.
+- Whether records begin at rest is not known. All are simulated from zero state, whose effect lies
+  in the 100 samples that are not scored.
+
+References:
+    M. Schoukens, J.P. Noël (2016), "Wiener-Hammerstein benchmark with process noise", Workshop on
+    Nonlinear System Identification Benchmarks.
+
+    D. Gedon, N. Wahlström, T.B. Schön, L. Ljung (2021), "Deep state space models for nonlinear
+    system identification", 19th IFAC Symposium on System Identification.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfrtorch.checks import integer
+from lfrtorch.datasets import Dataset, official
+from lfrtorch.records import Channel, Record
+
+__all__ = ["load"]
+
+_FILES = "WienHammer/WienerHammersteinFiles"
+_ESTIMATION, _TEST = "WH_EstimationExample.mat", "WH_TestDataset.mat"
+_LOADER = "not_splitted_benchmarks.WienerHammerstein_Process_Noise"
+_FS = 78125.0  # Hz
+_SKIP = 100  # samples, unscored, of all records
+_TESTS = ("multisine", "sweep")  # the columns of the test file
+
+_NOTE = (
+    "training and validation records have process noise, a floor of their errors; the tests have "
+    "none"
+)
+
+
+def load(*, validation: int = 2, download: bool = False, root: str | Path | None = None) -> Dataset:
+    """The realisations of the estimation file, and the two tests.
+
+    Args:
+        validation: how many realisations, the last of them, validate.
+        download: whether files that are missing are downloaded (423 MB) by nonlinear_benchmarks.
+        root: folder that holds ``WienHammer/WienerHammersteinFiles/WH_EstimationExample.mat`` and
+            ``WH_TestDataset.mat`` beside it; by default the cache folder of the package
+            nonlinear_benchmarks.
+
+    Shape:
+        u, y (V) of training and validation: (T, 1), as long as the file has them; of the tests
+        ``"multisine"`` and ``"sweep"``: (16384, 1). The first 100 samples are not scored.
+
+    Raises:
+        ValueError: an argument out of range, or a file that cannot be used.
+        FileNotFoundError: no such file below ``root``, or nothing to download it with.
+        OSError: the download fails.
+    """
+    integer("data.validation", validation, 1)
+
+    def columns(file: str) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
+        """Path, u and y (samples, records)."""
+        path = official.find(root, f"{_FILES}/{file}", _LOADER, download=download)
+        u, y = official.read_struct(path, "dataMeas", ("u", "y"))
+        if len(u) <= _SKIP:
+            raise ValueError(
+                f"'{path}': 'dataMeas.u' has shape {u.shape}; expected (samples, records) and more "
+                f"than {_SKIP} samples; download the file again."
+            )
+        return path, u, y
+
+    def record(name: str, u: NDArray[np.float64], y: NDArray[np.float64]) -> Record:
+        return Record(
+            u,
+            y,
+            fs=_FS,
+            skip=_SKIP,
+            name=name,
+            source="official",
+            inputs=(Channel("u", "V"),),
+            outputs=(Channel("y", "V"),),
+        )
+
+    path, u, y = columns(_ESTIMATION)
+    trained = u.shape[1] - validation
+    if trained < 1:
+        raise ValueError(
+            f"data.validation is {validation}, and '{path}' has {u.shape[1]} record(s), of which "
+            f"one at least must train; give 1 to {u.shape[1] - 1}."
+        )
+    estimation = [
+        record(f"train_{i + 1}" if i < trained else f"validation_{i - trained + 1}", *signals)
+        for i, signals in enumerate(zip(u.T, y.T, strict=True))
+    ]
+    path, u, y = columns(_TEST)
+    if u.shape[1] != len(_TESTS):
+        raise ValueError(
+            f"'{path}': 'dataMeas.u' has shape {u.shape}; expected (samples, {len(_TESTS)}), "
+            f"{' and '.join(_TESTS)}; download the file again."
+        )
+    return Dataset(
+        name="wh_process_noise",
+        train=estimation[:trained],
+        validation=estimation[trained:],
+        tests=[record(*test) for test in zip(_TESTS, u.T, y.T, strict=True)],
+        notes=(_NOTE,),
+    )
