@@ -264,3 +264,5 @@ def test_part():
     assert part.source == "official"
     assert np.array_equal(part.u[:, 0], np.arange(5.0, 12.0))
     assert np.array_equal(part.y[part.skip :, 0], -np.arange(8.0, 12.0))
+    estimated = official.part(whole, 8, 12, warm_up=3, name="test", start="estimated")
+    assert (estimated.start, estimated.skip) == ("estimated", 3)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from lfrtorch.checks import number
-from lfrtorch.records import Record
+from lfrtorch.records import Record, Start
 
 _AGAIN = "download the file again."
 
@@ -59,9 +59,12 @@ def find(
         download: whether a missing file is downloaded, by ``loader``.
 
     Raises:
+        ValueError: ``download`` is neither true nor false.
         FileNotFoundError: it is not there, or it cannot be downloaded without nonlinear_benchmarks.
         OSError: the download fails.
     """
+    if not isinstance(download, bool):
+        raise ValueError(f"data.download is {download!r}; give true or false.")
     below = folder(root)
     path = _present(below, (file, *others))
     if path is None and download:
@@ -197,13 +200,15 @@ def held_out(samples: int, validation: float, least: int = 1) -> int:
     return count
 
 
-def part(whole: Record, first: int, last: int, *, warm_up: int, name: str) -> Record:
+def part(
+    whole: Record, first: int, last: int, *, warm_up: int, name: str, start: Start = "zero"
+) -> Record:
     """Samples ``first`` to ``last`` as a record that begins ``warm_up`` unscored samples earlier.
 
-    It is simulated from zero state, and its transient falls into the warm-up: no state has to be
-    estimated from outputs that are scored.
+    From zero state its transient falls into the warm-up, and an estimated start state is fitted to
+    the warm-up: no state has to be estimated from outputs that are scored.
     """
-    return replace(whole[first - warm_up : last], name=name, skip=warm_up)
+    return replace(whole[first - warm_up : last], name=name, skip=warm_up, start=start)
 
 
 def _there(path: Path) -> bool:
