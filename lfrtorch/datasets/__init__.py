@@ -5,6 +5,8 @@ from lfrtorch.datasets.dataset import Dataset, Published  # first: the others im
 from lfrtorch.datasets import (  # isort: skip
     boucwen,
     cascaded_tanks,
+    ced,
+    emps,
     f16,
     files,
     parwh,
@@ -18,6 +20,8 @@ __all__ = [
     "Published",
     "boucwen",
     "cascaded_tanks",
+    "ced",
+    "emps",
     "f16",
     "files",
     "parwh",

@@ -1,0 +1,109 @@
+"""Coupled electric drives (CED): measurements of two motors that drive a pulley by a flexible belt.
+
+Input u (V, the two motors together), output z (ticks/s, the speed of the pulley), 500 samples at
+50 Hz in each of two measurements, u11, z11 at a low amplitude and u12, z12 at a high one. Of each
+the first 400 samples are for estimation and the last 100 for the test, whose first 10 the score
+leaves out (4 in older versions of the package nonlinear_benchmarks, and of scores that were
+published with them).
+
+The pulse counter is blind to the sign of the speed: z is its absolute value, an even function. The
+pulley hangs on a spring, which makes for a lightly damped mode.
+
+The archive's address and name have changed: older versions of nonlinear_benchmarks ask for
+CoupledElectricDrivesDataSetAndReferenceModels.zip, newer ones for FULLTEXT01.zip. Both hold
+DATAUNIF.MAT. The archive's PRBS measurements, DATAPRBS.MAT, are no part of the benchmark. The
+package's README gives the unit of this benchmark, ticks/s, to EMPS, and that of EMPS to this one.
+
+References:
+    T. Wigren, M. Schoukens (2017), "Coupled electric drives data set and reference models",
+    Technical report 2017-024, Uppsala University.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lfrtorch.datasets import Dataset, Published, official
+from lfrtorch.records import Channel, Record
+
+__all__ = ["load"]
+
+_FILE = "CED/DATAUNIF.MAT"
+_ARCHIVES = ("CED/FULLTEXT01.zip", "CED/CoupledElectricDrivesDataSetAndReferenceModels.zip")
+_ADVICE = f"remove '{_FILE}' and the archive beside it, and download them again."
+_FS = 50.0  # Hz
+_SAMPLES, _ESTIMATION = 500, 400
+_WINDOW = 10  # samples, unscored, of the tests
+_LEVELS = {"low": ("u11", "z11"), "high": ("u12", "z12")}
+
+_CT_SUBNET = "Beintema, Schoukens and Tóth (2023), continuous-time SUBNET"
+_PUBLISHED = (
+    Published("CT-SUBNET, best", {"low": 0.094, "high": 0.0735}, _CT_SUBNET),
+    Published("CT-SUBNET, median", {"low": 0.143, "high": 0.100}, _CT_SUBNET),
+    Published("pNARX", {"low": 0.100, "high": 0.141}, "Champneys et al. (2024)"),
+)
+
+
+def load(
+    *, validation: float = 0.2, download: bool = False, root: str | Path | None = None
+) -> Dataset:
+    """Both measurements, each cut in time into a training, a validation and a test record.
+
+    Validation and tests are simulated from the beginning of their measurement: all that comes
+    before their scored samples is warm-up. Whether a measurement begins at rest is not known, and
+    ``start="zero"`` would be rest at the inputs' mean, which is another state. So all records have
+    an estimated start: training fits it with the parameters, and in validation and tests it is
+    fitted to the warm-up, to training outputs and the window that is given to initialise a model.
+    It matters little by then: hundreds of samples of known inputs decide the state, better than the
+    10 outputs of the window could, which do not show the sign of the speed.
+
+    Args:
+        validation: fraction of the estimation samples of each measurement, the last of them, that
+            validate.
+        download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
+        root: folder that holds ``CED/DATAUNIF.MAT``, or ``CED/FULLTEXT01.zip`` with the file in it;
+            by default the cache folder of nonlinear_benchmarks.
+
+    Shape:
+        u (V), z (ticks/s) of training: (320, 1); of validation: (400, 1), 80 of them scored; of the
+        tests ``"low"`` and ``"high"``: (500, 1), 90 scored.
+
+    Raises:
+        ValueError: an argument out of range, or a file that cannot be used.
+        FileNotFoundError: no such file below ``root``, or nothing to download it with.
+        OSError: the download fails.
+    """
+    trained = _ESTIMATION - official.held_out(_ESTIMATION, validation)
+    path = official.find(root, _FILE, "CED", others=_ARCHIVES, download=download)
+    shapes = {signal: (_SAMPLES, 1) for signals in _LEVELS.values() for signal in signals}
+    arrays = official.read_arrays(path, shapes, Path(_FILE).name, _ADVICE)
+
+    whole = {
+        level: Record(
+            arrays[u],
+            arrays[z],
+            fs=_FS,
+            source="official",
+            inputs=(Channel("u", "V"),),
+            outputs=(Channel("z", "ticks/s"),),
+        )
+        for level, (u, z) in _LEVELS.items()
+    }
+
+    def parts(first: int, last: int, prefix: str = "", *, warm_up: int) -> list[Record]:
+        return [
+            official.part(
+                record, first, last, warm_up=warm_up, name=prefix + level, start="estimated"
+            )
+            for level, record in whole.items()
+        ]
+
+    scored = _ESTIMATION + _WINDOW
+    return Dataset(
+        name="ced",
+        train=parts(0, trained, "train_", warm_up=0),
+        validation=parts(trained, _ESTIMATION, "validation_", warm_up=trained),
+        tests=parts(scored, _SAMPLES, warm_up=scored),
+        published=_PUBLISHED,
+        leaderboard=parts(scored, _SAMPLES, warm_up=_WINDOW),
+    )

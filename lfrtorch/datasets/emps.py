@@ -1,0 +1,124 @@
+"""Electro-mechanical positioning system (EMPS): measurements of a drive of a linear axis.
+
+Input vir (V, the controller's output to the motor), output qm (m, the position), 24841 samples at
+1 kHz in each of two files: DATA_EMPS.mat is for estimation, DATA_EMPS_PULSES.mat, where pulses act
+on top of the motion, for the test, whose first 20 samples the score leaves out. Scores are in
+metres here and published in millimetres.
+
+A force moves a mass against viscous and dry friction: from the force to the position the system
+integrates, the friction is the nonlinearity, and both measurements are under the feedback of a
+position controller (its reference qg and the times t are in the files, too, and not read).
+
+What to know of the file and of the package nonlinear_benchmarks:
+
+- vir is a voltage. The package calls it a force in N, at the load; the scripts of those who
+  measured make that force of it, gtau vir, with the drive gain gtau (N/V) in the files. A model's
+  scores do not depend on that.
+- The test file has the pulses as pulses_N, which neither those scripts nor the package use as an
+  input, and this module does not.
+- The package's README gives the unit of this benchmark, mm, to the coupled drives, and ticks/s to
+  this one. Its data are qm as it stands, in metres.
+
+References:
+    A. Janot, M. Gautier, M. Brunot (2019), "Data set and reference models of EMPS", Workshop on
+    Nonlinear System Identification Benchmarks, Eindhoven.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lfrtorch.checks import integer
+from lfrtorch.datasets import Dataset, Published, official
+from lfrtorch.records import Channel, Record
+
+__all__ = ["load"]
+
+_ESTIMATION, _TEST = "EMPS/DATA_EMPS.mat", "EMPS/DATA_EMPS_PULSES.mat"
+_ARCHIVE = "EMPS/EMPS.zip"
+_FS = 1000.0  # Hz
+_SAMPLES = 24_841  # of each file
+_WINDOW = 20  # samples, unscored, of the test
+
+_PUBLISHED = (
+    Published("dynoNet", {"test": 2.64e-3}, "Forgione and Piga (2021)"),
+    Published(
+        "CT-SUBNET",
+        {"test": 4.61e-3},
+        "Beintema, Schoukens and Tóth (2023), continuous-time SUBNET",
+    ),
+    Published("LSTM", {"test": 74e-3}, "Champneys et al. (2024)"),
+)
+
+
+def load(
+    *,
+    validation: float = 0.2,
+    warm_up: int = _WINDOW,
+    download: bool = False,
+    root: str | Path | None = None,
+) -> Dataset:
+    """The estimation measurement, cut in time into training and validation, and the test record.
+
+    All start states are estimated. An integrator never forgets where it started: the error that a
+    zero state makes in the position stays for good, and no warm-up from zero state would end it.
+    Training fits the start with the parameters; in validation and test it is fitted to the first
+    samples, which are not scored.
+
+    Args:
+        validation: fraction of the estimation samples, the last of them, that validate.
+        warm_up: first samples of the validation record, which its start state is fitted to and
+            which are not scored; by default as many as the test has.
+        download: whether missing files are downloaded, by the package nonlinear_benchmarks.
+        root: folder that holds ``EMPS/DATA_EMPS.mat`` and ``EMPS/DATA_EMPS_PULSES.mat``, or
+            ``EMPS/EMPS.zip`` with both in it; by default the cache folder of nonlinear_benchmarks.
+
+    Shape:
+        u (V), y (m) of training: (19873, 1); of validation: (4968, 1), 4948 of them scored; of the
+        test: (24841, 1), 24821 scored.
+
+    Raises:
+        ValueError: an argument out of range, or a file that cannot be used.
+        FileNotFoundError: no such file below ``root``, or nothing to download it with.
+        OSError: the download fails.
+    """
+    integer("data.warm_up", warm_up, 1)
+    held_out = official.held_out(_SAMPLES, validation)
+    if warm_up >= held_out:
+        raise ValueError(
+            f"data.warm_up is {warm_up}, which leaves none of the {held_out} validation samples "
+            "to score; give fewer, or a larger data.validation."
+        )
+    trained = _SAMPLES - held_out
+    estimation, test = (_measured(file, root, download) for file in (_ESTIMATION, _TEST))
+
+    def part(whole: Record, first: int, last: int, *, unscored: int, name: str) -> Record:
+        return official.part(
+            whole, first + unscored, last, warm_up=unscored, name=name, start="estimated"
+        )
+
+    tests = [part(test, 0, _SAMPLES, unscored=_WINDOW, name="test")]
+    return Dataset(
+        name="emps",
+        train=[part(estimation, 0, trained, unscored=0, name="train")],
+        validation=[part(estimation, trained, _SAMPLES, unscored=warm_up, name="validation")],
+        tests=tests,
+        published=_PUBLISHED,
+        leaderboard=tests,
+    )
+
+
+def _measured(file: str, root: str | Path | None, download: bool) -> Record:
+    """One file as a record."""
+    path = official.find(root, file, "EMPS", others=[_ARCHIVE], download=download)
+    advice = f"remove '{file}' and '{_ARCHIVE}', and download them again."
+    shapes = {signal: (_SAMPLES, 1) for signal in ("vir", "qm")}
+    arrays = official.read_arrays(path, shapes, Path(file).name, advice)
+    return Record(
+        arrays["vir"],
+        arrays["qm"],
+        fs=_FS,
+        source="official",
+        inputs=(Channel("vir", "V"),),
+        outputs=(Channel("qm", "m"),),
+    )
