@@ -5,7 +5,7 @@ import pytest
 from scipy.io import savemat
 from scipy.signal import lfilter
 
-from lfrtorch.datasets import silverbox
+from lfrtorch.datasets import official, silverbox
 
 FILE = "Silverbox/SilverboxFiles/SNLS80mV.mat"
 SAMPLES = 131_072
@@ -52,6 +52,10 @@ def test_split(numbered):
         assert [str(c) for c in (*record.inputs, *record.outputs)] == ["V1 (V)", "V2 (V)"]
     assert (data.name, data.noise_rms) == ("silverbox", None)
     assert all(set(p.scores) <= set(names) for p in data.published)
+    # As the package cuts them, with nothing before: its [105712:127400], [100:40575], [100:32100].
+    cuts = [(105_763, 127_400), (151, 40_575), (151, 32_100)]
+    assert [scored(record) for record in data.leaderboard] == cuts
+    assert all((r.start, r.skip) == ("estimated", 50) for r in data.leaderboard)
 
 
 def test_the_rules_of_the_cuts(numbered):
@@ -75,6 +79,18 @@ def test_the_rules_of_the_cuts(numbered):
 def test_refused_arguments(arguments, match):
     with pytest.raises(ValueError, match=match):
         silverbox.load(**arguments)
+
+
+def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered, monkeypatch):
+    root = tmp_path / "fresh"
+
+    def download(below, file, loader):
+        assert (below, file, loader) == (root, FILE, "Silverbox")
+        (root / FILE).parent.mkdir(parents=True)
+        (root / FILE).write_bytes((numbered / FILE).read_bytes())
+
+    monkeypatch.setattr(official, "_download", download)
+    assert silverbox.load(root=root, download=True).train[0].samples > 1
 
 
 def test_a_missing_file_is_one_message(tmp_path):

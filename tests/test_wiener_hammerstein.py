@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from lfrtorch.datasets import wiener_hammerstein
+from lfrtorch.datasets import official, wiener_hammerstein
 
 FILE = "WienerHammerBenchMark/WienerHammerBenchMark.mat"
 SAMPLES = 188_000
@@ -39,6 +39,9 @@ def test_official_split(numbered):
         assert [str(c) for c in (*record.inputs, *record.outputs)] == ["u (V)", "y (V)"]
     assert (data.name, data.noise_rms) == ("wiener_hammerstein", None)
     assert {p.label: p.scores["test"] for p in data.published}["SUBNET"] == 0.241e-3
+    (submitted,) = data.leaderboard  # the package's [5200:184000][100000:], 78800 samples
+    assert (scored(submitted), submitted.samples) == ((105_251, 184_000), 78_800)
+    assert (submitted.start, submitted.skip) == ("estimated", 50)
 
 
 def test_the_rule_of_the_validation_part(numbered):
@@ -61,6 +64,18 @@ def test_the_rule_of_the_validation_part(numbered):
 def test_refused_arguments(arguments, match):
     with pytest.raises(ValueError, match=match):
         wiener_hammerstein.load(**arguments)
+
+
+def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered, monkeypatch):
+    root = tmp_path / "fresh"
+
+    def download(below, file, loader):
+        assert (below, file, loader) == (root, FILE, "WienerHammerBenchMark")
+        (root / FILE).parent.mkdir(parents=True)
+        (root / FILE).write_bytes((numbered / FILE).read_bytes())
+
+    monkeypatch.setattr(official, "_download", download)
+    assert wiener_hammerstein.load(root=root, download=True).train[0].samples > 1
 
 
 def test_a_missing_file_is_one_message(tmp_path):

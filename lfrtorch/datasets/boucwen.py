@@ -52,6 +52,8 @@ _TEST_OFFSET = 2000  # seed of the simulated multisine test, beyond the training
 
 _FILES = "BoucWen/BoucWenFiles/Test signals/Validation signals"  # below the benchmarks' folder
 
+_LOADER = "not_splitted_benchmarks.BoucWen"
+
 _PAPER = "Schoukens and Tóth (2020), table 1"
 _PUBLISHED = (
     Published("LTI (paper)", {"multisine": 15.8e-5, "sweep": 17.7e-5}, _PAPER),
@@ -74,6 +76,7 @@ def load(
     rms: float | Sequence[float] = 50.0,
     selection_rms: Sequence[float] = (25.0, 10.0),
     noise_rms: float = 8e-6,
+    download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
     """Simulated estimation data, and the official tests where their files are at hand.
@@ -95,6 +98,7 @@ def load(
         selection_rms: of the selection inputs, N.
         noise_rms: of the measurement noise before the decimation, m; the low-pass filters leave
             0.92 of it: 7.35e-6 m of the official 8e-6 m.
+        download: whether missing test files are downloaded, by the package nonlinear_benchmarks.
         root: folder that holds ``BoucWen/BoucWenFiles/...`` as the package nonlinear_benchmarks
             lays it out; by default that package's cache folder, if there is one.
 
@@ -120,7 +124,7 @@ def load(
             "selection_rms: none may be the training or simulated test realisation "
             f"(offsets 0 and {_TEST_OFFSET}); use for example 1000."
         )
-    folder = _official_folder(root)
+    folder = _official_folder(root, download)
     estimation: dict[str, Any] = {"samples": samples, "noise_rms": noise_rms}
     chosen = [
         _realisation(
@@ -344,8 +348,11 @@ def _record(u: NDArray[np.float64], y: NDArray[np.float64], **kwargs: Any) -> Re
     return Record(u, y, fs=_FS, **channels, **kwargs)
 
 
-def _official_folder(root: str | Path | None) -> Path:
+def _official_folder(root: str | Path | None, download: bool) -> Path:
     """Folder of the official test files; below a ``root`` that is given there must be some."""
+    if download:
+        first = f"{_FILES}/uval_multisine.mat"
+        return official.find(root, first, _LOADER, download=True).parent
     if root is None:
         return official.cache() / _FILES
     folder = Path(root).expanduser() / _FILES

@@ -79,9 +79,8 @@ def find(
     if path is None:
         raise FileNotFoundError(
             f"there is no '{file}' in '{below}'. Give the folder that holds "
-            f"'{file.split('/')[0]}' with data.root=DIR, or download the file into the default "
-            "folder: pip install 'lfrtorch[bench]', then in Python "
-            f"nonlinear_benchmarks.{loader}()."
+            f"'{file.split('/')[0]}' with data.root=DIR, or have it downloaded: pip install "
+            f"'lfrtorch[bench]', then data.download=true (nonlinear_benchmarks.{loader}())."
         )
     return path
 

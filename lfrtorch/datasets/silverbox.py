@@ -45,7 +45,13 @@ _PUBLISHED = (
 )
 
 
-def load(*, validation: float = 0.2, warm_up: int = 500, root: str | Path | None = None) -> Dataset:
+def load(
+    *,
+    validation: float = 0.2,
+    warm_up: int = 500,
+    download: bool = False,
+    root: str | Path | None = None,
+) -> Dataset:
     """The measurement, cut in time into a training, a validation and three test records.
 
     All records are simulated from zero state. The arrow begins at rest. The others begin amid the
@@ -57,6 +63,7 @@ def load(*, validation: float = 0.2, warm_up: int = 500, root: str | Path | None
     Args:
         validation: fraction of the estimation samples, the last of them, that validate.
         warm_up: samples that are simulated and not scored.
+        download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
         root: folder that holds ``Silverbox/SilverboxFiles/SNLS80mV.mat``; by default the cache
             folder of the package nonlinear_benchmarks.
 
@@ -68,11 +75,12 @@ def load(*, validation: float = 0.2, warm_up: int = 500, root: str | Path | None
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``.
+        OSError: the download fails.
     """
     integer("data.warm_up", warm_up, 0)
     begin, end = _ESTIMATION
     trained = end - official.held_out(end - begin, validation, least=warm_up + 1)
-    path = official.find(root, _FILE, "Silverbox")
+    path = official.find(root, _FILE, "Silverbox", download=download)
     u, y = official.read_mat(path, ["V1", "V2"], _SAMPLES)
     whole = Record(
         u,

@@ -40,7 +40,11 @@ _PUBLISHED = (
 
 
 def load(
-    *, validation: float = 0.2, skip: int = _AT_REST, root: str | Path | None = None
+    *,
+    validation: float = 0.2,
+    skip: int = _AT_REST,
+    download: bool = False,
+    root: str | Path | None = None,
 ) -> Dataset:
     """The measurement, cut in time into a training, a validation and the official test record.
 
@@ -52,6 +56,7 @@ def load(
         validation: fraction of the estimation samples, the last of them, that validate.
         skip: samples at the beginning of the training record that are not fitted: the end of an
             earlier response (55 samples), then rest. The input starts at sample 4999.
+        download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
         root: folder that holds ``WienerHammerBenchMark/WienerHammerBenchMark.mat``; by default the
             cache folder of the package nonlinear_benchmarks.
 
@@ -62,10 +67,11 @@ def load(
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``.
+        OSError: the download fails.
     """
     integer("data.skip", skip, 0)
     held_out = official.held_out(_ESTIMATION, validation, least=_WARM_UP + skip + 1)
-    path = official.find(root, _FILE, "WienerHammerBenchMark")
+    path = official.find(root, _FILE, "WienerHammerBenchMark", download=download)
     u, y = official.read_mat(path, ["uBenchMark", "yBenchMark"], _SAMPLES)
     whole = Record(
         u,
