@@ -16,6 +16,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -251,9 +252,14 @@ def costs(each: Case) -> str:
         str(run["fit"]["iterations"]),
         f"{np.median([r['seconds'] for r in each.runs]):.0f}",
         f"{1e3 * iteration:.0f}",
-        f"`{run['command']}`",
+        f"`{anywhere(run['command'])}`",
     ]
     return f"| {' | '.join(cells)} |"
+
+
+def anywhere(command: str) -> str:
+    """A command as it is on another machine."""
+    return re.sub(r"data\.root=\S+", "data.root=DIR", command)
 
 
 def published(dataset: Dataset, test: str) -> tuple[str, float] | None:
@@ -285,7 +291,7 @@ def entries(cases: Sequence[Case]) -> list[leaderboard.Entry]:
             lfrtorch.load(each.folders[each.chosen]),
             each.dataset.leaderboard,
             seconds=each.runs[each.chosen]["seconds"],
-            command=each.runs[each.chosen]["command"],
+            command=anywhere(each.runs[each.chosen]["command"]),
         )
         for each in cases
         if each.runs and each.dataset is not None and each.dataset.leaderboard

@@ -32,7 +32,7 @@ def metrics(validation: float | None, rmse: float | None, seed: int = 0) -> dict
         "starts": 4,
         "ranking": [],
         "fit": {"iterations": 200, "seconds": 90.0, "seconds_per_iteration": 0.5, "reason": "end"},
-        "command": f"python train.py +bench=wiener_hammerstein seed={seed}",
+        "command": f"python train.py +bench=wiener_hammerstein data.root=/here seed={seed}",
         "seconds": 100.0,
         "machine": "a machine",
     }
@@ -57,6 +57,9 @@ def test_validation_chooses_and_the_row_has_all():
         "3", "0.241 (B)", "88000 - 1000",
     ]  # fmt: skip
     assert "| 6, 2, 2, 15 | 160 (116) | 80000 | 4 | 200 | 100 | 500 |" in reproduce.costs(each)
+    assert "| `python train.py +bench=wiener_hammerstein data.root=DIR seed=0` |" in (
+        reproduce.costs(each)
+    )
     assert reproduce.references([each]) == [
         "- wiener_hammerstein, B: two (2002)",
         "- wiener_hammerstein: a note",
