@@ -29,7 +29,10 @@ def of_run(
     drawn: dict[str, Figure] = {}
     for shown in simulated:
         if shown.use == "test":
-            drawn[shown.record.name] = plots.errors(shown.record, shown.y_lti, shown.y_hat)
+            record, signals = shown.record, (shown.record, shown.y_lti, shown.y_hat)
+            drawn[record.name] = plots.errors(*signals)
+            if not plots.is_whole(record):
+                drawn[f"{record.name}_density"] = plots.density(*signals)
     signals = model.signals(dataset.train[0])
     drawn["static_map"] = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
     unit = model.outputs[0].unit
@@ -47,14 +50,13 @@ def of_tests(simulated: Sequence[Response]) -> tuple[dict[str, Figure], dict[str
         if shown.use != "test":
             continue
         record, signals = shown.record, (shown.record, shown.y_lti, shown.y_hat)
-        name, other, near = record.name, f"{record.name}_other", f"{record.name}_near"
+        name, near = record.name, f"{record.name}_near"
         drawn[near] = plots.close_up(*signals)
         if plots.is_whole(record):
-            drawn[other] = plots.response(*signals)
-            response, spectrum, of = other, name, "Spectrum over whole periods."
+            response, spectrum, of = f"{name}_response", name, "Spectrum over whole periods."
+            drawn[response] = plots.response(*signals)
         else:
-            drawn[other] = plots.density(*signals)
-            response, spectrum, of = name, other, "Power spectral density."
+            response, spectrum, of = name, f"{name}_density", "Power spectral density."
         views[name] = {
             response: "Measured output and errors against time.",
             near: "The same about the largest error of the NL-LFR.",

@@ -306,7 +306,8 @@ def gallery(cases: Sequence[Case], folder: Path, start: Path) -> dict[str, list[
         if not each.runs:
             continue
         drawn = each.folders[each.chosen] / "figures"
-        for name in (*each.runs[each.chosen]["scores"], *FIGURES):
+        tests = each.runs[each.chosen]["scores"]
+        for name in (*tests, *(f"{test}_density" for test in tests), *FIGURES):
             if (drawn / f"{name}.png").is_file():
                 target = folder / f"{each.name}_{name}.png"
                 shutil.copyfile(drawn / f"{name}.png", target)
