@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lfrtorch.datasets import Dataset, Published
+from lfrtorch.datasets import Dataset, Published, official
 from lfrtorch.records import Record
 from scripts import reproduce
 
@@ -116,6 +116,17 @@ def test_missing_files_are_a_row(tmp_path: Path, monkeypatch, capsys):
     assert results.read_text().count("| no data at hand |") == 2
 
 
+def test_a_stand_in_is_not_the_benchmark(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(official, "cache", lambda: tmp_path)
+    words = ["+bench=parwh"]
+    each = reproduce.case("parwh", words, tmp_path, 1, start=False)
+    assert each.missing == "no data at hand"
+    each = reproduce.case("x", [*words, "data.source=stand-in"], tmp_path, 1, start=False)
+    assert each.missing == "not run"
+    assert each.dataset is not None
+    assert reproduce.published(each.dataset, "arrow") is None
+
+
 def test_wrong_words_are_refused(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         started(monkeypatch, "silverboxx")
@@ -143,7 +154,7 @@ def test_quick_end_to_end(tmp_path: Path, monkeypatch, benchmark_root: Path):
     page = (tmp_path / "RESULTS.md").read_text()
     for row in ("| cascaded_tanks | test | official | V |", "| boucwen | sweep | official | "):
         assert row in page
-    assert (tmp_path / "results" / "boucwen_sweep.png").is_file()
+    assert (tmp_path / "results" / "boucwen_sweep_density.png").is_file()
     with (tmp_path / "results" / "leaderboard.csv").open() as file:
         (line,) = csv.DictReader(file)
     assert (line["benchmark"], line["unit"]) == ("cascaded_tanks", "V")

@@ -30,15 +30,17 @@ BENCHES = sorted(path.stem for path in (CONF / "bench").glob("*.yaml"))
 SHORTER = {  # fewer samples and iterations, so that two iterations take seconds
     "boucwen": "starts=2",
     "boucwen_record": "data.rms=[50,25] nn=15",
+    "cascaded_tanks": "bla.max_iter=1 starts=1",
     "ced": "bla.max_iter=1",
     "emps": "data.validation=0.8 bla.max_iter=1",
     "f16": "data.levels=[3] nx=6 bla.max_iter=1 starts=1",
     "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1 starts=1",
-    "silverbox": "data.validation=0.8 bla.max_iter=1",
+    "silverbox": "data.validation=0.8 bla.max_iter=1 starts=1",
     "wh_process_noise": "bla.max_iter=1 starts=1",
-    "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1",
+    "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1 starts=1",
 }
 MEASURED = {  # and their folders
+    "cascaded_tanks": "Cascaded_Tanks",
     "ced": "CED",
     "emps": "EMPS",
     "f16": "F16",
