@@ -39,6 +39,7 @@ SHORTER = {  # fewer samples and iterations, so that two iterations take seconds
     "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1",
 }
 MEASURED = {  # and their folders
+    "cascaded_tanks": "Cascaded_Tanks",
     "ced": "CED",
     "emps": "EMPS",
     "f16": "F16",
