@@ -21,6 +21,7 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "sigmoid": torch.sigmoid,
     "relu": torch.relu,
     "rbf": lambda v: torch.exp(-v.square()),
+    "softplus": lambda v: torch.logaddexp(v, v.new_zeros(())),  # F.softplus cuts off at v = 20
 }
 
 
@@ -31,7 +32,8 @@ class Network(Module):
         nz: inputs.
         nw: outputs.
         nn: neurons.
-        activation: σ: ``"tanh"``, ``"sigmoid"``, ``"relu"`` or ``"rbf"`` (exp(-v²)).
+        activation: σ: ``"tanh"``, ``"sigmoid"``, ``"relu"``, ``"rbf"`` (exp(-v²)) or ``"softplus"``
+            (ln(1 + exp(v)), a hinge without its corner).
         device, dtype: as everywhere in torch.
 
     Shape:

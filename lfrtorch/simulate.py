@@ -227,7 +227,7 @@ def _compiled(cell: LFRCell, u: Tensor, x0: Tensor, near: Trajectory | None) -> 
     return near
 
 
-_ACTIVATION_CODES = {"tanh": 0, "sigmoid": 1, "relu": 2, "rbf": 3}
+_ACTIVATION_CODES = {"tanh": 0, "sigmoid": 1, "relu": 2, "rbf": 3, "softplus": 4}
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -304,9 +304,13 @@ def _activate(activation, h):
     elif activation == 2:
         for n in range(len(h)):
             h[n] = max(h[n], 0.0)
-    else:
+    elif activation == 3:
         for n in range(len(h)):
             t = _exp(-h[n] * h[n])
+            h[n] = t if h[n] == h[n] else h[n]
+    else:
+        for n in range(len(h)):
+            t = max(h[n], 0.0) + math.log1p(_exp(-abs(h[n])))
             h[n] = t if h[n] == h[n] else h[n]
 
 

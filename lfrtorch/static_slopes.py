@@ -56,6 +56,7 @@ _SLOPES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "sigmoid": lambda v, h: h * (1.0 - h),
     "relu": lambda v, h: (v > 0).to(v.dtype),
     "rbf": lambda v, h: -2.0 * v * h,
+    "softplus": lambda v, h: torch.sigmoid(v),
 }
 """σ'(v) from v and h = σ(v)."""
 

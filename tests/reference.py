@@ -30,6 +30,7 @@ SIGMA = {
     "sigmoid": lambda v: 1 / (1 + torch.exp(-v)),
     "relu": lambda v: torch.where(v > 0, v, torch.zeros_like(v)),
     "rbf": lambda v: torch.exp(-(v**2)),
+    "softplus": lambda v: torch.log(1 + torch.exp(v)),
 }
 
 # --- the NL-LFR equations -------------------------------------------------------------------

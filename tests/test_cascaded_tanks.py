@@ -26,7 +26,7 @@ def scored(record):
 
 
 def test_official_split(numbered):
-    data = cascaded_tanks.load(root=numbered)
+    data = cascaded_tanks.load(root=numbered, first=768)
     (train,), (validation,), (test,) = data.train, data.validation, data.tests
     assert (data.name, [r.name for r in (train, validation, test)]) == (
         "cascaded_tanks",
@@ -46,11 +46,19 @@ def test_official_split(numbered):
 
 
 def test_the_rules_of_the_cuts(numbered):
-    data = cascaded_tanks.load(root=str(numbered), validation=0.5, skip=5)
+    data = cascaded_tanks.load(root=str(numbered), validation=0.5, first=512, skip=5)
     assert scored(data.train[0]) == (1, 512)
     assert scored(data.validation[0]) == (513, 1024)
     assert scored(data.tests[0]) == (2006, 3024)
     assert data.leaderboard[0].skip == 50
+
+
+def test_validation_amid_the_record(numbered):
+    data = cascaded_tanks.load(root=numbered)
+    assert [scored(record) for record in data.train] == [(1, 256), (513, 1024)]
+    assert {record.start for record in (*data.train, *data.validation)} == {"estimated"}
+    (validation,) = data.validation
+    assert (scored(validation), validation.skip) == ((257, 512), 256)
 
 
 @pytest.mark.parametrize(
@@ -59,6 +67,8 @@ def test_the_rules_of_the_cuts(numbered):
         ({"validation": 0}, "data.validation is 0"),
         ({"validation": 1.0}, "leaves 0 of the 1024"),
         ({"skip": 0}, "data.skip is 0"),
+        ({"first": 0}, "data.first is 0"),
+        ({"first": 769}, "data.first is 769.*give 768 at most"),
     ],
 )
 def test_refused_arguments(arguments, match):
@@ -80,7 +90,7 @@ def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered
         (root / FILE).write_bytes((numbered / FILE).read_bytes())
 
     monkeypatch.setattr(official, "_download", download)
-    assert scored(cascaded_tanks.load(root=root, download=True).train[0]) == (1, 768)
+    assert scored(cascaded_tanks.load(root=root, download=True).train[0]) == (1, 256)
 
 
 def test_a_file_of_another_length_is_refused(numbered):
@@ -91,7 +101,7 @@ def test_a_file_of_another_length_is_refused(numbered):
 
 @pytest.mark.data
 def test_official_file(benchmark_root):
-    data = cascaded_tanks.load(root=benchmark_root)
+    data = cascaded_tanks.load(root=benchmark_root, first=768)
     (validation,), (test,) = data.validation, data.tests
     for record in (validation, test):
         assert record.y.max() == pytest.approx(10.0, abs=0.01)  # the sensor's end

@@ -3,13 +3,16 @@
 from itertools import product
 from math import comb, prod
 
+import numpy as np
 import pytest
 import torch
 from reference import SIGMA, normal
 from torch.func import functional_call, jacrev, vmap
 from torch.testing import assert_close
 
+from lfrtorch.cell import LFRCell
 from lfrtorch.nonlinearity import ACTIVATIONS, Network, Polynomial
+from lfrtorch.simulate import simulate
 
 # --- one hidden layer -----------------------------------------------------------------------
 
@@ -47,8 +50,25 @@ def test_draw_follows_its_generator():
     assert not torch.equal(a.Wz, c.Wz)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_softplus_far_from_its_corner(dtype: torch.dtype):
+    """Neither overflow above nor zeros below, in torch and in machine code."""
+    static = Network(1, 1, 1, "softplus", dtype=dtype)
+    cell = LFRCell(1, 1, 1, 1, 1, static, dtype=dtype)
+    with torch.no_grad():
+        for weight in (cell.Dzu, cell.Dyw, static.Wz, static.Ww):
+            weight.fill_(1.0)
+        static.bz.zero_()
+    points = [-1e4, -30.0, -1.0, 0.0, 1.0, 30.0, 1e4]
+    both = np.array([points, np.logaddexp(0.0, points)])
+    v, expected = torch.as_tensor(both, dtype=dtype).unsqueeze(-1)
+    y = simulate(cell, v.unsqueeze(0), v.new_zeros(1, 1)).y[0]
+    for found in (static(v), y):  # machine code has exp(-700) for what is less
+        assert_close(found, expected, rtol=4 * torch.finfo(dtype).eps, atol=1e-300)
+
+
 def test_unknown_activation():
-    with pytest.raises(ValueError, match="activation is 'swish'; use one of rbf, relu, sigmoid, t"):
+    with pytest.raises(ValueError, match="activation is 'swish'; use one of rbf, relu, sigmoid, s"):
         Network(1, 1, 1, "swish")
 
 

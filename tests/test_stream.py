@@ -45,7 +45,7 @@ def test_any_blocks_give_the_bits_of_one_simulation(ends: list[int]):
     assert np.array_equal(np.concatenate(found), MODEL.simulate(U))
 
 
-@pytest.mark.parametrize("activation", ["tanh", "sigmoid", "relu", "rbf"])
+@pytest.mark.parametrize("activation", ["tanh", "sigmoid", "relu", "rbf", "softplus"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_every_compiled_model(activation: str, dtype: torch.dtype):
     model = random_model(random_cell(2, 2, 3, 2, 1, 4, activation=activation, dtype=dtype))

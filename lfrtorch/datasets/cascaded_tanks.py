@@ -16,7 +16,6 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,26 +43,29 @@ _PUBLISHED = (
 def load(
     *,
     validation: float = 0.25,
+    first: int = 256,
     skip: int = _WINDOW,
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
     """The estimation record, cut in time for training and validation, and the test record.
 
-    Training estimates its start state with the parameters. The validation record is the whole
-    estimation record, of which the last part is scored: the samples before, which it skips, give
-    its start state. The start state of the test is fitted to its first ``skip`` samples.
+    Training estimates its start states with the parameters. The validation record is the estimation
+    record up to the last sample that validates: the samples before the first one, which it skips,
+    give its start state. The start state of the test is fitted to its first ``skip`` samples.
 
     Args:
-        validation: fraction of the estimation samples, the last of them, that validate.
+        validation: fraction of the estimation samples that validate.
+        first: the first of them, counted from 0; what is before and what is after trains. The last
+            quarter, 768, has the only inputs below 1.2 V and the second overflow.
         skip: samples at the beginning of the test that are not scored.
         download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
         root: folder that holds ``Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat``; by default
             the cache folder of the package nonlinear_benchmarks.
 
     Shape:
-        u, y (V) of training: (768, 1); of validation: (1024, 1), 256 of them scored; of the test
-        ``"test"``: (1024, 1), 974 scored.
+        u, y (V) of training: (256, 1) and (512, 1); of validation: (512, 1), 256 of them scored; of
+        the test ``"test"``: (1024, 1), 974 scored.
 
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.
@@ -71,7 +73,14 @@ def load(
         OSError: the download fails.
     """
     integer("data.skip", skip, 1)
-    trained = _SAMPLES - official.held_out(_SAMPLES, validation)
+    held_out = official.held_out(_SAMPLES, validation)
+    latest = _SAMPLES - held_out
+    integer("data.first", first, 1)
+    if first > latest:
+        raise ValueError(
+            f"data.first is {first}, and {held_out} samples are to validate from there on; there "
+            f"are {_SAMPLES}: give {latest} at most, or a smaller data.validation."
+        )
     path = official.find(root, _FILE, "Cascaded_Tanks", download=download)
     signals = official.read_mat(path, ["uEst", "yEst", "uVal", "yVal"], _SAMPLES)
 
@@ -82,10 +91,18 @@ def load(
             u, y, fs=_FS, start="estimated", name=name, source="official", **channels, **settings
         )
 
+    whole, end = record("train", 0), first + held_out
+    before = official.part(whole, 0, first, warm_up=0, name="train", start="estimated")
+    after = [
+        official.part(whole, end, _SAMPLES, warm_up=0, name="train, after", start="estimated")
+        for _ in range(end < _SAMPLES)
+    ]
     return Dataset(
         name="cascaded_tanks",
-        train=[replace(record("train", 0)[:trained], start="estimated")],
-        validation=[record("validation", 0, skip=trained)],
+        train=[before, *after],
+        validation=[
+            official.part(whole, first, end, warm_up=first, name="validation", start="estimated")
+        ],
         tests=[record("test", 1, skip=skip)],
         leaderboard=[record("test", 1, skip=_WINDOW)],
         published=_PUBLISHED,
