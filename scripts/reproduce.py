@@ -38,6 +38,7 @@ sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
 import lfrtorch  # noqa: E402
 from lfrtorch import leaderboard  # noqa: E402
 from lfrtorch.datasets import Dataset  # noqa: E402
+from lfrtorch.html_report import number  # noqa: E402
 from lfrtorch.whole_file import whole_file  # noqa: E402
 from train import CONF  # noqa: E402
 
@@ -185,7 +186,7 @@ def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: boo
         "",
         "Simulation RMSE on the test records, written by `python scripts/reproduce.py "
         "data.root=DIR`. *chosen* is the run that is best on validation, then the median and the "
-        "range of all runs (seeds 0, 1, ...); LTI is the linear model that they start from. "
+        "range of all runs (seeds 0, 1, ...); LTI is the best linear approximation (of parwh one a level). "
         "*seconds* are those of the whole command, the linear model, all starts, scores and "
         "figures included (median).",
         "",
@@ -219,23 +220,26 @@ def rows(each: Case) -> list[str]:
     """Of the table of errors, one a test record."""
     if not each.runs or each.dataset is None:
         return [f"| {each.name} | {each.missing} |" + " |" * 9]
+    scores = each.runs[each.chosen]["scores"]
+    errors = {name: [r["scores"][name]["rmse"] for r in each.runs] for name in scores}
+    errors = {name: [np.inf if e is None else e for e in of] for name, of in errors.items()}
+    (plain,) = {score["unit"] for score in scores.values()}
+    linear = [score["lti_rmse"] for score in scores.values()]
+    unit, scale = prefixed(plain, min(map(min, errors.values())), max(linear))
     found = []
-    for name, score in each.runs[each.chosen]["scores"].items():
-        values = [run["scores"][name]["rmse"] for run in each.runs]
-        values = [np.inf if value is None else value for value in values]
+    for name, score in scores.items():
+        values = errors[name]
         best = published(each.dataset, name)
-        unit, scale = prefixed(score["unit"], min(values))
         cells = [score["lti_rmse"], values[each.chosen], np.median(values)]
-        cells = [number(value, scale) for value in cells]
+        cells = [three_digits(value, scale) for value in cells]
         cells[1] = f"**{cells[1]}**"
-        spread = f"{number(min(values), scale)} .. {number(max(values), scale)}"
-        other = "-" if best is None else f"{number(best[1], scale)} ({best[0]})"
+        spread = f"{three_digits(min(values), scale)} .. {three_digits(max(values), scale)}"
+        other = "-" if best is None else f"{three_digits(best[1], scale)} ({best[0]})"
         window = f"{score['samples']} - {score['skip']}"
         head = [each.name, name, score["source"], unit]
-        found.append(
-            " | ".join(["|", *head, *cells, spread, str(len(values)), other, window, "|"]).strip()
-        )
-    return [line.replace("| |", "|", 1).replace(" | |", " |") for line in found]
+        row = [*head, *cells, spread, str(len(values)), other, window]
+        found.append(f"| {' | '.join(row)} |")
+    return found
 
 
 def costs(each: Case) -> str:
@@ -342,25 +346,26 @@ def machine() -> str:
     return f"{model or platform.machine()}, {os.cpu_count()} cores, {platform.system()}, {versions}"
 
 
-def prefixed(unit: str, value: float) -> tuple[str, float]:
-    """The unit with the prefix that makes the value readable, and what to multiply by."""
-    for prefix, scale in (("", 1.0), ("m", 1e3), ("µ", 1e6)):
-        if unit not in ("V", "m") or value * scale >= 0.1 or prefix == "µ":
-            return f"{prefix}{unit}", scale
-    raise AssertionError
+def prefixed(unit: str, least: float, largest: float) -> tuple[str, float]:
+    """The unit with the prefix that makes values readable, and what to multiply by."""
+    shown, scale = unit, 1.0
+    for prefix in ("m", "µ"):
+        if unit in ("V", "m") and least * scale < 0.1 and largest * scale < 2.0:
+            shown, scale = f"{prefix}{unit}", 1e3 * scale
+    return shown, scale
 
 
-def number(value: float | None, scale: float = 1.0) -> str:
-    """Three digits."""
+def three_digits(value: float | None, scale: float = 1.0) -> str:
+    """Of a value that may be none where a simulation diverges."""
     if value is None or not np.isfinite(value):
         return "diverges"
-    return f"{scale * value:.3g}"
+    return number(scale * value)
 
 
 def shown_in(value: float | None, unit: str) -> str:
     """Value and unit."""
-    prefix, scale = prefixed(unit, value or 1.0)
-    return f"{number(value, scale)} {prefix}".strip()
+    prefix, scale = prefixed(unit, value or 1.0, value or 1.0)
+    return f"{three_digits(value, scale)} {prefix}".strip()
 
 
 if __name__ == "__main__":

@@ -53,8 +53,8 @@ def test_validation_chooses_and_the_row_has_all():
     (row,) = reproduce.rows(each)
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells == [
-        "wiener_hammerstein", "test", "official", "mV", "44", "**0.23**", "0.23", "0.21 .. 0.26",
-        "3", "0.241 (B)", "88000 - 1000",
+        "wiener_hammerstein", "test", "official", "mV", "44.0", "**0.230**", "0.230",
+        "0.210 .. 0.260", "3", "0.241 (B)", "88000 - 1000",
     ]  # fmt: skip
     assert "| 6, 2, 2, 15 | 160 (116) | 80000 | 4 | 200 | 100 | 500 |" in reproduce.costs(each)
     assert "| `python train.py +bench=wiener_hammerstein data.root=DIR seed=0` |" in (
@@ -68,7 +68,7 @@ def test_validation_chooses_and_the_row_has_all():
 
 def test_a_run_that_diverges_is_no_number():
     (row,) = reproduce.rows(case(metrics(1.0, 0.2e-3), metrics(None, None)))
-    assert "0.2 .. diverges" in row
+    assert "0.200 .. diverges" in row
 
 
 def test_rows_without_data_or_runs_say_so():
@@ -88,14 +88,20 @@ def test_rows_without_data_or_runs_say_so():
 @pytest.mark.parametrize(
     ("value", "unit", "shown"),
     [
-        (2.6e-6, "m", "2.6 µm"),
-        (2.3e-4, "V", "0.23 mV"),
-        (0.34, "V", "0.34 V"),
-        (0.1, "ticks/s", "0.1 ticks/s"),
+        (2.6e-6, "m", "2.60 µm"),
+        (2.3e-4, "V", "0.230 mV"),
+        (0.34, "V", "0.340 V"),
+        (0.01, "ticks/s", "0.0100 ticks/s"),
     ],
 )
 def test_units(value: float, unit: str, shown: str):
     assert reproduce.shown_in(value, unit) == shown
+
+
+def test_one_unit_a_benchmark():
+    """Where the linear errors are large, as those of the parallel Wiener-Hammerstein system."""
+    assert reproduce.prefixed("V", 7e-6, 39e-3) == ("mV", 1e3)
+    assert reproduce.prefixed("m", 2.2e-6, 189e-6) == ("µm", 1e6)
 
 
 def started(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
