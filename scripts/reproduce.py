@@ -62,6 +62,9 @@ CASES = {
 """Settings of train.py by name."""
 
 QUICK = ["starts=1", "trainer.max_iter=10"]
+LONG = 5000
+"""Samples from which on errors in time are a band of colour."""
+
 RUN = "run.json"
 """In the folder of a run: the time that the command took."""
 
@@ -186,8 +189,8 @@ def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: boo
         "",
         "Simulation RMSE on the test records, written by `python scripts/reproduce.py "
         "data.root=DIR`. *chosen* is the run that is best on validation, then the median and the "
-        "range of all runs (seeds 0, 1, ...); LTI is the best linear approximation (of parwh one a level). "
-        "*seconds* are those of the whole command, the linear model, all starts, scores and "
+        "range of all runs (seeds 0, 1, ...); LTI is the best linear approximation (of parwh one "
+        "a level). *seconds* are those of the whole command, the linear model, all starts, scores and "
         "figures included (median).",
         "",
     ]
@@ -311,7 +314,7 @@ def entries(cases: Sequence[Case]) -> list[leaderboard.Entry]:
 def gallery(cases: Sequence[Case], folder: Path, start: Path) -> dict[str, list[Path]]:
     """Figures of the chosen runs, copied; their paths from ``start`` by benchmark.
 
-    Of each test the spectrum or the density of the errors, and the static map.
+    Of each test the errors' spectrum or, of a short one, their course; and the static map.
     """
     folder.mkdir(parents=True, exist_ok=True)
     copied: dict[str, list[Path]] = {}
@@ -319,9 +322,10 @@ def gallery(cases: Sequence[Case], folder: Path, start: Path) -> dict[str, list[
         if not each.runs:
             continue
         drawn = each.folders[each.chosen] / "figures"
-        for test in each.runs[each.chosen]["scores"]:
+        for test, score in each.runs[each.chosen]["scores"].items():
             density = drawn / f"{test}_density.png"
-            figures = [density if density.is_file() else drawn / f"{test}.png"]
+            dense = density.is_file() and score["samples"] > LONG
+            figures = [density if dense else drawn / f"{test}.png"]
             copied[each.name] = copied.get(each.name, []) + figures
         copied[each.name].append(drawn / "static_map.png")
     for name, figures in copied.items():
