@@ -190,8 +190,8 @@ def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: boo
         "Simulation RMSE on the test records, written by `python scripts/reproduce.py "
         "data.root=DIR`. *chosen* is the run that is best on validation, then the median and the "
         "range of all runs (seeds 0, 1, ...); LTI is the best linear approximation (of parwh one "
-        "a level). *seconds* are those of the whole command, the linear model, all starts, scores and "
-        "figures included (median).",
+        "a level). *seconds* are those of the whole command, the linear model, all starts, scores "
+        "and figures included (median).",
         "",
     ]
     if quick:
