@@ -33,7 +33,7 @@ def test_official_split(numbered):
         ["train", "validation", "test"],
     )
     assert scored(train) == (1, 768)
-    assert scored(validation) == (51, 1024)
+    assert scored(validation) == (769, 1024)
     assert scored(test) == (2051, 3024)
     assert (validation.samples, test.samples) == (1024, 1024)
     for record in (train, validation, test):
@@ -48,17 +48,17 @@ def test_official_split(numbered):
 def test_the_rules_of_the_cuts(numbered):
     data = cascaded_tanks.load(root=str(numbered), validation=0.5, first=512, skip=5)
     assert scored(data.train[0]) == (1, 512)
-    assert scored(data.validation[0]) == (6, 1024)
+    assert scored(data.validation[0]) == (513, 1024)
     assert scored(data.tests[0]) == (2006, 3024)
     assert data.leaderboard[0].skip == 50
 
 
-def test_a_part_amid_the_record_is_not_fitted(numbered):
+def test_validation_amid_the_record(numbered):
     data = cascaded_tanks.load(root=numbered)
     assert [scored(record) for record in data.train] == [(1, 256), (513, 1024)]
     assert {record.start for record in (*data.train, *data.validation)} == {"estimated"}
     (validation,) = data.validation
-    assert (scored(validation), validation.skip) == ((51, 1024), 50)
+    assert (scored(validation), validation.skip) == ((257, 512), 256)
 
 
 @pytest.mark.parametrize(
