@@ -87,6 +87,10 @@ class SimulationError:
         own = [p.detach().flatten() for p in self._parameters]
         return torch.cat([*own, self._starts.flatten()])
 
+    def start_states(self, theta: Tensor) -> Tensor:
+        """The estimated start states (records, nx) in θ."""
+        return theta[len(theta) - self._starts.numel() :].view(self._starts.shape)
+
     def rmse(self, theta: Tensor) -> float:
         """Root mean squared error at θ over scored samples and outputs, output unit, unweighted."""
         total = torch.zeros((), dtype=torch.float64, device=self._start.device)

@@ -81,6 +81,10 @@ class ResponseFit:
         )
         return Search(problem, torch.as_tensor(np.concatenate([m.ravel() for m in matrices])))
 
+    def improbability(self, search: Search) -> float:
+        """The cost: lines have no start states."""
+        return search.state.cost
+
     def refined(self, search: Search) -> Refined:
         """Where a search stands, with the covariance there."""
         problem, state = search.problem, search.state

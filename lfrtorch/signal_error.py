@@ -35,6 +35,9 @@ MOST_STARTS, SHORT = 8, 200_000
 LARGEST_ROWS = 50_000_000
 """Entries of a Jacobian that is formed whole for a covariance: 400 MB."""
 
+ROUNDING = 1e-12
+"""Relative variance of a state that the inputs do not move."""
+
 OBSERVERS = (0.0, 1e-4, 1e-2, 1.0)
 """Variance of the state noise over that of the states, times the output error's, of the innovation
 models that a prediction-error fit may start from."""
@@ -116,6 +119,25 @@ class SignalFit:
         problems = [self._problem(matrices, K) for K in gains]
         problem = min(problems, key=lambda p: p.cost(p.residual(p.theta)))
         return Search(problem, problem.theta)
+
+    def improbability(self, search: Search) -> float:
+        """The cost, and x0ᵀ P⁻¹ x0 of each estimated start state, times the error's variance.
+
+        P is the covariance of the states that the inputs lead to from rest: the cost of the most
+        probable model and start states, where the inputs before the records were like those in it.
+        """
+        problem, state = search.problem, search.state
+        x0 = problem.start_states(state.theta)
+        if self._prediction or not len(x0):
+            return state.cost
+        problem.write(state.theta)
+        driven = torch.cat(
+            [problem.model.lfr.trajectory(batch.u).x.flatten(0, 1) for batch in problem.batches]
+        )
+        spread, axes = torch.linalg.eigh(driven.mT @ driven / len(driven))
+        variances = spread.clamp_min(ROUNDING * float(spread[-1]))
+        unlikely = float(((x0 @ axes).square() / variances).sum())
+        return state.cost * (1.0 + unlikely / problem.size)
 
     def refined(self, search: Search) -> Refined:
         """Where a search stands, with the covariance there."""

@@ -156,3 +156,24 @@ def test_unstable_system_of_a_stable_predictor_is_refused():
     inside = np.array([[0.99]]), *system[1:]
     found = refined(fit_of([record], prediction=True), inside, 50)
     assert abs(found.A[0, 0]) < 1
+
+
+def test_start_states_that_no_input_leads_to_are_improbable():
+    """A mode that the input hardly moves fits a drift; one that it moves as far does not."""
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(400, 1))
+    drift = 0.999 ** np.arange(400.0)[:, None]
+    record = Record(u, drift + 0.01 * rng.normal(size=(400, 1)), fs=1.0, start="estimated")
+    problem = fit_of([record])
+
+    def ratio(gain: float) -> float:
+        matrices = np.array([[0.999]]), np.array([[gain]]), np.eye(1), np.zeros((1, 1))
+        search = problem.search(matrices)
+        return problem.improbability(search) / search.state.cost
+
+    assert ratio(1e-6) > 100.0 * ratio(0.05)
+    assert ratio(0.05) < 1.1
+    # From rest there is no start state, and nothing to add.
+    at_rest = fit_of([Record(u, drift, fs=1.0)])
+    search = at_rest.search((0.9 * np.eye(1), np.eye(1), np.eye(1), np.zeros((1, 1))))
+    assert at_rest.improbability(search) == search.state.cost
