@@ -35,6 +35,12 @@ START_ITERATIONS, START_HALVINGS, START_TOLERANCE = 20, 6, 1e-10
 START_SEEN = 1e-9
 """Least that a start state moves the weighted outputs to be told from them."""
 
+START_PASSES, START_FLAT = 8, 1e-4
+"""Passes with a prior on a start state, and its least variance relative to the largest."""
+
+START_ODD = 1e-3
+"""Part of the cost that a prior on the start state adds at least where it makes a difference."""
+
 MAX_PERIODS = 30
 """Passes over the record after which the periodic steady state is given up."""
 
@@ -140,20 +146,73 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
 
 @torch.no_grad()
 def estimated_start(cell: LFRCell, u: Tensor, y: Tensor, weight: Tensor) -> Trajectory:
-    """Trajectory from the start state that fits the output best, by Gauss-Newton from x = 0.
+    """Trajectory from the most probable start state, given the output.
+
+    The start state of least squares follows the noise where there are few samples and many states.
+    The other one considered has x0ᵀ P⁻¹ x0 added to the squares of the output's errors over their
+    variance, found in START_PASSES; P is the second moment of the states that the input leads to
+    from rest. It is taken unless the first one is more probable under a prior of heavy tails, as
+    where a system at work is left alone. Where the model is exact, or there are far more samples
+    than states, they are the same.
 
     Shape:
         u: (R, T, nu), y: (R, T, ny), weight: (R, T, ny), factors of the errors.
     """
-    x0 = u.new_zeros(len(u), cell.nx)
-    best = simulate(cell, u, x0)
-    cost = (weight * (best.y - y)).square().sum(dim=(1, 2))
+    R, nx = len(u), cell.nx
+    counted = (weight != 0).sum(dim=(1, 2))
+    rest = simulate(cell, u, u.new_zeros(R, nx))
+    x = rest.x.nan_to_num(0.0, 0.0, 0.0)
+    moments, axes = torch.linalg.eigh(x.mT @ x / x.shape[1])
+    moments = moments.clamp_min(START_FLAT * moments[:, -1:])
+    known = torch.isfinite(rest.x).all(dim=(1, 2)) & (moments > 0).all(dim=1)
+    white = torch.where(known[:, None, None], axes.mT / moments.sqrt().unsqueeze(-1), 0.0)
+
+    def variance(found: Trajectory) -> Tensor:
+        errors = (weight * (found.y - y)).square().sum(dim=(1, 2))
+        return errors / (counted - nx).clamp_min(1)
+
+    def odd(found: Trajectory) -> Tensor:
+        return (white @ found.x[:, 0].unsqueeze(-1)).square().sum(dim=(1, 2))
+
+    def improbability(found: Trajectory) -> Tensor:
+        return counted * variance(found).log() + nx * (odd(found) / nx).log1p()
+
+    squares = _fitted_start(cell, u, y, weight, u.new_zeros(R, nx, nx), rest)
+    stayed = ~squares.x[:, 0].any(dim=1)  # Gauss-Newton may fail on many states
+    if not (known & (stayed | (odd(squares) > START_ODD * counted))).any():
+        return squares
+    probable = rest
+    for _ in range(START_PASSES):
+        prior = white * variance(probable).nan_to_num(0.0, 0.0).sqrt()[:, None, None]
+        probable = _fitted_start(cell, u, y, weight, prior, probable)
+    least = improbability(squares).nan_to_num(math.inf)
+    better = known & (improbability(probable).nan_to_num(math.inf) < least)
+    pairs = zip(probable, squares, strict=True)
+    return Trajectory(*(torch.where(better[:, None, None], a, b) for a, b in pairs))
+
+
+def _fitted_start(
+    cell: LFRCell, u: Tensor, y: Tensor, weight: Tensor, prior: Tensor, best: Trajectory
+) -> Trajectory:
+    """Trajectory of the start state that minimises |weight (y_hat - y)|² + |prior x0|².
+
+    Shape:
+        prior: (R, nx, nx).
+    """
+
+    def squares(trajectory: Trajectory, x0: Tensor) -> Tensor:
+        errors = (weight * (trajectory.y - y)).square().sum(dim=(1, 2))
+        return errors + (prior @ x0.unsqueeze(-1)).square().sum(dim=(1, 2))
+
+    x0 = best.x[:, 0].clone()
+    cost = squares(best, x0)
     for _ in range(START_ITERATIONS):
         F, H = slopes(cell, best.z)
         identity = torch.eye(cell.nx).to(x0).expand_as(F[:, 0])
         free = H @ linear_recurrence(F, torch.zeros_like(F), identity)[:, :-1]
-        rows = (weight.unsqueeze(-1) * free).flatten(1, 2)
+        rows = torch.cat([(weight.unsqueeze(-1) * free).flatten(1, 2), prior], dim=1)
         errors = (weight * (best.y - y)).flatten(1).unsqueeze(-1)
+        errors = torch.cat([errors, prior @ x0.unsqueeze(-1)], dim=1)
         usable = torch.isfinite(rows).all(dim=(1, 2)) & torch.isfinite(cost)
         rows, errors = (torch.where(usable[:, None, None], t, 0.0) for t in (rows, errors))
         # A state that the output does not show stays where it is.
@@ -163,7 +222,7 @@ def estimated_start(cell: LFRCell, u: Tensor, y: Tensor, weight: Tensor) -> Traj
         waiting = usable.clone()
         for _ in range(START_HALVINGS):
             trial = simulate(cell, u, x0 + step)
-            trial_cost = (weight * (trial.y - y)).square().sum(dim=(1, 2))
+            trial_cost = squares(trial, x0 + step)
             better = waiting & (trial_cost < cost)  # False for NaN
             x0 = torch.where(better[:, None], x0 + step, x0)
             cost = torch.where(better, trial_cost, cost)

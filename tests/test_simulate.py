@@ -280,14 +280,27 @@ def test_estimated_start_counts_what_is_weighted_only():
     assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
 
 
-def test_estimated_start_of_a_state_that_no_output_shows_stays():
+def test_estimated_start_of_a_state_that_no_output_shows_is_the_likeliest():
+    """Given the other one, with the moments that the input gives both."""
     cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 30, 1)
     with torch.no_grad():
         cell.A.copy_(torch.diag(torch.tensor([0.5, 0.4])))
         cell.Cy[0, 1] = 0.0
     made = simulate(cell, u, u.new_tensor([[2.0, 3.0]]))
     found = estimated_start(cell, u, made.y, torch.ones_like(made.y))
-    assert_close(found.x[:, 0], u.new_tensor([[2.0, 0.0]]), rtol=0, atol=1e-9)
+    x = simulate(cell, u, u.new_zeros(1, 2)).x[0]
+    moments = x.mT @ x
+    expected = u.new_tensor([[2.0, 2.0 * moments[1, 0] / moments[0, 0]]])
+    assert_close(found.x[:, 0], expected, rtol=0, atol=1e-6)
+
+
+def test_estimated_start_of_a_system_left_alone_is_that_of_least_squares():
+    """The input moves the states a hundredth as far as they are at the start."""
+    cell, u = random_cell(1, 1, 2, radius=0.9), 0.01 * normal(1, 60, 1)
+    x0 = u.new_tensor([[3.0, -2.0]])
+    clean = simulate(cell, u, x0).y
+    found = estimated_start(cell, u, clean + 1e-3 * normal(1, 60, 1, seed=3), torch.ones_like(u))
+    assert_close(found.x[:, 0], x0, rtol=0, atol=0.02)
 
 
 def test_estimated_start_of_a_diverging_model_is_not_finite():
