@@ -42,6 +42,7 @@ from lfrtorch.ranks import LOST, ProcessLost, Ranks
 from lfrtorch.responses import respond
 from lfrtorch.resume import Snapshots
 from lfrtorch.sizes import SizeSearch
+from lfrtorch.stability import LOUDER
 from lfrtorch.termination import Terminated, Termination
 from lfrtorch.threads import each_alone
 from lfrtorch.trainer import INTERRUPTED
@@ -85,7 +86,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
         f"({models[0].parameters_net} without the gauge directions), {len(models)} start(s)"
     )
 
-    best, several = folder / "model", len(models) > 1
+    best, several, judged = folder / "model", len(models) > 1, None
     if ranks.rank == 0:
         with whole_file(folder / CONFIG) as fresh:
             OmegaConf.save(cfg, fresh, resolve=True)
@@ -93,7 +94,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
             shutil.rmtree(folder / SNAPSHOTS, ignore_errors=True)
     snapshots = Snapshots(folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None)
     settings = {"optimiser": instantiate(cfg.trainer), "ridge": cfg.ridge, "ranks": ranks}
-    settings["snapshots"] = snapshots
+    settings |= {"snapshots": snapshots, "average": min(cfg.average, len(models))}
     records = (dataset.train, dataset.validation, dataset.selection)
     search = partial(lfrtorch.fit_starts, models, *records, **settings)
     with Termination(ranks) as termination:
@@ -115,15 +116,15 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
                 line = ProgressLine()
                 result = search(monitors=[[line, board, keep, termination]])
                 line.close()
-            write(cfg, folder, command, result, bla, dataset, board, chosen)
+            scores = write(cfg, folder, command, result, bla, dataset, board, chosen)
+            judged = scores["validation"]["rmse"]
     if result.reason.startswith(LOST):
         raise ProcessLost(f"{result.reason}; the best model so far is in {best}; {go_on(folder)}")
     if termination.asked == signal.SIGTERM and result.reason == INTERRUPTED:
         raise Terminated(
             f"the fit was terminated; the best model so far is in {best}; {go_on(folder)}"
         )
-    kept = result.history[result.chosen_iteration]
-    return kept.train if math.isnan(kept.validation) else kept.validation
+    return result.history[result.chosen_iteration].train if judged is None else judged
 
 
 def starts(cfg: DictConfig, bla: lfrtorch.LinearModel, dataset: Dataset) -> list[lfrtorch.Model]:
@@ -241,8 +242,8 @@ def write(
     dataset: Dataset,
     board: TensorBoard,
     search: SizeSearch | None,
-) -> None:
-    """Print the scores, and write all files of a run."""
+) -> dict[str, Any]:
+    """Print the scores, and write all files of a run; returns what ``metrics.json`` holds."""
     print(
         f"{result.reason}; kept iteration {result.chosen_iteration} of {result.iterations}, "
         f"{result.seconds:.1f} s, {1e3 * result.seconds_per_iteration:.0f} ms an iteration\n"
@@ -264,12 +265,14 @@ def write(
         board.text("sizes", search.table())
     if len(result.starts) > 1:
         print(report.starts_table(metrics) + "\n")
+    if result.averaged > 1:
+        print(f"The model is the mean of the best {result.averaged} starts, side by side.\n")
     text = json.dumps(metrics, indent=2, allow_nan=False)
     with whole_file(folder / "metrics.json") as fresh:
         fresh.write_text(text + "\n")
     table = report.table(metrics, dataset.published)
     print(table)
-    if metrics["stable_to"] < max(report.LOUDER):
+    if metrics["stable_to"] < max(LOUDER):
         print(
             f"note: stable on the training inputs {metrics['stable_to']:g} times as loud, and no "
             "longer on the next louder ones tried; validate at the amplitudes you will use."
@@ -308,6 +311,7 @@ def write(
     print(f"TensorBoard: tensorboard --logdir {folder}")
     if result.reason == INTERRUPTED:
         print(go_on(folder))
+    return metrics
 
 
 def go_on(folder: Path) -> str:
@@ -346,6 +350,12 @@ def require(cfg: DictConfig) -> None:
     integer("nx_max", cfg.nx_max, 1)
     integer("seed", cfg.seed, 0)
     integer("starts", cfg.starts, 1)
+    integer("average", cfg.average, 1)
+    if cfg.average > cfg.starts:
+        raise ValueError(
+            f"average is {cfg.average} and starts are {cfg.starts}: the mean is of some of the "
+            f"starts; give starts={cfg.average} or more."
+        )
     if cfg.threads is not None:
         integer("threads", cfg.threads, 1)
     if cfg.dtype not in ("float32", "float64"):

@@ -8,6 +8,7 @@ from importlib.metadata import version
 
 from lfrtorch import datasets, distributed
 from lfrtorch.adam import Adam
+from lfrtorch.average import average
 from lfrtorch.bla import estimate_bla
 from lfrtorch.cell import LFRCell
 from lfrtorch.datasets.files import load_records
@@ -49,6 +50,7 @@ __all__ = [
     "Scaler",
     "SizeSearch",
     "Snapshots",
+    "average",
     "datasets",
     "distributed",
     "estimate_bla",

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from lfrtorch.advice import Advice
 from lfrtorch.datasets import Dataset
 from lfrtorch.linear_model import LinearModel
-from lfrtorch.report import LOUDER
 from lfrtorch.responses import Response, rms
 from lfrtorch.roots import poles_at_rest, roots
+from lfrtorch.stability import LOUDER
 from lfrtorch.trainer import FitResult
 
 USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
@@ -301,6 +301,8 @@ def _fit(metrics: Mapping[str, Any], validated: bool) -> dict[str, Any]:
     )
     if len(ranking) > 1:
         summary += f" The best of {len(ranking)} starts."
+    if metrics["averaged"] > 1:
+        summary += f" The model is the mean of the best {metrics['averaged']}, side by side."
     return {"summary": summary, "starts": starts}
 
 

@@ -8,6 +8,8 @@ smallest squared validation error: all to the end 3.37 (3026 iterations), half a
 3.37 (1609, 1696), half after 1/5 3.45, after 3/10 3.48, quarter after 1/16 and 1/8 3.43 (926), an
 eighth after 1/8, 1/4 and 1/2 3.59 (933).
 
+Of starts that end alike the mean may be better than each of them: see :func:`lfrtorch.average`.
+
 References:
     Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter
     optimization", AISTATS 2016.
@@ -24,12 +26,15 @@ from threading import Event, Lock
 
 import torch
 
+from lfrtorch.average import average as mean_of
+from lfrtorch.checks import integer
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
 from lfrtorch.ranks import LOST, Ranks
 from lfrtorch.records import Record, as_records
 from lfrtorch.residual import Ridge, SimulationError
 from lfrtorch.resume import Snapshots
+from lfrtorch.stability import LOUDER, loudest
 from lfrtorch.stack import Stack
 from lfrtorch.threads import each_alone, spread_by_hand
 from lfrtorch.trainer import (
@@ -78,6 +83,7 @@ def fit_starts(
     *,
     optimiser: Optimiser | None = None,
     ridge: Ridge = 0.0,
+    average: int = 1,
     monitors: Sequence[Sequence[Monitor]] = (),
     watch: Callable[[Round], None] = lambda _: None,
     ranks: Ranks | None = None,
@@ -98,6 +104,10 @@ def fit_starts(
             sweep's error has a rank correlation of 0.45 with that at the training's level, of 0.7
             and 0.8 with those at a half and a fifth of it. Iterates that are chosen there are among
             the first where the model is too small, and worse at the training's level by up to 6 %.)
+        average: so many starts go to the end at least, and the model of the result is the mean of
+            so many of the best (:func:`lfrtorch.average`) where that is better than the best one on
+            validation and selection; without both always. Starts that inputs twice as loud as those
+            of training make run away have no part in it.
         monitors: of each start, called one at a time.
         watch: called after each round.
         snapshots: where the starts are kept as far as they came. Where some are, they go on from
@@ -105,9 +115,11 @@ def fit_starts(
 
     Returns:
         The fit of the best start, its duration that of all; ``starts`` has all, the best first.
+        ``averaged`` says of how many the model is the mean.
 
     Raises:
-        ValueError: no model, another number of lists of monitors, or see :func:`lfrtorch.fit`.
+        ValueError: no model, another number of lists of monitors, fewer models than are to be
+            averaged, or see :func:`lfrtorch.fit` and :func:`lfrtorch.average`.
     """
     if not models:
         raise ValueError("there is no model to start from; give one or more.")
@@ -115,6 +127,12 @@ def fit_starts(
         raise ValueError(
             f"there are {len(models)} models and {len(monitors)} lists of monitors; give each "
             "model its own."
+        )
+    integer("average", average, 1)
+    if average > len(models):
+        raise ValueError(
+            f"average is {average} and starts are {len(models)}: the mean is of some of the "
+            "starts; give as many starts or more."
         )
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots
@@ -124,8 +142,8 @@ def fit_starts(
         for number, model in enumerate(models)
     ]
     snapshots.restore(fits)
-    judging = (validation, selection) if selection else ()
-    judge = _Judge(fits, [record for some in judging if some for record in as_records(some)])
+    unseen = [r for some in (validation, selection) if some for r in as_records(some)]
+    judge = _Judge(fits, unseen if selection else [], unseen)
     together = _Together(fits, monitors or [()] * len(fits))
     limit, field = fits[0].optimiser.limit, fits
     rounds = ROUNDS if len(fits) > 1 else ()
@@ -146,12 +164,20 @@ def fit_starts(
                 fit.reason = fit.reason or cut  # of those that had come to the end of the round
             break
         if until < limit:
-            kept = max(FINALISTS, ceil(len(field) / 2))
+            kept = max(FINALISTS, average, ceil(len(field) / 2))
             snapshots.decided([judge.number(fit) for fit in field[:kept]])
             field = _gone_on(field, field[:kept])
     ranked = judge.ranked(fits)
-    seconds = time.perf_counter() - clock
-    return replace(ranked[0].result(), seconds=seconds, starts=judge.summaries(ranked))
+    result = replace(ranked[0].result(), starts=judge.summaries(ranked))
+    if average > 1:
+        best = judge.ranked(field)
+        # With one that runs away the mean does.
+        best = [fit for fit in best if loudest(fit.model, as_records(train)) >= max(LOUDER)] or best
+        best = best[:average]
+        mean = mean_of([fit.model for fit in best])
+        if judge.prefers(mean):
+            result = replace(result, model=mean, averaged=len(best))
+    return replace(result, seconds=time.perf_counter() - clock)
 
 
 class _Judge:
@@ -160,10 +186,13 @@ class _Judge:
     Args:
         fits: of all starts.
         records: that they are judged on; what the fits themselves are judged on where empty.
+        unseen: the records that none of them is fitted to.
     """
 
-    def __init__(self, fits: Sequence[Fit], records: Sequence[Record]) -> None:
-        self.fits = fits
+    def __init__(
+        self, fits: Sequence[Fit], records: Sequence[Record], unseen: Sequence[Record]
+    ) -> None:
+        self.fits, self._unseen = fits, unseen
         self._errors = [
             SimulationError(fit.model, records, solved_starts=True) if records else None
             for fit in fits
@@ -191,7 +220,18 @@ class _Judge:
             )
         return tuple(found)
 
+    def prefers(self, mean: Model) -> bool:
+        """Whether a mean of starts is better than the best of them, or nothing tells."""
+        if not self._unseen:
+            return True
+        error = SimulationError(mean, self._unseen, solved_starts=True)
+        score = error.cost(error.residual(error.theta))
+        better = score < min(map(self._score, self.fits))  # False for NaN
+        return bool(self.fits[0].ranks.first(torch.tensor(better)))
+
     def _score(self, fit: Fit) -> float:
+        if not fit.history:
+            return math.inf
         error = self._errors[self.number(fit)]
         if error is None:
             return fit.best

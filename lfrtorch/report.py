@@ -9,25 +9,17 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
-
 from lfrtorch.datasets import Dataset, Published
 from lfrtorch.linear_model import LinearModel
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 from lfrtorch.sizes import SizeSearch
+from lfrtorch.stability import loudest
 from lfrtorch.trainer import FitResult
 
 SEED_STEP = 1000
 """Between the seeds of several starts."""
-
-
-LOUDER = (1.25, 1.5, 2.0)
-"""Amplitudes, over those of the data, that a model is tried at."""
-
-RUNAWAY = 100.0
-"""Output, over the rms in the data, of a model that diverges."""
 
 
 @dataclass(frozen=True)
@@ -63,32 +55,6 @@ def score(model: Model, bla: LinearModel | None, record: Record) -> Score:
         samples=record.samples,
         skip=record.skip,
     )
-
-
-def loudest(model: Model, records: Sequence[Record]) -> float:
-    """How many times as loud as in the data the input may be before the model diverges.
-
-    A simulation of finite data says nothing of others: a static map that was fitted where it is
-    bounded may feed back more than it did.
-
-    Args:
-        model: what is simulated, from rest.
-        records: the data; the deviations of their inputs from the model's operating point are
-            multiplied.
-
-    Returns:
-        The largest of ``LOUDER`` at which no output runs away, 1 where none is.
-    """
-    offset, scale = model.scaler.u_offset, model.scaler.y_scale
-    found = 1.0
-    for factor in LOUDER:
-        for record in records:
-            y = model.simulate(offset + factor * (record.u - offset))
-            far = np.abs((y - model.scaler.y_offset) / scale)
-            if not (far < RUNAWAY * factor).all():  # NaN counts
-                return found
-        found = factor
-    return found
 
 
 def seeds(seed: int, starts: int) -> list[int]:
@@ -136,6 +102,7 @@ def metrics(
         "chosen_iteration": result.chosen_iteration,
         "stable_to": loudest(model, dataset.train),
         "starts": max(1, len(result.starts)),
+        "averaged": result.averaged,
         "ranking": [
             {"seed": seeds(seed, start.number + 1)[-1], **asdict(start)} for start in result.starts
         ],

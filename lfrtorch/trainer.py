@@ -158,6 +158,8 @@ class FitResult:
         seconds_per_iteration: median over the accepted iterations but the first, which may compile.
         reason: why the search ended.
         starts: of several starts all, the best first.
+        averaged: of how many starts the model is the mean; history and iterate are those of the
+            best one.
     """
 
     model: Model
@@ -167,6 +169,7 @@ class FitResult:
     seconds_per_iteration: float
     reason: str
     starts: tuple[Start, ...] = ()
+    averaged: int = 1
 
     @property
     def iterations(self) -> int:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
 from lfrtorch.adam import Adam
+from lfrtorch.average import average
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
@@ -232,3 +233,45 @@ def test_bad_calls_are_refused():
         fit_starts([], train)
     with pytest.raises(ValueError, match=r"2 models and 1 lists"):
         fit_starts(models, train, monitors=[[]])
+
+
+@pytest.mark.parametrize("judged_on", ["validation", "selection"])
+def test_mean_of_starts_is_taken_where_it_is_better(judged_on: str):
+    optimiser = LevenbergMarquardt(max_iter=2)
+    models, train, validation = several(5)
+    options: Any = {judged_on: validation, "optimiser": optimiser, "average": 3}
+    result = fit_starts(models, train, **options)
+    assert [start.reason == LEFT for start in result.starts].count(False) == 3
+    best = [models[start.number] for start in result.starts if start.reason != LEFT]
+    alone = min(rmse(validation, model.simulate(validation)) for model in models)
+    together = rmse(validation, average(best).simulate(validation))
+    if together < alone:
+        assert result.averaged == 3
+        assert result.model.lfr.cell.nx == 3 * models[0].lfr.cell.nx
+    else:
+        assert result.averaged == 1
+        assert result.model is models[result.starts[0].number]
+    assert rmse(validation, result.model.simulate(validation)) == min(alone, together)
+
+
+def test_mean_of_starts_is_not_taken_where_one_is_better():
+    models, train, validation = several(2)
+    move(models[0], -0.05)  # the one that made the data
+    optimiser = LevenbergMarquardt(max_iter=1)
+    result = fit_starts(models, train, validation, optimiser=optimiser, average=2)
+    assert result.averaged == 1
+    assert result.model is models[0]
+
+
+def test_mean_of_starts_is_taken_where_nothing_tells():
+    models, train, _ = several(3)
+    optimiser = LevenbergMarquardt(max_iter=2)
+    result = fit_starts(models, train, optimiser=optimiser, average=3)
+    assert result.averaged == 3
+    assert result.model.lfr.cell.nx == 3 * models[0].lfr.cell.nx
+
+
+def test_mean_is_of_starts_that_there_are():
+    models, train, validation = several(2)
+    with pytest.raises(ValueError, match="average is 3 and starts are 2"):
+        fit_starts(models, train, validation, average=3)
