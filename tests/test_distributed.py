@@ -95,7 +95,7 @@ def start(task: Callable[[Ranks], Any], folder: Path, world: int = 2) -> list[An
     for process in processes:
         process.start()
     for process in processes:
-        process.join(60)
+        process.join(300)  # a hang, not a slow machine
         assert process.exitcode is not None
     files = [folder / f"{rank}.pt" for rank in range(world)]
     return [torch.load(f, weights_only=False) if f.exists() else None for f in files]
