@@ -105,9 +105,9 @@ def fit_starts(
             and 0.8 with those at a half and a fifth of it. Iterates that are chosen there are among
             the first where the model is too small, and worse at the training's level by up to 6 %.)
         average: so many starts go to the end at least, and the model of the result is the mean of
-            so many of the best (:func:`lfrtorch.average`) where that is better than the best one on
-            validation and selection; without both always. Starts that inputs twice as loud as those
-            of training make run away have no part in it.
+            so many of the best at most (:func:`lfrtorch.average`): of as many as are best on
+            validation and selection, which may be one, and without both of all. Starts that inputs
+            twice as loud as those of training make run away have no part in it.
         monitors: of each start, called one at a time.
         watch: called after each round.
         snapshots: where the starts are kept as far as they came. Where some are, they go on from
@@ -172,11 +172,10 @@ def fit_starts(
     if average > 1:
         best = judge.ranked(field)
         # With one that runs away the mean does.
-        best = [fit for fit in best if loudest(fit.model, as_records(train)) >= max(LOUDER)] or best
-        best = best[:average]
-        mean = mean_of([fit.model for fit in best])
-        if judge.prefers(mean):
-            result = replace(result, model=mean, averaged=len(best))
+        best = [fit for fit in best if loudest(fit.model, as_records(train)) >= max(LOUDER)]
+        mean, count = judge.mean([fit.model for fit in best[:average]])
+        if mean is not None:
+            result = replace(result, model=mean, averaged=count)
     return replace(result, seconds=time.perf_counter() - clock)
 
 
@@ -220,14 +219,22 @@ class _Judge:
             )
         return tuple(found)
 
-    def prefers(self, mean: Model) -> bool:
-        """Whether a mean of starts is better than the best of them, or nothing tells."""
+    def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
+        """The mean of the first few models that is best, of how many, or none where one is better.
+
+        Where there is nothing to judge on, the mean of all.
+        """
         if not self._unseen:
-            return True
-        error = SimulationError(mean, self._unseen, solved_starts=True)
-        score = error.cost(error.residual(error.theta))
-        better = score < min(map(self._score, self.fits))  # False for NaN
-        return bool(self.fits[0].ranks.first(torch.tensor(better)))
+            return (mean_of(best), len(best)) if len(best) > 1 else (None, 1)
+        means = [mean_of(best[:count]) for count in range(2, len(best) + 1)]
+        scores = [min(map(self._score, self.fits))]
+        for mean in means:
+            error = SimulationError(mean, self._unseen, solved_starts=True)
+            scores.append(error.cost(error.residual(error.theta)))
+        # Rounding may differ between processes, and the choice must not.
+        scores = self.fits[0].ranks.first(torch.tensor(scores, dtype=torch.float64))
+        chosen = int(scores.nan_to_num(math.inf).argmin())
+        return (means[chosen - 1], chosen + 1) if chosen else (None, 1)
 
     def _score(self, fit: Fit) -> float:
         if not fit.history:

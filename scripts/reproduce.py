@@ -188,10 +188,10 @@ def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: boo
         "# Results",
         "",
         "Simulation RMSE on the test records, written by `python scripts/reproduce.py "
-        "data.root=DIR`. *chosen* is the run that is best on validation, then the median and the "
-        "range of all runs (seeds 0, 1, ...); LTI is the best linear approximation (of parwh one "
-        "a level). *seconds* are those of the whole command, the linear model, all starts, scores "
-        "and figures included (median).",
+        "data.root=DIR`. *chosen* is the run that is best on validation (of the tanks, all of "
+        "whose samples train, on training), then the median and the range of all runs (seeds 0, "
+        "1, ...); LTI is the best linear approximation (of parwh one a level). *seconds* are those "
+        "of the whole command, the linear model, all starts, scores and figures included (median).",
         "",
     ]
     if quick:
@@ -259,7 +259,7 @@ def costs(each: Case) -> str:
         sizes,
         f"{run['parameters']} ({run['parameters_net']})",
         str(run["data"]["samples"]),
-        str(run["starts"]),
+        str(run["starts"]) + f", mean of {run['averaged']}" * (run.get("averaged", 1) > 1),
         str(run["fit"]["iterations"]),
         f"{np.median([r['seconds'] for r in each.runs]):.0f}",
         f"{1e3 * iteration:.0f}",
