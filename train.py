@@ -37,6 +37,7 @@ from lfrtorch.distributed import connect
 from lfrtorch.evidence import evidence
 from lfrtorch.findings import findings
 from lfrtorch.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
+from lfrtorch.nonlinearity import is_network
 from lfrtorch.order import OrderScan
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
 from lfrtorch.responses import respond
@@ -94,7 +95,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
             shutil.rmtree(folder / SNAPSHOTS, ignore_errors=True)
     snapshots = Snapshots(folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None)
     settings = {"optimiser": instantiate(cfg.trainer), "ridge": cfg.ridge, "ranks": ranks}
-    settings |= {"snapshots": snapshots, "average": min(cfg.average, len(models))}
+    settings |= {"snapshots": snapshots, "average": average(cfg, models)}
     records = (dataset.train, dataset.validation, dataset.selection)
     search = partial(lfrtorch.fit_starts, models, *records, **settings)
     with Termination(ranks) as termination:
@@ -139,6 +140,14 @@ def starts(cfg: DictConfig, bla: lfrtorch.LinearModel, dataset: Dataset) -> list
     for model in models:
         model.lfr.to(device=cfg.device, dtype=getattr(torch, cfg.dtype))
     return models
+
+
+def average(cfg: DictConfig, models: Sequence[lfrtorch.Model]) -> int:
+    """Of how many starts the model is the mean, at most; 1 with a note where there is no mean."""
+    if cfg.average > 1 and not all(is_network(model.lfr.cell.static) for model in models):
+        print("note: average is for networks; the best start is kept")
+        return 1
+    return cfg.average
 
 
 def loaded(cfg: DictConfig) -> Dataset:
@@ -351,11 +360,6 @@ def require(cfg: DictConfig) -> None:
     integer("seed", cfg.seed, 0)
     integer("starts", cfg.starts, 1)
     integer("average", cfg.average, 1)
-    if cfg.average > cfg.starts:
-        raise ValueError(
-            f"average is {cfg.average} and starts are {cfg.starts}: the mean is of some of the "
-            f"starts; give starts={cfg.average} or more."
-        )
     if cfg.threads is not None:
         integer("threads", cfg.threads, 1)
     if cfg.dtype not in ("float32", "float64"):

@@ -30,6 +30,7 @@ from lfrtorch.average import average as mean_of
 from lfrtorch.checks import integer
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
+from lfrtorch.nonlinearity import is_network
 from lfrtorch.ranks import LOST, Ranks
 from lfrtorch.records import Record, as_records
 from lfrtorch.residual import Ridge, SimulationError
@@ -118,8 +119,8 @@ def fit_starts(
         ``averaged`` says of how many the model is the mean.
 
     Raises:
-        ValueError: no model, another number of lists of monitors, fewer models than are to be
-            averaged, or see :func:`lfrtorch.fit` and :func:`lfrtorch.average`.
+        ValueError: no model, another number of lists of monitors, models to average that have no
+            network, or see :func:`lfrtorch.fit`.
     """
     if not models:
         raise ValueError("there is no model to start from; give one or more.")
@@ -129,10 +130,10 @@ def fit_starts(
             "model its own."
         )
     integer("average", average, 1)
-    if average > len(models):
+    if average > 1 and not all(is_network(model.lfr.cell.static) for model in models):
         raise ValueError(
-            f"average is {average} and starts are {len(models)}: the mean is of some of the "
-            "starts; give as many starts or more."
+            f"average is {average}, and the mean is of models with a network as their static "
+            "nonlinearity; give average=1 for other maps."
         )
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots

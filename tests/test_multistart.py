@@ -18,6 +18,7 @@ from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.multistart import LEFT, Round, advance_in_step, fit_starts
+from lfrtorch.nonlinearity import Polynomial
 from lfrtorch.ranks import Ranks
 from lfrtorch.records import Record
 from lfrtorch.trainer import INTERRUPTED, Fit, Progress, fit
@@ -270,7 +271,16 @@ def test_mean_of_starts_is_taken_where_nothing_tells():
     assert result.model.lfr.cell.nx == 3 * models[0].lfr.cell.nx
 
 
-def test_mean_is_of_starts_that_there_are():
-    models, train, validation = several(2)
-    with pytest.raises(ValueError, match="average is 3 and starts are 2"):
-        fit_starts(models, train, validation, average=3)
+def test_mean_is_of_the_starts_that_there_are():
+    models, train, _ = several(2)
+    assert fit_starts(models, train, average=8).averaged == 2
+    assert fit_starts(models[:1], train, average=8).model is models[0]
+    with pytest.raises(ValueError, match="average is 0"):
+        fit_starts(models, train, average=0)
+
+
+def test_mean_of_other_maps_is_refused_before_the_fit():
+    models, train, _ = several(2)
+    models[1].lfr.cell.static = Polynomial(1, 1, 3, dtype=torch.float64)
+    with pytest.raises(ValueError, match="average is 2, and the mean is of models with a network"):
+        fit_starts(models, train, average=2, optimiser=Adam(epochs=10**9))

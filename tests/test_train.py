@@ -326,6 +326,24 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
     assert weights[0] == weights[1]
 
 
+def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
+    settings = [*file_overrides(csv), "nx=1", "starts=3", "average=3", "trainer.max_iter=3"]
+    judged = train.identify(configuration(*settings, "data.validation=0", "figures=true"), tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["averaged"], metrics["sizes"]["nx"]) == (3, 3)
+    assert judged == metrics["ranking"][0]["train"]
+    model = lfrtorch.load(tmp_path)
+    assert model.sizes == metrics["sizes"]
+    assert "mean of the best 3" in (tmp_path / "report.html").read_text()
+
+
+def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    settings = [*file_overrides(csv), "nx=1", "starts=2", "average=2", "trainer.max_iter=1"]
+    train.identify(configuration(*settings, "init=polynomial", "figures=false"), tmp_path)
+    assert "note: average is for networks" in capsys.readouterr().out
+    assert json.loads((tmp_path / "metrics.json").read_text())["averaged"] == 1
+
+
 def test_a_new_run_forgets_the_one_that_it_replaces(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=2"]
     for seed in (0, 1):
