@@ -1,9 +1,12 @@
 """Cascaded tanks benchmark: the official split, and the file."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.io import savemat
 
+import lfrtorch
 from lfrtorch.datasets import cascaded_tanks, official
 
 FILE = "Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat"
@@ -26,7 +29,7 @@ def scored(record):
 
 
 def test_official_split(numbered):
-    data = cascaded_tanks.load(root=numbered, first=768)
+    data = cascaded_tanks.load(root=numbered, validation=0.25, first=768)
     (train,), (validation,), (test,) = data.train, data.validation, data.tests
     assert (data.name, [r.name for r in (train, validation, test)]) == (
         "cascaded_tanks",
@@ -53,8 +56,15 @@ def test_the_rules_of_the_cuts(numbered):
     assert data.leaderboard[0].skip == 50
 
 
-def test_validation_amid_the_record(numbered):
+def test_all_samples_train_where_none_validate(numbered):
     data = cascaded_tanks.load(root=numbered)
+    assert [scored(record) for record in data.train] == [(1, 1024)]
+    assert data.train[0].start == "estimated"
+    assert data.validation == []
+
+
+def test_validation_amid_the_record(numbered):
+    data = cascaded_tanks.load(root=numbered, validation=0.25)
     assert [scored(record) for record in data.train] == [(1, 256), (513, 1024)]
     assert {record.start for record in (*data.train, *data.validation)} == {"estimated"}
     (validation,) = data.validation
@@ -64,11 +74,11 @@ def test_validation_amid_the_record(numbered):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"validation": 0}, "data.validation is 0"),
+        ({"validation": -0.1}, "data.validation is -0.1"),
         ({"validation": 1.0}, "leaves 0 of the 1024"),
         ({"skip": 0}, "data.skip is 0"),
         ({"first": 0}, "data.first is 0"),
-        ({"first": 769}, "data.first is 769.*give 768 at most"),
+        ({"validation": 0.25, "first": 769}, "data.first is 769.*give 768 at most"),
     ],
 )
 def test_refused_arguments(arguments, match):
@@ -90,7 +100,7 @@ def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered
         (root / FILE).write_bytes((numbered / FILE).read_bytes())
 
     monkeypatch.setattr(official, "_download", download)
-    assert scored(cascaded_tanks.load(root=root, download=True).train[0]) == (1, 256)
+    assert scored(cascaded_tanks.load(root=root, download=True).train[0]) == (1, 1024)
 
 
 def test_a_file_of_another_length_is_refused(numbered):
@@ -101,9 +111,17 @@ def test_a_file_of_another_length_is_refused(numbered):
 
 @pytest.mark.data
 def test_official_file(benchmark_root):
-    data = cascaded_tanks.load(root=benchmark_root, first=768)
-    (validation,), (test,) = data.validation, data.tests
-    for record in (validation, test):
+    data = cascaded_tanks.load(root=benchmark_root)
+    (train,), (test,) = data.train, data.tests
+    for record in (train, test):
         assert record.y.max() == pytest.approx(10.0, abs=0.01)  # the sensor's end
         assert np.count_nonzero(record.y > 9.9) > 40
-    assert validation.y[0, 0] == pytest.approx(test.y[0, 0], abs=0.3)  # one start state, or nearly
+    assert train.y[0, 0] == pytest.approx(test.y[0, 0], abs=0.3)  # one start state, or nearly
+
+
+@pytest.mark.data
+def test_no_mode_of_the_linear_model_is_drift(benchmark_root):
+    """Of seven eighths of the record, the least cost has a pole of 0.999996."""
+    (whole,) = cascaded_tanks.load(root=benchmark_root).train
+    part = replace(whole[:896], start="estimated")
+    assert abs(lfrtorch.estimate_bla(part, nx=2).poles).max() < 0.985

@@ -19,7 +19,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lfrtorch.checks import integer
+from lfrtorch.checks import integer, number
 from lfrtorch.datasets import Dataset, Published, official
 from lfrtorch.records import Channel, Record
 
@@ -42,30 +42,30 @@ _PUBLISHED = (
 
 def load(
     *,
-    validation: float = 0.25,
+    validation: float = 0.0,
     first: int = 256,
     skip: int = _WINDOW,
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """The estimation record, cut in time for training and validation, and the test record.
+    """The estimation record, whole or cut in time for training and validation, and the test record.
 
-    Training estimates its start states with the parameters. The validation record is the estimation
+    Training estimates its start states with the parameters. A validation record is the estimation
     record up to the last sample that validates: the samples before the first one, which it skips,
     give its start state. The start state of the test is fitted to its first ``skip`` samples.
 
     Args:
-        validation: fraction of the estimation samples that validate.
-        first: the first of them, counted from 0; what is before and what is after trains. The last
-            quarter, 768, has the only inputs below 1.2 V and the second overflow.
+        validation: fraction of the estimation samples that validate; 0: all of them train, as each
+            of the two overflows and the only inputs below 1.2 V (the last quarter's) are wanted.
+        first: the first of them, counted from 0; what is before and what is after trains.
         skip: samples at the beginning of the test that are not scored.
         download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
         root: folder that holds ``Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat``; by default
             the cache folder of the package nonlinear_benchmarks.
 
     Shape:
-        u, y (V) of training: (256, 1) and (512, 1); of validation: (512, 1), 256 of them scored; of
-        the test ``"test"``: (1024, 1), 974 scored.
+        u, y (V) of training: (1024, 1), or (256, 1) and (512, 1) with ``validation=0.25``; of
+        validation: (512, 1), 256 of them scored; of the test ``"test"``: (1024, 1), 974 scored.
 
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.
@@ -73,7 +73,8 @@ def load(
         OSError: the download fails.
     """
     integer("data.skip", skip, 1)
-    held_out = official.held_out(_SAMPLES, validation)
+    number("data.validation", validation)
+    held_out = official.held_out(_SAMPLES, validation) if validation else 0
     latest = _SAMPLES - held_out
     integer("data.first", first, 1)
     if first > latest:
@@ -92,17 +93,20 @@ def load(
         )
 
     whole, end = record("train", 0), first + held_out
-    before = official.part(whole, 0, first, warm_up=0, name="train", start="estimated")
-    after = [
-        official.part(whole, end, _SAMPLES, warm_up=0, name="train, after", start="estimated")
-        for _ in range(end < _SAMPLES)
-    ]
+
+    def part(name: str, first: int, last: int, warm_up: int = 0) -> Record:
+        return official.part(whole, first, last, warm_up=warm_up, name=name, start="estimated")
+
+    train, chosen = [whole], []
+    if held_out:
+        train = [part("train", 0, first)]
+        if end < _SAMPLES:
+            train.append(part("train, after", end, _SAMPLES))
+        chosen = [part("validation", first, end, first)]
     return Dataset(
         name="cascaded_tanks",
-        train=[before, *after],
-        validation=[
-            official.part(whole, first, end, warm_up=first, name="validation", start="estimated")
-        ],
+        train=train,
+        validation=chosen,
         tests=[record("test", 1, skip=skip)],
         leaderboard=[record("test", 1, skip=_WINDOW)],
         published=_PUBLISHED,
