@@ -76,9 +76,9 @@ class Model:
             data: a record, or an input in physical units.
             start: ``"zero"`` (x = 0: at rest at the input's offset, exactly so for the linear model
                 and the start of a fit, later up to the network's bias), ``"given"`` (x0),
-                ``"periodic"``, or ``"estimated"``: from the state that fits the record's output
-                best, in the samples it skips, or in all if it skips none. Where left
-                out, the record's own, and ``"zero"`` for a bare input.
+                ``"periodic"``, or ``"estimated"``: from the most probable state, given the record's
+                output in the samples it skips, or in all if it skips none. Where left out, the
+                record's own, and ``"zero"`` for a bare input.
             x0: start state in the model's coordinates, for ``start="given"``.
 
         Shape:

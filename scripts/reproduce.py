@@ -253,13 +253,14 @@ def costs(each: Case) -> str:
         for name in ("nx", "nz", "nw", "nn", "degree")
         if name in run["sizes"]
     )
+    mean = run.get("averaged", 1)
     iteration = np.median([r["fit"]["seconds_per_iteration"] for r in each.runs])
     cells = [
         each.name,
         sizes,
         f"{run['parameters']} ({run['parameters_net']})",
         str(run["data"]["samples"]),
-        str(run["starts"]) + f", mean of {run['averaged']}" * (run.get("averaged", 1) > 1),
+        str(run["starts"]) + (f", mean of {mean}" if mean > 1 else ""),
         str(run["fit"]["iterations"]),
         f"{np.median([r['seconds'] for r in each.runs]):.0f}",
         f"{1e3 * iteration:.0f}",
