@@ -55,6 +55,10 @@ FINALISTS = 2
 """Least number of starts that go to the end: of four on the parallel Wiener-Hammerstein stand-in
 the best one after 25 iterations ended in a poor minimum at one of five realisations."""
 
+AS_GOOD = 1.01
+"""Ratio of errors up to which a mean of more starts is as good: the best of many iterates of some
+starts is so by luck, too, on the records that chose it."""
+
 LEFT = "others were better"
 """Reason of a start that was left."""
 
@@ -106,9 +110,9 @@ def fit_starts(
             and 0.8 with those at a half and a fifth of it. Iterates that are chosen there are among
             the first where the model is too small, and worse at the training's level by up to 6 %.)
         average: so many starts go to the end at least, and the model of the result is the mean of
-            so many of the best at most (:func:`lfrtorch.average`): of as many as are best on
-            validation and selection, which may be one, and without both of all. Starts that inputs
-            twice as loud as those of training make run away have no part in it.
+            so many of the best at most (:func:`lfrtorch.average`): of as many as come within 1 % of
+            the best error on validation and selection, which may be one, and without both of all.
+            Starts that inputs twice as loud as those of training make run away have no part in it.
         monitors: of each start, called one at a time.
         watch: called after each round.
         snapshots: where the starts are kept as far as they came. Where some are, they go on from
@@ -221,9 +225,10 @@ class _Judge:
         return tuple(found)
 
     def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
-        """The mean of the first few models that is best, of how many, or none where one is better.
+        """The mean of as many of the models as do about as well as the best, and of how many.
 
-        Where there is nothing to judge on, the mean of all.
+        None where a single start is better than all means. Where there is nothing to judge on, the
+        mean of all.
         """
         if not self._unseen:
             return (mean_of(best), len(best)) if len(best) > 1 else (None, 1)
@@ -234,8 +239,8 @@ class _Judge:
             scores.append(error.cost(error.residual(error.theta)))
         # Rounding may differ between processes, and the choice must not.
         scores = self.fits[0].ranks.first(torch.tensor(scores, dtype=torch.float64))
-        chosen = int(scores.nan_to_num(math.inf).argmin())
-        return (means[chosen - 1], chosen + 1) if chosen else (None, 1)
+        count = 1 + int((scores <= AS_GOOD**2 * scores.nan_to_num(math.inf).min()).nonzero().max())
+        return (means[count - 2], count) if count > 1 else (None, 1)
 
     def _score(self, fit: Fit) -> float:
         if not fit.history:

@@ -254,6 +254,19 @@ def test_mean_of_as_many_starts_as_are_best_is_taken(judged_on: str):
     assert rmse(validation, result.model.simulate(validation)) == errors[1]
 
 
+def test_mean_of_more_starts_is_taken_where_it_is_as_good():
+    """The best one is by some luck: here by less than 1 %."""
+    models, train, validation = several(3)
+    for i, model in enumerate(models):
+        move(model, 0.1 + 3e-4 * i - 0.05 * (i + 1))  # to 0.1, 0.1003 and 0.1006
+    stay = Adam(epochs=1, learning_rate=1e-12)
+    result = fit_starts(models, train, validation, optimiser=stay, average=3)
+    assert result.averaged == 3
+    assert rmse(validation, result.model.simulate(validation)) > min(
+        start.validation for start in result.starts
+    )
+
+
 def test_mean_of_starts_is_not_taken_where_one_is_better():
     models, train, validation = several(2)
     move(models[0], -0.05)  # the one that made the data
