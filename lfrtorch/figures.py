@@ -34,7 +34,8 @@ def of_run(
             if not plots.is_whole(record):
                 drawn[f"{record.name}_density"] = plots.density(*signals)
     signals = model.signals(dataset.train[0])
-    drawn["static_map"] = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
+    of_best = [s[0, :, : s.shape[2] // result.averaged].numpy() for s in (signals.z, signals.w)]
+    drawn["static_map"] = plots.static_map(*of_best)
     unit = model.outputs[0].unit
     drawn["convergence"] = plots.convergence(result.history, result.chosen_iteration, unit)
     drawn["frequency_response"] = linear_plots.frequency_response(bla, measured(dataset.train))

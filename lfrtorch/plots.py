@@ -25,9 +25,6 @@ DPI = 150
 MOST_POINTS = 20_000
 """Samples drawn of a long signal as a cloud."""
 
-MOST_PANELS = 4
-"""Signals z and w of a static nonlinearity that are drawn."""
-
 CLOSE_UP = 500
 """Samples of a close-up: some periods of what the model follows."""
 
@@ -150,13 +147,13 @@ def static_map(z: Array, w: Array) -> Figure:
     """The static nonlinearity over the region that the data visited.
 
     One input: w against z with the data's density below. Two: w in colour over the (z1, z2) plane.
-    More: w against each z in turn, of many the first MOST_PANELS.
+    More: w against each z in turn.
 
     Shape:
         z: (samples, nz), w: (samples, nw), normalised units, along a simulation.
     """
     step = max(1, len(z) // MOST_POINTS)
-    z, w = z[::step, :MOST_PANELS], w[::step, :MOST_PANELS]
+    z, w = z[::step], w[::step]
     nz, nw = z.shape[1], w.shape[1]
     columns = nz if nz > 2 else 1
     figure = Figure(figsize=(5.5 * columns, 4.0 * nw), layout="constrained")

@@ -191,7 +191,8 @@ def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: boo
         "data.root=DIR`. *chosen* is the run that is best on validation (of the tanks, all of "
         "whose samples train, on training), then the median and the range of all runs (seeds 0, "
         "1, ...); LTI is the best linear approximation (of parwh one a level). *seconds* are those "
-        "of the whole command, the linear model, all starts, scores and figures included (median).",
+        "of the whole command, the linear model, all starts, scores and figures included (median). "
+        "Sizes of a mean are those of each start; its parameters count the zeros between them.",
         "",
     ]
     if quick:
@@ -248,12 +249,12 @@ def rows(each: Case) -> list[str]:
 def costs(each: Case) -> str:
     """What the runs of a benchmark take, as a line of the table."""
     run = each.runs[each.chosen]
+    mean = run.get("averaged", 1)
     sizes = ", ".join(
-        str(run["sizes"][name])
+        str(run["sizes"][name] // mean)
         for name in ("nx", "nz", "nw", "nn", "degree")
         if name in run["sizes"]
     )
-    mean = run.get("averaged", 1)
     iteration = np.median([r["fit"]["seconds_per_iteration"] for r in each.runs])
     cells = [
         each.name,
