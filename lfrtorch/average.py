@@ -39,7 +39,7 @@ def average(models: Sequence[Model]) -> Model:
                 f"the mean is of models with a network, and one of these has {static!r} as its "
                 "static nonlinearity; average the simulated outputs instead."
             )
-        if static.activation != networks[0].activation if networks else False:
+        if networks and static.activation != networks[0].activation:
             raise ValueError("the models have networks of different activations; give one kind.")
         if not _alike(model, first):
             raise ValueError(

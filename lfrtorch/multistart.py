@@ -175,10 +175,7 @@ def fit_starts(
     ranked = judge.ranked(fits)
     result = replace(ranked[0].result(), starts=judge.summaries(ranked))
     if average > 1:
-        best = judge.ranked(field)
-        # With one that runs away the mean does.
-        best = [fit for fit in best if loudest(fit.model, as_records(train)) >= max(LOUDER)]
-        mean, count = judge.mean([fit.model for fit in best[:average]])
+        mean, count = judge.mean(judge.stable(field, as_records(train))[:average])
         if mean is not None:
             result = replace(result, model=mean, averaged=count)
     return replace(result, seconds=time.perf_counter() - clock)
@@ -224,6 +221,16 @@ class _Judge:
             )
         return tuple(found)
 
+    def stable(self, fits: Sequence[Fit], train: Sequence[Record]) -> list[Model]:
+        """The models that stay stable on louder inputs, the best first: with one a mean runs away.
+
+        Rounding may differ between processes, and the choice must not.
+        """
+        models = [fit.model for fit in self.ranked(fits)]
+        reach = torch.tensor([loudest(model, train) for model in models], dtype=torch.float64)
+        reach = self.fits[0].ranks.first(reach).tolist()
+        return [model for model, to in zip(models, reach, strict=True) if to >= max(LOUDER)]
+
     def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
         """The mean of as many of the models as do about as well as the best, and of how many.
 
@@ -237,7 +244,6 @@ class _Judge:
         for mean in means:
             error = SimulationError(mean, self._unseen, solved_starts=True)
             scores.append(error.cost(error.residual(error.theta)))
-        # Rounding may differ between processes, and the choice must not.
         scores = self.fits[0].ranks.first(torch.tensor(scores, dtype=torch.float64))
         count = 1 + int((scores <= AS_GOOD**2 * scores.nan_to_num(math.inf).min()).nonzero().max())
         return (means[count - 2], count) if count > 1 else (None, 1)

@@ -31,6 +31,7 @@ from lfrtorch.distributed import connect
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt, LMState
 from lfrtorch.model import Model, load
 from lfrtorch.monitor import Checkpoint
+from lfrtorch.multistart import fit_starts
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
 from lfrtorch.records import Record
 from lfrtorch.residual import SimulationError
@@ -147,8 +148,17 @@ def slope(ranks: Ranks) -> dict[str, Any]:
     return found | {"step": system.solve(product, 0.1), "start": problem.theta}
 
 
+def averaged(ranks: Ranks) -> tuple[Tensor, int]:
+    """Weights of a mean of starts, without validation, and of how many."""
+    models, (_, train, _) = [case()[0], case()[0]], case()
+    optimiser = LevenbergMarquardt(max_iter=2)
+    result = fit_starts(models, train, optimiser=optimiser, average=2, ranks=ranks)
+    return theta(result.model), result.averaged
+
+
 def everything(ranks: Ranks) -> dict[str, Any]:
     found: dict[str, Any] = {name: fitted(name, ranks) for name in FITS}
+    found["averaged"] = averaged(ranks)
     found["slope"] = slope(ranks)
     rows = normal(2 * ranks.rank, 3, seed=ranks.rank)
     found["stacked"] = ranks.stack(rows), ranks.first(normal(3 - ranks.rank, 2))
@@ -163,6 +173,12 @@ def everything(ranks: Ranks) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     return start(everything, tmp_path_factory.mktemp("ranks"))
+
+
+def test_two_processes_take_one_mean(both: list[dict[str, Any]]):
+    (first, count), (second, other) = (found["averaged"] for found in both)
+    assert count == other == averaged(Ranks())[1] == 2
+    assert torch.equal(first, second)
 
 
 @pytest.mark.parametrize("name", FITS)
