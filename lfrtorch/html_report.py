@@ -135,7 +135,8 @@ def verdict(responses: Sequence[Response]) -> list[str]:
 def _line(name: str, unit: str, errors: Errors) -> str:
     if not math.isfinite(errors.error):
         return f"{name}: the NL-LFR diverges"
-    below = f"error {number(errors.ratio)} × below" if errors.ratio > 1 else "no error below"
+    lower = _to_three_digits(errors.ratio) > 1  # a ratio of 1 + rounding errors is none
+    below = f"error {number(errors.ratio)} × below" if lower else "no error below"
     error, lti = (f"{number(value)} {unit}".strip() for value in (errors.error, errors.lti))
     relative = percent(errors.relative)
     return f"{name}: {below} the linear model's ({error} beside {lti}), NRMSE {relative}"
@@ -145,11 +146,15 @@ def number(value: float | None) -> str:
     """Three digits; a dash where it is not known or not finite."""
     if value is None or not math.isfinite(value):
         return "–"
-    if value == 0 or 1e-3 <= abs(value) < 1e5:
-        digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
+    mantissa, exponent = f"{value:.2e}".split("e")  # the exponent is that of the rounded value
+    if value == 0 or 1e-3 <= abs(_to_three_digits(value)) < 1e5:
+        digits = max(0, 2 - int(exponent)) if value else 0
         return f"{value:.{digits}f}"
-    mantissa, exponent = f"{value:.2e}".split("e")
     return f"{mantissa}e{int(exponent)}"
+
+
+def _to_three_digits(value: float) -> float:
+    return float(f"{value:.2e}")
 
 
 def percent(ratio: float | None) -> str:

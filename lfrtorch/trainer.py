@@ -294,8 +294,9 @@ class Fit:
         """
         numbers, tensors = snapshot.read(path)
         device = self.problem.theta.device
-        self.problem.load_state_dict(snapshot.within("problem.", tensors, device))
         like = self.optimiser.init(self.problem, self.problem.theta)
+        # After init, which may evaluate gradients and leave guesses of periodic orbits behind.
+        self.problem.load_state_dict(snapshot.within("problem.", tensors, device))
         try:
             state = snapshot.within("state.", tensors, device)
             state = snapshot.unpacked(like, numbers["state"], state)

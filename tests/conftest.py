@@ -1,9 +1,12 @@
 import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy's, read at its import; see below
+# Small matrices: more threads cost more than they give. Emulated machines have two, too.
+THREADS = int(os.environ.get("LFRTORCH_TEST_THREADS", "1"))
+os.environ.setdefault("OPENBLAS_NUM_THREADS", str(THREADS))  # numpy's, read at its import
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +14,7 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parents[1]
 
-torch.set_num_threads(1)  # small matrices: more threads cost more than they give
+torch.set_num_threads(THREADS)
 
 # Same examples in every run, none kept on disk; compilation may take its time.
 settings.register_profile("lfrtorch", deadline=None, derandomize=True, database=None)
@@ -30,8 +33,21 @@ def benchmark_root() -> Path:
     pytest.skip("no benchmark files: set LFRTORCH_DATA to a folder of the nonlinear benchmarks")
 
 
+@pytest.fixture
+def official(benchmark_root: Path) -> Callable[..., Any]:
+    """Reads a benchmark with the reader given; a test whose files are missing is skipped."""
+
+    def load(reader: Callable[..., Any], **options: Any) -> Any:
+        try:
+            return reader(root=benchmark_root, **options)
+        except FileNotFoundError as missing:
+            pytest.skip(str(missing))
+
+    return load
+
+
 @pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
+def same_threads() -> Iterator[None]:
     """Whatever a test does to torch's threads ends with it."""
     yield
-    torch.set_num_threads(1)
+    torch.set_num_threads(THREADS)

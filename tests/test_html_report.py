@@ -221,6 +221,15 @@ def test_many_tests_have_one_verdict(single: Run):
     assert lost == "t3: the NL-LFR diverges"
 
 
+@pytest.mark.parametrize(("part", "below"), [(1 - 1e-15, False), (1 + 1e-15, False), (0.99, True)])
+def test_a_ratio_of_one_plus_rounding_is_no_gain(single: Run, part: float, below: bool):
+    test = single.responses[-1]
+    error = test.record.y - test.y_lti
+    (line,) = html_report.verdict([replace(test, y_hat=test.record.y - part * error)])
+    assert ("no error below" not in line) is below
+    assert ("error 1.01 × below" in line) is below
+
+
 def test_a_linear_model_alone_is_shown(single: Run):
     cell = lfrtorch.LFRCell(1, 1, 2, 0, 0, None).double()
     single.bla.write(cell, single.result.model.scaler)
@@ -254,6 +263,12 @@ def test_roots_of_a_known_oscillator():
         (1234.56, "1235"),
         (12.345, "12.3"),
         (0.00123456, "0.00123"),
+        (9.9999, "10.0"),  # the digits are those of the rounded value
+        (99.99, "100"),
+        (999.9, "1000"),
+        (0.00099999, "0.00100"),
+        (99999.0, "1.00e5"),
+        (9.999e-5, "1.00e-4"),
         (9.4e-5, "9.40e-5"),
         (2e6, "2.00e6"),
         (math.nan, "–"),

@@ -1,0 +1,306 @@
+"""Does the suite notice faults? Small ones are put into the numerical core, one at a time.
+
+    python tests/mutants.py --count 300 --seed 0 --out mutants.md
+
+Mutants are drawn at random; each is tried on the tests of its module alone, in a copy of the
+sources. One that no test notices is either a gap in the tests or does not change what the code
+promises (a speed-up, a tolerance): read it and say which. Operators are those of cosmic-ray, which
+``make mutants`` installs, and two of our own: a term that is dropped, a statement that is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import multiprocessing
+import os
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, NamedTuple
+
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.operators import (
+    binary_operator_replacement,
+    boolean_replacer,
+    comparison_operator_replacement,
+    number_replacer,
+    unary_operator_replacement,
+    zero_iteration_for_loop,
+)
+from cosmic_ray.operators.operator import Operator
+
+ROOT = Path(__file__).resolve().parents[1]
+
+TESTS: dict[str, str] = {
+    "recurrence": "recurrence newton sensitivity",
+    "newton": "newton",
+    "simulate": "simulate model newton",
+    "slopes": "sensitivity simulate",
+    "static_slopes": "static_slopes sensitivity",
+    "emission": "sensitivity residual",
+    "sensitivity": "sensitivity residual",
+    "layout": "sensitivity residual",
+    "jacobian": "residual memory",
+    "factors": "factors residual",
+    "batch": "residual",
+    "gauge": "gauge residual",
+    "residual": "residual trainer",
+    "stack": "stack",
+    "levenberg_marquardt": "levenberg_marquardt",
+    "adam": "adam",
+    "trainer": "trainer resume",
+    "resume": "resume",
+    "snapshot": "resume",
+    "multistart": "multistart resume",
+    "records": "records stream",
+    "subspace": "subspace bla",
+    "regression": "frf subspace",
+    "linear_search": "bla signal_error response_error",
+    "response_error": "response_error bla",
+    "signal_error": "signal_error bla",
+    "bla": "bla order",
+    "lines": "response_error bla",
+    "spectra": "frf",
+    "local_polynomial": "frf",
+    "frf": "frf",
+}
+"""The modules of the numerical core, and their tests."""
+
+TOO_LONG = 240.0
+"""Seconds after which a mutant that is still running has been noticed: the clean tests take 30."""
+
+LIBRARIES = ["torch", "numba", "scipy.signal", "scipy.io", "pandas", "matplotlib", "hypothesis"]
+"""Imported once, for all mutants."""
+
+
+class Mutant(NamedTuple):
+    """One fault: the occurrence of an operator in a module."""
+
+    module: str
+    line: int
+    operator: Operator
+    occurrence: int
+
+    def source(self, clean: str) -> str:
+        """The module's source with the fault."""
+        mutated = mutate_code(clean, self.operator, self.occurrence)
+        assert mutated is not None
+        return mutated
+
+
+class DropTerm(Operator):
+    """a + b becomes a, and a * b becomes a."""
+
+    def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        """The last term of a sum or product."""
+        if node.type in ("arith_expr", "term"):
+            yield node.start_pos, node.end_pos
+
+    def mutate(self, node: Any, index: int) -> Any:
+        """Without it."""
+        node.children = node.children[:-2]
+        return node
+
+    @classmethod
+    def examples(cls) -> tuple[()]:
+        """None."""
+        return ()
+
+
+class DropStatement(Operator):
+    """A call, or an assignment to what exists already, becomes ``pass``."""
+
+    def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        """Where one stands."""
+        if node.type == "simple_stmt" and self._is_left_out(node.children[0]):
+            yield node.start_pos, node.end_pos
+
+    def _is_left_out(self, statement: Any) -> bool:
+        if statement.type == "atom_expr":
+            return True
+        if statement.type != "expr_stmt":
+            return False
+        target, operator = statement.children[0], statement.children[1]
+        augmented = operator.type == "operator" and operator.value != "="
+        return augmented or (operator.type == "operator" and target.type == "atom_expr")
+
+    def mutate(self, node: Any, index: int) -> Any:
+        """``pass`` in its place."""
+        first = node.get_first_leaf()
+        node.children[0] = type(first)("pass", first.start_pos, prefix=first.prefix)
+        return node
+
+    @classmethod
+    def examples(cls) -> tuple[()]:
+        """None."""
+        return ()
+
+
+def operators() -> list[Operator]:
+    """Faults that someone might make; no shifts of floats, which any test notices."""
+    arithmetic = (
+        "Add_Sub Sub_Add Mul_Div Div_Mul FloorDiv_Div FloorDiv_Mul Mod_FloorDiv Pow_Mul "
+        "BitAnd_BitOr BitOr_BitAnd"
+    )
+    comparisons = (
+        "Lt_LtE LtE_Lt Gt_GtE GtE_Gt Lt_Gt Gt_Lt LtE_Gt GtE_Lt Eq_NotEq NotEq_Eq Is_IsNot IsNot_Is"
+    )
+    unary = "USub_Nothing Not_Nothing Invert_Nothing"
+    found = [
+        *(
+            getattr(binary_operator_replacement, f"ReplaceBinaryOperator_{name}")
+            for name in arithmetic.split()
+        ),
+        *(
+            getattr(comparison_operator_replacement, f"ReplaceComparisonOperator_{name}")
+            for name in comparisons.split()
+        ),
+        *(
+            each
+            for each in unary_operator_replacement.operators()
+            if each.__name__.endswith(tuple(unary.split()))
+        ),
+        boolean_replacer.AddNot,
+        boolean_replacer.ReplaceTrueWithFalse,
+        boolean_replacer.ReplaceFalseWithTrue,
+        boolean_replacer.ReplaceAndWithOr,
+        boolean_replacer.ReplaceOrWithAnd,
+        number_replacer.NumberReplacer,
+        zero_iteration_for_loop.ZeroIterationForLoop,
+        DropTerm,
+        DropStatement,
+    ]
+    return [operator() for operator in found]
+
+
+def mutants(module: str) -> Iterator[Mutant]:
+    """All of a module, but for those in annotations, assertions, messages and decorators."""
+    tree = get_ast((ROOT / "lfrtorch" / f"{module}.py").read_text())
+    for operator in operators():
+        positions = (node for node in ast_nodes(tree) for _ in operator.mutation_positions(node))
+        for occurrence, node in enumerate(positions):
+            if not _is_outside(node):
+                yield Mutant(module, node.start_pos[0], operator, occurrence)
+
+
+def _is_outside(node: Any) -> bool:
+    """Whether a node has no effect on what is computed."""
+    below = None
+    while node is not None:
+        if node.type in ("annassign", "tfpdef", "decorator", "assert_stmt", "raise_stmt"):
+            return not (node.type == "annassign" and below is node.children[-1])
+        if node.type in ("fstring", "import_from"):
+            return True
+        if node.type == "funcdef" and below is not None and below is node.annotation:
+            return True
+        below, node = node, node.parent
+    return False
+
+
+def _run(folder: Path, module: str) -> None:
+    """In a process of its own: the exit code is that of pytest."""
+    import pytest
+
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+    os.chdir(folder)
+    os.environ["PYTHONPATH"] = str(folder)
+    sys.path[:0] = [str(folder)]
+    files = [f"tests/test_{name}.py" for name in TESTS[module].split()]
+    os._exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *files]))
+
+
+def is_noticed(mutant: Mutant | str, folder: Path, processes: Any) -> bool:
+    """Whether the tests of the module fail on the mutant; of a module's name, on the clean one."""
+    module = mutant if isinstance(mutant, str) else mutant.module
+    path = folder / "lfrtorch" / f"{module}.py"
+    clean = (ROOT / "lfrtorch" / f"{module}.py").read_text()
+    if isinstance(mutant, Mutant):
+        path.write_text(mutant.source(clean))
+    process = processes.Process(target=_run, args=(folder, module))
+    process.start()
+    process.join(TOO_LONG)
+    if late := process.is_alive():
+        process.kill()
+        process.join()
+    shutil.copy2(ROOT / "lfrtorch" / f"{module}.py", path)
+    for file in (folder / "lfrtorch/__pycache__").glob(f"{module}.*"):
+        file.unlink()
+    for file in (ROOT / "lfrtorch/__pycache__").glob(f"{module}.*"):  # kernels compiled already
+        shutil.copy2(file, folder / "lfrtorch/__pycache__")
+    return late or process.exitcode != 0
+
+
+def difference(mutant: Mutant) -> str:
+    """The lines that the mutant changes."""
+    clean = (ROOT / "lfrtorch" / f"{mutant.module}.py").read_text()
+    lines = difflib.unified_diff(
+        clean.splitlines(), mutant.source(clean).splitlines(), n=0, lineterm=""
+    )
+    return "\n".join(line for line in lines if line[:3] not in ("---", "+++"))
+
+
+def main() -> int:
+    """Draw, try and list them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--modules", nargs="+", choices=sorted(TESTS), default=sorted(TESTS))
+    parser.add_argument("--only", nargs="+", type=int, help="numbers of the draw to try again")
+    parser.add_argument("--out", type=Path, default=Path("mutants.md"))
+    given = parser.parse_args()
+
+    every = [mutant for module in given.modules for mutant in mutants(module)]
+    drawn = random.Random(given.seed).sample(every, min(given.count, len(every)))
+    numbers = range(len(drawn)) if given.only is None else given.only
+    print(f"{len(numbers)} of {len(every)} mutants in {len(given.modules)} modules", flush=True)
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(LIBRARIES)
+    begun, noticed = time.monotonic(), 0
+    with tempfile.TemporaryDirectory() as top, given.out.open("w") as out:
+        folders: SimpleQueue[Path] = SimpleQueue()
+        for job in range(given.jobs):
+            folder = Path(top) / str(job)
+            ignored = shutil.ignore_patterns(".venv", ".git", "runs", "results")
+            shutil.copytree(ROOT, folder, ignore=ignored)
+            folders.put(folder)
+
+        def tried(task: Mutant | str) -> bool:
+            folder = folders.get()
+            try:
+                return is_noticed(task, folder, processes)
+            finally:
+                folders.put(folder)
+
+        with ThreadPoolExecutor(given.jobs) as pool:
+            used = sorted({drawn[i].module for i in numbers})
+            for module, failed in zip(used, pool.map(tried, used), strict=True):
+                if failed:
+                    print(f"the tests of {module} fail without a mutant")
+                    return 2
+            found = pool.map(tried, [drawn[i] for i in numbers])
+            for number, caught in zip(numbers, found, strict=True):
+                noticed += caught
+                mutant = drawn[number]
+                if not caught:
+                    name = f"{number}: lfrtorch/{mutant.module}.py, line {mutant.line}"
+                    out.write(f"## {name}\n\n```diff\n{difference(mutant)}\n```\n\n")
+                    out.flush()
+                seconds = time.monotonic() - begun
+                print(f"{number} {mutant.module} {caught} {noticed} {seconds:.0f} s", flush=True)
+    print(f"{noticed} of {len(numbers)} noticed; those that were not are in {given.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
