@@ -14,10 +14,14 @@ import torch
 from torch import Tensor
 
 from lfrtorch.ranks import Ranks
-from lfrtorch.threads import spread, workers
+from lfrtorch.threads import spread
 
 MERGED = 16
 """Triangles that wait before they are made one."""
+
+PIECES, TALL = 16, 8
+"""Most pieces that rows are cut into for the threads, and least rows a column in each: the merge of
+their triangles then takes at most an eighth of the work."""
 
 
 class System(Protocol):
@@ -175,9 +179,12 @@ class Gram:
 def _of_pieces(
     kernel: Callable[[int, Sequence[Tensor], list[Tensor]], None], rows: Tensor
 ) -> list[Tensor]:
-    """What the kernel makes of the rows, in as many pieces as there are threads for them."""
-    threads = workers() if rows.device.type == "cpu" else 1
-    pieces = rows.tensor_split(max(1, min(threads, len(rows) // rows.shape[1])))
+    """What the kernel makes of the rows, in pieces that the threads share.
+
+    The pieces do not depend on the number of threads, and so neither do the digits of their sum.
+    """
+    most = PIECES if rows.device.type == "cpu" else 1
+    pieces = rows.tensor_split(max(1, min(most, len(rows) // (TALL * rows.shape[1]))))
     parts: list[Tensor] = [rows[:0]] * len(pieces)
     spread(kernel, len(pieces), pieces, parts)
     return parts

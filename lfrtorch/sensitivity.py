@@ -153,7 +153,8 @@ class Linearisation:
         R, nx = self.state.shape
         compiled = has_kernels(self.u)
         samples = BLOCK if compiled else PASS
-        together = workers() if compiled else R  # records, a thread each
+        # Blocks do not depend on the number of threads, and so neither do sums over them.
+        together = 1 if compiled else R
         ends = []
         for records in _slices(R, max(together, samples // self.u.shape[1])):
             S = self.state.new_zeros(len(self.u[records]), nx, len(kept) + (nx if start else 0))

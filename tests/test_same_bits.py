@@ -1,0 +1,149 @@
+"""The same data and seed give the same bits on one thread and on two."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from reference import measure, random_cell, random_model
+from threadpoolctl import threadpool_limits
+from torch import Tensor
+
+import lfrtorch
+from lfrtorch import jacobian
+from lfrtorch.adam import Adam
+from lfrtorch.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.model import Model
+from lfrtorch.multistart import fit_starts
+from lfrtorch.records import Record
+
+pytestmark = pytest.mark.numeric
+
+
+class Sine(torch.nn.Linear):
+    """w = sin(W z + b), a map that is not compiled."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        return torch.sin(super().forward(input))
+
+
+def on_threads(threads: int, work: Callable[[], Any]) -> Any:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with threadpool_limits(limits=threads, user_api="blas"):
+            return work()
+    finally:
+        torch.set_num_threads(before)
+
+
+def truth(**options: Any) -> Model:
+    return random_model(random_cell(2, 2, 3, 2, 1, 5, radius=0.7, **options))
+
+
+def own_map() -> dict[str, Any]:
+    torch.manual_seed(0)
+    return {"static": Sine(2, 1, dtype=torch.float64)}
+
+
+def records(T: int = 3000) -> list[Record]:
+    """Of every start state."""
+    model = truth()
+    late = measure(model, 1020, seed=2)[20:]
+    return [
+        measure(model, T),
+        measure(model, 1000, seed=1, start="periodic"),
+        Record(late.u, late.y, fs=late.fs, start="estimated"),
+    ]
+
+
+def noisy(data: list[Record]) -> list[Record]:
+    rng = np.random.default_rng(0)
+    return [
+        Record(r.u, r.y + 0.1 * rng.normal(size=r.y.shape), fs=r.fs, start=r.start) for r in data
+    ]
+
+
+def bits(found: Any) -> list[bytes]:
+    """All numbers of a result."""
+    if isinstance(found, lfrtorch.LinearModel):
+        arrays = (found.A, found.B, found.C, found.D, found.u_offset, found.y_offset)
+        return [np.ascontiguousarray(array).tobytes() for array in arrays]
+    if isinstance(found, Model):
+        return [p.detach().numpy().tobytes() for p in found.lfr.parameters()]
+    if isinstance(found, lfrtorch.FitResult):
+        errors = [(p.train, p.validation) for p in found.history]
+        return [*bits(found.model), np.array(errors).tobytes()]
+    return [np.ascontiguousarray(found).tobytes()]
+
+
+def same(work: Callable[[], Any]) -> None:
+    """Whether the work gives the same bits on one and two threads."""
+    assert bits(on_threads(1, work)) == bits(on_threads(2, work))
+
+
+@pytest.mark.parametrize("options", [dict, own_map], ids=["network", "own map"])
+@pytest.mark.parametrize("start", ["zero", "periodic", "estimated"])
+def test_simulation(options: Callable[[], dict[str, Any]], start: Any):
+    model = truth(**options())
+    (record, *_) = noisy(records(12000))  # torch would use two threads for so many
+    same(lambda: model.simulate(record, start=start))
+
+
+@pytest.mark.parametrize("refine", ["simulation", "prediction", "frequency"])
+def test_best_linear_approximation(refine: Any):
+    data = noisy(records())
+    same(lambda: lfrtorch.estimate_bla(data, nx=3, refine=refine, max_iter=3))
+
+
+def test_initialisation():
+    data = noisy(records())
+    bla = lfrtorch.estimate_bla(data[:1], nx=3, max_iter=1)
+    same(lambda: lfrtorch.initialise(bla, data, nz=2, nw=1, nn=5, seed=1))
+
+
+LM = LevenbergMarquardt(max_iter=2)
+
+
+@pytest.mark.parametrize(
+    ("trainer", "options", "regime", "kept"),
+    [
+        (LM, dict, 0.0, jacobian.KEPT_BYTES),  # normal equations
+        (LM, dict, math.inf, jacobian.KEPT_BYTES),  # orthogonal
+        (LM, dict, 0.0, 0),  # rows in blocks
+        (LM, dict, math.inf, 0),
+        (LM, own_map, 0.0, jacobian.KEPT_BYTES),
+        (Adam(epochs=2), dict, 0.0, jacobian.KEPT_BYTES),
+        (Adam(epochs=2), own_map, 0.0, jacobian.KEPT_BYTES),
+    ],
+)
+def test_single_fit(
+    trainer: Any,
+    options: Callable[[], dict[str, Any]],
+    regime: float,
+    kept: int,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(jacobian, "NORMAL", regime)
+    monkeypatch.setattr(jacobian, "KEPT_BYTES", kept)
+    train, validation = noisy(records()), noisy([measure(truth(), 500, seed=5)])
+
+    def work() -> lfrtorch.FitResult:
+        model = truth(seed=7, **options())
+        return lfrtorch.fit(model, train, validation, optimiser=trainer)
+
+    same(work)
+
+
+def test_several_starts():
+    train, validation = noisy(records()), noisy([measure(truth(), 500, seed=5)])
+
+    def work() -> lfrtorch.FitResult:
+        models = [truth(seed=seed) for seed in range(3)]
+        return fit_starts(models, train, validation, optimiser=LM)
+
+    same(work)
