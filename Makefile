@@ -6,10 +6,10 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadgroup
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all check bench reproduce docs clean
+.PHONY: help setup run test test-all test-machines mutants coverage check bench reproduce docs clean
 
 help:  ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
 
 setup: $(READY)  ## create .venv and install lfrtorch with its tools (PYTHON=python3.12 to choose)
 	@echo "Ready: $(BIN)/python"
@@ -22,6 +22,16 @@ test: $(READY)  ## fast tests (ARGS="-k name ..." is passed on)
 
 test-all: $(READY)  ## all tests, the slow ones too
 	@$(BIN)/python -m pytest -m "" $(PARALLEL) $(ARGS)
+
+test-machines: $(READY)  ## tests that compute, as on other processors (ARGS="oldest newest ...")
+	@$(BIN)/python tests/machines.py $(ARGS)
+
+coverage: $(READY)  ## lines and branches of lfrtorch/ that the fast tests reach
+	@$(BIN)/python -m pytest $(PARALLEL) --cov=lfrtorch --cov-branch --cov-report=term:skip-covered $(ARGS)
+
+mutants: $(READY)  ## faults put into the numerical core: does a test notice? (up to an hour)
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[mutants]'
+	@$(BIN)/python tests/mutants.py $(ARGS)
 
 check: $(READY)  ## format, lint, types, import order
 	@$(BIN)/ruff format --check .

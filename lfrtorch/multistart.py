@@ -116,7 +116,7 @@ def fit_starts(
         monitors: of each start, called one at a time.
         watch: called after each round.
         snapshots: where the starts are kept as far as they came. Where some are, they go on from
-            there, to the same end as if they had not been interrupted (on as many threads).
+            there, to the same end as if they had not been interrupted (on the same machine).
 
     Returns:
         The fit of the best start, its duration that of all; ``starts`` has all, the best first.

@@ -211,7 +211,15 @@ def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: boo
         "|---" * 9 + "|",
     ]
     lines += [costs(each) for each in cases if each.runs]
-    lines += ["", *references(cases), "", *(f"- {line}" for line in machines(cases)), ""]
+    lines += ["", *references(cases), ""]
+    if made_on := machines(cases):
+        lines += [
+            "Made on the machine below. Another processor rounds in other ways, and a fit may end in "
+            "another minimum there: compare medians.",
+            "",
+            *(f"- {line}" for line in made_on),
+            "",
+        ]
     for each in cases:
         if figures.get(each.name):
             lines += [f"## {each.name}", ""]
