@@ -1,7 +1,9 @@
 """A fit that was interrupted ends as if it had not been, to the last bit."""
 
+import copy
+import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,13 @@ from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
 from lfrtorch.multistart import fit_starts
 from lfrtorch.ranks import Ranks
-from lfrtorch.records import Record
+from lfrtorch.records import Record, Start
 from lfrtorch.resume import Snapshots
 from lfrtorch.trainer import INTERRUPTED, Fit, FitResult, Progress
+
+pytestmark = pytest.mark.numeric
+
+STARTS: tuple[Start, ...] = ("zero", "given", "periodic", "estimated")
 
 
 class Sine(torch.nn.Linear):
@@ -34,14 +40,19 @@ def own_map() -> dict[str, Any]:
     return {"static": Sine(2, 1, dtype=torch.float64), "nz": 2}
 
 
-def records(**sizes: Any) -> tuple[list[Record], Record]:
-    """One record of each kind of start, and one for validation."""
+def measured(kind: Start, seed: int, **sizes: Any) -> Record:
+    """A record of the true model whose start is of that kind."""
     truth = random_model(random_cell(**sizes, radius=0.7))
-    train = [measure(truth, 150), measure(truth, 100, seed=1, start="periodic")]
-    unknown = measure(truth, 120, seed=3)[20:]
-    return [*train, Record(unknown.u, unknown.y, fs=unknown.fs, start="estimated")], measure(
-        truth, 150, seed=2
-    )
+    if kind in ("zero", "periodic"):
+        return measure(truth, 60, seed=seed, start=kind)
+    late = measure(truth, 80, seed=seed)
+    return replace(late[20:], start=kind, x0=[0.3, -0.2] if kind == "given" else None)
+
+
+def records(kinds: Sequence[Start] = STARTS, **sizes: Any) -> tuple[list[Record], Record]:
+    """One record of each kind of start, and one for validation."""
+    train = [measured(kind, seed, **sizes) for seed, kind in enumerate(kinds)]
+    return train, measured("estimated", 9, **sizes)
 
 
 def starts(count: int, **sizes: Any) -> list[Model]:
@@ -78,48 +89,90 @@ def run(
     return fit_starts(models, *data, monitors=monitors, snapshots=Snapshots(folder, 0.0), **options)
 
 
+# --- one start ------------------------------------------------------------------------------
+
+
+def stand(fit: Fit) -> dict[str, Any]:
+    """All that the next steps of a fit depend on, and all that its result is made of."""
+    found = {field.name: getattr(fit.state, field.name) for field in fields(fit.state)}
+    found |= {name: getattr(fit, name) for name in trainer._KEPT}
+    found |= {"history": [asdict(p) for p in fit.history], "theta_best": fit._theta_best}
+    return copy.deepcopy(found | {"problem": fit.problem.state_dict()})
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two are alike in every bit; NaN is like NaN."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, torch.Tensor):
+        return one.dtype == other.dtype and torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return one == other or (isinstance(one, float) and math.isnan(one) and math.isnan(other))
+
+
+KINDS = {kind: (kind,) for kind in STARTS} | {"mixed": STARTS}
+
+
 @pytest.mark.parametrize(
-    ("optimiser", "sizes"),
-    [
-        (LevenbergMarquardt(max_iter=12), dict),
-        (LevenbergMarquardt(max_iter=7), own_map),
-        (Adam(epochs=12, learning_rate=1e-2), dict),
-    ],
-    ids=["compiled", "own map", "adam"],
+    "optimiser",
+    [LevenbergMarquardt(max_iter=5), Adam(epochs=5, learning_rate=1e-2)],
+    ids=["levenberg_marquardt", "adam"],
 )
-def test_ends_as_without_interruption(tmp_path: Path, optimiser: Any, sizes: Any):
-    data = records(**sizes())
-    whole = run(starts(1, **sizes()), data, optimiser=optimiser, ridge=1e-3)
-    for iterations in (2, 5):  # interrupted twice
-        cut = run(starts(1, **sizes()), data, tmp_path, 3, optimiser=optimiser, ridge=1e-3)
-        assert (cut.reason, cut.iterations) == (INTERRUPTED, iterations)
-    resumed = run(starts(1, **sizes()), data, tmp_path, optimiser=optimiser, ridge=1e-3)
-    assert outcome(resumed) == outcome(whole)
-
-
-@pytest.mark.parametrize("stop", [2, 7])
-def test_several_starts_end_as_without_interruption(tmp_path: Path, stop: int):
-    data, optimiser = records(), LevenbergMarquardt(max_iter=16)
-    whole = run(starts(5), data, optimiser=optimiser)
-    assert run(starts(5), data, tmp_path, stop, optimiser=optimiser).reason == INTERRUPTED
-    resumed = run(starts(5), data, tmp_path, optimiser=optimiser)
-    assert outcome(resumed) == outcome(whole)
-
-
-def test_a_run_that_is_killed_loses_what_came_after_the_last_file(tmp_path: Path):
-    """A file of an earlier iteration leads to the same end."""
-    (train, validation), optimiser = records(), LevenbergMarquardt(max_iter=6)
-    file = tmp_path / "0.safetensors"
+@pytest.mark.parametrize(
+    ("kinds", "sizes"),
+    [*((KINDS[name], dict) for name in KINDS), (STARTS, own_map)],
+    ids=[*KINDS, "mixed, own map"],
+)
+def test_all_of_a_fit_comes_back_from_its_file(
+    tmp_path: Path, kinds: Sequence[Start], sizes: Any, optimiser: Any
+):
+    """From a file in the midst of a fit that was killed later, and from where one paused."""
+    (train, _), validation = records(kinds, **sizes()), measured("zero", 9, **sizes())
+    wanted: dict[Path, dict[str, Any]] = {}
 
     def keep(fit: Fit, paused: bool) -> None:
-        if fit.history and fit.state.iteration == 3 and not paused:
+        if fit.state.iteration == (3 if paused else 2):
+            file = tmp_path / ("paused" if paused else "killed")
+            wanted[file] = stand(fit)
             fit.save(file)
 
-    fit = Fit(starts(1)[0], train, validation, optimiser=optimiser, keep=keep).advance()
-    again = Fit(starts(1)[0], train, validation, optimiser=optimiser)
-    again.restore(file)
-    assert again.state.iteration == 3
-    assert outcome(again.advance().result()) == outcome(fit.result())
+    def begun(**options: Any) -> Fit:
+        model, options = starts(1, **sizes())[0], options | {"ridge": 1e-3}
+        return Fit(model, train, validation, optimiser=optimiser, **options)
+
+    whole = begun(keep=keep).advance(until=3).advance()
+    assert len(wanted) == 2
+    for file, state in wanted.items():
+        again = begun()
+        again.restore(file)
+        found = stand(again)
+        assert found.keys() == state.keys()
+        assert not [name for name in state if not same(found[name], state[name])], file
+        again.advance()
+        assert outcome(again.result()) == outcome(whole.result()), file
+        assert same(stand(again)["problem"], stand(whole)["problem"]), file
+
+
+def test_ends_as_without_interruption(tmp_path: Path):
+    data, optimiser = records(), LevenbergMarquardt(max_iter=6)
+    whole = run(starts(1), data, optimiser=optimiser, ridge=1e-3)
+    for iterations in (2, 5):  # interrupted twice
+        cut = run(starts(1), data, tmp_path, 3, optimiser=optimiser, ridge=1e-3)
+        assert (cut.reason, cut.iterations) == (INTERRUPTED, iterations)
+    resumed = run(starts(1), data, tmp_path, optimiser=optimiser, ridge=1e-3)
+    assert outcome(resumed) == outcome(whole)
+
+
+@pytest.mark.parametrize("stop", [2, 5])  # in the first round, and in the last
+def test_several_starts_end_as_without_interruption(tmp_path: Path, stop: int):
+    data, optimiser = records(["zero", "periodic"]), LevenbergMarquardt(max_iter=8)
+    whole = run(starts(3), data, optimiser=optimiser)
+    assert run(starts(3), data, tmp_path, stop, optimiser=optimiser).reason == INTERRUPTED
+    resumed = run(starts(3), data, tmp_path, optimiser=optimiser)
+    assert outcome(resumed) == outcome(whole)
 
 
 def test_more_iterations_than_were_asked_for(tmp_path: Path):
