@@ -214,8 +214,8 @@ def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: boo
     lines += ["", *references(cases), ""]
     if made_on := machines(cases):
         lines += [
-            "Made on the machine below. Another processor rounds in other ways, and a fit may end in "
-            "another minimum there: compare medians.",
+            "Made on the machine below. Another processor rounds in other ways, and a fit may end "
+            "in another minimum there: compare medians.",
             "",
             *(f"- {line}" for line in made_on),
             "",
