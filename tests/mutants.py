@@ -78,7 +78,7 @@ TESTS: dict[str, str] = {
 TOO_LONG = 240.0
 """Seconds after which a mutant that is still running has been noticed: the clean tests take 30."""
 
-LIBRARIES = ["torch", "numba", "scipy.signal", "scipy.io", "pandas", "matplotlib", "hypothesis"]
+LIBRARIES = ["torch", "numba", "scipy.signal", "scipy.io", "pandas", "matplotlib"]
 """Imported once, for all mutants."""
 
 
