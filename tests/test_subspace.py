@@ -1,5 +1,7 @@
 """Subspace starts: exact without noise on any band, stable on any data, of bounded cost."""
 
+import itertools
+
 import numpy as np
 import pytest
 import reference
@@ -9,6 +11,8 @@ from lfrtorch import subspace
 from lfrtorch.frequency_response import frequency_response
 from lfrtorch.response_error import Lines, ResponseFit
 from lfrtorch.subspace import LARGEST_POLE, MOVED_POLE, from_signals, from_spectra, shortest
+
+pytestmark = pytest.mark.numeric
 
 # --- from spectra ---------------------------------------------------------------------------
 
@@ -43,23 +47,37 @@ def best_error(lines: Lines, nx: int) -> float:
     return float(np.abs(frequency_response(*system, lines.z) - lines.Y).max())
 
 
-@pytest.mark.parametrize("band", BANDS)
-@pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 1), (1, 3), (3, 3)])
-@pytest.mark.parametrize("nx", [1, 2, 3, 6, 12])
-def test_response_without_noise_is_found(nx: int, nu: int, ny: int, band: str):
-    """The powers of z lose digits on a narrow band: seven to eight of 16 after the bilinear map.
+EVERY = list(itertools.product((1, 2, 3, 6, 12), BANDS, ((1, 1), (2, 1), (1, 3), (3, 3))))
+
+
+@pytest.mark.parametrize(
+    ("nx", "band", "sizes"),
+    # Every third meets every pair of orders, bands and channels.
+    [pytest.param(*c, marks=pytest.mark.slow if i % 3 else ()) for i, c in enumerate(EVERY)],
+)
+def test_response_without_noise_is_found(nx: int, band: str, sizes: tuple[int, int]):
+    """The powers of z lose digits on a narrow band: seven to nine of 16 after the bilinear map.
 
     A refinement gets them back (test_bla).
     """
-    system = random_system(nx, nu, ny)
-    lines = lines_of(system, BANDS[band], few_lines(nx, nu, ny))
-    assert best_error(lines, nx) < 1e-7
+    lines = lines_of(random_system(nx, *sizes), BANDS[band], few_lines(nx, *sizes))
+    # Three kinds of processors leave up to 7e-8 on the narrow band, 1e-11 elsewhere.
+    assert best_error(lines, nx) < (1e-6 if (nx, band) == (12, "0..10 %") else 1e-9)
 
 
 def test_several_outputs_need_fewer_block_rows():
-    """12 states on a tenth of the axis: 13 block rows leave 1e-6; 3 outputs need 5, for 1e-14."""
-    lines = lines_of(random_system(12, 1, 3), BANDS["0..10 %"], few_lines(12, 1, 3))
-    assert best_error(lines, 12) < 1e-11
+    """12 states on a tenth of the axis: 13 block rows leave 5e-11; 4 outputs need 4, for 1e-13.
+
+    On three kinds of processors; the limit is their geometric mean.
+    """
+    lines = lines_of(random_system(12, 1, 4), BANDS["0..10 %"], few_lines(12, 1, 4))
+    assert best_error(lines, 12) < 2e-12
+
+
+def test_bilinear_map_spreads_the_lines_of_a_narrow_band():
+    """8 states on a tenth of the axis: 2e-11 and more without it, 1e-13 and less with it."""
+    lines = lines_of(random_system(8), BANDS["0..10 %"], few_lines(8, 1, 1))
+    assert best_error(lines, 8) < 2e-12
 
 
 @pytest.mark.parametrize(("nx", "F"), [(1, 2), (2, 3), (4, 5), (6, 7)])
@@ -80,8 +98,8 @@ def test_several_experiments_at_once():
     found = [fit.with_input_matrices(start.A, start.C) for start in fit.starts(3)]
     _, (A, B, C, D) = min(found, key=lambda each: each[0])
     G = reference.frf(system, omega)
-    # eps times the slowest pole's gain of 10, and a condition of 1e3.
-    np.testing.assert_allclose(frequency_response(A, B, C, D, lines.z), G, rtol=0, atol=1e-11)
+    # eps times the slowest pole's gain of 10, and a condition of 1e4.
+    np.testing.assert_allclose(frequency_response(A, B, C, D, lines.z), G, rtol=0, atol=1e-10)
 
 
 def test_singular_values_fall_off_behind_the_order():
