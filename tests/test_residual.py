@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from reference import measure, random_cell, random_model
+from reference import measure, normal, random_cell, random_model
 from torch.testing import assert_close
 
 from lfrtorch.levenberg_marquardt import LevenbergMarquardt
@@ -14,6 +14,8 @@ from lfrtorch.model import Model
 from lfrtorch.records import Record, Start
 from lfrtorch.residual import SimulationError
 from lfrtorch.stack import Stack
+
+pytestmark = pytest.mark.numeric
 
 
 @pytest.fixture
@@ -94,10 +96,17 @@ def test_jacobian_is_the_slope_of_the_residual(model: Model, ridge):
     assert_close(problem.jacobian(theta) @ step, expected, rtol=0, atol=1e-8)
 
 
-@RIDGES
-@pytest.mark.parametrize("given", [True, False])
-@pytest.mark.parametrize("precise", [True, False])
-@pytest.mark.parametrize("kept", [True, False])
+@pytest.mark.parametrize(
+    ("ridge", "given", "precise", "kept"),
+    [
+        (0.0, True, True, True),
+        (0.0, False, False, False),
+        (0.5, False, True, False),
+        (0.5, True, False, True),
+        ({"static": 0.1, "A": 0.3, "x0": 2.0}, False, False, True),
+        ({"static": 0.1, "A": 0.3, "x0": 2.0}, True, True, False),
+    ],
+)
 def test_system_and_products_are_those_of_the_whole_jacobian(
     model: Model, ridge, given: bool, precise: bool, kept: bool, monkeypatch
 ):
@@ -157,6 +166,23 @@ def test_line_weights_weigh_the_spectrum_of_the_error(model: Model, T: int):
     # Σ cos² = Σ sin² = T / 2 over whole periods, in each of two outputs.
     expected = 2 * (4.0 * 1.0 + 0.25 * 4.0) * T / 2
     assert problem.cost(problem.residual(problem.theta)) == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("T", [29, 30])
+@pytest.mark.parametrize("by_line", [True, False])
+def test_adjoint_of_the_weights_is_that_of_their_product(model: Model, T: int, by_line: bool):
+    """<W e, r> = <e, W' r>, where each line but 0 and fs / 2 stands for two."""
+    rng, record = np.random.default_rng(0), measure(model, T, start="periodic")
+    F = T // 2 + 1
+    weights = {"line_weight": rng.uniform(0.5, 2.0, (F, 2))} if by_line else {"weight": [0.5, 3.0]}
+    problem = SimulationError(model, [replace(record, **weights)] * 2)
+    (batch,) = problem.batches
+    e, r = normal(2, T, 2), normal(*batch.residual_shape, seed=1)
+    assert batch.residual_shape == (2, 2 * F if by_line else T, 2)
+    weighed, unweighed = batch.weigh(e), batch.unweigh(r)
+    assert unweighed.shape == e.shape
+    # Sums of some hundred products of size 1.
+    assert_close((weighed * r).sum(), (e * unweighed).sum(), rtol=0, atol=1e-11)
 
 
 def test_start_state_is_fitted_with_the_parameters(model: Model):
@@ -358,9 +384,7 @@ def test_a_jacobian_asks_for_room_once(model: Model, monkeypatch):
 
 # --- entries that stay as they are ------------------------------------------------------------
 
-RIDGE_AND_ROOM = pytest.mark.parametrize(
-    ("ridge", "kept"), [(0.0, True), (0.0, False), (0.5, True), (0.5, False)]
-)
+RIDGE_AND_ROOM = pytest.mark.parametrize(("ridge", "kept"), [(0.0, True), (0.5, False)])
 
 
 def some_fixed(model: Model) -> torch.Tensor:
@@ -368,8 +392,10 @@ def some_fixed(model: Model) -> torch.Tensor:
     return torch.arange(model.parameters) % 3 == 0
 
 
-@RIDGE_AND_ROOM
-@pytest.mark.parametrize("precise", [True, False])
+@pytest.mark.parametrize(
+    ("ridge", "kept", "precise"),
+    [(0.0, True, True), (0.5, False, True), (0.5, True, False), (0.0, False, False)],
+)
 def test_fixed_entries_have_columns_of_zeros(
     model: Model, ridge: float, kept: bool, precise: bool, monkeypatch
 ):
