@@ -14,6 +14,8 @@ from lfrtorch.lfr import LFR
 from lfrtorch.records import Start
 from lfrtorch.sensitivity import Linearisation, output_jacobian
 
+pytestmark = pytest.mark.numeric
+
 STARTS: tuple[Start, ...] = ("zero", "periodic")
 
 
@@ -88,15 +90,12 @@ def test_any_optimiser_trains_it_within_a_larger_model(start: Start):
         return (behind(lfr(before(u), start=start)) - target).square().mean()
 
     first = float(loss().detach())
-    optimiser = torch.optim.LBFGS(parameters, max_iter=40, line_search_fn="strong_wolfe")
-
-    def closure() -> float:
+    # Steps of bounded length: a line search may try an unstable model, whose loss is NaN.
+    optimiser = torch.optim.Adam(parameters, lr=0.05)
+    for _ in range(60):
         optimiser.zero_grad()
-        value = loss()
-        value.backward()
-        return float(value.detach())
-
-    optimiser.step(closure)
+        loss().backward()
+        optimiser.step()
     assert float(loss().detach()) < 0.1 * first
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in parameters)
 
