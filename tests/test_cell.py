@@ -9,6 +9,8 @@ from torch.testing import assert_close
 from lfrtorch.cell import LFRCell
 from lfrtorch.nonlinearity import Network
 
+pytestmark = pytest.mark.numeric
+
 
 def test_step_is_the_equations():
     cell = random_cell(2, 3, 4, 2, 1, 3)

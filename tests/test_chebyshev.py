@@ -6,6 +6,8 @@ from numpy.polynomial import chebyshev as oracle
 
 from lfrtorch.chebyshev import REACH, chebyshev, chebyshev_slope
 
+pytestmark = pytest.mark.numeric
+
 
 @pytest.mark.parametrize("degree", [1, 2, 5])
 def test_one_variable(degree: int):

@@ -10,6 +10,8 @@ from torch.testing import assert_close
 
 from lfrtorch.factors import Gram, Normal, Orthogonal, Triangle
 
+pytestmark = pytest.mark.numeric
+
 
 def squares(factor: Triangle | Gram) -> Tensor:
     return factor.R.mT @ factor.R if isinstance(factor, Triangle) else factor.G

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from lfrtorch.frequency_response import Complex, frequency_response, resolvents, slopes
 
+pytestmark = pytest.mark.numeric
+
 OMEGA = np.linspace(0.0, np.pi, 9)
 Z = np.exp(1j * OMEGA)
 

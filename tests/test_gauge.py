@@ -14,6 +14,8 @@ from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.sensitivity import Linearisation, output_jacobian
 from lfrtorch.simulate import simulate, steady_state
 
+pytestmark = pytest.mark.numeric
+
 
 def none(cell: LFRCell) -> torch.Tensor:
     return cell.A.new_zeros(0, cell.nx)

@@ -21,6 +21,8 @@ from lfrtorch.linear_model import LinearFit, LinearModel, balancing
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler
 
+pytestmark = pytest.mark.numeric
+
 FS = 10.0
 OMEGA = np.linspace(0.01, 3.1, 50)
 U0, Y0 = np.array([3.0, -1.0]), np.array([-7.0, 20.0])
@@ -184,7 +186,7 @@ def test_deviation_of_the_response_is_that_of_its_linear_part():
 def test_deviation_of_the_response_is_that_of_many_draws(observed: LinearModel):
     assert observed.covariance is not None
     small = replace(observed, covariance=1e-6 * observed.covariance)  # 1e-6 each: linear to 1e-4
-    N, omega = 2000, OMEGA[::10]
+    N, omega = 500, OMEGA[::10]
     draws = np.random.default_rng(1).multivariate_normal(
         np.zeros(25), 1e-6 * observed.covariance, size=N
     )

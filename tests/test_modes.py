@@ -11,6 +11,8 @@ from lfrtorch.linear_model import LinearModel
 from lfrtorch.modes import shares, without_slow_minor_modes
 from lfrtorch.records import Channel, Record, Start
 
+pytestmark = pytest.mark.numeric
+
 NOISE = 0.1
 
 

@@ -9,6 +9,8 @@ import pytest
 import lfrtorch
 from lfrtorch.multisine import Multisine, multisine
 
+pytestmark = pytest.mark.numeric
+
 
 def spectra(design: Multisine) -> np.ndarray:
     """Complex rms amplitudes (experiment, line 0 to N / 2, input)."""
@@ -83,7 +85,7 @@ def test_rms_is_exact_for_every_input_and_experiment():
     design = multisine(300, nu=3, realisations=2, rms=[1.0, 2.0, 0.5], band=(0.02, 0.3))
     rms = np.sqrt(np.mean(design.u**2, axis=1))
     assert np.abs(rms - [1.0, 2.0, 0.5]).max() < 1e-13
-    assert np.abs(design.u.mean(axis=1)).max() < 1e-14
+    assert np.abs(design.u.mean(axis=1)).max() < 1e-13
     amplitudes = np.abs(spectra(design)[:, design.lines])
     assert np.ptp(amplitudes, axis=1).max() < 1e-13  # uniform
 

@@ -14,6 +14,8 @@ from lfrtorch.cell import LFRCell
 from lfrtorch.nonlinearity import ACTIVATIONS, Network, Polynomial
 from lfrtorch.simulate import simulate
 
+pytestmark = pytest.mark.numeric
+
 # --- one hidden layer -----------------------------------------------------------------------
 
 

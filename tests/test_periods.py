@@ -7,6 +7,8 @@ import scipy.signal
 from lfrtorch.multisine import multisine
 from lfrtorch.periods import find_period, find_transient
 
+pytestmark = pytest.mark.numeric
+
 N = 256
 
 

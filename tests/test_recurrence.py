@@ -2,13 +2,15 @@
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import normal
 from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.recurrence import compiled, linear_recurrence, loop, scan
+
+pytestmark = pytest.mark.numeric
 
 LENGTHS = st.integers(1, 40)  # squares, primes, and one step among them
 SIZES = st.integers(1, 4)
@@ -26,6 +28,7 @@ def assert_same(s: Tensor, expected: Tensor, eps: float):
 
 
 @given(R=st.integers(1, 3), T=LENGTHS, n=SIZES, m=SIZES)
+@settings(max_examples=40)
 def test_loop_compiled_and_scan_agree(R: int, T: int, n: int, m: int):
     F, g, s0 = problem(R, T, n, m)
     expected = loop(F, g, s0)

@@ -17,6 +17,8 @@ from lfrtorch.nonlinearity import ACTIVATIONS
 from lfrtorch.sensitivity import Linearisation, output_jacobian
 from lfrtorch.simulate import simulate, steady_state
 
+pytestmark = pytest.mark.numeric
+
 # Sums of at most some hundred products along a contraction, in double precision: 1e-13 or so.
 TOLERANCE = 1e-9
 

@@ -9,6 +9,8 @@ from lfrtorch.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.static_error import StaticError
 
+pytestmark = pytest.mark.numeric
+
 
 @pytest.mark.parametrize(
     "static",

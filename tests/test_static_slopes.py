@@ -10,6 +10,8 @@ from torch.testing import assert_close
 from lfrtorch.nonlinearity import ACTIVATIONS, Network, Stacked
 from lfrtorch.static_slopes import StaticSlopes, static_slopes
 
+pytestmark = pytest.mark.numeric
+
 R, T, nz, nw = 2, 5, 2, 3
 
 

@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from reference import random_cell, random_model
@@ -21,6 +21,8 @@ from lfrtorch.model import Model
 from lfrtorch.records import Record
 
 Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.numeric
 
 T = 1000
 U = np.random.default_rng(0).normal(size=(T, 2))
@@ -39,6 +41,7 @@ def streamed(model: Model, blocks: list[Array], **options) -> Array:
 
 
 @given(ends=st.lists(st.integers(1, T - 1), unique=True, max_size=8))
+@settings(max_examples=25)
 def test_any_blocks_give_the_bits_of_one_simulation(ends: list[int]):
     found = list(simulate_blocks(MODEL, cut(U, *sorted(ends))))
     assert [len(y) for y in found] == np.diff([0, *sorted(ends), T]).tolist()
@@ -169,6 +172,7 @@ def test_wrong_start_state():
 
 
 @given(ends=st.lists(st.integers(1, T - 1), unique=True, max_size=5), skip=st.integers(0, T - 2))
+@settings(max_examples=25)
 def test_scores_of_blocks_are_those_of_the_whole(ends: list[int], skip: int):
     generator = np.random.default_rng(1)
     y = 1e3 + generator.normal(size=(T, 2)) * [1.0, 5.0]  # a spread far below the mean
