@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import json
 import os
@@ -9,29 +10,35 @@ import signal
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra._internal import utils as hydra_utils
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
-from omegaconf import OmegaConf
+from matplotlib.figure import Figure
+from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
 import train
-from lfrtorch import termination
-from lfrtorch.datasets import official
+from lfrtorch import plots, termination
+from lfrtorch.datasets import boucwen, official
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
 BENCHES = sorted(path.stem for path in (CONF / "bench").glob("*.yaml"))
-SHORTER = {  # fewer samples and iterations, so that two iterations take seconds
-    "boucwen": "starts=2",
-    "boucwen_record": "data.rms=[50,25] nn=15",
+PERIOD, SWEEP = 1024, 3000
+"""Samples of the Bouc-Wen system, where it is simulated."""
+SHORTER = {  # fewer samples and iterations, so that two iterations take a second
+    "boucwen": f"data.samples={PERIOD} starts=2 bla.max_iter=1",
+    "boucwen_record": f"data.samples={PERIOD} data.rms=[50,25] bla.max_iter=1 starts=1",
     "cascaded_tanks": "bla.max_iter=1 starts=1",
-    "ced": "bla.max_iter=1",
+    "ced": "bla.max_iter=1 starts=1",
     "emps": "data.validation=0.8 bla.max_iter=1",
     "f16": "data.levels=[3] nx=6 bla.max_iter=1 starts=1",
     "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1 starts=1",
@@ -39,31 +46,60 @@ SHORTER = {  # fewer samples and iterations, so that two iterations take seconds
     "wh_process_noise": "bla.max_iter=1 starts=1",
     "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1 starts=1",
 }
-MEASURED = {  # and their folders
-    "cascaded_tanks": "Cascaded_Tanks",
-    "ced": "CED",
-    "emps": "EMPS",
-    "f16": "F16",
-    "silverbox": "Silverbox",
-    "wh_process_noise": "WienHammer",
-    "wiener_hammerstein": "WienerHammerBenchMark",
-}
+SIMULATED = ("boucwen", "boucwen_record", "parwh")
+"""All others are measured."""
+GROUPS = ("+bench", "data", "bla", "init", "trainer")
 
 
-def configuration(*overrides: str):
-    """Of a run without figures, which take seconds, unless they are asked for."""
+@cache
+def composed(*groups: str) -> DictConfig:
+    """By Hydra, which takes a tenth of a second; without figures, which take seconds."""
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        return compose("config", ["figures=false", *overrides])
+        return compose("config", ["figures=false", *groups])
+
+
+def configuration(*overrides: str) -> DictConfig:
+    """Of a run without figures, unless they are asked for."""
+    groups = [word for word in overrides if word.split("=")[0] in GROUPS]
+    cfg = copy.deepcopy(composed(*groups))
+    cfg.merge_with_dotlist([word for word in overrides if word not in groups])
+    return cfg
 
 
 def command(*overrides: str, folder: Path) -> list[str]:
     return [sys.executable, str(ROOT / "train.py"), f"hydra.run.dir='{folder}'", *overrides]
 
 
-def run(*overrides: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        command(*overrides, folder=folder), capture_output=True, text=True, check=False, cwd=folder
-    )
+def launched(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    """The command line in this process."""
+    monkeypatch.setattr(sys, "argv", ["train.py", *words])
+    train.launch()
+
+
+@pytest.fixture
+def untraced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hydra raises its errors where it sees a debugger, and takes coverage for one."""
+    monkeypatch.setattr(hydra_utils, "is_under_debugger", lambda: False)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All figures of a run are empty, which takes no time."""
+    empty = plots.png(Figure(figsize=(0.1, 0.1)))
+    monkeypatch.setattr(plots, "png", lambda _: empty)
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The Bouc-Wen system is simulated, official files at hand or not, and for short."""
+    nothing = tmp_path_factory.mktemp("nothing")
+    monkeypatch.setattr(official, "cache", lambda: nothing)
+    monkeypatch.setattr(boucwen, "_PERIOD", PERIOD)
+    monkeypatch.setattr(boucwen, "_SWEEP", SWEEP)
+
+
+ROUNDING = 1e-12
+"""Of outputs of about 5, a thousand units in the last place: sums in another order."""
 
 
 @pytest.fixture(scope="module")
@@ -83,17 +119,6 @@ def csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def file_overrides(csv: Path) -> list[str]:
     return ["data=file", f"data.path={csv}", "data.inputs=[u]", "data.outputs=[y]", "data.fs=10"]
-
-
-def bench_overrides(bench: str, request: pytest.FixtureRequest) -> list[str]:
-    """Of a short run; skips the test where the benchmark's measurement is not at hand."""
-    overrides = [f"+bench={bench}", *SHORTER.get(bench, "").split()]
-    if bench in MEASURED:
-        root = request.getfixturevalue("benchmark_root")
-        if not (root / MEASURED[bench]).is_dir():
-            pytest.skip(f"no folder {MEASURED[bench]} in {root}")
-        overrides.append(f"data.root='{root}'")
-    return overrides
 
 
 @pytest.mark.parametrize("bench", BENCHES)
@@ -120,17 +145,26 @@ INFERENCE = "init=inference trainer.max_iter=2"
 @pytest.mark.parametrize(
     ("bench", "choice"),
     [
-        *((bench, "init=zero_output trainer.max_iter=2") for bench in BENCHES),
-        ("boucwen", "init=zero_output trainer.max_iter=2 figures=true"),
+        *((bench, "trainer.max_iter=2") for bench in BENCHES),
         ("boucwen", ADAM),
         ("boucwen", INFERENCE),
     ],
 )
+@pytest.mark.numeric
+@pytest.mark.usefixtures("short")
 def test_every_bench_runs_two_iterations(
     bench: str, choice: str, tmp_path: Path, request: pytest.FixtureRequest
 ):
-    cfg = configuration(*bench_overrides(bench, request), *choice.split())
-    train.identify(cfg, tmp_path)
+    cfg = configuration(f"+bench={bench}", *SHORTER.get(bench, "").split(), *choice.split())
+    if bench not in SIMULATED:
+        cfg.data.root = str(request.getfixturevalue("benchmark_root"))
+    cfg.figures = (bench, choice) == ("boucwen", "trainer.max_iter=2")  # of whole periods, once
+    try:
+        train.identify(cfg, tmp_path)
+    except InstantiationException as failed:
+        if bench not in SIMULATED and isinstance(failed.__cause__, FileNotFoundError):
+            pytest.skip(str(failed.__cause__))
+        raise
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["fit"]["iterations"] == 2
     for name, score in metrics["scores"].items():
@@ -152,7 +186,7 @@ def test_notes_on_the_data_are_printed(
 @pytest.mark.parametrize("group", ["bla", "data", "init", "trainer"])
 def test_every_option_of_a_group_is_an_argument_of_its_target(group: str):
     for path in (CONF / group).glob("*.yaml"):
-        node = configuration("+bench=boucwen", f"{group}={path.stem}")[group]
+        node = OmegaConf.create(path.read_text())
         parameters = inspect.signature(get_object(node["_target_"])).parameters
         assert set(node) - {"_target_"} <= set(parameters)
 
@@ -163,28 +197,32 @@ def test_the_paper_cases_are_one_override():
         assert (cfg.init.nz, cfg.init.nw, cfg.init.nn) == (nz, nw, 15)
 
 
-def test_run_writes_its_folder_and_the_checkpoint_simulates(csv: Path, tmp_path: Path):
-    done = run(*file_overrides(csv), "nx=1", "trainer.max_iter=20", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+@pytest.mark.numeric
+def test_run_writes_its_folder_and_the_checkpoint_simulates(
+    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words = [f"hydra.run.dir='{tmp_path}'", *file_overrides(csv), "nx=1", "trainer.max_iter=20"]
+    launched(monkeypatch, *words)
     for name in ("metrics.json", "config.yaml", "model/model.json", "figures/test.png"):
         assert (tmp_path / name).is_file()
     assert list(tmp_path.glob("events.out.tfevents.*"))
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 7  # three of the test, BLA, poles, map, history
-    (line,) = [line for line in done.stdout.splitlines() if "starts=8" in line]
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "starts=8" in line]
     assert line.startswith("next: ")
     metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["command"].startswith("python train.py data=file ")
     score = metrics["scores"]["test"]
     assert score["source"] == "file"
-    assert score["rmse"] < 0.2 * score["lti_rmse"]  # the saturation is found
+    assert score["rmse"] < 0.5 * score["lti_rmse"]  # the saturation is found: 0.2, and falling
 
-    cfg = configuration(*file_overrides(csv), "nx=1")
-    test = instantiate(cfg.data).tests[0]
+    test = instantiate(configuration(*file_overrides(csv), "nx=1").data).tests[0]
     model = lfrtorch.load(tmp_path)
-    assert lfrtorch.rmse(test, model.simulate(test)) == pytest.approx(score["rmse"], rel=1e-12)
+    assert lfrtorch.rmse(test, model.simulate(test)) == pytest.approx(score["rmse"], abs=ROUNDING)
     assert [c.name for c in model.inputs + model.outputs] == ["u", "y"]
 
 
+@pytest.mark.numeric
 def test_init_from_continues_where_the_run_ended(csv: Path, tmp_path: Path):
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):
@@ -195,7 +233,7 @@ def test_init_from_continues_where_the_run_ended(csv: Path, tmp_path: Path):
         configuration(*arguments, f"init_from={first}", "trainer.max_iter=0"), second
     )
     before = json.loads((first / "metrics.json").read_text())["validation"]["rmse"]
-    assert validation == pytest.approx(before, rel=1e-12)
+    assert validation == pytest.approx(before, abs=ROUNDING)
 
 
 def test_polynomial_is_chosen_and_continued(
@@ -230,6 +268,7 @@ def test_init_from_says_which_sizes_it_takes(
         train.identify(configuration("+bench=boucwen", f"init_from={first}"), second)
 
 
+@pytest.mark.numeric
 def test_a_resting_test_part_gives_a_score_that_is_null(tmp_path: Path):
     rng = np.random.default_rng(0)
     u = np.concatenate([rng.standard_normal(400), np.zeros(200)])
@@ -244,6 +283,7 @@ def test_a_resting_test_part_gives_a_score_that_is_null(tmp_path: Path):
     assert score["rmse"] >= 0
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_without_test_and_validation_records(tmp_path: Path, capsys):
     u = np.random.default_rng(0).standard_normal(300)
     y = np.convolve(u, [0.0, 0.5, 0.3])[: len(u)]
@@ -257,16 +297,12 @@ def test_a_run_without_test_and_validation_records(tmp_path: Path, capsys):
     assert (tmp_path / "figures" / "convergence.png").is_file()
 
 
-def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
+def test_the_interrupt_key_keeps_the_best_model_and_its_scores(csv: Path, tmp_path: Path):
+    """Of Adam, which has no end of its own."""
+    words = [*file_overrides(csv), "nx=1", "trainer=adam", "trainer.epochs=1000000"]
+    words += ["trainer.learning_rate=0.01", "threads=1"]
     with subprocess.Popen(
-        command(
-            "+bench=boucwen",
-            "starts=1",
-            "trainer.max_iter=100000",
-            "trainer.patience=100000",
-            "figures=false",
-            folder=tmp_path,
-        ),
+        command(*words, "figures=false", folder=tmp_path),
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
@@ -275,7 +311,7 @@ def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
     ) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            if line.lstrip().startswith("10/"):
+            if line.lstrip().startswith("50/"):
                 break
         time.sleep(0.1)
         process.send_signal(signal.SIGINT)
@@ -284,8 +320,9 @@ def test_the_interrupt_key_keeps_the_best_model_and_its_scores(tmp_path: Path):
     assert "interrupted" in rest
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["fit"]["reason"] == "interrupted"
-    assert metrics["scores"]["sweep"]["rmse"] < metrics["scores"]["sweep"]["lti_rmse"]
-    assert lfrtorch.load(tmp_path).sizes["nx"] == 3
+    assert metrics["fit"]["iterations"] >= 50
+    assert metrics["validation"]["rmse"] < metrics["validation"]["lti_rmse"]
+    assert lfrtorch.load(tmp_path).sizes["nx"] == 1
 
 
 class Terminated(lfrtorch.LevenbergMarquardt):
@@ -297,6 +334,7 @@ class Terminated(lfrtorch.LevenbergMarquardt):
         return super().step(problem, state)
 
 
+@pytest.mark.numeric
 def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, tmp_path: Path):
     usual = signal.getsignal(signal.SIGTERM)
     cfg = configuration(*file_overrides(csv), "nx=1", "trainer._target_=test_train.Terminated")
@@ -309,6 +347,7 @@ def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, t
     assert metrics["scores"]["test"]["rmse"] < metrics["scores"]["test"]["lti_rmse"]
 
 
+@pytest.mark.numeric
 def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "starts=2", "trainer.max_iter=8", "threads=1"]
     cut, whole = tmp_path / "cut", tmp_path / "whole"
@@ -326,6 +365,8 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
     assert weights[0] == weights[1]
 
 
+@pytest.mark.numeric
+@pytest.mark.usefixtures("undrawn")
 def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "starts=3", "average=3", "trainer.max_iter=3"]
     judged = train.identify(configuration(*settings, "data.validation=0", "figures=true"), tmp_path)
@@ -381,6 +422,7 @@ def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path, option
     assert train.arguments([*given, "overwrite=true"]) == [*given, "overwrite=true"]
 
 
+@pytest.mark.numeric
 def test_sizes_are_searched_for(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     arguments = ["nx=auto", "nx_max=2", "nz=auto", "nw=1", "nn=auto", "trainer.max_iter=20"]
     cfg = configuration(*file_overrides(csv), *arguments, "sizes_search.nn=[1,3]")
@@ -400,6 +442,7 @@ def test_sizes_are_searched_for(csv: Path, tmp_path: Path, capsys: pytest.Captur
     assert printed.count("  chosen\n") == 2  # the order, and these
 
 
+@pytest.mark.numeric
 def test_degree_is_searched_for_with_adam(csv: Path, tmp_path: Path):
     arguments = [*file_overrides(csv), "nx=1", "nz=1", "init=polynomial", "degree=auto"]
     arguments += ["sizes_search.degree=[1,2]", "trainer=adam", "trainer.epochs=4"]
@@ -436,9 +479,8 @@ def test_a_search_for_sizes_that_is_ended_says_so(
     capsys: pytest.CaptureFixture[str],
 ):
     words = [*file_overrides(csv), "nx=1", "nn=auto", f"trainer._target_=test_train.{trainer}"]
-    monkeypatch.setattr(sys, "argv", ["train.py", f"hydra.run.dir='{tmp_path}'", *words])
     with pytest.raises(SystemExit) as stop:
-        train.main()
+        launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words)
     assert stop.value.code == code
     assert capsys.readouterr().err == f"{message}\n"
 
@@ -456,9 +498,8 @@ def test_a_search_for_sizes_that_is_ended_says_so(
 def test_iterations_of_the_other_trainer_are_named(
     words: list[str], message: str, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(sys, "argv", ["train.py", "+bench=boucwen", *words])
     with pytest.raises(SystemExit, match=message):
-        train.launch()
+        launched(monkeypatch, "+bench=boucwen", *words)
 
 
 @pytest.mark.parametrize(
@@ -467,56 +508,73 @@ def test_iterations_of_the_other_trainer_are_named(
         ([], "no data chosen"),
         (["+bench=nonsense"], "nonsense"),
         (["+bench=boucwen", "nz=0"], "nz is 0"),
-        (["+bench=boucwen", "nz=many"], "nz is 'many'; give a whole number of at least 1, or auto"),
-        (["+bench=boucwen", "degree=auto"], "degree is auto, and this init has none; give nn=auto"),
-        (["+bench=boucwen", "nn=auto", "init=polynomial"], "nn is auto, and this init has none"),
-        (["+bench=boucwen", "nn=auto", "sizes_search.nn=[]"], "nn is empty"),
-        (["+bench=boucwen", "sizes_search.starts=0"], "sizes_search.starts is 0"),
-        (["+bench=boucwen", "init.method=magic"], "init method is 'magic'"),
-        (["+bench=boucwen", "init=polynomial", "degree=0"], "degree is 0"),
-        (["+bench=boucwen", "activation=softsign"], "activation is 'softsign'"),
         (["+bench=boucwen", "trainer.speed=3"], "speed"),
-        (["+bench=boucwen", "trainer.damping=-1"], "damping is -1"),
-        (["+bench=boucwen", "bla.coordinates=polar"], "coordinates is 'polar'"),
-        (["+bench=boucwen", "data.root=/nowhere"], "/nowhere"),
-        (["+bench=boucwen", "data.samples=ten"], "samples"),
-        (["+bench=silverbox", "data.root=/nowhere"], "there is no 'Silverbox/"),
-        (["+bench=parwh", "data.levels=[200]"], "data.levels is [200]; give one or more of 100"),
-        (["+bench=parwh", "data.root=/nowhere"], "there is no 'ParWH/ParWHFiles/ParWHData.mat'"),
-        (
-            ["+bench=boucwen", "init_from=/nowhere"],
-            "there is no '/nowhere'; give the folder of a run",
-        ),
-        (["+bench=boucwen", "ridge=-1"], "ridge is -1"),
-        (["+bench=boucwen", "ridge=abc"], "ridge is 'abc'"),
-        (["+bench=boucwen", "threads=0"], "threads is 0"),
-        (["+bench=boucwen", "dtype=float16"], "dtype is float16; give float64 or float32"),
-        (["+bench=boucwen", "device=abacus"], "device is abacus, which torch cannot use here"),
-        (["+bench=boucwen", "ridge={B: 1.0}"], "ridge has a group 'B'"),
+        (["+bench=boucwen", "data.root=/nowhere"], "no Bouc-Wen test files in '/nowhere'"),
         (["+bench=boucwen", "timeout=-1"], "timeout is -1"),
-        (["+bench=boucwen", "nx=2.5"], "nx is 2.5"),
-        (["+bench=boucwen", "nn=x"], "nn is 'x'"),
-        (["+bench=boucwen", "seed=a"], "seed is 'a'"),
-        (["+bench=boucwen", "data.seed=x"], "data.seed is 'x'"),
-        (["data=boucwen"], "+bench=boucwen"),
-        (["data=file", "data.path=/nowhere.csv", "nx=1"], "there is no file '/nowhere.csv'"),
-        (file_overrides(Path("FILE")), "nx, the number of states, is not set"),
     ],
 )
+@pytest.mark.usefixtures("untraced")
 def test_user_errors_are_one_message(
     overrides: list[str],
     message: str,
-    csv: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
-    overrides = [override.replace("FILE", str(csv)) for override in overrides]
-    monkeypatch.setattr(sys, "argv", ["train.py", f"hydra.run.dir='{tmp_path}'", *overrides])
     with pytest.raises(SystemExit) as stop:
-        train.main()
+        launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *overrides)
     printed = capsys.readouterr()
     assert stop.value.code == 1
     assert message in printed.err
     assert "Traceback" not in printed.err + printed.out
     assert not (tmp_path / "config.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["nz=many"], "nz is 'many'; give a whole number of at least 1, or auto"),
+        (["degree=auto"], "degree is auto, and this init has none; give nn=auto"),
+        (["nn=auto", "init=polynomial"], "nn is auto, and this init has none"),
+        (["nn=auto", "sizes_search.nn=[]"], "nn is empty"),
+        (["sizes_search.starts=0"], "sizes_search.starts is 0"),
+        (["init.method=magic"], "init method is 'magic'"),
+        (["init=polynomial", "degree=0"], "degree is 0"),
+        (["activation=softsign"], "activation is 'softsign'"),
+        (["trainer.damping=-1"], "damping is -1"),
+        (["bla.coordinates=polar"], "coordinates is 'polar'"),
+        (["+bench=boucwen", "data.samples=ten"], "a period of ten samples"),
+        (["+bench=boucwen", "data.seed=x"], "data.seed is 'x'"),
+        (["+bench=silverbox", "data.root=/nowhere"], "there is no 'Silverbox/"),
+        (["+bench=parwh", "data.levels=[200]"], "data.levels is [200]; give one or more of 100"),
+        (["+bench=parwh", "data.root=/nowhere"], "there is no 'ParWH/ParWHFiles/ParWHData.mat'"),
+        (["init_from=/nowhere"], "there is no '/nowhere'; give the folder of a run"),
+        (["ridge=-1"], "ridge is -1"),
+        (["ridge=abc"], "ridge is 'abc'"),
+        (["ridge={B: 1.0}"], "ridge has a group 'B'"),
+        (["threads=0"], "threads is 0"),
+        (["dtype=float16"], "dtype is float16; give float64 or float32"),
+        (["device=abacus"], "device is abacus, which torch cannot use here"),
+        (["nx=2.5"], "nx is 2.5"),
+        (["nn=x"], "nn is 'x'"),
+        (["seed=a"], "seed is 'a'"),
+        (["data=boucwen"], "+bench=boucwen"),
+        (["data=file", "data.path=/nowhere.csv", "nx=1"], "there is no file '/nowhere.csv'"),
+        (["nx=null"], "nx, the number of states, is not set"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_message(
+    overrides: list[str],
+    message: str,
+    csv: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    """Of the short file, where no other data are given."""
+    given = any(word.startswith(("+bench=", "data=")) for word in overrides)
+    cfg = configuration(*([] if given else [*file_overrides(csv), "nx=1"]), *overrides)
+    with pytest.raises(SystemExit) as stop, train.user_errors():
+        train.identify(cfg, tmp_path)
+    assert stop.value.code == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "metrics.json").exists()
