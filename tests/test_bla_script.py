@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.signal
+from hydra import compose, initialize_config_dir
+from matplotlib.figure import Figure
+from omegaconf import DictConfig, OmegaConf
 from test_train import configuration
 
 import lfrtorch
@@ -28,6 +33,12 @@ def written(path: Path, **columns: np.ndarray) -> Path:
     rows = "\n".join(",".join(f"{v:.12g}" for v in row) for row in np.stack([*columns.values()], 1))
     path.write_text(f"{','.join(columns)}\n{rows}\n")
     return path
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of figures are empty, which takes no time."""
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).touch())
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +66,7 @@ def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> dict:
     return json.loads((folder / "linear.json").read_text())
 
 
+@pytest.mark.numeric
 def test_one_command_gives_table_figures_and_checkpoint(
     csv: Path, tmp_path: Path, monkeypatch, capsys
 ):
@@ -74,6 +86,8 @@ def test_one_command_gives_table_figures_and_checkpoint(
     assert [c.name for c in model.outputs] == ["x", "phi"]
 
 
+@pytest.mark.numeric
+@pytest.mark.usefixtures("undrawn")
 def test_numbers_are_those_of_the_system(csv: Path, tmp_path: Path, monkeypatch):
     found = run(monkeypatch, tmp_path, *overrides(csv, "a,b", "x,phi", "nx=3"))
     assert [(s["use"], s["record"]) for s in found["scores"]] == [
@@ -106,6 +120,8 @@ def test_numbers_are_those_of_the_system(csv: Path, tmp_path: Path, monkeypatch)
     assert found["scan"] is None
 
 
+@pytest.mark.numeric
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("refine", ["prediction", "frequency"])
 def test_refinements_and_zeros_by_channel(refine: str, csv: Path, tmp_path: Path, monkeypatch):
     words = overrides(csv, "a,b", "x", "nx=2", f"bla.refine={refine}")
@@ -132,6 +148,7 @@ def odd_multisine() -> Dataset:
     return Dataset("odd", [record(0)], [record(1)], [record(2)])
 
 
+@pytest.mark.numeric
 def test_fast_method_draws_the_distortion(tmp_path: Path, monkeypatch, capsys):
     words = ["+data={_target_: test_bla_script.odd_multisine}", "nx=1", "bla.refine=frequency"]
     found = run(monkeypatch, tmp_path, *words, "frf.method=fast")
@@ -149,6 +166,8 @@ def two_inputs_at_once() -> Dataset:
     return Dataset("once", records, [], records)
 
 
+@pytest.mark.numeric
+@pytest.mark.usefixtures("undrawn")
 def test_without_a_response_the_model_is_found_all_the_same(tmp_path: Path, monkeypatch, capsys):
     words = ["+data={_target_: test_bla_script.two_inputs_at_once}", "nx=1"]
     found = run(monkeypatch, tmp_path, *words)
@@ -166,14 +185,6 @@ def test_without_a_response_the_model_is_found_all_the_same(tmp_path: Path, monk
     [
         ("force", ["nx=2"], "has no column 'force'"),
         ("a", [], "nx, the number of states, is not set"),
-        ("a", ["nx=automatic"], "nx is 'automatic'; give a whole number"),
-        ("a", ["nx=auto", "nx_max=0"], "nx_max is 0; give a whole number"),
-        ("a", ["nx=auto", "+bla.speed=3"], "speed"),
-        ("a", ["nx=2", "bla.refine=magic"], "refine is 'magic'"),
-        ("a", ["nx=2", "frf.method=magic"], "method is 'magic'"),
-        ("a", ["nx=2", "frf.method=fast"], "record 'train' has no period"),
-        ("rest", ["nx=2"], "signal 'rest' is constant"),
-        ("rest", ["nx=auto"], "signal 'rest' is constant"),
     ],
 )
 def test_user_errors_are_one_message(
@@ -188,15 +199,59 @@ def test_user_errors_are_one_message(
     assert not (tmp_path / "linear.json").exists()
 
 
-def test_help_says_how_to_use_it(tmp_path: Path):
+@cache
+def composed() -> DictConfig:
+    with initialize_config_dir(version_base="1.3", config_dir=str(ROOT / "conf")):
+        return compose("linear", ["data=file"])
+
+
+@pytest.mark.parametrize(
+    ("inputs", "more", "message"),
+    [
+        ("a", ["nx=automatic"], "nx is 'automatic'; give a whole number"),
+        ("a", ["nx=auto", "nx_max=0"], "nx_max is 0; give a whole number"),
+        ("a", ["nx=auto", "bla.speed=3"], "speed"),
+        ("a", ["nx=2", "bla.refine=magic"], "refine is 'magic'"),
+        ("a", ["nx=2", "frf.method=magic"], "method is 'magic'"),
+        ("a", ["nx=2", "frf.method=fast"], "record 'train' has no period"),
+        ("rest", ["nx=2"], "signal 'rest' is constant"),
+        ("rest", ["nx=auto"], "signal 'rest' is constant"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_message(
+    inputs: str, more: list[str], message: str, csv: Path, tmp_path: Path, capsys
+):
+    cfg = copy.deepcopy(composed())
+    OmegaConf.set_struct(cfg, False)  # as + does on the command line
+    cfg.merge_with_dotlist(overrides(csv, inputs, "x", *more)[1:])
+    with pytest.raises(SystemExit) as stop, train.user_errors():
+        bla.identify(cfg, tmp_path)
+    assert stop.value.code == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "linear.json").exists()
+
+
+HELP = ("data.path=", "nx=auto", "bla.refine=", "frf.method=", "+bench=", "linear.json")
+
+
+def test_help_says_how_to_use_it(tmp_path: Path, monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, tmp_path, "--help")
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in HELP)
+
+
+@pytest.mark.slow
+def test_it_is_a_script_that_runs_anywhere(tmp_path: Path):
     done = subprocess.run(
         [sys.executable, str(ROOT / "scripts" / "bla.py"), "--help"],
         capture_output=True, text=True, check=True, cwd=tmp_path,
     )  # fmt: skip
-    for word in ("data.path=", "nx=auto", "bla.refine=", "frf.method=", "+bench=", "linear.json"):
-        assert word in done.stdout
+    assert all(word in done.stdout for word in HELP)
 
 
+@pytest.mark.numeric
 def test_train_takes_the_order_of_a_scan(csv: Path, tmp_path: Path, capsys):
     words = overrides(csv, "a", "x", "nx=auto", "nx_max=3", "nn=2", "trainer.max_iter=1")
     cfg = configuration(*words)
