@@ -1,8 +1,8 @@
 import os
 
-# Small matrices: more threads cost more than they give. Emulated machines have two, too.
-THREADS = int(os.environ.get("LFRTORCH_TEST_THREADS", "1"))
-os.environ.setdefault("OPENBLAS_NUM_THREADS", str(THREADS))  # numpy's, read at its import
+# Small matrices: more threads cost more than they give. Emulated machines may have two.
+os.environ.setdefault("LFRTORCH_TEST_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", os.environ["LFRTORCH_TEST_THREADS"])  # numpy's
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +14,7 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parents[1]
 
+THREADS = int(os.environ["LFRTORCH_TEST_THREADS"])
 torch.set_num_threads(THREADS)
 
 # Same examples in every run, none kept on disk; compilation may take its time.
