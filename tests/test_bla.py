@@ -15,6 +15,8 @@ from lfrtorch.frf import estimate_frf
 from lfrtorch.linear_model import LinearModel
 from lfrtorch.records import Channel, Record, Start
 
+pytestmark = pytest.mark.numeric
+
 OMEGA = np.linspace(0.01, 3.1, 50)
 U0, Y0 = np.array([3.0, -1.0]), np.array([-7.0, 20.0])
 
@@ -48,13 +50,15 @@ def normalised(model: LinearModel, record: Record) -> System:
 
 # --- linear data ----------------------------------------------------------------------------
 
-# The fit is exact, so that what is left is rounding: 1e-14 times the gain of the slowest pole.
-EXACT = 1e-11
+# The fit is exact, so that what is left is rounding: eps times the gain of the slowest pole, 10,
+# and the condition of the parameters, 1e3 at order 6, is 1e-12.
+EXACT = 1e-10
 
 
 @pytest.mark.parametrize("start", ["zero", "periodic"])
-@pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 2)])
-@pytest.mark.parametrize("nx", [1, 2, 3, 4, 5, 6])
+@pytest.mark.parametrize(
+    ("nx", "nu", "ny"), [(1, 1, 1), (2, 2, 2), (3, 1, 1), (6, 1, 1), (6, 2, 2)]
+)
 def test_linear_system_is_recovered(nx: int, nu: int, ny: int, start: Start):
     system = random_system(nx, nu, ny)
     model = estimate_bla(record_of(system, start), nx, offset=False)
@@ -64,10 +68,11 @@ def test_linear_system_is_recovered(nx: int, nu: int, ny: int, start: Start):
 
 
 @pytest.mark.parametrize("start", ["zero", "periodic"])
-@pytest.mark.parametrize(("nx", "nu", "ny"), [(1, 1, 1), (3, 1, 1), (2, 2, 2)])
+@pytest.mark.parametrize(("nx", "nu", "ny"), [(3, 1, 1), (2, 2, 2)])
 def test_linear_system_is_recovered_with_its_offsets(nx: int, nu: int, ny: int, start: Start):
     system = random_system(nx, nu, ny)
     model = estimate_bla(record_of(system, start, offset=True), nx)
+    # u has its mean to some eps of its largest samples.
     np.testing.assert_allclose(model.u_offset, U0[:nu], rtol=1e-12)
     np.testing.assert_allclose(model.y_offset, Y0[:ny], rtol=EXACT)
     assert frf_error(model, system) < EXACT
@@ -103,7 +108,7 @@ def test_small_and_large_units_change_nothing():
 
 # --- any data -------------------------------------------------------------------------------
 
-T = 200
+T = 120
 NOISE = np.random.default_rng(1).normal(size=(2, T))
 TIME, ONE = np.arange(T), np.ones((1, 1))
 ANY_DATA = {
@@ -120,13 +125,20 @@ ANY_DATA = {
 }
 
 
-@pytest.mark.parametrize("start", ["zero", "periodic"])
-@pytest.mark.parametrize("nx", [2, 6])
+@pytest.mark.parametrize(
+    ("nx", "start"),
+    [
+        (2, "zero"),
+        (6, "periodic"),
+        pytest.param(2, "periodic", marks=pytest.mark.slow),
+        pytest.param(6, "zero", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("data", ANY_DATA)
 def test_model_of_any_data_is_stable(data: str, nx: int, start: Start):
-    model = estimate_bla(Record(*ANY_DATA[data], start=start), nx, max_iter=20)
-    assert np.abs(model.poles).max() < 1
     record = Record(*ANY_DATA[data], start=start)
+    model = estimate_bla(record, nx, max_iter=10)
+    assert np.abs(model.poles).max() < 1
     assert np.isfinite(model.simulate(record)).all()
     # B = D = 0 is among the candidates.
     assert np.std(record.y - model.simulate(record)) < 1.01 * np.std(record.y)
@@ -198,7 +210,7 @@ def test_record_that_is_too_short():
 
 def test_many_short_records_do():
     system, rng = random_system(2), np.random.default_rng(4)
-    records = []
+    records: list[Record] = []
     for _ in range(6):
         u = rng.normal(size=(20, 1))
         records.append(Record(u, reference.dlsim(system, u)))
@@ -226,9 +238,9 @@ def test_coordinates():
 def test_start_state_is_fitted(start):
     """A record that begins in the middle of another, whatever coordinates its state is in."""
     system = random_system(3)
-    u = np.random.default_rng(0).normal(size=(400, 1))
+    u = np.random.default_rng(0).normal(size=(200, 1))
     x0 = np.ones(3) if start == "given" else None
-    record = Record(u[100:], reference.dlsim(system, u)[100:], start=start, x0=x0)
+    record = Record(u[50:], reference.dlsim(system, u)[50:], start=start, x0=x0)
     bla = estimate_bla(record, 3, offset=False)
     assert frf_error(bla, system) < 1e-8
     np.testing.assert_allclose(bla.simulate(record), record.y, rtol=0, atol=1e-8)
@@ -241,7 +253,7 @@ BANDS = {"all": (0.0, 1.0), "a third": (0.05, 0.4), "a tenth": (0.0, 0.1)}
 
 
 def excited(
-    system: System, band: tuple[float, float], *, T: int = 2048, R: int = 3
+    system: System, band: tuple[float, float], *, T: int = 1024, R: int = 3
 ) -> list[Record]:
     """Steady-state records of multisines that excite only a part of the frequency axis."""
     nu, first, last = system[3].shape[1], *(np.array(band) * T / 2)
@@ -256,22 +268,33 @@ def excited(
     return records
 
 
-@pytest.mark.parametrize("band", BANDS)
-@pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 1), (3, 3)])
-@pytest.mark.parametrize("nx", [1, 2, 5, 8, 12])
+def cases_of_a_part() -> list:
+    """Every order, number of channels and band, of which a few are fast."""
+    fast = {
+        (1, 1, 1, "a third"), (2, 2, 1, "a tenth"), (5, 3, 3, "a tenth"), (8, 2, 1, "a third"),
+        (12, 1, 1, "a tenth"), (12, 2, 1, "all"),
+    }  # fmt: skip
+    every = itertools.product((1, 2, 5, 8, 12), ((1, 1), (2, 1), (3, 3)), BANDS)
+    cases = [(nx, nu, ny, band) for nx, (nu, ny), band in every]
+    return [pytest.param(*c, marks=() if c in fast else pytest.mark.slow) for c in cases]
+
+
+@pytest.mark.parametrize(("nx", "nu", "ny", "band"), cases_of_a_part())
 def test_linear_system_is_recovered_from_a_part_of_the_axis(nx: int, nu: int, ny: int, band: str):
     system = random_system(nx, nu, ny)
     low, high = BANDS[band]
     model = estimate_bla(excited(system, BANDS[band], R=nu), nx)
-    omega = np.linspace(max(low, 1 / 1024) * np.pi, (high - 1 / 1024) * np.pi, 200)
+    omega = np.linspace(max(low, 1 / 512) * np.pi, (high - 1 / 512) * np.pi, 200)
     G = reference.frf(system, omega)
     error = np.abs(model.frf(omega * model.fs / 2 / np.pi) - G).max() / np.abs(G).max()
     assert error < 1e-8
     assert np.abs(model.poles).max() < 1
 
 
-@pytest.mark.parametrize("nx", [9, 12])
-@pytest.mark.parametrize(("nu", "ny"), [(1, 1), (3, 3)])
+@pytest.mark.parametrize(
+    ("nx", "nu", "ny"),
+    [(12, 1, 1), *(pytest.param(*s, marks=pytest.mark.slow) for s in ((9, 3, 3), (12, 3, 3)))],
+)
 def test_high_orders_are_recovered_from_signals(nx: int, nu: int, ny: int):
     system = random_system(nx, nu, ny)
     model = estimate_bla(record_of(system, "zero", T=1500), nx, offset=False)
@@ -290,8 +313,9 @@ def test_high_orders_are_recovered_from_signals(nx: int, nu: int, ny: int):
 )
 def test_without_feedthrough(refine, start: Start):
     A, B, C, D = random_system(3, 2, 2)
-    record = record_of((A, B, C, 0 * D), start, T=600)
-    model = estimate_bla(record, 3, refine=refine, feedthrough=False)
+    record = record_of((A, B, C, 0 * D), start, T=600 if refine == "frequency" else 300)
+    # Without noise any predictor is as good, and the search for one goes on.
+    model = estimate_bla(record, 3, refine=refine, feedthrough=False, max_iter=20)
     assert not model.D.any()
     # The response by local polynomials has a bias of the order of (their window)³.
     limit = 0.05 if refine == "frequency" else 1e-8
@@ -300,16 +324,16 @@ def test_without_feedthrough(refine, start: Start):
 
 def test_data_under_feedback_are_predicted_without_bias():
     """u = r - 0.5 y: a regulator that acts at once, around a first-order system with noise."""
-    rng = np.random.default_rng(8)
-    x, u, y = 0.0, np.zeros(20_000), np.zeros(20_000)
-    for k, (r, e) in enumerate(rng.normal(size=(20_000, 2))):
+    T, rng = 10_000, np.random.default_rng(8)
+    x, u, y = 0.0, np.zeros(T), np.zeros(T)
+    for k, (r, e) in enumerate(rng.normal(size=(T, 2))):
         y[k] = x + e
         u[k] = r - 0.5 * y[k]
         x = 0.9 * x + 0.3 * u[k] + 0.4 * e
     model = estimate_bla(Record(u, y), 1, refine="prediction", feedthrough=False)
-    # About 1 / √20000 = 0.7 %, four of them.
-    assert model.poles[0].real == pytest.approx(0.9, abs=0.03)
-    assert float(model.C[0, 0] * model.B[0, 0]) == pytest.approx(0.3, abs=0.02)
+    # About 1 / √10000 = 1 %, four of them.
+    assert model.poles[0].real == pytest.approx(0.9, abs=0.04)
+    assert float(model.C[0, 0] * model.B[0, 0]) == pytest.approx(0.3, abs=0.04)
     biased = estimate_bla(Record(u, y), 1, refine="prediction")
     assert abs(float(biased.D[0, 0])) > 0.1
 
@@ -334,7 +358,7 @@ def test_response_is_fitted_with_its_operating_point():
     frf = estimate_frf(records)
     for model in (estimate_bla(frf, 3), estimate_bla(records, 3, refine="frequency")):
         assert frf_error(model, system) < 1e-9
-        np.testing.assert_allclose(model.u_offset, np.ones(2))
+        np.testing.assert_allclose(model.u_offset, np.ones(2), rtol=1e-12)  # a mean
         y = model.simulate(records[0])
         np.testing.assert_allclose(y, records[0].y, atol=1e-8)
         assert model.fit is not None
@@ -344,10 +368,10 @@ def test_response_is_fitted_with_its_operating_point():
 def test_weighted_error_of_a_true_model_is_one():
     """Where the variances are those of the errors, only they are left."""
     system = random_system(2)
-    frf = estimate_frf(noisy(system, R=40, P=1))
+    frf = estimate_frf(noisy(system, R=20, P=1))
     model = estimate_bla(frf, 2)
     assert model.fit is not None
-    # 127 lines, 254 real residuals: 1 / √(2 · 254) = 4.4 %; smoothing and 39 degrees of freedom
+    # 127 lines, 254 real residuals: 1 / √(2 · 254) = 4.4 %; smoothing and 19 degrees of freedom
     # of the variances add about as much.
     assert model.fit.rmse == pytest.approx(1.0, abs=0.25)
 
@@ -424,6 +448,7 @@ def test_fit_is_described():
     fit = model.fit
     assert fit is not None
     error = (record.y - model.simulate(record))[:, 0]
+    # The constant fitted takes their mean off.
     assert fit.rmse == pytest.approx(error.std() / record.y.std(), rel=1e-9)
     assert fit.criterion == "simulation"
     assert fit.reason.startswith("converged")
@@ -433,6 +458,33 @@ def test_fit_is_described():
     s = np.array(fit.singular_values)
     assert 0.1 < s[0] <= 1.0
     assert s[1] > 5 * s[2]
+
+
+def test_constant_that_a_response_leaves_out_is_the_mean_of_the_errors_that_count():
+    """Records of other lengths and levels: the response has the mean of their means."""
+    system, records = random_system(2, 2, 2), []
+    for record in noisy(system, R=2, P=1, noise=0.0):
+        P = 1 + 2 * len(records)
+        u, y = np.tile(record.u, (P, 1)), np.tile(record.y, (P, 1)) + 3.0 * len(records)
+        records.append(Record(u, y, 10.0, "periodic", period=len(record.u)))
+    model = estimate_bla(records, 2, refine="frequency")
+    errors = np.concatenate([r.y - model.simulate(r) for r in records])
+    # The mean of some hundred numbers of size 10; the levels have the mean 9 / 4, not 3 / 2.
+    np.testing.assert_allclose(errors.mean(axis=0), np.zeros(2), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(model.y_offset, np.full(2, 4.0 + 9 / 4), rtol=0, atol=1e-8)
+
+
+def test_error_of_periodic_records_is_that_of_their_deviations():
+    """Records of other levels, which no constant makes up for: they count, relative to the rms."""
+    record = record_of(random_system(2), "periodic", noise=0.1)
+    records = [record, replace(record, y=record.y + 1.0)]
+    model = estimate_bla(records, 2)
+    errors = np.concatenate([r.y - model.simulate(r) for r in records])
+    spread = np.concatenate([r.y for r in records]).std()
+    np.testing.assert_allclose(errors.mean(), 0.0, rtol=0, atol=1e-11)
+    assert model.fit is not None
+    assert model.fit.rmse == pytest.approx(errors.std() / spread, rel=1e-9)
+    assert errors.std() > 0.5
 
 
 def test_search_that_was_cut_short_says_so():
@@ -449,7 +501,7 @@ def test_order_above_what_the_data_carry():
 
 
 def test_static_data_carry_no_order():
-    for seed in range(5):
+    for seed in range(3):
         u = np.random.default_rng(seed).normal(size=300)
         note = notes_of(Record(u, 2.0 * u, start="periodic"), 2)
         assert note.startswith("order 2 is above what the data carry: the subspace has 0 ")
@@ -459,12 +511,12 @@ def test_static_data_carry_no_order():
 def test_unstable_data():
     u = np.random.default_rng(0).normal(size=300)
     y = reference.dlsim((1.03 * ONE, ONE, ONE, 0 * ONE), u)
-    assert "come from an unstable system" in notes_of(Record(u, y), 1)
+    assert "come from an unstable system" in notes_of(Record(u, y), 1, max_iter=20)
 
 
 def test_model_that_explains_nothing():
     swapped = Record(NOISE[1], NOISE[0])
-    assert "the model explains little: 9" in notes_of(swapped, 2)
+    assert "the model explains little: 9" in notes_of(swapped, 2, max_iter=10)
     system = random_system(2)
     assert "explains little" not in notes_of(record_of(system, "zero", noise=0.1), 2)
 
@@ -478,7 +530,8 @@ def test_start_has_no_covariance_and_says_why_it_ended():
 
 def test_narrow_input():
     record = Record(*ANY_DATA["sine"])
-    assert "the input is too narrow: it excites 3 of the 5 directions" in notes_of(record, 2)
+    notes = notes_of(record, 2, max_iter=0)
+    assert "the input is too narrow: it excites 3 of the 5 directions" in notes
 
 
 def test_fewer_lines_than_unknowns():
