@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import math
 import multiprocessing
 import os
 import random
@@ -75,8 +76,9 @@ TESTS: dict[str, str] = {
 }
 """The modules of the numerical core, and their tests."""
 
-TOO_LONG = 240.0
-"""Seconds after which a mutant that is still running has been noticed: the clean tests take 30."""
+TOO_LONG, LEAST = 6.0, 60.0
+"""A mutant whose tests still run after so many times those of the clean module, and after so many
+seconds, has been noticed: it does not end."""
 
 LIBRARIES = ["torch", "numba", "scipy.signal", "scipy.io", "pandas", "matplotlib"]
 """Imported once, for all mutants."""
@@ -220,16 +222,24 @@ def _run(folder: Path, module: str) -> None:
     os._exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *files]))
 
 
-def is_noticed(mutant: Mutant | str, folder: Path, processes: Any) -> bool:
-    """Whether the tests of the module fail on the mutant; of a module's name, on the clean one."""
-    module = mutant if isinstance(mutant, str) else mutant.module
-    path = folder / "lfrtorch" / f"{module}.py"
-    clean = (ROOT / "lfrtorch" / f"{module}.py").read_text()
-    if isinstance(mutant, Mutant):
-        path.write_text(mutant.source(clean))
+def clean_seconds(module: str, folder: Path, processes: Any) -> float:
+    """How long the module's tests take without a fault; infinite where they fail."""
+    begun = time.monotonic()
     process = processes.Process(target=_run, args=(folder, module))
     process.start()
-    process.join(TOO_LONG)
+    process.join()
+    return math.inf if process.exitcode else time.monotonic() - begun
+
+
+def is_noticed(mutant: Mutant, folder: Path, processes: Any, limit: float) -> bool:
+    """Whether the tests of the module fail on the mutant, or take longer than so many seconds."""
+    module = mutant.module
+    path = folder / "lfrtorch" / f"{module}.py"
+    clean = (ROOT / "lfrtorch" / f"{module}.py").read_text()
+    path.write_text(mutant.source(clean))
+    process = processes.Process(target=_run, args=(folder, module))
+    process.start()
+    process.join(limit)
     if late := process.is_alive():
         process.kill()
         process.join()
@@ -276,19 +286,28 @@ def main() -> int:
             shutil.copytree(ROOT, folder, ignore=ignored)
             folders.put(folder)
 
+        seconds: dict[str, float] = {}
+
         def tried(task: Mutant | str) -> bool:
             folder = folders.get()
             try:
-                return is_noticed(task, folder, processes)
+                if isinstance(task, str):
+                    seconds[task] = clean_seconds(task, folder, processes)
+                    return math.isfinite(seconds[task])
+                limit = max(LEAST, TOO_LONG * seconds[task.module])
+                return is_noticed(task, folder, processes, limit)
             finally:
                 folders.put(folder)
 
         with ThreadPoolExecutor(given.jobs) as pool:
             used = sorted({drawn[i].module for i in numbers})
-            for module, failed in zip(used, pool.map(tried, used), strict=True):
-                if failed:
-                    print(f"the tests of {module} fail without a mutant")
-                    return 2
+            sound = list(pool.map(tried, used))
+            for module, passed in zip(used, sound, strict=True):
+                print(f"{module} {seconds[module]:.0f} s", flush=True)
+                if not passed:
+                    print(f"the tests of {module} fail without a fault: mend them first")
+            if not all(sound):
+                return 2
             found = pool.map(tried, [drawn[i] for i in numbers])
             for number, caught in zip(numbers, found, strict=True):
                 noticed += caught
@@ -297,8 +316,10 @@ def main() -> int:
                     name = f"{number}: lfrtorch/{mutant.module}.py, line {mutant.line}"
                     out.write(f"## {name}\n\n```diff\n{difference(mutant)}\n```\n\n")
                     out.flush()
-                seconds = time.monotonic() - begun
-                print(f"{number} {mutant.module} {caught} {noticed} {seconds:.0f} s", flush=True)
+                state = "noticed" if caught else "NOT noticed"
+                print(
+                    f"{number} {mutant.module} {state} {time.monotonic() - begun:.0f} s", flush=True
+                )
     print(f"{noticed} of {len(numbers)} noticed; those that were not are in {given.out}")
     return 0
 
