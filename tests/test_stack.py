@@ -29,6 +29,8 @@ class Bend(nn.Module):
         return self.gain * torch.sin(z @ self.W.mT)
 
 
+pytestmark = pytest.mark.numeric
+
 STATICS = {"network": lambda: None, "polynomial": lambda: Polynomial(2, 1, 2), "own": Bend}
 KINDS = pytest.mark.parametrize("kind", sorted(STATICS))
 
@@ -97,7 +99,9 @@ def test_residuals_and_systems_are_those_of_each_alone(kind: str):
         assert_close(jacobian.adjoint(r), J.mT @ r, rtol=0, atol=1e-6)
 
 
-@KINDS
+@pytest.mark.parametrize(
+    "kind", ["network", *(pytest.param(k, marks=pytest.mark.slow) for k in ("own", "polynomial"))]
+)
 def test_searches_in_step_are_searches_one_by_one(kind: str):
     """Five steps, in which the searches need different numbers of trials."""
     optimiser = LevenbergMarquardt(max_iter=5)
