@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from zipfile import ZipFile
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import pytest
@@ -134,7 +134,7 @@ def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):
 def test_arrays_keep_their_axes(tmp_path):
     whole = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
     savemat(tmp_path / "x.mat", {"a": whole, "b": whole[0], "other": 1.0})
-    with ZipFile(tmp_path / "x.zip", "w") as archive:
+    with ZipFile(tmp_path / "x.zip", "w", ZIP_DEFLATED) as archive:
         archive.writestr("folder/other.mat", "")
         archive.write(tmp_path / "x.mat", "folder/x.mat")
     for path in (tmp_path / "x.mat", tmp_path / "x.zip"):

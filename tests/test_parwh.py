@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from zipfile import ZIP_DEFLATED, ZipFile
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -15,6 +15,8 @@ from scipy.signal import butter, cheby1, cheby2, ellip, lfilter
 
 from lfrtorch import metrics
 from lfrtorch.datasets import official, parwh
+
+pytestmark = pytest.mark.numeric
 
 stand_in = partial(parwh.load, source="stand-in")
 
@@ -87,7 +89,8 @@ def test_two_periods_of_the_arrow_from_rest_end_in_the_scored_one(data):
 
 def test_several_periods_are_as_good_as_one():
     u = parwh.multisine(seed=1)
-    assert np.abs(parwh.simulate(np.tile(u, 2)) - np.tile(parwh.simulate(u), 2)).max() < 1e-13
+    # Rounding of a transform of volts, twice as long: about eps log2(32768) = 3e-15.
+    assert np.abs(parwh.simulate(np.tile(u, 2)) - np.tile(parwh.simulate(u), 2)).max() < 1e-12
 
 
 @pytest.mark.parametrize("samples", [1, 7, 1000])
@@ -106,17 +109,18 @@ def test_a_constant_input_gives_a_constant(samples):
 
 @pytest.mark.parametrize("level", parwh.LEVELS)
 def test_error_of_the_best_linear_model(level):
-    """The nonparametric BLA of 100 realisations leaves about the errors that are published.
+    """The nonparametric BLA of 20 realisations leaves about the errors that are published.
 
     Of one realisation it varies by 8 % at 100 mV, where few samples saturate, and 2 % at 1000 mV:
-    that of the level's test may be far from the mean, which is compared here.
+    that of the level's test may be far from the mean of 10, which is compared here. The BLA's own
+    variance adds 1 / 40 to it. Measured: -5 % at 100 mV, of the others -1 % to 0 %.
     """
     rng = np.random.default_rng(1)
-    pairs = [(u, parwh.simulate(u)) for u in (one_period(level, rng) for _ in range(150))]
+    pairs = [(u, parwh.simulate(u)) for u in (one_period(level, rng) for _ in range(30))]
     G = np.zeros(PERIOD // 2 + 1, complex)
-    for u, y in pairs[:100]:
-        G[EXCITED] += np.fft.rfft(y)[EXCITED] / np.fft.rfft(u)[EXCITED] / 100
-    errors = [np.std(y - np.fft.irfft(G * np.fft.rfft(u), PERIOD)) for u, y in pairs[100:]]
+    for u, y in pairs[:20]:
+        G[EXCITED] += np.fft.rfft(y)[EXCITED] / np.fft.rfft(u)[EXCITED] / 20
+    errors = [np.std(y - np.fft.irfft(G * np.fft.rfft(u), PERIOD)) for u, y in pairs[20:]]
     assert 1e3 * np.mean(errors) == pytest.approx(FLOOR[level], rel=0.1)
 
 
@@ -373,7 +377,7 @@ def test_all_realisations_but_the_last_can_train(numbered, seed):
 def test_the_file_is_read_from_its_archive(numbered, tmp_path):
     whole = parwh.load(root=numbered, levels=[100])
     (tmp_path / ARCHIVE).parent.mkdir()
-    with ZipFile(tmp_path / ARCHIVE, "w", ZIP_DEFLATED, compresslevel=1) as archive:
+    with ZipFile(tmp_path / ARCHIVE, "w") as archive:  # test_official has one that is compressed
         archive.writestr("ParWHFiles/readme.txt", "text")
         archive.write(numbered / MAT, "ParWHFiles/ParWHData.mat")
     data = parwh.load(root=tmp_path, levels=[100])
@@ -494,11 +498,9 @@ def test_a_file_of_another_shape(tmp_path):
 
 
 @pytest.mark.data
-def test_official_file(benchmark_root):
+def test_official_file(official):
     """What the description says of the levels, the lines and the arrow; the two periods agree."""
-    if not any((benchmark_root / file).is_file() for file in (MAT, ARCHIVE)):
-        pytest.skip(f"no folder ParWH in {benchmark_root}")
-    data = parwh.load(source="official", root=benchmark_root, periods=2)
+    data = official(parwh.load, periods=2)
     assert "not the known file" not in data.notes[0]
     for records in (data.train, data.validation, data.tests[:-1]):
         for record, level in zip(records, parwh.LEVELS, strict=True):
