@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import copy
+import sys
 import weakref
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hydra import compose, initialize_config_dir
 from numpy.typing import NDArray
+from omegaconf import DictConfig
 from reference import random_cell, random_model
 
 import lfrtorch
@@ -48,6 +53,20 @@ def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
     simulate.main()
 
 
+@cache
+def composed() -> DictConfig:
+    with initialize_config_dir(version_base="1.3", config_dir=str(simulate.CONF)):
+        return compose("simulate")
+
+
+def direct() -> None:
+    """The command line without the start of Hydra, which takes a quarter of a second."""
+    cfg = copy.deepcopy(composed())
+    cfg.merge_with_dotlist(sys.argv[1:])
+    with simulate.user_errors():
+        simulate.simulate(cfg)
+
+
 def refused(monkeypatch, capsys, folder: Path, *words: str) -> str:
     """The message; the folder is as it was."""
     before = sorted(folder.rglob("*"))
@@ -69,6 +88,7 @@ def columns(path: Path) -> dict[str, NDArray[np.float64]]:
 # --- what is written ------------------------------------------------------------------------
 
 
+@pytest.mark.numeric
 @pytest.mark.parametrize("extension", ["csv", "npz", "parquet"])
 def test_outputs_of_inputs_alone(extension: str, folder: Path, monkeypatch, capsys):
     run(monkeypatch, folder, "data.path=inputs.csv", f"out=made/x.{extension}")
@@ -84,6 +104,7 @@ def test_outputs_of_inputs_alone(extension: str, folder: Path, monkeypatch, caps
     assert "RMSE" not in printed.out
 
 
+@pytest.mark.numeric
 def test_a_column_named_like_time_is_the_time(folder: Path, monkeypatch, capsys):
     """A file at another rate is not simulated as if it were at the model's."""
     run(monkeypatch, folder, "data.path=both.csv", "out=x.csv")
@@ -96,6 +117,7 @@ def test_a_column_named_like_time_is_the_time(folder: Path, monkeypatch, capsys)
     run(monkeypatch, folder, "data.path=slow.csv", "data.fs=50", "out=y.csv")  # as it is told
 
 
+@pytest.mark.numeric
 def test_measured_outputs_are_scored(folder: Path, monkeypatch, capsys):
     run(monkeypatch, folder, "data.path=both.csv", "data.time=t", "skip=100", "out=x.csv")
     found = columns(folder / "x.csv")
@@ -115,6 +137,7 @@ def test_measured_outputs_are_scored(folder: Path, monkeypatch, capsys):
     assert len(rows) == 2
 
 
+@pytest.mark.numeric
 def test_columns_of_other_names(folder: Path, monkeypatch, capsys):
     csv(folder / "lab.csv", pos=Y[:, 0], b=U[:, 1], a=U[:, 0], ang=Y[:, 1])
     words = ["data=file", "data.path=lab.csv", "data.inputs=[a,1]", "data.outputs=[pos,ang]"]
@@ -125,6 +148,7 @@ def test_columns_of_other_names(folder: Path, monkeypatch, capsys):
     assert "note" not in capsys.readouterr().out
 
 
+@pytest.mark.numeric
 def test_inputs_beyond_those_of_training_are_said(folder: Path, monkeypatch, capsys):
     loud = np.array(U)
     loud[7, 1] = MODEL.scaler.u_offset[1] - 8.0 * MODEL.scaler.u_scale[1]
@@ -135,6 +159,7 @@ def test_inputs_beyond_those_of_training_are_said(folder: Path, monkeypatch, cap
     assert said[0].startswith("note: the input u2 goes 8 standard deviations of the training input")
 
 
+@pytest.mark.numeric
 def test_a_wrong_start_state_is_said(folder: Path, monkeypatch, capsys):
     y = Y.copy()
     y[: simulate.BEGINNING, 1] += 10.0
@@ -146,6 +171,7 @@ def test_a_wrong_start_state_is_said(folder: Path, monkeypatch, capsys):
     assert "scored samples" not in capsys.readouterr().out
 
 
+@pytest.mark.numeric
 def test_missing_outputs_are_left_out_of_the_scores(folder: Path, monkeypatch, capsys):
     y = np.where(np.arange(T) % 3 == 0, np.nan, Y[:, 0])
     csv(folder / "some.csv", u1=U[:, 0], u2=U[:, 1], y1=y, y2=Y[:, 1])
@@ -175,6 +201,7 @@ def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
     assert len(columns(folder / "x.csv")["y1_hat"]) == T
 
 
+@pytest.mark.numeric
 def test_the_linear_model_of_a_run(folder: Path, monkeypatch, capsys):
     cell = MODEL.lfr.cell
     linear = lfrtorch.LinearModel(
@@ -191,12 +218,14 @@ def test_the_linear_model_of_a_run(folder: Path, monkeypatch, capsys):
 # --- the start ------------------------------------------------------------------------------
 
 
+@pytest.mark.numeric
 def test_a_given_start(folder: Path, monkeypatch):
     run(monkeypatch, folder, "data.path=inputs.csv", "out=x.npz", "start=given", "x0=[1,-2,0.5]")
     expected = MODEL.simulate(U, start="given", x0=[1, -2, 0.5])
     assert np.array_equal(columns(folder / "x.npz")["y1_hat"], expected[:, 0])
 
 
+@pytest.mark.numeric
 def test_an_estimated_start_goes_on_where_the_measurement_was_cut(
     folder: Path, monkeypatch, capsys
 ):
@@ -210,6 +239,7 @@ def test_an_estimated_start_goes_on_where_the_measurement_was_cut(
     assert "(skip=50 leaves them out of the scores)" in printed
 
 
+@pytest.mark.numeric
 def test_a_file_shorter_than_the_estimate(folder: Path, monkeypatch, capsys):
     run(monkeypatch, folder, "data.path=both.csv", "out=x.npz", "start=estimated", "skip=299")
     assert "from the first 300 samples of 'both.csv'" in capsys.readouterr().out
@@ -231,6 +261,7 @@ class Thousands(FileStream):
             yield block
 
 
+@pytest.mark.numeric
 @pytest.mark.parametrize("extension", ["csv", "parquet"])
 def test_blocks_give_the_numbers_of_one_simulation(
     extension: str, folder: Path, monkeypatch: pytest.MonkeyPatch
@@ -288,6 +319,7 @@ def test_blocks_give_the_numbers_of_one_simulation(
 def test_user_errors_are_one_message(
     words: list[str], message: str, folder: Path, monkeypatch, capsys
 ):
+    monkeypatch.setattr(simulate, "main", direct)
     assert message in refused(monkeypatch, capsys, folder, *words)
 
 
@@ -298,6 +330,7 @@ def test_a_gap_in_the_inputs_is_named_by_its_line(folder: Path, monkeypatch, cap
     assert "'gap.csv', line 202: column 'u1' has no finite number; interpolate the gap" in message
 
 
+@pytest.mark.numeric
 def test_a_model_that_diverges_writes_nothing(folder: Path, monkeypatch, capsys):
     model = random_model(random_cell(2, 2, 3, 2, 1, 4, radius=300.0), fs=50.0)
     model.save(folder / "model")
