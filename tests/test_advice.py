@@ -17,6 +17,8 @@ from lfrtorch.records import Channel, Record
 from lfrtorch.responses import Response
 from lfrtorch.trainer import FitResult, Progress, Start
 
+pytestmark = pytest.mark.numeric
+
 GOOD = Evidence(
     train=0.02,
     lti_train=0.2,

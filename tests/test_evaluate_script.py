@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from reference import measure, random_cell, random_model
 from test_train import configuration, file_overrides
-from test_train import csv as csv  # the fixture
+from test_train import csv as csv  # the fixtures
+from test_train import untraced as untraced
 
 import lfrtorch
 import train
@@ -57,6 +58,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     evaluate.main()
 
 
+@pytest.mark.numeric
 def test_scores_are_those_of_the_model_from_the_start_of_each_record(
     run_folder: Path, tmp_path: Path, monkeypatch, capsys
 ):
@@ -101,6 +103,7 @@ def test_without_a_linear_model_its_column_is_empty(tmp_path: Path, monkeypatch,
     assert rest.split()[-3:] == ["-", "0.25", "0.125"]
 
 
+@pytest.mark.numeric
 def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypatch, capsys):
     folder = tmp_path / "run"
     folder.mkdir()
@@ -133,6 +136,7 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
         (["checkpoint=RUN", "+bench=nonsense"], "nonsense"),
     ],
 )
+@pytest.mark.usefixtures("untraced")
 def test_user_errors_are_one_message(
     words: list[str], message: str, run_folder: Path, monkeypatch, capsys
 ):

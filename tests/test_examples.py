@@ -10,6 +10,7 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
 @pytest.mark.slow
+@pytest.mark.numeric
 @pytest.mark.parametrize(
     ("name", "ratio"), [("own_static_map", 50), ("in_a_larger_model", 20), ("own_data", 3)]
 )

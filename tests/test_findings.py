@@ -17,6 +17,8 @@ from lfrtorch.survey import survey
 
 Array = NDArray[np.float64]
 
+pytestmark = pytest.mark.numeric
+
 T = 5000
 NOISE = 0.01
 

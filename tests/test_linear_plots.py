@@ -12,6 +12,7 @@ from lfrtorch import linear_plots
 from lfrtorch.frf import Distortion, Level
 from lfrtorch.records import Channel
 
+pytestmark = pytest.mark.numeric
 FS = 100.0
 F = np.arange(1.0, 41.0)
 MODEL = lfrtorch.LinearModel(

@@ -90,6 +90,7 @@ def test_tensorboard_without_a_record_has_scalars_alone(model: lfrtorch.Model, t
     assert not events.Tags()["images"]
 
 
+@pytest.mark.numeric
 def test_tensorboard_holds_scalars_figures_and_texts(model: lfrtorch.Model, tmp_path: Path):
     board = TensorBoard(tmp_path, RECORD, 0.5 * RECORD.y, every=2)
     for iteration in range(3):

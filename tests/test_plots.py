@@ -8,6 +8,7 @@ from lfrtorch import plots
 from lfrtorch.records import Channel, Record
 from lfrtorch.trainer import Progress
 
+pytestmark = pytest.mark.numeric
 T = np.arange(400) / 100.0
 Y = np.column_stack([np.sin(2 * np.pi * 10 * T), 3 * np.cos(2 * np.pi * 20 * T)])
 RECORD = Record(T, Y, 100.0, skip=0, name="lab", outputs=(Channel("a", "m"), Channel("b")))

@@ -12,6 +12,8 @@ from lfrtorch import report
 from lfrtorch.datasets import Dataset, Published
 from lfrtorch.records import Channel, Record
 
+pytestmark = pytest.mark.numeric
+
 
 @pytest.fixture(scope="module")
 def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:

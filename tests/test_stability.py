@@ -1,6 +1,7 @@
 """How much louder than its data a model may be driven."""
 
 import numpy as np
+import pytest
 import torch
 
 import lfrtorch
@@ -8,6 +9,7 @@ from lfrtorch.records import Record
 from lfrtorch.stability import loudest
 
 
+@pytest.mark.numeric
 def test_a_model_that_runs_away_on_louder_inputs_is_found():
     """x+ = u + c x³ stays bounded under a constant u below 2 / (3 √(3 c)), here 1.3."""
     square = np.repeat(np.tile([1.0, -1.0], 5), 60)

@@ -186,7 +186,8 @@ def test_notes_on_the_data_are_printed(
 @pytest.mark.parametrize("group", ["bla", "data", "init", "trainer"])
 def test_every_option_of_a_group_is_an_argument_of_its_target(group: str):
     for path in (CONF / group).glob("*.yaml"):
-        node = OmegaConf.create(path.read_text())
+        node = OmegaConf.load(path)
+        assert isinstance(node, DictConfig)
         parameters = inspect.signature(get_object(node["_target_"])).parameters
         assert set(node) - {"_target_"} <= set(parameters)
 
