@@ -124,7 +124,7 @@ def test_numbers_are_those_of_the_system(csv: Path, tmp_path: Path, monkeypatch)
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("refine", ["prediction", "frequency"])
 def test_refinements_and_zeros_by_channel(refine: str, csv: Path, tmp_path: Path, monkeypatch):
-    words = overrides(csv, "a,b", "x", "nx=2", f"bla.refine={refine}")
+    words = overrides(csv, "a,b", "x", "nx=2", f"bla.refine={refine}", "bla.max_iter=20")
     found = run(monkeypatch, tmp_path, *words)
     assert found["fit"]["criterion"] == refine
     assert set(found["zeros"]) == {"x/a", "x/b"}
@@ -253,7 +253,8 @@ def test_it_is_a_script_that_runs_anywhere(tmp_path: Path):
 
 @pytest.mark.numeric
 def test_train_takes_the_order_of_a_scan(csv: Path, tmp_path: Path, capsys):
-    words = overrides(csv, "a", "x", "nx=auto", "nx_max=3", "nn=2", "trainer.max_iter=1")
+    # Order 3 finds noise only, and validates worse than 2 by 0.6 %.
+    words = overrides(csv, "a,b", "x", "nx=auto", "nx_max=3", "nn=2", "trainer.max_iter=1")
     cfg = configuration(*words)
     train.identify(cfg, tmp_path)
     assert cfg.nx == 2

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra._internal import utils as hydra_utils
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -387,9 +388,10 @@ def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_new_run_forgets_the_one_that_it_replaces(csv: Path, tmp_path: Path):
-    settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=2"]
+    settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=2", "threads=3"]
     for seed in (0, 1):
         train.identify(configuration(*settings, f"seed={seed}"), tmp_path)
+    assert torch.get_num_threads() == 3
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["fit"]["iterations"] == 2
 
@@ -528,7 +530,7 @@ def test_user_errors_are_one_message(
     assert stop.value.code == 1
     assert message in printed.err
     assert "Traceback" not in printed.err + printed.out
-    assert not (tmp_path / "config.yaml").exists()
+    assert not (tmp_path / ".hydra").exists()  # no folder is left behind
 
 
 @pytest.mark.parametrize(
