@@ -6,6 +6,8 @@ from torch import Tensor
 
 from lfrtorch.adam import Adam
 
+pytestmark = pytest.mark.numeric
+
 
 class Quadratic:
     """r = (x - 1, 10 (y - 2))."""
