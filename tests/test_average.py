@@ -14,6 +14,8 @@ from lfrtorch.model import Model
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Start
 
+pytestmark = pytest.mark.numeric
+
 
 def models() -> list[Model]:
     """Three of one data set, whose starts were drawn from three seeds."""

@@ -62,6 +62,7 @@ def refused(folder: Path, message: str):
 # --- there and back -------------------------------------------------------------------------
 
 
+@pytest.mark.numeric
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 def test_the_same_bits_come_back(tmp_path: Path, activation: str, dtype: torch.dtype):
@@ -79,6 +80,7 @@ def test_the_same_bits_come_back(tmp_path: Path, activation: str, dtype: torch.d
         assert np.array_equal(model.simulate(U, start=start), back.simulate(U, start=start))
 
 
+@pytest.mark.numeric
 def test_linear_model_comes_back(tmp_path: Path):
     model = random_model(random_cell(2, 1, 3, 0, 0))
     back = load(model.save(tmp_path / "saved"))
@@ -86,6 +88,7 @@ def test_linear_model_comes_back(tmp_path: Path):
     assert np.array_equal(model.simulate(U), back.simulate(U))
 
 
+@pytest.mark.numeric
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_polynomial_comes_back(tmp_path: Path, dtype: torch.dtype):
     model = small(static=Polynomial(2, 1, 3), dtype=dtype)
@@ -297,6 +300,7 @@ def test_file_of_a_checkpoint_is_not_the_checkpoint(saved: Path):
 # --- the two models of a run ----------------------------------------------------------------
 
 
+@pytest.mark.numeric
 def test_each_kind_of_model_is_found_in_a_run(tmp_path: Path):
     model, run = random_model(random_cell(2, 1, 3, 0, 0)), tmp_path / "run"
     linear = lfrtorch.LinearModel(

@@ -14,6 +14,8 @@ from lfrtorch.nonlinearity import ACTIVATIONS
 from lfrtorch.residual import SimulationError
 from lfrtorch.stack import Stack
 
+pytestmark = pytest.mark.numeric
+
 DEVICES = ["torch", *(["cuda"] if torch.cuda.is_available() else [])]
 
 

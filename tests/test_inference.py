@@ -21,6 +21,8 @@ from lfrtorch.model import Model
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Channel, Record, Scaler
 
+pytestmark = pytest.mark.numeric
+
 PERIOD = 512
 ONE: dict[str, Any] = {"nz": 1, "nw": 1, "nn": 5}
 
@@ -109,7 +111,7 @@ def error(model: Model | LinearModel, data: list[Record]) -> float:
     return float(np.sqrt(np.mean([rmse(r, model.simulate(r)) ** 2 for r in data])))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_start_is_better_than_the_linear_model(planted, seed: int):
     data, bla = planted
     model = inference(bla, data, **ONE, seed=seed)
@@ -119,7 +121,7 @@ def test_start_is_better_than_the_linear_model(planted, seed: int):
         assert torch.equal(cell.get_parameter(name), plain.get_parameter(name))
 
 
-@pytest.mark.parametrize(("nz", "nw"), [(2, 1), (1, 2), (2, 2)])
+@pytest.mark.parametrize(("nz", "nw"), [(2, 1), (1, 2)])
 def test_start_of_other_sizes_is_never_worse(planted, nz: int, nw: int):
     data, bla = planted
     model = inference(bla, data, nz=nz, nw=nw, nn=6)
@@ -170,7 +172,15 @@ def test_options_reach_the_model(spring):
     assert error(model, data) < 0.8 * error(bla, data)
 
 
-@pytest.mark.parametrize(("nz", "nw", "ny"), [(2, 1, 1), (1, 2, 1), (2, 1, 2), (2, 2, 2)])
+@pytest.mark.parametrize(
+    ("nz", "nw", "ny"),
+    [
+        (1, 2, 1),
+        pytest.param(2, 1, 1, marks=pytest.mark.slow),
+        pytest.param(2, 1, 2, marks=pytest.mark.slow),
+        (2, 2, 2),
+    ],
+)
 def test_gradient(nz: int, nw: int, ny: int, monkeypatch: pytest.MonkeyPatch):
     """Exact, as r is orthogonal to what Kaufman's approximation leaves out of J."""
     # The damping of β is no part of the cost.

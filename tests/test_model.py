@@ -20,6 +20,8 @@ from lfrtorch.residual import SimulationError
 from lfrtorch.sensitivity import Linearisation, output_jacobian
 from lfrtorch.simulate import simulate, steady_state
 
+pytestmark = pytest.mark.numeric
+
 # --- coordinates that do not matter ---------------------------------------------------------
 
 
@@ -72,11 +74,12 @@ def test_net_parameters_are_the_rank_of_the_periodic_jacobian(nu, ny, nx, nz, nw
     model = random_model(cell)
     linear = nx * (nx + nu + nw) + nz * (nx + nu) + ny * (nx + nu + nw)
     assert model.parameters == linear + nn * (nz + 1 + nw) + nw
-    u = normal(1, 500, nu)
+    u = normal(1, 200, nu)
     linearisation = Linearisation(cell, u, steady_state(cell, u), periodic=True)
     J = output_jacobian(linearisation).flatten(0, 2)
     s = torch.linalg.svdvals(J / J.norm(dim=0))
-    assert model.parameters_net == int((s > 1e-12 * s[0]).sum())
+    # Directions that are seen have 6e-7 or more, those of the gauge rounding errors of 5e-16.
+    assert model.parameters_net == int((s > 1e-11 * s[0]).sum())
 
 
 @pytest.mark.parametrize(
@@ -92,7 +95,8 @@ def test_net_parameters_of_a_polynomial_are_the_rank_as_well(nu, ny, nx, nz, nw,
     linearisation = Linearisation(cell, u, steady_state(cell, u), periodic=True)
     J = output_jacobian(linearisation).flatten(0, 2)
     s = torch.linalg.svdvals(J / J.norm(dim=0))
-    assert model.parameters_net == int((s > 1e-12 * s[0]).sum())
+    # Directions that are seen have 6e-7 or more, those of the gauge rounding errors of 5e-16.
+    assert model.parameters_net == int((s > 1e-11 * s[0]).sum())
 
 
 def test_net_parameters_of_a_linear_model():
@@ -132,7 +136,8 @@ def test_start_state_is_carried(model: Model):
     normalised = torch.tensor(model.scaler.normalise_u(u))[None]
     middle = model.lfr.trajectory(normalised).x[0, 20]
     second = model.simulate(u[20:], x0=middle.numpy())
-    np.testing.assert_allclose(second, model.simulate(u)[20:], rtol=0, atol=1e-13)
+    # eps over the 1 - 0.9 of the contraction, in outputs of order one
+    np.testing.assert_allclose(second, model.simulate(u)[20:], rtol=0, atol=1e-12)
 
 
 def test_one_input_may_be_one_dimensional():

@@ -33,7 +33,10 @@ from lfrtorch.trainer import Progress
 
 OPTIMISER = LevenbergMarquardt(max_iter=10)
 
-pytestmark = pytest.mark.xdist_group("sizes")  # its fixture takes seconds: once
+pytestmark = [
+    pytest.mark.xdist_group("sizes"),  # its fixture takes seconds: once
+    pytest.mark.numeric,
+]
 
 
 Planted = tuple[list[Record], list[Record], LinearModel]
@@ -91,7 +94,7 @@ def test_planted_sizes_are_chosen(single: SizeSearch):
 
 
 def test_a_second_input_of_the_map_is_found():
-    found = search(plant(2, 1), nn=3)
+    found = search(plant(2, 1), nn=3, seeds=(0,))
     assert found.chosen.sizes == {"nz": 2, "nw": 1, "nn": 3}
     assert len(found.candidates) == 4
     assert found.notes == ("nz 2 is the largest tried; a larger one may do better.",)
