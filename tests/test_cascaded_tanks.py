@@ -110,8 +110,8 @@ def test_a_file_of_another_length_is_refused(numbered):
 
 
 @pytest.mark.data
-def test_official_file(benchmark_root):
-    data = cascaded_tanks.load(root=benchmark_root)
+def test_official_file(official):
+    data = official(cascaded_tanks.load)
     (train,), (test,) = data.train, data.tests
     for record in (train, test):
         assert record.y.max() == pytest.approx(10.0, abs=0.01)  # the sensor's end
@@ -119,9 +119,13 @@ def test_official_file(benchmark_root):
     assert train.y[0, 0] == pytest.approx(test.y[0, 0], abs=0.3)  # one start state, or nearly
 
 
+@pytest.mark.numeric
 @pytest.mark.data
-def test_no_mode_of_the_linear_model_is_drift(benchmark_root):
-    """Of seven eighths of the record, the least cost has a pole of 0.999996."""
-    (whole,) = cascaded_tanks.load(root=benchmark_root).train
+def test_no_mode_of_the_linear_model_is_drift(official):
+    """Of seven eighths of the record, the least cost has a pole of 0.999996.
+
+    The poles stay at 0.97907 and 0.89659 from 50 iterations on.
+    """
+    (whole,) = official(cascaded_tanks.load).train
     part = replace(whole[:896], start="estimated")
-    assert abs(lfrtorch.estimate_bla(part, nx=2).poles).max() < 0.985
+    assert abs(lfrtorch.estimate_bla(part, nx=2, max_iter=60).poles).max() < 0.985

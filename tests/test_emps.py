@@ -168,6 +168,7 @@ def scores(root: Path, *words: str) -> dict[str, dict[str, float]]:
     return metrics["scores"] | {"validation": metrics["validation"]}
 
 
+@pytest.mark.numeric
 def test_start_states_of_an_integrator(tmp_path):
     """The window of 20 samples finds them; from zero state the position is wrong for good."""
     moves = 4 * [0.24, 0.0]
@@ -192,6 +193,7 @@ def test_start_states_of_an_integrator(tmp_path):
     assert from_zero[-1000:].min() > 0.1
 
 
+@pytest.mark.numeric
 @pytest.mark.slow
 def test_friction_is_identified(simulated, capsys):
     """From 15 mm of the linear model to less than 1 mm (27 µm after 150 iterations)."""
@@ -203,10 +205,8 @@ def test_friction_is_identified(simulated, capsys):
 
 
 @pytest.mark.data
-def test_official_files(benchmark_root):
-    if not (benchmark_root / "EMPS").is_dir():
-        pytest.skip(f"no folder EMPS in {benchmark_root}")
-    data = emps.load(root=benchmark_root)
+def test_official_files(official):
+    data = official(emps.load)
     for record in (*data.train, *data.tests):
         assert np.abs(record.u).max() <= 10.0  # V, where the controller saturates
         assert 0.1 < np.ptp(record.y) < 1.0  # m

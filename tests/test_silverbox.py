@@ -99,8 +99,8 @@ def test_a_missing_file_is_one_message(tmp_path):
 
 
 @pytest.mark.data
-def test_official_file(benchmark_root):
-    data = silverbox.load(root=benchmark_root)
+def test_official_file(official):
+    data = official(silverbox.load)
     (train,), (multisine, arrow, inside) = data.train, data.tests
     for record in (train, multisine, arrow):
         assert 1e3 * np.mean(record.u) == pytest.approx(6.2, abs=0.1)  # the offsets are left in
@@ -112,12 +112,13 @@ def test_official_file(benchmark_root):
     assert np.std(arrow.u[-2000:-200]) > np.std(train.u)
 
 
+@pytest.mark.numeric
 @pytest.mark.data
-def test_warm_up_is_long_enough(benchmark_root):
+def test_warm_up_is_long_enough(official):
     """The BLA's poles, 0.9655 in magnitude at 70 Hz, from zero state and from the whole past."""
     pole = 0.9655 * np.exp(2j * np.pi * 70 / 610.35)
     denominator = np.real(np.poly([pole, np.conj(pole)]))
-    data = silverbox.load(root=benchmark_root)
+    data = official(silverbox.load)
     (train,), (multisine, *_) = data.train, data.tests
     y = lfilter(np.sum(denominator), denominator, multisine.u[:, 0])
     late = lfilter(np.sum(denominator), denominator, multisine.u[250:, 0])

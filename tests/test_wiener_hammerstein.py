@@ -90,8 +90,8 @@ def test_a_file_of_another_length_is_refused(numbered):
 
 
 @pytest.mark.data
-def test_official_file(benchmark_root):
-    data = wiener_hammerstein.load(root=benchmark_root)
+def test_official_file(official):
+    data = official(wiener_hammerstein.load)
     (train,), (test,) = data.train, data.tests
     assert 1e3 * np.std(test.y) == pytest.approx(239.1, abs=0.1)
     # What is skipped of the training part is rest but for an old response, and the input follows.
