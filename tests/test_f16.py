@@ -196,6 +196,7 @@ def shaken():
         yield Path(folder)
 
 
+@pytest.mark.numeric
 def test_the_mean_of_the_periods_has_less_noise(shaken):
     """Noise of the rms NOISE / √8 in the input and, as the transient is left out, in the outputs.
 
@@ -212,6 +213,7 @@ def test_the_mean_of_the_periods_has_less_noise(shaken):
             assert noise == pytest.approx(expected, rel=0.04)  # 5 / √(2 · 8192)
 
 
+@pytest.mark.numeric
 @pytest.mark.slow
 def test_run(shaken, tmp_path, capsys):
     """The bench from its files to the table: inferred and in two iterations 10 % below linear."""

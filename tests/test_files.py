@@ -219,9 +219,9 @@ def test_files_that_do_not_belong_together(tmp_path, signals):
 
 
 def test_refused_uses(runs):
-    pattern = str(runs)
-    refused("data.test=12 takes the last 12 of the 12 record", pattern, test=12)
-    refused("data.validation=11 .* of the 11 record", pattern, test=1, validation=11)
+    pattern = str(runs.parent / "run[123].csv")
+    refused("data.test=3 takes the last 3 of the 3 record", pattern, test=3)
+    refused("data.validation=2 .* of the 2 record", pattern, test=1, validation=2)
     refused("data.test is 1.5; give a fraction below 1", pattern, test=1.5)
     refused("'run99'.*neither a file nor one of the records: run1, run2", pattern, test="run99")
     refused("'run3', which has a use already", pattern, test="run3", validation="run3")
@@ -235,6 +235,7 @@ def test_refused_uses(runs):
 # --- time stamps ----------------------------------------------------------------------------
 
 
+@pytest.mark.numeric
 @pytest.mark.parametrize(
     ("t", "fs"),
     [
@@ -255,6 +256,7 @@ def test_sampling_frequency_of_time_stamps(tmp_path, t, fs):
     load_records(tmp_path / "a.csv", **TIMED, fs=fs)
 
 
+@pytest.mark.numeric
 def test_dates_and_units_of_time(tmp_path, signals):
     stamps = pd.date_range("2024-12-31T23:59:58", periods=SAMPLES, freq="20ms")
     table = pd.DataFrame(signals, columns=["u1", "u2", "y"])
@@ -268,6 +270,7 @@ def test_dates_and_units_of_time(tmp_path, signals):
         assert np.array_equal(joined(data.tests[0]), signals)
 
 
+@pytest.mark.numeric
 def test_refused_time(tmp_path):
     path = tmp_path / "a.csv"
     even = np.arange(300) / 100
@@ -373,6 +376,7 @@ PERIODIC: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 1.0}
 SAME_INPUT = "the parts of a record have the same input in every period"
 
 
+@pytest.mark.numeric
 def test_period_and_transient_are_found(tmp_path):
     periodic(tmp_path / "a.csv", 5, more=30)
     data = load_records(tmp_path / "a.csv", **PERIODIC)
@@ -390,17 +394,20 @@ def test_period_and_transient_are_found(tmp_path):
     assert data.notes == ("the input repeats every 100 samples, 5.3 times",)
 
 
+@pytest.mark.numeric
 def test_a_transient_that_is_most_of_the_record_is_kept(tmp_path):
     periodic(tmp_path / "a.csv", 2)
     assert load_records(tmp_path / "a.csv", **PERIODIC).train[0].skip == 10
 
 
+@pytest.mark.numeric
 def test_settled_data_from_rest_are_noted(tmp_path):
     periodic(tmp_path / "a.csv", 4, settled=True)
     data = load_records(tmp_path / "a.csv", **PERIODIC)
     assert data.notes[0].endswith("settled from the first sample on: use data.start=periodic")
 
 
+@pytest.mark.numeric
 def test_steady_state_is_cut_to_whole_periods(tmp_path):
     table = periodic(tmp_path / "a.csv", 7, more=40)
     data = load_records(tmp_path / "a.csv", **PERIODIC, start="periodic")
@@ -415,6 +422,7 @@ def test_steady_state_is_cut_to_whole_periods(tmp_path):
     assert [r.samples for r in (*given.train, *given.tests)] == [2 * N] * 2 or given.train
 
 
+@pytest.mark.numeric
 def test_refused_periods(tmp_path, signals):
     path = tmp_path / "a.csv"
     periodic(path, 3)
@@ -494,9 +502,10 @@ def test_refused_values(tmp_path, signals):
 @pytest.mark.data
 def test_cascaded_tanks_as_a_spreadsheet(tmp_path, benchmark_root):
     """The benchmark's own file, its estimation and validation signals as two files of Excel."""
-    found = scipy.io.loadmat(
-        benchmark_root / "Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat", squeeze_me=True
-    )
+    path = benchmark_root / "Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat"
+    if not path.is_file():
+        pytest.skip(f"no file '{path}'")
+    found = scipy.io.loadmat(path, squeeze_me=True)
     ts = float(found["Ts"])
     for name, part in (("estimation", "Est"), ("test", "Val")):
         columns = {
@@ -522,14 +531,16 @@ def test_cascaded_tanks_as_a_spreadsheet(tmp_path, benchmark_root):
 @pytest.mark.data
 def test_silverbox_in_matlab_and_text(tmp_path, benchmark_root):
     path = benchmark_root / "Silverbox/SilverboxFiles/SNLS80mV.mat"
+    if not path.is_file():
+        pytest.skip(f"no file '{path}'")
     found = scipy.io.loadmat(path, squeeze_me=True)
     use: dict[str, Any] = {"fs": 1e7 / 2**14, "period": None}
     data = load_records(path, inputs="V1", outputs="V2", **use)
     np.savetxt(
-        tmp_path / "a.txt", np.stack([found["V1"], found["V2"]], axis=1)[:20_000], header="V1 V2",
+        tmp_path / "a.txt", np.stack([found["V1"], found["V2"]], axis=1)[:2000], header="V1 V2",
         fmt="%.17g",
     )  # fmt: skip
     text = load_records(tmp_path / "a.txt", inputs="V1", outputs="V2", **use)
     assert Path(path).stem == data.name
     assert np.array_equal(data.tests[0].y[:, 0], found["V2"])
-    assert np.array_equal(text.tests[0].y, data.tests[0].y[:20_000])
+    assert np.array_equal(text.tests[0].y, data.tests[0].y[:2000])

@@ -6,6 +6,8 @@ import pytest
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.records import Record
 
+pytestmark = pytest.mark.numeric
+
 Y = np.array([9.0, 1.0, 3.0, 1.0, 3.0])
 
 

@@ -177,6 +177,7 @@ def test_records_of_different_rates():
 # --- scaling --------------------------------------------------------------------------------
 
 
+@pytest.mark.numeric
 def test_scaler_maps_to_offset_and_scale_and_back():
     scaler = Scaler(np.array([1.0, 2.0]), np.array([2.0, 4.0]), np.array([-1.0]), np.array([0.5]))
     assert np.array_equal(scaler.normalise_u(np.array([[3.0, 2.0]])), [[1.0, 0.0]])
@@ -184,6 +185,7 @@ def test_scaler_maps_to_offset_and_scale_and_back():
     assert np.array_equal(scaler.restore_y(np.array([[2.0]])), [[0.0]])
 
 
+@pytest.mark.numeric
 def test_rms_scale_is_about_the_offset_and_1_for_a_constant_channel():
     signals = [np.array([[4.0, 7.0], [-2.0, 7.0]]), np.array([[1.0, 7.0]])]
     assert np.allclose(rms_scale(signals, np.array([1.0, 7.0])), [np.sqrt(6.0), 1.0])

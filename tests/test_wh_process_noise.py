@@ -137,6 +137,7 @@ def rms(x):
     return np.sqrt(np.mean(np.square(x)))
 
 
+@pytest.mark.numeric
 def test_run(tmp_path):
     """From files to scores: process noise is a floor of the validation error and not of the tests'.
 
