@@ -254,6 +254,15 @@ def test_patience_counts_steps_without_progress():
     assert states[-1].reason == "converged: the cost no longer falls"
 
 
+def test_residual_below_the_floor_counts_as_zero():
+    # λ is 1 and then 1/5 of |J|²: what is left is a half, and a sixth of that.
+    optimiser = LevenbergMarquardt(damping=1.0, floor=0.5)
+    states = search(Problem(lambda x: x - 1), tensor(5, 7), optimiser)
+    rms = [float(state.residual.square().mean().sqrt()) for state in states]
+    assert rms == pytest.approx([26**0.5, 26**0.5 / 2, 26**0.5 / 12])
+    assert states[-1].reason == "converged: the residual vanishes"
+
+
 def test_acceleration_costs_one_residual_a_trial():
     for acceleration, evaluations in ((False, 1), (True, 2)):
         problem = Problem(rosenbrock)

@@ -211,6 +211,17 @@ def test_a_step_that_was_taken_back_is_taken_back_again(
         assert outcome(again.advance().result()) == outcome(whole)
 
 
+@pytest.mark.parametrize(("every", "files"), [(0.0, 4), (1e9, 1)])
+def test_files_are_written_when_it_is_time_and_at_the_end(
+    tmp_path: Path, every: float, files: int, monkeypatch: pytest.MonkeyPatch
+):
+    written, save = [], Fit.save
+    monkeypatch.setattr(Fit, "save", lambda fit, path: (written.append(path), save(fit, path)))
+    options: Any = {"optimiser": LevenbergMarquardt(max_iter=3)}
+    fit_starts(starts(1), *records(["zero"]), snapshots=Snapshots(tmp_path, every), **options)
+    assert written == files * [tmp_path / "0.safetensors"]
+
+
 def test_the_best_score_of_all(tmp_path: Path):
     assert Snapshots(tmp_path).least == Snapshots().least == float("inf")
     result = run(starts(3), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=2))

@@ -18,7 +18,7 @@ from lfrtorch.model import Model, load
 from lfrtorch.ranks import LOST, ProcessLost, Ranks
 from lfrtorch.records import Record
 from lfrtorch.residual import SimulationError
-from lfrtorch.trainer import EXPLOSION, INTERRUPTED, Progress, fit
+from lfrtorch.trainer import EXPLOSION, INTERRUPTED, Fit, Progress, fit
 
 pytestmark = pytest.mark.numeric
 
@@ -391,6 +391,19 @@ def test_monitors_see_every_iteration_with_its_weights():
     assert {p.limit for p in result.history} == {4}
     assert result.history[4].seconds_left == 0
     assert 0 < result.seconds_per_iteration < result.seconds
+
+
+def test_time_left_is_that_of_the_iterations_so_far():
+    progress = Progress(2, 6, 1.0, 1.0, 3.0, True, {}, 1.0)
+    assert progress.seconds_left == 6.0
+    assert replace(progress, iteration=0).seconds_left == 18.0
+
+
+def test_usual_duration_is_the_median_without_the_first():
+    begun = Fit(*planted(T=20)[:2], optimiser=LevenbergMarquardt(max_iter=1)).advance()
+    for durations, usual in (([9.0, 1.0, 4.0, 2.0], 2.0), ([9.0], 9.0)):
+        begun._durations = durations
+        assert begun.result().seconds_per_iteration == usual
 
 
 def test_monitors_never_see_a_trial():
