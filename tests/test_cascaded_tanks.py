@@ -119,13 +119,14 @@ def test_official_file(official):
     assert train.y[0, 0] == pytest.approx(test.y[0, 0], abs=0.3)  # one start state, or nearly
 
 
+@pytest.mark.slow
 @pytest.mark.numeric
 @pytest.mark.data
 def test_no_mode_of_the_linear_model_is_drift(official):
     """Of seven eighths of the record, the least cost has a pole of 0.999996.
 
-    The poles stay at 0.97907 and 0.89659 from 50 iterations on.
+    Measured: 0.97907 with the kernels of three processors.
     """
     (whole,) = official(cascaded_tanks.load).train
     part = replace(whole[:896], start="estimated")
-    assert abs(lfrtorch.estimate_bla(part, nx=2, max_iter=60).poles).max() < 0.985
+    assert abs(lfrtorch.estimate_bla(part, nx=2).poles).max() < 0.985
