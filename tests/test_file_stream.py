@@ -128,6 +128,11 @@ def test_times_at_another_rate(rate: float, samples: int, tmp_path: Path):
     refused(message, timed(tmp_path, np.arange(T) / rate), samples=samples, times="t")
 
 
+def test_times_are_one_column(tmp_path: Path):
+    np.savez(tmp_path / "x.npz", t=np.stack([TIMES, TIMES], axis=1), u1=U[:, 0], u2=U[:, 1])
+    refused("data.time is 't', 2 columns; name one", tmp_path / "x.npz", times="t")
+
+
 def test_times_that_do_not_rise(tmp_path: Path):
     refused("line 3: the time column t does not rise", timed(tmp_path, -TIMES), times="t")
 

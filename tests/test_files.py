@@ -395,6 +395,19 @@ def test_period_and_transient_are_found(tmp_path):
 
 
 @pytest.mark.numeric
+def test_a_transient_of_several_periods(tmp_path):
+    """A pole of 0.98 takes the response below noise of a thousandth in three to five periods."""
+    table = periodic(tmp_path / "a.csv", 12)
+    slow = scipy.signal.lfilter([1.0], [1, -0.98], table[:, 0])
+    slow += 1e-3 * np.std(slow) * np.random.default_rng(0).normal(size=len(slow))
+    write(tmp_path / "a.csv", np.stack([table[:, 0], slow], axis=1), "u,y")
+    data = load_records(tmp_path / "a.csv", **PERIODIC)
+    count = data.train[0].skip // N
+    assert 2 <= count <= 5
+    assert f"the first {count} periods are the transient and are not fitted" in data.notes[0]
+
+
+@pytest.mark.numeric
 def test_a_transient_that_is_most_of_the_record_is_kept(tmp_path):
     periodic(tmp_path / "a.csv", 2)
     assert load_records(tmp_path / "a.csv", **PERIODIC).train[0].skip == 10

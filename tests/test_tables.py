@@ -292,6 +292,13 @@ def test_npy(tmp_path):
 
 
 @pytest.mark.numeric
+def test_npz_under_the_name_of_npy(tmp_path):
+    np.savez(tmp_path / "a.npz", u=U)
+    (tmp_path / "a.npz").rename(tmp_path / "a.npy")
+    with pytest.raises(ValueError, match=r"a\.npy' holds several arrays; give it the extension"):
+        open_table(tmp_path / "a.npy")
+
+
 def test_times_of_numpy_are_seconds(tmp_path):
     stamps = np.datetime64("2024-01-01T10:00") + np.arange(4) * np.timedelta64(2, "ms")
     np.savez(tmp_path / "a.npz", t=stamps)
