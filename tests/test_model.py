@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from torch.testing import assert_close
 from lfrtorch.cell import LFRCell
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
+from lfrtorch.newton import newton
 from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Record
 from lfrtorch.residual import SimulationError
@@ -63,6 +65,18 @@ def test_output_does_not_depend_on_coordinates(transform):
     # eps κ(T)² is about 1e-14; the steady state is known to 1e-10 / (1 - 0.9^100).
     assert_close(simulate(cell, u, zero).y, before[0], rtol=1e-9, atol=1e-9)
     assert_close(steady_state(cell, u).y, before[1], rtol=1e-9, atol=1e-9)
+
+
+def test_passes_find_the_steady_state_where_newton_fails(monkeypatch: pytest.MonkeyPatch):
+    cell = random_cell(nz=2, static=torch.nn.Linear(2, 1, dtype=torch.float64))
+    u = normal(2, 40, 1)
+    expected = steady_state(cell, u)
+
+    def failing(*args: Any, periodic: bool = False, **options: Any) -> Tensor:
+        return torch.nan * expected.x if periodic else newton(*args, **options)
+
+    monkeypatch.setattr("lfrtorch.simulate.newton", failing)
+    assert_close(steady_state(cell, u).y, expected.y, rtol=0, atol=1e-8)  # known to 1e-10
 
 
 @pytest.mark.parametrize(
