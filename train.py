@@ -93,7 +93,8 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
             OmegaConf.save(cfg, fresh, resolve=True)
         if cfg.resume is None:
             shutil.rmtree(folder / SNAPSHOTS, ignore_errors=True)
-    snapshots = Snapshots(folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None)
+    kept = folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None
+    snapshots = Snapshots(kept, writes=ranks.rank == 0)
     settings = {"optimiser": instantiate(cfg.trainer), "ridge": cfg.ridge, "ranks": ranks}
     settings |= {"snapshots": snapshots, "average": average(cfg, models)}
     records = (dataset.train, dataset.validation, dataset.selection)

@@ -24,13 +24,17 @@ class Snapshots:
     Args:
         folder: where they are; without one nothing is kept.
         every: least seconds between two files of one start; there is one at each of its ends.
+        writes: whether files are written; of several processes the first one's are.
 
     Raises:
         ValueError: damaged files.
     """
 
-    def __init__(self, folder: Path | None = None, every: float = EVERY) -> None:
+    def __init__(
+        self, folder: Path | None = None, every: float = EVERY, *, writes: bool = True
+    ) -> None:
         self.folder, self.every = folder, every
+        self._writes = writes and folder is not None
         self.rounds: list[list[int]] = []
         """Numbers of the starts that went on after each round that has ended."""
         self._count: int | None = None
@@ -72,7 +76,7 @@ class Snapshots:
 
     def keeper(self, number: int) -> Keep:
         """What writes the file of a start, where it is time."""
-        if self.folder is None:
+        if not self._writes:
             return nothing
         due = monotonic() + self.every
 
@@ -87,14 +91,15 @@ class Snapshots:
     def decided(self, numbers: list[int]) -> None:
         """Note which starts go on after a round."""
         self.rounds.append(numbers)
-        if self.folder is not None:
-            self._write()
+        self._write()
 
     def _file(self, number: int) -> Path:
         assert self.folder is not None
         return self.folder / f"{number}.safetensors"
 
     def _write(self) -> None:
+        if not self._writes:
+            return
         assert self.folder is not None
         with whole_file(self.folder / ROUNDS) as fresh:
             fresh.write_text(json.dumps({"starts": self._count, "rounds": self.rounds}) + "\n")

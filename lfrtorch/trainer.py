@@ -311,6 +311,7 @@ class Fit:
                 f"{self.optimiser.limit} asked for; ask for more."
             )
         if self.ranks.world > 1:  # what was kept is the first one's part
+            self.problem.guesses = [None] * len(self.problem.batches)
             state = replace(state, residual=self.problem.residual(state.theta))
         self.state = self.optimiser.prolonged(state)
         self.reason = self.state.reason

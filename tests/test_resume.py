@@ -244,6 +244,36 @@ def test_processes_take_their_own_residuals(tmp_path: Path):
     assert torch.equal(again.state.residual, again.problem.residual(again.state.theta))
 
 
+def test_processes_forget_the_periodic_orbits_of_the_first(tmp_path: Path):
+    """The guesses on disk are those of the first process's records."""
+
+    class Second(Ranks):
+        rank, world = 1, 2
+
+    model = random_model(random_cell(radius=0.7))
+    data = [measure(model, 50 + 10 * i, seed=i, start="periodic") for i in range(4)]
+    fit = Fit(starts(1)[0], data[::2], optimiser=LevenbergMarquardt(max_iter=3))
+    fit.advance(until=2).save(tmp_path / "fit")
+    again = Fit(starts(1)[0], data, optimiser=LevenbergMarquardt(max_iter=3), ranks=Second())
+    again.restore(tmp_path / "fit")
+    alone = Fit(again.model, data[1::2]).problem
+    # Of one point to the tolerance of the steady state, 1e-10, times the gain.
+    torch.testing.assert_close(
+        again.state.residual, alone.residual(again.state.theta), rtol=0, atol=1e-8
+    )
+
+
+def test_the_first_process_alone_writes_files(tmp_path: Path):
+    result = fit_starts(
+        starts(3),
+        *records(),
+        optimiser=LevenbergMarquardt(max_iter=2),
+        snapshots=Snapshots(tmp_path, 0.0, writes=False),
+    )
+    assert result.iterations == 2
+    assert list(tmp_path.iterdir()) == []
+
+
 # --- what cannot go on ----------------------------------------------------------------------
 
 
