@@ -1,7 +1,7 @@
 """Coupled electric drives (CED): measurements of two motors that drive a pulley by a flexible belt.
 
 Input u (V, the two motors together), output z (ticks/s, the speed of the pulley), 500 samples at
-50 Hz in each of two measurements, u11, z11 at a low amplitude and u12, z12 at a high one. Of each
+50 Hz in each of two measurements: u12, z12 is louder, its input u11 + 0.5 V. Of each
 the first 400 samples are for estimation and the last 100 for the test, whose first 10 the score
 leaves out (4 in older versions of the package nonlinear_benchmarks, and of scores that were
 published with them).
