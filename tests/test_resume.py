@@ -251,7 +251,7 @@ def test_processes_forget_the_periodic_orbits_of_the_first(tmp_path: Path):
         rank, world = 1, 2
 
     model = random_model(random_cell(radius=0.7))
-    data = [measure(model, 50 + 10 * i, seed=i, start="periodic") for i in range(4)]
+    data = [measure(model, 50, seed=i, start="periodic") for i in range(3)]  # two are the first's
     fit = Fit(starts(1)[0], data[::2], optimiser=LevenbergMarquardt(max_iter=3))
     fit.advance(until=2).save(tmp_path / "fit")
     again = Fit(starts(1)[0], data, optimiser=LevenbergMarquardt(max_iter=3), ranks=Second())
