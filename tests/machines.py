@@ -24,7 +24,7 @@ import numpy as np
 from llvmlite.binding import get_host_cpu_features
 
 ROOT = Path(__file__).resolve().parents[1]
-PARALLEL = ["-n", "auto", "--maxprocesses", "4", "--dist", "loadgroup"]
+PARALLEL = ["-n", "auto", "--maxprocesses", "4", "--dist", "loadfile"]
 PYTEST = ["-m", "pytest", "-q", "--no-header", "-m", "numeric and not slow", *PARALLEL]
 NOTHING_SELECTED = 5  # pytest's exit code
 

@@ -42,8 +42,6 @@ from lfrtorch.trainer import FitResult, fit
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = Path(__file__).resolve().parent
 
-pytestmark = pytest.mark.xdist_group("distributed")  # its fixture takes seconds: once
-
 
 def case() -> tuple[Model, list[Record], Record]:
     """A model some way off, records of three lengths and starts of the true one, and another."""

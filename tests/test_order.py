@@ -14,7 +14,7 @@ from lfrtorch.linear_model import LinearFit, LinearModel
 from lfrtorch.order import MARGIN, OrderScan, scan_orders
 from lfrtorch.records import Channel, Record
 
-pytestmark = [pytest.mark.numeric, pytest.mark.xdist_group("order")]
+pytestmark = pytest.mark.numeric
 
 
 def record_of(system: System, seed: int, noise: float = 0.1, T: int = 600) -> Record:

@@ -33,10 +33,7 @@ from lfrtorch.trainer import Progress
 
 OPTIMISER = LevenbergMarquardt(max_iter=10)
 
-pytestmark = [
-    pytest.mark.xdist_group("sizes"),  # its fixture takes seconds: once
-    pytest.mark.numeric,
-]
+pytestmark = pytest.mark.numeric
 
 
 Planted = tuple[list[Record], list[Record], LinearModel]
