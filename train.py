@@ -29,25 +29,26 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
-from lfrtorch import figures, html_report, plots, report
-from lfrtorch.advice import advise
-from lfrtorch.checks import integer, number
-from lfrtorch.datasets import Dataset
-from lfrtorch.distributed import connect
-from lfrtorch.evidence import evidence
-from lfrtorch.findings import findings
-from lfrtorch.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
-from lfrtorch.nonlinearity import is_network
-from lfrtorch.order import OrderScan
-from lfrtorch.ranks import LOST, ProcessLost, Ranks
-from lfrtorch.responses import respond
-from lfrtorch.resume import Snapshots
-from lfrtorch.sizes import SizeSearch
-from lfrtorch.stability import LOUDER
-from lfrtorch.termination import Terminated, Termination
-from lfrtorch.threads import each_alone
-from lfrtorch.trainer import INTERRUPTED
-from lfrtorch.whole_file import whole_file
+from lfrtorch._atomic import whole_file
+from lfrtorch._checks import integer, number
+from lfrtorch._threads import each_alone
+from lfrtorch.analysis.amplitude_margin import LOUDER
+from lfrtorch.cli.interrupts import Terminated, Termination
+from lfrtorch.dataset import Dataset
+from lfrtorch.distributed import LOST, ProcessLost, Ranks, connect
+from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.fitting.size_search import SizeSearch
+from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.trainer import INTERRUPTED
+from lfrtorch.linear.order_scan import OrderScan
+from lfrtorch.reporting import figures, plots
+from lfrtorch.reporting import html as html_report
+from lfrtorch.reporting import scores as report
+from lfrtorch.reporting.advice import advise
+from lfrtorch.reporting.diagnosis import evidence
+from lfrtorch.reporting.monitor import Checkpoint, ProgressLine, StartsLine, TensorBoard
+from lfrtorch.reporting.simulations import respond
+from lfrtorch.survey.findings import findings
 
 CONF = Path(__file__).resolve().parent / "conf"
 

@@ -21,10 +21,10 @@ import problems
 import torch
 
 import lfrtorch
-from lfrtorch.gauge import reduction
-from lfrtorch.levenberg_marquardt import LMState
-from lfrtorch.residual import SimulationError
-from lfrtorch.threads import spread_by_hand
+from lfrtorch._threads import spread_by_hand
+from lfrtorch.least_squares.gauge import reduction
+from lfrtorch.least_squares.levenberg_marquardt import LMState
+from lfrtorch.least_squares.simulation_problem import SimulationError
 
 NEARBY = (1.0 + 1e-12 * i for i in itertools.count())
 """Factors of what is kept from one call to the next where it is the same."""

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 import lfrtorch
 from lfrtorch import Record
 from lfrtorch.datasets import boucwen, parwh, silverbox, wiener_hammerstein
-from lfrtorch.frequency_response import frequency_response
+from lfrtorch.linear.resolvent import frequency_response
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -112,7 +112,7 @@ def measured(root: Path | None) -> None:
     head("Measured benchmarks, official tests, simulation RMSE with offset (mV)")
     row("benchmark", "nx", "error", "tests", "seconds")
     rule(5)
-    loads: list[tuple[Callable[..., lfrtorch.datasets.Dataset], int]] = [
+    loads: list[tuple[Callable[..., lfrtorch.dataset.Dataset], int]] = [
         (wiener_hammerstein.load, 6),
         (silverbox.load, 2),
     ]

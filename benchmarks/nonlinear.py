@@ -23,7 +23,8 @@ import numpy as np
 import torch
 
 import lfrtorch
-from lfrtorch.datasets import Dataset, parwh
+from lfrtorch.dataset import Dataset
+from lfrtorch.datasets import parwh
 
 HERE = Path(__file__).resolve().parent
 SIZES = {"nx": 12, "nz": 2, "nw": 2}

@@ -16,7 +16,7 @@ from scipy import signal
 
 import lfrtorch
 from lfrtorch import LinearModel, Model, Record
-from lfrtorch.residual import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationError
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import lfrtorch
-from lfrtorch.findings import findings
+from lfrtorch.survey.findings import findings
 
 
 def write_measurement(path: Path) -> None:

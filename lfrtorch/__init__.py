@@ -7,28 +7,27 @@ records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 from importlib.metadata import version
 
 from lfrtorch import datasets, distributed
-from lfrtorch.adam import Adam
-from lfrtorch.average import average
-from lfrtorch.bla import estimate_bla
-from lfrtorch.cell import LFRCell
-from lfrtorch.datasets.files import load_records
-from lfrtorch.frf import FRF, estimate_frf
-from lfrtorch.inference import inference
-from lfrtorch.initialise import initialise
-from lfrtorch.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.lfr import LFR
-from lfrtorch.linear_model import LinearFit, LinearModel
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.excitation import multisine
+from lfrtorch.files.load import load_records
+from lfrtorch.fitting.inference import inference
+from lfrtorch.fitting.means import average
+from lfrtorch.fitting.multistart import fit_starts
+from lfrtorch.fitting.size_search import SizeSearch, search_sizes
+from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.starts import initialise
+from lfrtorch.fitting.trainer import FitResult, fit
+from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.linear.frf import FRF, estimate_frf
+from lfrtorch.linear.model import LinearFit, LinearModel
+from lfrtorch.linear.order_scan import OrderScan, scan_orders
 from lfrtorch.metrics import nrmse, rmse
-from lfrtorch.model import Model, load
-from lfrtorch.multisine import multisine
-from lfrtorch.multistart import fit_starts
-from lfrtorch.nonlinearity import Network, Polynomial
-from lfrtorch.order import OrderScan, scan_orders
+from lfrtorch.model import Model, load, simulate_blocks
 from lfrtorch.records import Channel, Record, Scaler
-from lfrtorch.resume import Snapshots
-from lfrtorch.sizes import SizeSearch, search_sizes
-from lfrtorch.stream import simulate_blocks
-from lfrtorch.trainer import FitResult, fit
 
 __version__ = version("lfrtorch")
 

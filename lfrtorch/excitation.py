@@ -1,72 +1,203 @@
-"""What data must have for a linear model of an order: excitation, length, lines."""
+"""Random-phase multisines: the periodic excitation that tells noise from nonlinear distortion."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from lfrtorch.lines import Lines
-from lfrtorch.records import Record
-from lfrtorch.subspace import shortest, suffice
+from lfrtorch import _checks
+from lfrtorch._checks import integer, number
+from lfrtorch._checks import lines as checked_lines
 
-NARROW = 1e-10
-"""Relative size of a direction that the input does not excite."""
-
-
-def check_signals(records: list[Record]) -> None:
-    """Refuse a channel that is constant in all records with a ValueError."""
-    for signals, channels in (
-        ([r.u for r in records], records[0].inputs),
-        ([r.y for r in records], records[0].outputs),
-    ):
-        everything = np.concatenate(signals)
-        for channel, span in zip(channels, np.ptp(everything, axis=0), strict=True):
-            if span == 0:
-                raise ValueError(
-                    f"signal '{channel.name}' is constant in all records; "
-                    "a model needs an input that excites and an output that responds: "
-                    "check the columns."
-                )
+Grid = Literal["full", "odd", "random_odd"]
 
 
-def check_length(records: list[Record], nx: int) -> None:
-    """Refuse records that are too short for a subspace of the order with a ValueError."""
-    nu, ny = len(records[0].inputs), len(records[0].outputs)
-    lengths = [r.samples for r in records]
-    if not suffice(lengths, nx, nu, ny):
+@dataclass(frozen=True, eq=False)
+class Multisine:
+    """One period of each experiment, and its excited lines; line k is at k fs / N Hz.
+
+    Args:
+        u: one period of every experiment; nu experiments after one another are one realisation.
+        lines: the excited DFT lines, rising, the same for all experiments and inputs.
+        fs: sampling frequency in Hz.
+
+    Shape:
+        u: (realisations * nu, N, nu), lines: (F,).
+    """
+
+    u: NDArray[np.float64]
+    lines: NDArray[np.int64]
+    fs: float
+
+    @property
+    def frequencies(self) -> NDArray[np.float64]:
+        """Frequencies (F,) of the excited lines, Hz."""
+        return self.lines * self.fs / self.u.shape[1]
+
+    @property
+    def odd_detection(self) -> NDArray[np.int64]:
+        """Odd lines left out between the first and the last excited one."""
+        return self._left_out(1)
+
+    @property
+    def even_detection(self) -> NDArray[np.int64]:
+        """Even lines left out between the first and the last excited one."""
+        return self._left_out(0)
+
+    def _left_out(self, parity: int) -> NDArray[np.int64]:
+        between = np.setdiff1d(np.arange(self.lines[0], self.lines[-1]), self.lines)
+        return between[between % 2 == parity]
+
+
+def multisine(
+    samples: int,
+    *,
+    fs: float = 1.0,
+    band: tuple[float, float] | None = None,
+    lines: ArrayLike | None = None,
+    grid: Grid = "full",
+    group: int = 4,
+    rms: ArrayLike = 1.0,
+    amplitude: ArrayLike | None = None,
+    nu: int = 1,
+    realisations: int = 1,
+    seed: int | np.random.Generator = 0,
+) -> Multisine:
+    """Random-phase multisines with an exact rms, orthogonal over the experiments of several inputs.
+
+    At each excited line k the nu experiments (columns) of the nu inputs (rows) of one realisation
+    are a full random orthogonal multisine::
+
+        U(k) = A(k) D1(k) T D2(k)
+
+    with A the amplitudes, T the nu x nu DFT matrix, and D1, D2 diagonal with independent uniform
+    phases. U Uᴴ is diagonal, and the nonlinear distortions of the experiments do not depend on
+    each other.
+
+    Args:
+        samples: N, of one period.
+        fs: sampling frequency in Hz.
+        band: lowest and highest frequency in Hz; all lines between 0 and fs / 2 by default.
+        lines: the DFT lines to choose from, in place of a band.
+        grid: which of these are excited: ``"full"`` all; ``"odd"`` the odd ones; ``"random_odd"``
+            the odd ones but one, drawn at random, of every ``group`` that follow one another.
+            What falls on the lines left out is nonlinear distortion and noise.
+        group: odd lines of a group.
+        rms: root mean square of each input, in every experiment.
+        amplitude: relative amplitudes of the lines 0 to N / 2, of which the excited ones count;
+            all equal by default.
+        nu: inputs.
+        realisations: number of independent ones, nu experiments each.
+        seed: of phases and lines, or a generator to draw them from.
+
+    Shape:
+        lines: (F,), rms: () or (nu,), amplitude: (N // 2 + 1,) or (N // 2 + 1, nu).
+
+    Raises:
+        ValueError: a band or a grid without lines, lines that are not between 0 and fs / 2, or an
+            argument out of range.
+
+    References:
+        Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,
+        2012, chapters 2 and 4.3. Dobrowiecki and Schoukens, "Measuring a linear approximation to
+        weakly nonlinear MIMO systems", Automatica 43, 2007.
+    """
+    integer("samples", samples, 3)
+    integer("nu", nu, 1)
+    integer("realisations", realisations, 1)
+    integer("group", group, 2)
+    number("fs", fs, positive=True)
+    if band is not None:
+        _checks.band(band)
+    generator = np.random.default_rng(seed)
+    excited = _on_grid(_candidates(samples, fs, band, lines), grid, group, generator)
+    A = _amplitudes(amplitude, samples, nu, excited)
+    A *= _rms(rms, nu) / np.sqrt(np.sum(A**2, axis=0))
+
+    shape = (realisations, excited.size, nu)
+    D1 = np.exp(1j * generator.uniform(0, 2 * np.pi, shape))
+    D2 = np.exp(1j * generator.uniform(0, 2 * np.pi, shape))
+    T = np.exp(-2j * np.pi * np.outer(np.arange(nu), np.arange(nu)) / nu)
+    U = np.einsum("fi,mfi,ij,mfj->mjfi", A, D1, T, D2)  # (realisation, experiment, line, input)
+    spectrum = np.zeros((realisations * nu, samples // 2 + 1, nu), complex)
+    spectrum[:, excited] = U.reshape(-1, excited.size, nu) * samples / np.sqrt(2)
+    u = np.asarray(np.fft.irfft(spectrum, samples, axis=1), dtype=np.float64)
+    return Multisine(u, excited, float(fs))
+
+
+def _candidates(
+    samples: int, fs: float, band: tuple[float, float] | None, lines: ArrayLike | None
+) -> NDArray[np.int64]:
+    """The lines that the grid chooses from, rising; fs / 2 itself has no free phase."""
+    last = (samples - 1) // 2
+    if lines is not None:
+        if band is not None:
+            raise ValueError("both lines and band are given; give one of them.")
+        return checked_lines(lines, samples)
+    low, high = (0.0, fs / 2) if band is None else band
+    if not 0 <= low <= high <= fs / 2:
         raise ValueError(
-            f"the longest of {len(records)} record(s) has {max(lengths)} samples; order nx={nx} "
-            f"with {nu} input(s) and {ny} output(s) needs one of {shortest(nx, nu, ny)}, or many "
-            "shorter ones: record more, or lower nx."
+            f"the band is {low} to {high} Hz; give a lower and an upper frequency between 0 and "
+            f"fs / 2 = {fs / 2:g} Hz."
         )
-
-
-def check_lines(lines: Lines, nx: int) -> None:
-    """Refuse fewer lines than unknowns with a ValueError."""
-    nu, ny = lines.U.shape[1], lines.Y.shape[1]
-    unknowns, equations = nx * (nu + ny) + nu * ny, lines.equations
-    if equations < unknowns:
+    # A frequency that is a line up to rounding belongs to the band.
+    first = max(1, int(np.ceil(low * samples / fs * (1 - 1e-12))))
+    found = np.arange(first, min(last, int(high * samples / fs * (1 + 1e-12))) + 1)
+    if not found.size:
         raise ValueError(
-            f"{len(lines.z)} excited line(s) make {equations} equations; order nx={nx} with {nu} "
-            f"input(s) and {ny} output(s) has {unknowns} unknowns: excite more lines, or lower nx."
+            f"the band {low:g} to {high:g} Hz holds no line of a period of {samples} samples, "
+            f"whose lines are {fs / samples:g} Hz apart; use a wider band or a longer period."
         )
+    return found
 
 
-def narrow(records: list[Record], nx: int) -> list[str]:
-    """A note where the input moves in too few directions to tell all parameters apart."""
-    nu = records[0].u.shape[1]
-    wanted = 2 * nx + 1
-    windows = [
-        np.lib.stride_tricks.sliding_window_view(r.u - r.u.mean(axis=0), wanted, axis=0)
-        for r in records
-        if r.samples >= wanted
-    ]
-    rows = np.concatenate([w.reshape(len(w), -1) for w in windows])
-    rows = rows / np.maximum(np.sqrt((rows**2).mean(axis=0)), 1e-300)
-    size = np.linalg.eigvalsh(rows.T @ rows)
-    rank = int((size > NARROW * size[-1]).sum())
-    if rank == nu * wanted:
-        return []
-    return [
-        f"the input is too narrow: it excites {rank} of the {nu * wanted} directions that "
-        f"order {nx} has (one a frequency and phase); between its frequencies the model is a guess."
-    ]
+def _on_grid(
+    lines: NDArray[np.int64], grid: Any, group: int, generator: np.random.Generator
+) -> NDArray[np.int64]:
+    if grid not in get_args(Grid):
+        raise ValueError(f"grid is {grid!r}; use 'full', 'odd' or 'random_odd'.")
+    if grid == "full":
+        return lines
+    odd = lines[lines % 2 == 1]
+    least = group if grid == "random_odd" else 1
+    if odd.size < least:
+        raise ValueError(
+            f"grid {grid!r} needs {least} odd line(s) and there are {odd.size}; use a wider band "
+            "or a longer period."
+        )
+    if grid == "odd":
+        return odd
+    groups = odd.size // group  # what follows the last whole group is excited
+    dropped = np.arange(groups) * group + generator.integers(group, size=groups)
+    return np.delete(odd, dropped)
+
+
+def _amplitudes(
+    amplitude: ArrayLike | None, samples: int, nu: int, excited: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Relative amplitudes (F, nu) of the excited lines."""
+    if amplitude is None:
+        return np.ones((excited.size, nu))
+    given = np.asarray(amplitude, dtype=np.float64)
+    if given.ndim == 1:
+        given = given[:, None]
+    F = samples // 2 + 1
+    if given.shape not in ((F, 1), (F, nu)):
+        raise ValueError(
+            f"amplitude has shape {np.shape(amplitude)}; a period of {samples} samples has {F} "
+            f"lines from 0 to fs / 2: give ({F},) or ({F}, {nu})."
+        )
+    A = given[excited]
+    if not (np.isfinite(A).all() and (A > 0).all()):
+        raise ValueError("amplitude must be finite and positive at every excited line.")
+    return np.broadcast_to(A, (excited.size, nu)).copy()
+
+
+def _rms(rms: ArrayLike, nu: int) -> NDArray[np.float64]:
+    given = np.asarray(rms, dtype=np.float64)
+    if given.shape not in ((), (nu,)) or not (np.isfinite(given).all() and (given > 0).all()):
+        raise ValueError(f"rms is {rms}; give a positive number, or one for each of {nu} input(s).")
+    return given

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,12 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch.nn import Module
 
-from lfrtorch import checkpoint
-from lfrtorch.cell import LFRCell
-from lfrtorch.lfr import LFR
-from lfrtorch.nonlinearity import Network, Polynomial, is_network
+from lfrtorch import _checkpoint
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network
+from lfrtorch.engine.simulate import Trajectory, estimated_start
 from lfrtorch.records import Channel, Record, Scaler, Start, as_signal, check_start
-from lfrtorch.simulate import Trajectory, estimated_start
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +163,45 @@ class Model:
         weights = dict(self.lfr.cell.state_dict())
         scaling = ("u_offset", "u_scale", "y_offset", "y_scale")
         weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in scaling}
-        return checkpoint.write(folder, description, weights)
+        return _checkpoint.write(folder, description, weights)
+
+
+def simulate_blocks(
+    model: Model, blocks: Iterable[ArrayLike], *, x0: ArrayLike | None = None
+) -> Iterator[NDArray[np.float64]]:
+    """Simulated output of an input that comes in blocks, as if it were simulated in one go.
+
+    The state at the end of a block is that at the start of the next: the numbers are the same to
+    the bit where the model is linear or a ``Network`` on the CPU, and to rounding elsewhere. No
+    more than a block is in memory.
+
+    Args:
+        model: what is simulated; ``LinearModel.to_model`` gives that of a linear one.
+        blocks: the input, physical units, one block after another, of any lengths.
+        x0: start state in the model's coordinates; 0 where left out. That of a measurement is
+            ``model.signals(record, start="estimated").x[0, 0]``.
+
+    Shape:
+        blocks: (n, nu) or (n,), x0: (nx,) -> (n, ny) for each block, physical units.
+
+    Raises:
+        ValueError: in the block where it is found: an input of the wrong shape or with NaN, or a
+            model that diverges; the message says at which sample of the whole input.
+    """
+    first, state = 0, np.zeros(model.lfr.cell.nx) if x0 is None else x0
+    for block in blocks:
+        u = as_signal(block, model.inputs, "input", first=first)
+        trajectory = model.signals(u, start="given", x0=state)
+        y = model.scaler.restore_y(trajectory.y[0].double().numpy())
+        lost = ~np.isfinite(y).all(axis=1)
+        if lost.any():
+            raise ValueError(
+                f"the model diverges: its output is not finite at sample {first + lost.argmax()}; "
+                "check the units of the inputs and whether they are louder than those it was "
+                "fitted to, or start from another state."
+            )
+        yield y
+        first, state = first + len(u), trajectory.x[0, -1].numpy()
 
 
 def load(folder: str | Path, *, static: Module | None = None) -> Model:
@@ -177,7 +216,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         ValueError: no checkpoint, a damaged one, one of another program or a newer version, one
             that holds a linear model, or a file that may carry code (it is not opened).
     """
-    description, weights = checkpoint.read(folder)
+    description, weights = _checkpoint.read(folder)
     if "linear" in description:
         raise ValueError(
             f"'{folder}' holds a linear model, as estimate_bla makes it; "

@@ -29,7 +29,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lfrtorch.checks import integer
+from lfrtorch._checks import integer
 
 Start = Literal["zero", "given", "estimated", "periodic"]
 

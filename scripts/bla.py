@@ -26,11 +26,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
 
 import lfrtorch  # noqa: E402
-from lfrtorch import linear_plots, plots  # noqa: E402
-from lfrtorch.datasets import Dataset  # noqa: E402
-from lfrtorch.ranks import Ranks  # noqa: E402
-from lfrtorch.roots import roots  # noqa: E402
-from lfrtorch.whole_file import whole_file  # noqa: E402
+from lfrtorch._atomic import whole_file  # noqa: E402
+from lfrtorch.analysis.poles import roots  # noqa: E402
+from lfrtorch.dataset import Dataset  # noqa: E402
+from lfrtorch.distributed import Ranks  # noqa: E402
+from lfrtorch.reporting import linear_plots, plots  # noqa: E402
 from train import (  # noqa: E402
     CONF,
     CONFIG,

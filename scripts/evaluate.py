@@ -19,8 +19,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
 
 import lfrtorch  # noqa: E402
-from lfrtorch import report  # noqa: E402
-from lfrtorch.whole_file import refuse_existing, whole_file  # noqa: E402
+from lfrtorch._atomic import refuse_existing, whole_file  # noqa: E402
+from lfrtorch.reporting import scores as report  # noqa: E402
 from train import CONF, loaded, require_data, same_channels, user_errors  # noqa: E402
 
 

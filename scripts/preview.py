@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
 
-from lfrtorch.checks import number  # noqa: E402
-from lfrtorch.datasets.tables import BLOCK, Table, open_table  # noqa: E402
-from lfrtorch.datasets.time_stamps import Uneven, in_seconds, is_time, sampling  # noqa: E402
-from lfrtorch.findings import examine  # noqa: E402
+from lfrtorch._atomic import whole_file  # noqa: E402
+from lfrtorch._checks import number  # noqa: E402
+from lfrtorch.files.formats import BLOCK, Table, open_table  # noqa: E402
+from lfrtorch.files.time_stamps import Uneven, in_seconds, is_time, sampling  # noqa: E402
 from lfrtorch.records import Channel  # noqa: E402
-from lfrtorch.signal_survey import SignalSurvey  # noqa: E402
-from lfrtorch.survey import Survey, survey  # noqa: E402
-from lfrtorch.survey_plots import survey_figure  # noqa: E402
-from lfrtorch.whole_file import whole_file  # noqa: E402
+from lfrtorch.reporting.survey_plots import survey_figure  # noqa: E402
+from lfrtorch.survey.findings import examine  # noqa: E402
+from lfrtorch.survey.measurement import Survey, survey  # noqa: E402
+from lfrtorch.survey.signal import SignalSurvey  # noqa: E402
 from scripts.bla import cell, columns  # noqa: E402
 from train import user_errors  # noqa: E402
 

@@ -36,10 +36,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
 
 import lfrtorch  # noqa: E402
-from lfrtorch import leaderboard  # noqa: E402
-from lfrtorch.datasets import Dataset  # noqa: E402
-from lfrtorch.html_report import number  # noqa: E402
-from lfrtorch.whole_file import whole_file  # noqa: E402
+from lfrtorch._atomic import whole_file  # noqa: E402
+from lfrtorch.dataset import Dataset  # noqa: E402
+from lfrtorch.reporting import leaderboard  # noqa: E402
+from lfrtorch.reporting.html import number  # noqa: E402
 from train import CONF  # noqa: E402
 
 STAND_IN = "stand-in"

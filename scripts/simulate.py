@@ -21,15 +21,15 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
 
 import lfrtorch  # noqa: E402
-from lfrtorch import checkpoint  # noqa: E402
-from lfrtorch.checks import integer, number  # noqa: E402
-from lfrtorch.datasets.file_stream import Block, FileStream  # noqa: E402
-from lfrtorch.datasets.files import listed_files  # noqa: E402
-from lfrtorch.datasets.table_writer import FORMATS, table_writer  # noqa: E402
-from lfrtorch.datasets.tables import open_table  # noqa: E402
-from lfrtorch.datasets.time_stamps import is_time  # noqa: E402
+from lfrtorch import _checkpoint  # noqa: E402
+from lfrtorch._atomic import refuse_existing, whole_file  # noqa: E402
+from lfrtorch._checks import integer, number  # noqa: E402
+from lfrtorch.files.formats import open_table  # noqa: E402
+from lfrtorch.files.load import listed_files  # noqa: E402
+from lfrtorch.files.stream import Block, FileStream  # noqa: E402
+from lfrtorch.files.time_stamps import is_time  # noqa: E402
+from lfrtorch.files.writer import FORMATS, table_writer  # noqa: E402
 from lfrtorch.metrics import BlockScores  # noqa: E402
-from lfrtorch.whole_file import refuse_existing, whole_file  # noqa: E402
 from scripts.bla import columns, finite, percent  # noqa: E402
 from train import CONF, user_errors  # noqa: E402
 
@@ -227,7 +227,7 @@ def scored(path: Path, model: lfrtorch.Model, scores: BlockScores, skip: int) ->
 
 def opened(folder: str) -> lfrtorch.Model:
     """The model of a checkpoint, a linear one as an NL-LFR without static nonlinearity."""
-    description, _ = checkpoint.read(folder)
+    description, _ = _checkpoint.read(folder)
     if "linear" in description:
         return lfrtorch.LinearModel.load(folder).to_model()
     return lfrtorch.load(folder)

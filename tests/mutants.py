@@ -42,37 +42,37 @@ from cosmic_ray.operators.operator import Operator
 ROOT = Path(__file__).resolve().parents[1]
 
 TESTS: dict[str, str] = {
-    "recurrence": "recurrence newton sensitivity",
-    "newton": "newton",
-    "simulate": "simulate model newton",
-    "slopes": "sensitivity simulate",
-    "static_slopes": "static_slopes sensitivity",
-    "emission": "sensitivity residual",
-    "sensitivity": "sensitivity residual",
-    "layout": "sensitivity residual",
-    "jacobian": "residual memory",
-    "factors": "factors residual",
-    "batch": "residual",
-    "gauge": "gauge residual",
-    "residual": "residual trainer",
-    "stack": "stack",
-    "levenberg_marquardt": "levenberg_marquardt",
-    "adam": "adam",
-    "trainer": "trainer resume",
-    "resume": "resume",
-    "snapshot": "resume",
-    "multistart": "multistart resume",
     "records": "records stream",
-    "subspace": "subspace bla",
-    "regression": "frf subspace",
-    "linear_search": "bla signal_error response_error",
-    "response_error": "response_error bla",
-    "signal_error": "signal_error bla",
-    "bla": "bla order",
-    "lines": "response_error bla",
-    "spectra": "frf",
-    "local_polynomial": "frf",
-    "frf": "frf",
+    "engine/recurrence": "engine/recurrence engine/newton engine/sensitivity",
+    "engine/newton": "engine/newton",
+    "engine/simulate": "engine/simulate model engine/newton",
+    "engine/linearised": "engine/sensitivity engine/simulate",
+    "engine/static_jacobian": "engine/static_jacobian engine/sensitivity",
+    "engine/jacobian_kernel": "engine/sensitivity least_squares/simulation_problem",
+    "engine/sensitivity": "engine/sensitivity least_squares/simulation_problem",
+    "engine/parameter_layout": "engine/sensitivity least_squares/simulation_problem",
+    "least_squares/jacobian": "least_squares/simulation_problem memory",
+    "least_squares/linear_systems": "least_squares/linear_systems least_squares/simulation_problem",
+    "least_squares/record_groups": "least_squares/simulation_problem",
+    "least_squares/gauge": "least_squares/gauge least_squares/simulation_problem",
+    "least_squares/simulation_problem": "least_squares/simulation_problem fitting/trainer",
+    "least_squares/joint": "least_squares/joint",
+    "least_squares/levenberg_marquardt": "least_squares/levenberg_marquardt",
+    "least_squares/adam": "least_squares/adam",
+    "fitting/trainer": "fitting/trainer fitting/snapshots",
+    "fitting/snapshots": "fitting/snapshots",
+    "fitting/state_file": "fitting/snapshots",
+    "fitting/multistart": "fitting/multistart fitting/snapshots",
+    "linear/subspace": "linear/subspace linear/bla",
+    "linear/regression": "linear/frf linear/subspace",
+    "linear/refinement": "linear/bla linear/signal_fit linear/response_fit",
+    "linear/response_fit": "linear/response_fit linear/bla",
+    "linear/signal_fit": "linear/signal_fit linear/bla",
+    "linear/bla": "linear/bla linear/order_scan",
+    "linear/spectral_data": "linear/response_fit linear/bla",
+    "linear/spectra": "linear/frf",
+    "linear/local_polynomial": "linear/frf",
+    "linear/frf": "linear/frf",
 }
 """The modules of the numerical core, and their tests."""
 
@@ -218,8 +218,9 @@ def _run(folder: Path, module: str) -> None:
     os.chdir(folder)
     os.environ["PYTHONPATH"] = str(folder)
     sys.path[:0] = [str(folder)]
-    files = [f"tests/test_{name}.py" for name in TESTS[module].split()]
-    os._exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *files]))
+    names = (Path(name) for name in TESTS[module].split())
+    files = [str(Path("tests", name.parent, f"test_{name.name}.py")) for name in names]
+    os._exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-n", "0", *files]))
 
 
 def clean_seconds(module: str, folder: Path, processes: Any) -> float:
@@ -244,10 +245,11 @@ def is_noticed(mutant: Mutant, folder: Path, processes: Any, limit: float) -> bo
         process.kill()
         process.join()
     shutil.copy2(ROOT / "lfrtorch" / f"{module}.py", path)
-    for file in (folder / "lfrtorch/__pycache__").glob(f"{module}.*"):
+    for file in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
         file.unlink()
-    for file in (ROOT / "lfrtorch/__pycache__").glob(f"{module}.*"):  # kernels compiled already
-        shutil.copy2(file, folder / "lfrtorch/__pycache__")
+    kernels = (ROOT / "lfrtorch" / f"{module}.py").parent / "__pycache__"
+    for file in kernels.glob(f"{path.stem}.*"):  # compiled already
+        shutil.copy2(file, path.parent / "__pycache__")
     return late or process.exitcode != 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 import scipy.signal
@@ -11,16 +12,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.func import functional_call, jacfwd
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from lfrtorch.cell import LFRCell
-from lfrtorch.lfr import LFR
-from lfrtorch.linear_search import Refined
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.engine.simulate import Trajectory
+from lfrtorch.linear.refinement import Refined
+from lfrtorch.linear.response_fit import ResponseFit
+from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.model import Model
-from lfrtorch.nonlinearity import Network
 from lfrtorch.records import Channel, Record, Scaler, Start
-from lfrtorch.response_error import ResponseFit
-from lfrtorch.signal_error import SignalFit
-from lfrtorch.simulate import Trajectory
 
 Array = NDArray[np.float64]
 Weights = dict[str, Tensor]
@@ -209,3 +211,22 @@ def periodic_response(system: System, u: Array) -> Array:
 def refined(fit: ResponseFit | SignalFit, system: System, max_iter: int) -> Refined:
     """What a linear fit finds from one start."""
     return fit.refined(fit.search(system).advance(max_iter))
+
+
+def theta(model: Model) -> Tensor:
+    return parameters_to_vector(model.lfr.parameters()).detach()
+
+
+def planted(T: int = 300, **sizes: Any) -> tuple[Model, list[Record], Record]:
+    """A model some way off, a record from zero and one in steady state of the true one, a test."""
+    truth, start = (random_model(random_cell(**sizes, radius=0.7)) for _ in range(2))
+    train = [measure(truth, T), measure(truth, T, seed=1, start="periodic")]
+    move(start, 0.05)
+    return start, train, measure(truth, T, seed=2)
+
+
+def move(model: Model, far: float):
+    vector = theta(model)
+    vector_to_parameters(
+        vector + far * normal(len(vector), seed=9, dtype=vector.dtype), model.lfr.parameters()
+    )

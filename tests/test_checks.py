@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from lfrtorch.checks import integer, number
+from lfrtorch._checks import integer, number
 
 
 @pytest.mark.parametrize("value", [3, np.int64(3), 4])

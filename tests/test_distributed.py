@@ -26,18 +26,17 @@ from reference import measure, normal, random_cell, random_model
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from lfrtorch import jacobian
-from lfrtorch.adam import Adam
-from lfrtorch.datasets import Dataset
-from lfrtorch.distributed import connect
-from lfrtorch.levenberg_marquardt import LevenbergMarquardt, LMState
+from lfrtorch.dataset import Dataset
+from lfrtorch.distributed import LOST, ProcessLost, Ranks, connect
+from lfrtorch.fitting.multistart import fit_starts
+from lfrtorch.fitting.trainer import FitResult, fit
+from lfrtorch.least_squares import jacobian
+from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
+from lfrtorch.least_squares.simulation_problem import SimulationError
 from lfrtorch.model import Model, load
-from lfrtorch.monitor import Checkpoint
-from lfrtorch.multistart import fit_starts
-from lfrtorch.ranks import LOST, ProcessLost, Ranks
 from lfrtorch.records import Record
-from lfrtorch.residual import SimulationError
-from lfrtorch.trainer import FitResult, fit
+from lfrtorch.reporting.monitor import Checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = Path(__file__).resolve().parent

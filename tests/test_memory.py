@@ -7,10 +7,11 @@ from reference import random_cell, random_model
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from lfrtorch import jacobian, sensitivity, slopes
-from lfrtorch.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.engine import linearised, sensitivity
+from lfrtorch.least_squares import jacobian
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.simulation_problem import SimulationError
 from lfrtorch.records import Record, Start
-from lfrtorch.residual import SimulationError
 
 pytestmark = pytest.mark.numeric
 
@@ -57,7 +58,7 @@ def test_iteration_over_a_million_samples_stays_below_half_a_gigabyte():
 @pytest.fixture
 def blocks(monkeypatch: pytest.MonkeyPatch) -> int:
     """Bytes of blocks that are 8 times shorter than usual: a record is long that is short."""
-    monkeypatch.setattr(slopes, "PASS", 2048)
+    monkeypatch.setattr(linearised, "PASS", 2048)
     monkeypatch.setattr(sensitivity, "PASS", 2048)
     monkeypatch.setattr(sensitivity, "BLOCK", 1024)
     monkeypatch.setattr(jacobian, "KEPT_BYTES", 1 << 24)

@@ -12,15 +12,15 @@ from reference import measure, normal, random_cell, random_model
 from torch import Tensor
 from torch.testing import assert_close
 
-from lfrtorch.cell import LFRCell
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.newton import newton
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
+from lfrtorch.engine.simulate import simulate, steady_state
+from lfrtorch.least_squares.simulation_problem import SimulationError
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
-from lfrtorch.newton import newton
-from lfrtorch.nonlinearity import Network, Polynomial
 from lfrtorch.records import Record
-from lfrtorch.residual import SimulationError
-from lfrtorch.sensitivity import Linearisation, output_jacobian
-from lfrtorch.simulate import simulate, steady_state
 
 pytestmark = pytest.mark.numeric
 
@@ -75,7 +75,7 @@ def test_passes_find_the_steady_state_where_newton_fails(monkeypatch: pytest.Mon
     def failing(*args: Any, periodic: bool = False, **options: Any) -> Tensor:
         return torch.nan * expected.x if periodic else newton(*args, **options)
 
-    monkeypatch.setattr("lfrtorch.simulate.newton", failing)
+    monkeypatch.setattr("lfrtorch.engine.simulate.newton", failing)
     assert_close(steady_state(cell, u).y, expected.y, rtol=0, atol=1e-8)  # known to 1e-10
 
 

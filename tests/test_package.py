@@ -45,7 +45,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     names = {name for name in ZipFile(wheel).namelist() if ".dist-info/" not in name}
     sources = {str(path.relative_to(ROOT)) for path in (ROOT / "lfrtorch").rglob("*.py")}
-    assert names == sources | {"lfrtorch/py.typed", "lfrtorch/templates/report.html"}
+    assert names == sources | {"lfrtorch/py.typed", "lfrtorch/reporting/templates/report.html"}
 
 
 @pytest.mark.slow

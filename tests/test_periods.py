@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from lfrtorch.multisine import multisine
+from lfrtorch.excitation import multisine
 from lfrtorch.periods import find_period, find_transient
 
 pytestmark = pytest.mark.numeric

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lfrtorch.datasets import Dataset, Published, official
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.datasets import official
 from lfrtorch.records import Record
 from scripts import reproduce
 

@@ -14,11 +14,11 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 import lfrtorch
-from lfrtorch import jacobian
-from lfrtorch.adam import Adam
-from lfrtorch.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.fitting.multistart import fit_starts
+from lfrtorch.least_squares import jacobian
+from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
-from lfrtorch.multistart import fit_starts
 from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric

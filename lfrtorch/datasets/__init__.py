@@ -1,14 +1,11 @@
-"""Benchmarks and users' files as records: one file a benchmark, ``files`` for one's own data."""
+"""Public benchmarks: one file a benchmark, and ``official``, which reads their files."""
 
-from lfrtorch.datasets.dataset import Dataset, Published  # first: the others import it from here
-
-from lfrtorch.datasets import (  # isort: skip
+from lfrtorch.datasets import (
     boucwen,
     cascaded_tanks,
     ced,
     emps,
     f16,
-    files,
     parwh,
     silverbox,
     wh_process_noise,
@@ -16,14 +13,11 @@ from lfrtorch.datasets import (  # isort: skip
 )
 
 __all__ = [
-    "Dataset",
-    "Published",
     "boucwen",
     "cascaded_tanks",
     "ced",
     "emps",
     "f16",
-    "files",
     "parwh",
     "silverbox",
     "wh_process_noise",

@@ -26,8 +26,9 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.signal import firwin, resample
 
-from lfrtorch.checks import integer, number
-from lfrtorch.datasets import Dataset, Published, official
+from lfrtorch._checks import integer, number
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
 
 __all__ = ["load", "multisine", "simulate", "sweep"]

@@ -19,8 +19,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lfrtorch.checks import integer, number
-from lfrtorch.datasets import Dataset, Published, official
+from lfrtorch._checks import integer, number
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
 
 __all__ = ["load"]

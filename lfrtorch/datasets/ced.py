@@ -23,7 +23,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lfrtorch.datasets import Dataset, Published, official
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
 
 __all__ = ["load"]

@@ -37,7 +37,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch.datasets import Dataset, Published, official
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
 
 __all__ = ["load"]

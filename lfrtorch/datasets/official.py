@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from lfrtorch.checks import number
+from lfrtorch._checks import number
 from lfrtorch.records import Record, Start
 
 _AGAIN = "download the file again."

@@ -23,8 +23,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch.checks import integer, number
-from lfrtorch.datasets import Dataset, Published, official
+from lfrtorch._checks import integer, number
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.datasets import official
 from lfrtorch.datasets.parwh_simulator import FS, PERIOD, Signals, StandIn, multisine, simulate
 from lfrtorch.records import Channel, Record
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.signal import butter, cheby1, cheby2, ellip, freqz
 
-from lfrtorch.checks import number
+from lfrtorch._checks import number
 
 FS = 78125.0
 """Sampling frequency of the records, Hz."""

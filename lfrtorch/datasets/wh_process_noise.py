@@ -42,8 +42,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch.checks import integer
-from lfrtorch.datasets import Dataset, official
+from lfrtorch._checks import integer
+from lfrtorch.dataset import Dataset
+from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
 
 __all__ = ["load"]

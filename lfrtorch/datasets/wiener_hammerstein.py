@@ -15,8 +15,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from lfrtorch.checks import integer
-from lfrtorch.datasets import Dataset, Published, official
+from lfrtorch._checks import integer
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
 
 __all__ = ["load"]

@@ -1,0 +1,48 @@
+"""Poles and zeros as an engineer reads them: frequency, damping, radius."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lfrtorch.engine.linearised import slopes
+from lfrtorch.model import Model
+
+Complex = NDArray[np.complex128]
+
+
+def roots(values: Complex, fs: float) -> list[dict[str, float | None]]:
+    """Poles or zeros z = exp(s / fs), one of each pair: |s| in Hz, damping ratio, radius of z."""
+    listed = []
+    for z in sorted(values[values.imag >= 0], key=lambda z: (abs(np.angle(z)), abs(z))):
+        radius = float(abs(z))
+        s = complex(math.log(radius), np.angle(z)) * fs if radius > 0 else complex(-math.inf)
+        frequency = abs(s) / (2 * math.pi)
+        damping = 1.0 if math.isinf(frequency) else -s.real / abs(s) if s else None
+        listed.append(
+            {
+                "real": float(z.real),
+                "imag": float(z.imag),
+                "frequency": frequency if math.isfinite(frequency) else None,
+                "damping": damping,
+                "radius": radius,
+            }
+        )
+    return listed
+
+
+@torch.no_grad()
+def poles_at_rest(model: Model) -> Complex:
+    """Poles (nx,) of the NL-LFR linearised where it rests at the input's offset.
+
+    They are the eigenvalues of A + Bw W'(z) Cz. Where no stable rest is found, z is that of x = 0.
+    """
+    cell = model.lfr.cell
+    u = cell.A.new_zeros(1, 1, cell.nu)
+    z = model.lfr.trajectory(u, start="periodic").z
+    if not torch.isfinite(z).all():
+        z = torch.zeros_like(z)
+    return np.asarray(np.linalg.eigvals(slopes(cell, z).F[0, 0].double().cpu().numpy()), complex)

@@ -1,0 +1,1 @@
+"""One trajectory of a model and its derivatives."""

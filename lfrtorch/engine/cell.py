@@ -1,0 +1,82 @@
+"""One step of the NL-LFR model: an LTI block in feedback with a static nonlinearity."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from lfrtorch._checks import integer
+
+
+class LFRCell(nn.Module):
+    """One time step (u, x) -> (y, x+) of the NL-LFR state-space model::
+
+        x+ = A  x + Bu  u + Bw  w
+        z  = Cz x + Dzu u              (no Dzw: no algebraic loop)
+        w  = static(z)
+        y  = Cy x + Dyu u + Dyw w
+
+    All matrices start at zero; ``lfrtorch.initialise`` writes the best linear approximation.
+
+    Args:
+        nu, ny, nx, nz, nw: sizes; ``nz = nw = 0`` without ``static`` is a linear model.
+        static: the map z -> w, any module from (..., nz) to (..., nw).
+        device, dtype: as everywhere in torch.
+
+    Shape:
+        A: (nx, nx), Bu: (nx, nu), Bw: (nx, nw), Cz: (nz, nx), Dzu: (nz, nu), Cy: (ny, nx),
+        Dyu: (ny, nu), Dyw: (ny, nw).
+
+    References:
+        Schoukens and Tóth, "On the Initialization of Nonlinear LFR Model Identification with the
+        Best Linear Approximation", IFAC-PapersOnLine 53(2), 2020, equations (1) and (2).
+    """
+
+    def __init__(
+        self,
+        nu: int,
+        ny: int,
+        nx: int,
+        nz: int = 0,
+        nw: int = 0,
+        static: nn.Module | None = None,
+        *,
+        device: torch.device | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        if (static is None) != (nw == 0) or (nz == 0) != (nw == 0):
+            raise ValueError(
+                f"nz={nz}, nw={nw} with static={static}: a static nonlinearity needs nz >= 1 and "
+                "nw >= 1, and a linear model has neither."
+            )
+        for name, size in (("nu", nu), ("ny", ny), ("nx", nx)):
+            integer(name, size, 1)
+        self.nu, self.ny, self.nx, self.nz, self.nw = nu, ny, nx, nz, nw
+
+        def matrix(rows: int, columns: int) -> nn.Parameter:
+            return nn.Parameter(torch.zeros(rows, columns, device=device, dtype=dtype))
+
+        self.A, self.Bu, self.Bw = matrix(nx, nx), matrix(nx, nu), matrix(nx, nw)
+        self.Cz, self.Dzu = matrix(nz, nx), matrix(nz, nu)
+        self.Cy, self.Dyu, self.Dyw = matrix(ny, nx), matrix(ny, nu), matrix(ny, nw)
+        self.static = static
+
+    def forward(self, u: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Output and next state.
+
+        Shape:
+            u: (..., nu), x: (..., nx) -> y: (..., ny), x+: (..., nx).
+        """
+        w = self.internal(u, x)[1]
+        y = x @ self.Cy.mT + u @ self.Dyu.mT + w @ self.Dyw.mT
+        return y, x @ self.A.mT + u @ self.Bu.mT + w @ self.Bw.mT
+
+    def internal(self, u: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Input z (..., nz) and output w (..., nw) of the static nonlinearity."""
+        z = x @ self.Cz.mT + u @ self.Dzu.mT
+        return z, (z if self.static is None else self.static(z))
+
+    def extra_repr(self) -> str:
+        """Sizes, for ``print(module)``."""
+        return f"nu={self.nu}, ny={self.ny}, nx={self.nx}, nz={self.nz}, nw={self.nw}"

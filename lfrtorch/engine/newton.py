@@ -1,0 +1,103 @@
+"""All states of a simulation at once: Newton's method over the whole trajectory.
+
+x(k+1) = f(x(k), u(k)) at all k is one system of equations in all states. Its Newton step is the
+model linearised along the latest trajectory: a linear recurrence, which is parallel in time::
+
+    x_new(k+1) = F(k) (x_new(k) - x(k)) + f(x(k), u(k)),    F(k) = A + Bw J(k) Cz
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linearised import slopes, spectral_radius
+from lfrtorch.engine.recurrence import linear_recurrence
+
+MAX_NEWTON = 20
+"""Iterations after which Newton's method is given up; from a nearby trajectory it needs 3 or 4."""
+
+UPDATE_ROUNDING = 1.0
+"""Largest update relative to 1 + max |x| after which the states count as found, in units of √eps.
+
+Convergence is quadratic: what is then left is about eps, the rounding of the loop over time.
+"""
+
+
+@torch.no_grad()
+def newton(
+    cell: LFRCell,
+    u: Tensor,
+    x0: Tensor,
+    *,
+    guess: Tensor | None = None,
+    periodic: bool = False,
+) -> Tensor:
+    """States of x(k+1) = f(x(k), u(k)), those of the loop over time to rounding.
+
+    Args:
+        cell: the model. Its matrices may have a leading axis R, one model a record.
+        u: input.
+        x0: start state; in periodic steady state the start of the search where ``guess`` is not.
+        guess: states of a nearby trajectory, whatever their start; x0 at all times where left out.
+        periodic: close the boundary by x(T) = x(0) instead of x(0) = x0.
+
+    Shape:
+        u: (R, T, nu), x0: (R, nx), guess: (R, T + 1, nx) -> (R, T + 1, nx). Normalised units.
+
+    Returns:
+        The states; NaN for a record where the iteration does not converge or overflows (a model
+        that diverges or is chaotic), or where the periodic solution is not stable, so that no
+        simulation would settle to it.
+
+    References:
+        Lim, Zhu, Selfridge and Kasim, "Parallelizing non-linear sequential models over the sequence
+        length", ICLR 2024.
+    """
+    tolerance = UPDATE_ROUNDING * torch.finfo(u.dtype).eps ** 0.5
+    x = x0.unsqueeze(1).expand(-1, u.shape[1] + 1, -1) if guess is None else guess
+    driven = u @ cell.Bu.mT
+    transition, found = cell.A, torch.zeros(len(u), dtype=torch.bool)  # of no iteration
+    for _ in range(MAX_NEWTON):
+        z, w = cell.internal(u, x[:, :-1])
+        defect = x[:, :-1] @ cell.A.mT + driven + w @ cell.Bw.mT - x[:, 1:]
+        gap = (x[:, -1] if periodic else x0) - x[:, 0]
+        update, transition = (_closed if periodic else _open)(slopes(cell, z).F, defect, gap)
+        x = x + update
+        change, size = (signal.abs().amax(dim=(1, 2)) for signal in (update, x))
+        found = change <= tolerance * (1.0 + size)  # False for NaN
+        if (found | ~torch.isfinite(change)).all():
+            break
+    if periodic:
+        found &= spectral_radius(transition) < 1.0  # False for NaN
+    return torch.where(found[:, None, None], x, torch.nan)
+
+
+def _open(F: Tensor, defect: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
+    """d(k+1) = F(k) d(k) + defect(k) from d(0) = gap: all d and the last.
+
+    Shape:
+        F: (R, T, nx, nx), defect: (R, T, nx), gap: (R, nx) -> (R, T + 1, nx), (R, nx).
+    """
+    d = linear_recurrence(F, defect.unsqueeze(-1), gap.unsqueeze(-1)).squeeze(-1)
+    return d, d[:, -1]
+
+
+def _closed(F: Tensor, defect: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
+    """The same from d(0) = d(T) + gap: all d and the transition matrix Φ over the whole record.
+
+    d(k) = Φ(k) d(0) + p(k), all columns of which are one recurrence; (I - Φ) d(0) = p(T) + gap.
+
+    Shape:
+        F: (R, T, nx, nx), defect: (R, T, nx), gap: (R, nx) -> (R, T + 1, nx), (R, nx, nx).
+    """
+    R, _, nx = defect.shape
+    identity = torch.eye(nx, dtype=F.dtype, device=F.device).expand(R, nx, nx)
+    columns = torch.cat([torch.zeros_like(F), defect.unsqueeze(-1)], dim=-1)
+    states = linear_recurrence(F, columns, pad(identity, (0, 1)))
+    transition, p = states[:, -1].split([nx, 1], dim=-1)
+    start = torch.linalg.solve_ex(identity - transition, p + gap.unsqueeze(-1)).result
+    d = states.flatten(1, 2) @ pad(start, (0, 0, 0, 1), value=1.0)
+    return d.unflatten(1, (-1, nx)).squeeze(-1), transition

@@ -1,0 +1,167 @@
+"""Static nonlinearities z -> w: any torch.nn.Module from (..., nz) to (..., nw) will do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+from itertools import combinations_with_replacement
+from operator import mul
+from typing import TypeGuard
+
+import torch
+from torch import Tensor
+from torch.func import functional_call, vmap
+from torch.nn import Module, Parameter, ParameterList
+from torch.nn.functional import pad
+
+from lfrtorch._checks import integer
+
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "tanh": torch.tanh,
+    "sigmoid": torch.sigmoid,
+    "relu": torch.relu,
+    "rbf": lambda v: torch.exp(-v.square()),
+    "softplus": lambda v: torch.logaddexp(v, v.new_zeros(())),  # F.softplus cuts off at v = 20
+}
+
+
+class Network(Module):
+    """One hidden layer: w = Ww σ(Wz z + bz) + bw.
+
+    Args:
+        nz: inputs.
+        nw: outputs.
+        nn: neurons.
+        activation: σ: ``"tanh"``, ``"sigmoid"``, ``"relu"``, ``"rbf"`` (exp(-v²)) or ``"softplus"``
+            (ln(1 + exp(v)), a hinge without its corner).
+        device, dtype: as everywhere in torch.
+
+    Shape:
+        Wz: (nn, nz), bz: (nn,), Ww: (nw, nn), bw: (nw,); z: (..., nz) -> w: (..., nw).
+    """
+
+    def __init__(
+        self,
+        nz: int,
+        nw: int,
+        nn: int,
+        activation: str = "tanh",
+        *,
+        device: torch.device | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        if activation not in ACTIVATIONS:
+            raise ValueError(
+                f"activation is {activation!r}; use one of {', '.join(sorted(ACTIVATIONS))}."
+            )
+        self.activation = activation
+        self.Wz = Parameter(torch.empty(nn, nz, device=device, dtype=dtype))
+        self.bz = Parameter(torch.empty(nn, device=device, dtype=dtype))
+        self.Ww = Parameter(torch.empty(nw, nn, device=device, dtype=dtype))
+        self.bw = Parameter(torch.empty(nw, device=device, dtype=dtype))
+        self.reset_parameters()
+
+    def reset_parameters(self, generator: torch.Generator | None = None) -> None:
+        """Wz, bz, Ww ~ U(-1, 1) and bw = 0, the draw of Schoukens and Tóth (2020)."""
+        with torch.no_grad():
+            for weight in (self.Wz, self.bz, self.Ww):
+                weight.uniform_(-1.0, 1.0, generator=generator)
+            self.bw.zero_()
+
+    def forward(self, z: Tensor) -> Tensor:
+        """w (..., nw) of z (..., nz)."""
+        hidden = ACTIVATIONS[self.activation](z @ self.Wz.mT + self.bz)
+        return hidden @ self.Ww.mT + self.bw
+
+    def extra_repr(self) -> str:
+        """Sizes and activation, for ``print(module)``."""
+        (nn, nz), nw = self.Wz.shape, len(self.Ww)
+        return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}"
+
+
+def is_network(static: Module | None) -> TypeGuard[Network]:
+    """Whether a map is a ``Network`` itself: a class of one's own may have another forward pass."""
+    return type(static) is Network
+
+
+class Polynomial(Module):
+    """All monomials up to a total degree: w = C m(z), m(z) = (1, z1, z2, .., z1², z1 z2, ..).
+
+    Affine maps of z and of w change nothing but C.
+
+    Args:
+        nz: inputs.
+        nw: outputs.
+        degree: highest total degree.
+        device, dtype: as everywhere in torch.
+
+    Shape:
+        C: (nw, monomials), (nz + degree)! / (nz! degree!) of them by rising degree, the constant in
+        column 0; z: (..., nz) -> w: (..., nw).
+
+    Raises:
+        ValueError: a degree below 1.
+    """
+
+    _factors: Tensor
+
+    def __init__(
+        self,
+        nz: int,
+        nw: int,
+        degree: int,
+        *,
+        device: torch.device | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        integer("degree", degree, 1)
+        self.nz, self.degree = nz, degree
+        # Each product of that many factors out of (1, z1, z2, ..) once; the ones lower its degree.
+        factors = list(combinations_with_replacement(range(nz + 1), degree))
+        self.register_buffer("_factors", torch.tensor(factors, device=device), persistent=False)
+        self.C = Parameter(torch.empty(nw, len(factors), device=device, dtype=dtype))
+        self.reset_parameters()
+
+    def reset_parameters(self, generator: torch.Generator | None = None) -> None:
+        """C ~ U(-1, 1) / monomials, so that |w| <= 1 where all |z| <= 1, and the constant 0."""
+        with torch.no_grad():
+            self.C.uniform_(-1.0, 1.0, generator=generator).div_(self.C.shape[-1])
+            self.C[:, 0] = 0.0
+
+    def forward(self, z: Tensor) -> Tensor:
+        """w (..., nw) of z (..., nz)."""
+        factors = pad(z, (1, 0), value=1.0)[..., self._factors]  # (..., monomials, degree)
+        return reduce(mul, factors.unbind(-1)) @ self.C.mT
+
+    def extra_repr(self) -> str:
+        """Sizes, for ``print(module)``."""
+        return f"nz={self.nz}, nw={len(self.C)}, degree={self.degree}"
+
+
+class Stacked(Module):
+    """One map with its own weights for every record: (R, T, nz) -> (R, T, nw).
+
+    Args:
+        base: the map; its own weights are not used.
+        weights: by the names of its parameters, each with a leading axis of length R.
+    """
+
+    def __init__(self, base: Module, weights: dict[str, Tensor]) -> None:
+        super().__init__()
+        self._base, self.names = [base], list(weights)  # a list hides the module's own weights
+        self.weights = ParameterList(weights.values())
+
+    @property
+    def base(self) -> Module:
+        """The map."""
+        return self._base[0]
+
+    def forward(self, z: Tensor) -> Tensor:
+        """w (R, T, nw) of z (R, T, nz)."""
+
+        def one(weights: dict[str, Tensor], z: Tensor) -> Tensor:
+            return functional_call(self.base, weights, (z,))
+
+        return vmap(one)(dict(zip(self.names, self.weights, strict=True)), z)

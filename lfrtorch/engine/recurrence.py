@@ -1,0 +1,137 @@
+"""The one sequential primitive: s(k+1) = F(k) s(k) + g(k), many columns at once.
+
+Sensitivities, adjoints, Newton steps over a trajectory and periodic boundaries are all this
+recurrence. ``loop`` says what it computes; ``compiled`` (numba) serves the CPU and ``scan`` (torch,
+parallel in time) any other device.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lfrtorch._threads import spread
+
+COMPILED_ON = {"cpu"}
+"""Devices that have compiled kernels; all else runs in torch, parallel in time."""
+
+
+def has_kernels(tensor: Tensor) -> bool:
+    """Whether compiled kernels serve the tensor's device."""
+    return tensor.device.type in COMPILED_ON
+
+
+def linear_recurrence(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+    """All states of s(k+1) = F(k) s(k) + g(k), s(0) = s0.
+
+    Shape:
+        F: (R, T, n, n), g: (R, T, n, m), s0: (R, n, m) -> (R, T + 1, n, m).
+    """
+    return compiled(F, g, s0) if has_kernels(F) else scan(F, g, s0)
+
+
+def adjoint_recurrence(F: Tensor, g: Tensor, end: Tensor) -> Tensor:
+    """All states of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end: the same back in time.
+
+    Shape:
+        F: (R, T, n, n), g: (R, T, n, m), end: (R, n, m) -> (R, T + 1, n, m).
+    """
+    if has_kernels(F):
+        return compiled(F, g, end, backwards=True)
+    return scan(F.mT.flip(1), g.flip(1), end).flip(1)
+
+
+def loop(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+    """The recurrence written out: the oracle of the two others."""
+    states = [s0]
+    for k in range(F.shape[1]):
+        states.append(F[:, k] @ states[-1] + g[:, k])
+    return torch.stack(states, dim=1)
+
+
+def compiled(F: Tensor, g: Tensor, s0: Tensor, *, backwards: bool = False) -> Tensor:
+    """Either recurrence in machine code, records in parallel; CPU tensors of one dtype."""
+    R, T, n, m = g.shape
+    s = g.new_empty(R, T + 1, n, m)
+    s[:, T if backwards else 0] = s0
+    spread(_recur_back if backwards else _recur, R, to_numpy(F), to_numpy(g), s.detach().numpy())
+    return s
+
+
+def to_numpy(tensor: Tensor) -> NDArray:
+    """A CPU tensor as a contiguous array for compiled code."""
+    return tensor.detach().contiguous().numpy()
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _recur(r, F, g, s):
+    _, T, n, m = g.shape
+    for k in range(T):
+        for i in range(n):
+            for c in range(m):
+                a = g[r, k, i, c]
+                for j in range(n):
+                    a += F[r, k, i, j] * s[r, k, j, c]
+                s[r, k + 1, i, c] = a
+        if k % 256 == 255:
+            _flush(s[r, k + 1])
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _recur_back(r, F, g, s):
+    _, T, n, m = g.shape
+    for k in range(T - 1, -1, -1):
+        for i in range(n):
+            for c in range(m):
+                a = g[r, k, i, c]
+                for j in range(n):
+                    a += F[r, k, j, i] * s[r, k + 1, j, c]
+                s[r, k, i, c] = a
+        if k % 256 == 255:
+            _flush(s[r, k])
+
+
+@njit(nogil=True)
+def _flush(s):
+    """A fading state would reach denormal numbers, a hundred times slower, and stay there."""
+    for i in range(s.shape[0]):
+        for c in range(s.shape[1]):
+            if abs(s[i, c]) < NOTHING:
+                s[i, c] = 0.0
+
+
+NOTHING = 1e-30
+"""States of unit size that have faded to less are zero."""
+
+
+def scan(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+    """The recurrence in about 3 √T batched products: chunks of √T steps side by side.
+
+    Each chunk is run from a zero state together with its transition matrices, the chunks' end
+    states are linked, and the links are propagated back into the chunks.
+    """
+    R, T, n, m = g.shape
+    steps = max(1, math.isqrt(T))
+    chunks = -(-T // steps)
+    pad = chunks * steps - T
+    eye = torch.eye(n, dtype=F.dtype, device=F.device)
+    F = torch.cat([F, eye.expand(R, pad, n, n)], dim=1).reshape(R, chunks, steps, n, n)
+    g = torch.cat([g, g.new_zeros(R, pad, n, m)], dim=1).reshape(R, chunks, steps, n, m)
+
+    local = torch.cat([g.new_zeros(R, chunks, n, m), eye.expand(R, chunks, n, n)], dim=-1)
+    inside = []
+    for k in range(steps):
+        local = F[:, :, k] @ local
+        local[..., :m] += g[:, :, k]
+        inside.append(local)
+    particular, transition = torch.stack(inside, dim=2).split([m, n], dim=-1)
+
+    starts = [s0]
+    for c in range(chunks - 1):
+        starts.append(transition[:, c, -1] @ starts[-1] + particular[:, c, -1])
+    s = particular + transition @ torch.stack(starts, dim=1).unsqueeze(2)
+    return torch.cat([s0.unsqueeze(1), s.reshape(R, chunks * steps, n, m)[:, :T]], dim=1)

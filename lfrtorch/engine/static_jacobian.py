@@ -1,0 +1,164 @@
+"""The static nonlinearity linearised at every sample, by each of its inputs and weights."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, jacrev, vjp, vmap
+
+from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Stacked, is_network
+
+Weights = dict[str, Tensor]
+
+
+class StaticSlopes(Protocol):
+    """dw = J dz + (∂w/∂φ) dφ, φ all weights of the map in the order of its parameters.
+
+    Shape:
+        J: (R, T, nw, nz); dφ: (nφ,), or (R, nφ) where every record has its own weights.
+    """
+
+    @property
+    def J(self) -> Tensor:
+        """∂w/∂z."""
+        ...
+
+    def part(self, records: slice, time: slice) -> StaticSlopes:
+        """The same for some of the records and samples."""
+        ...
+
+    def by_weight(self) -> Tensor:
+        """∂w/∂φ (R, T, nw, nφ)."""
+        ...
+
+    def tangent(self, d_weights: Tensor) -> Tensor:
+        """(∂w/∂φ) dφ (R, T, nw)."""
+        ...
+
+    def adjoint(self, d_w: Tensor) -> Tensor:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k) (R, nφ) of d_w (R, T, nw)."""
+        ...
+
+
+def static_slopes(static: nn.Module | None, z: Tensor, weights: Weights) -> StaticSlopes:
+    """The map linearised at z (R, T, nz), with the given weights in place of its own."""
+    if is_network(static):
+        return NetworkSlopes(static, z, weights)
+    return ModuleSlopes(static, z, weights)
+
+
+_SLOPES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "tanh": lambda v, h: torch.addcmul(h.new_ones(()), h, h, value=-1.0),
+    "sigmoid": lambda v, h: h * (1.0 - h),
+    "relu": lambda v, h: (v > 0).to(v.dtype),
+    "rbf": lambda v, h: -2.0 * v * h,
+    "softplus": lambda v, h: torch.sigmoid(v),
+}
+"""σ'(v) from v and h = σ(v)."""
+
+
+class NetworkSlopes:
+    """One hidden layer, in closed form: six times faster than ``torch.func``."""
+
+    def __init__(self, network: Network, z: Tensor, weights: Weights) -> None:
+        self.z = z
+        self.Wz, self.Ww = weights["Wz"], weights["Ww"]
+        v = (z @ self.Wz.mT).add_(weights["bz"])
+        self.h = ACTIVATIONS[network.activation](v)
+        self.slope = _SLOPES[network.activation](v, self.h)  # (R, T, nn)
+        nw, (nn, nz) = self.Ww.shape[-2], self.Wz.shape[-2:]
+        self.sizes = [nn * nz, nn, nw * nn, nw]
+        # J = Σ_n slope_n Ww[:, n] Wz[n, :]: one product with a matrix (nn, nw nz).
+        rank_ones = self.Ww.mT.unsqueeze(-1) * self.Wz.unsqueeze(-2)
+        self.J = (self.slope @ rank_ones.flatten(-2)).unflatten(-1, (nw, nz))
+
+    def part(self, records: slice, time: slice) -> StaticSlopes:
+        """The same for some of the records and samples."""
+        part = copy.copy(self)
+        part.z, part.h, part.slope, part.J = (
+            signal[records, time] for signal in (self.z, self.h, self.slope, self.J)
+        )
+        if self.Wz.ndim == 3:
+            part.Wz, part.Ww = self.Wz[records], self.Ww[records]
+        return part
+
+    def by_weight(self) -> Tensor:
+        """∂w/∂φ (R, T, nw, nφ)."""
+        R, T, nn = self.h.shape
+        nw, nz = self.J.shape[-2:]
+        out = self.h.new_zeros(R, T, nw, sum(self.sizes))
+        Wz, bz, Ww, bw = out.split(self.sizes, dim=-1)
+        torch.mul(self.slope.unsqueeze(2), self.Ww.unsqueeze(-3), out=bz)
+        torch.mul(bz.unsqueeze(-1), self.z[:, :, None, None], out=Wz.unflatten(-1, (nn, nz)))
+        h = self.h.unsqueeze(-1).expand(-1, -1, -1, nw)
+        Ww.unflatten(-1, (nw, nn)).diagonal(dim1=2, dim2=3).copy_(h)
+        bw.diagonal(dim1=2, dim2=3).fill_(1.0)
+        return out
+
+    def tangent(self, d_weights: Tensor) -> Tensor:
+        """(∂w/∂φ) dφ (R, T, nw)."""
+        (nn, nz), nw = self.Wz.shape[-2:], self.Ww.shape[-2]
+        Wz, bz, Ww, bw = d_weights.split(self.sizes, dim=-1)
+        Wz, Ww = Wz.unflatten(-1, (nn, nz)), Ww.unflatten(-1, (nw, nn))
+        d_h = self.slope * (self.z @ Wz.mT + bz.unsqueeze(-2))
+        return d_h @ self.Ww.mT + self.h @ Ww.mT + bw.unsqueeze(-2)
+
+    def adjoint(self, d_w: Tensor) -> Tensor:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k) (R, nφ)."""
+        d_v = (d_w @ self.Ww) * self.slope
+        parts = (d_v.mT @ self.z, d_v.sum(-2), d_w.mT @ self.h, d_w.sum(-2))
+        return torch.cat([part.flatten(1) for part in parts], dim=-1)
+
+
+class ModuleSlopes:
+    """Any module, by ``torch.func``; none at all is a map without inputs, outputs and weights."""
+
+    def __init__(self, static: nn.Module | None, z: Tensor, weights: Weights) -> None:
+        self.z, self.static, self.weights = z, static, weights
+        self.by_record = None  # the axis of the weights that counts the records
+        if isinstance(static, Stacked):
+            self.static, self.by_record = static.base, 0
+            self.weights = dict(zip(static.names, weights.values(), strict=True))
+        self.J = self._at_every_sample(jacrev(self._map, argnums=1))
+
+    def _map(self, weights: Weights, z: Tensor) -> Tensor:
+        return z if self.static is None else functional_call(self.static, weights, (z,))
+
+    def _at_every_sample(self, function: Callable[[Weights, Tensor], Any]) -> Any:
+        over_time = vmap(function, in_dims=(None, 0))
+        return vmap(over_time, in_dims=(self.by_record, 0))(self.weights, self.z)
+
+    def part(self, records: slice, time: slice) -> StaticSlopes:
+        """The same for some of the records and samples."""
+        part = copy.copy(self)
+        part.z, part.J = self.z[records, time], self.J[records, time]
+        if self.by_record is not None:
+            part.weights = {name: p[records] for name, p in self.weights.items()}
+        return part
+
+    def by_weight(self) -> Tensor:
+        """∂w/∂φ (R, T, nw, nφ)."""
+        parts = self._at_every_sample(jacrev(self._map)) if self.weights else {}
+        return torch.cat(
+            [self.J[..., :0], *(part.reshape(*self.J.shape[:3], -1) for part in parts.values())],
+            dim=-1,
+        )
+
+    def tangent(self, d_weights: Tensor) -> Tensor:
+        """(∂w/∂φ) dφ (R, T, nw)."""
+        return (self.by_weight() @ d_weights[..., None, :, None]).squeeze(-1)
+
+    def adjoint(self, d_w: Tensor) -> Tensor:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k) (R, nφ)."""
+
+        def one(weights: Weights, z: Tensor, d_w: Tensor) -> Weights:
+            return vjp(lambda weights: self._map(weights, z), weights)[1](d_w)[0]
+
+        parts = vmap(one, in_dims=(self.by_record, 0, 0))(self.weights, self.z, d_w)
+        return torch.cat(
+            [d_w[:, 0, :0], *(part.reshape(len(d_w), -1) for part in parts.values())], dim=-1
+        )

@@ -1,0 +1,1 @@
+"""Measurements in files of many formats, read as records."""

@@ -1,0 +1,94 @@
+"""Measurement files of any format as tables of channels."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from pathlib import Path
+
+from lfrtorch.files import arrays as array_table
+from lfrtorch.files.parquet import ParquetTable
+from lfrtorch.files.table import BLOCK, Table
+from lfrtorch.files.text import TextTable
+
+__all__ = ["BLOCK", "FORMATS", "Table", "open_table"]
+
+FORMATS: dict[str, Callable[[Path], Table]] = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".lvm"), TextTable),
+    ".mat": array_table.mat,
+    ".npz": array_table.npz,
+    ".npy": array_table.npy,
+    **dict.fromkeys((".h5", ".hdf5"), array_table.hdf5),
+    ".parquet": ParquetTable,
+}
+"""How a file is read, by its extension; a text file may be compressed (.csv.gz)."""
+
+_SHOWN = 8
+_INSTEAD = {
+    ".xlsx": "save the sheet as CSV",
+    ".xls": "save the sheet as CSV",
+    ".tdms": "export it as text or convert it to HDF5",
+    ".mdf": "export it as text, MATLAB or Parquet",
+    ".mf4": "export it as text, MATLAB or Parquet",
+}
+
+
+def open_table(path: str | Path) -> Table:
+    """The table of a file; what it holds is read as far as its columns ask for.
+
+    Args:
+        path: a text file (.csv, .tsv, .txt, .dat, .lvm, these also as .gz), a MATLAB file of any
+            version, .npz, .npy, HDF5 (.h5, .hdf5) or Parquet.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a folder, an unknown extension, a file without samples or a damaged one, or a
+            package that is missing.
+    """
+    path = Path(path).expanduser()
+    if path.is_dir():
+        inside = sorted(p.name for p in path.iterdir() if extension(p) in FORMATS)
+        raise ValueError(
+            f"'{path}' is a folder; name a file"
+            + (f": {', '.join(inside[:_SHOWN])}." if inside else ", it has none of a known format.")
+        )
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file '{path}'{similar(path)}.")
+    kind = extension(path)
+    if kind not in FORMATS:
+        instead = _INSTEAD.get(path.suffix.lower(), "convert it")
+        raise ValueError(
+            f"'{path}' has the unknown extension '{path.suffix}'; {instead}, or rename it where it "
+            f"is one of these: {', '.join(FORMATS)}."
+        )
+    if path.stat().st_size == 0:
+        raise ValueError(f"'{path}' is empty; give a file with data.")
+    return FORMATS[kind](path)
+
+
+def extension(path: Path) -> str:
+    """The extension in lower case, of a compressed text file that of the text."""
+    kind = path.suffix.lower()
+    if kind != ".gz":
+        return kind
+    text = Path(path.stem).suffix.lower()
+    return text if FORMATS.get(text) is TextTable else kind
+
+
+def similar(path: Path) -> str:
+    """What there is in place of a file that is not there, as the end of a message."""
+    folder = path.parent
+    while not folder.is_dir() and folder != folder.parent:
+        folder = folder.parent
+    if folder != path.parent:
+        return f", and no folder '{path.parent}'"
+    names = [p.name for p in folder.iterdir() if p.is_file()]
+    known = {name.lower(): name for name in names}
+    close = difflib.get_close_matches(path.name.lower(), known, n=_SHOWN, cutoff=0.6)
+    close = [known[name] for name in close]
+    if close:
+        return f"; there is {', '.join(map(repr, close))} in its folder"
+    usable = sorted(name for name in names if extension(Path(name)) in FORMATS)
+    if usable:
+        return f"; its folder has {', '.join(map(repr, usable[:_SHOWN]))}"
+    return " in its folder, and none of a known format"

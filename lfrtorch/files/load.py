@@ -1,0 +1,413 @@
+"""One's own measurements as records by use: one file or many, of any format."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import takewhile
+from pathlib import Path
+from typing import Literal, cast, get_args
+
+from lfrtorch._checks import integer, number
+from lfrtorch.dataset import Dataset
+from lfrtorch.files.formats import similar
+from lfrtorch.files.measurement import (
+    Columns,
+    Gaps,
+    Measurement,
+    Stretch,
+    Wanted,
+    read_measurement,
+)
+from lfrtorch.files.split import SHORTEST, TooShort, cut
+from lfrtorch.files.table import NoColumn
+from lfrtorch.periods import find_period, find_transient
+from lfrtorch.records import Record
+
+__all__ = ["load_records"]
+
+Paths = str | Path | Sequence[str | Path]
+Use = float | str | Path | Sequence[str | Path] | None
+
+Start = Literal["zero", "estimated", "periodic"]
+Period = int | Literal["auto"] | None
+
+_WARM_UP = 0.05  # of a record: default of skip
+_LONGEST_TRANSIENT = 1 / 3  # of a record; beyond it, leaving it out costs more than it helps
+_LEFT_OUT = "left out, as it is too short"
+_SAME = 1e-4  # relative, of sampling frequencies: what printed time stamps leave open
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """A file's record, or that of a stretch between its gaps, before it has a use."""
+
+    record: Record
+    path: Path
+    stem: str  # of all stretches of the file
+    stretch: bool
+
+
+def load_records(
+    path: Paths,
+    *,
+    inputs: Columns | None = None,
+    outputs: Columns | None = None,
+    fs: float | None = None,
+    time: str | int | None = None,
+    units: Mapping[str, str] | None = None,
+    validation: Use = 0.2,
+    test: Use = 0.2,
+    start: Start = "zero",
+    period: Period = "auto",
+    skip: int | Literal["auto"] | None = None,
+    gaps: Gaps = "error",
+) -> Dataset:
+    """Measurements from files, each a record, by use: training, validation and test.
+
+    Text (.csv, .tsv, .txt, .dat, .lvm, also .gz) with or without header, units line and preamble;
+    MATLAB (.mat), .npz, .npy, HDF5 (.h5, .hdf5) and Parquet.
+
+    What is cut off by a fraction begins where its record begins and is simulated from there: only
+    its own part is scored, so that the transient of the start reaches neither validation nor test.
+
+    Args:
+        path: a file, a pattern as ``"runs/*.csv"``, or a list of these.
+        inputs: one or several names of columns or arrays, or column numbers from 0. An array of
+            several channels is several inputs.
+        outputs: likewise.
+        fs: sampling frequency in Hz; it may be left out where there is ``time``.
+        time: the column of time stamps, in seconds or as ISO date-times, evenly spaced.
+        units: of the channels by name, in place of those in the file's header.
+        validation: records that choose among iterates and are not fitted: a fraction below 1 of
+            every record, the part after that for training; a number of records, the last ones;
+            names of records of ``path``, which are those of the files without extension; or other
+            files, as for ``path``. 0 for none.
+        test: records that are scored, likewise: of a fraction the last part, of a number the last
+            records.
+        start: ``"zero"`` (at rest), ``"estimated"`` (amid the measurement), or ``"periodic"``:
+            every record is cut to whole periods in steady state.
+        period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
+        skip: samples at the beginning of every record that are left out of cost and score. Where
+            left out they are the periods that the output takes to settle, and 5 % of the record
+            where the input does not repeat.
+        gaps: ``"error"`` refuses missing values and missing time stamps, ``"split"`` makes a record
+            of every stretch between them.
+
+    Shape:
+        u, y of a record: (its samples, inputs), (its samples, outputs), in the file's units.
+
+    Returns:
+        The records; ``notes`` say what was found of periods, transients, time and gaps.
+
+    Raises:
+        ValueError: a file, column or setting that cannot be used, files that do not belong
+            together, or a part too short to score.
+        FileNotFoundError: no such file.
+    """
+    reader = _Reader(
+        Wanted(inputs, outputs, fs, time, dict(units or {}), gaps),
+        start,
+        period,
+        None if skip == "auto" else skip,
+    )
+    paths = listed_files(path, "data.path")
+    left = reader.read(paths)
+    tests, left, tested = _taken("data.test", test, left, reader)
+    chosen, left, validated = _taken("data.validation", validation, left, reader)
+    if not left:
+        raise ValueError(
+            f"data.validation={validation} and data.test={test} leave no record for training; "
+            f"data.path has {len(reader.all)} in all."
+        )
+    if validated + tested >= 1:
+        raise ValueError(
+            f"the fractions are validation={validation} and test={test}; they must leave something "
+            "for training, for example 0.2 and 0.2."
+        )
+    parts: dict[str, list[Record]] = {"train": [], "validation": chosen, "test": tests}
+    short = None
+    for whole in left:
+        try:
+            for use, record in cut(whole.record, validated, tested).items():
+                parts[use].append(record)
+        except TooShort as error:
+            if not whole.stretch:
+                raise ValueError(f"'{whole.path}': {error}") from error
+            short = error
+            reader.note(whole.record.name, _LEFT_OUT)
+    if not parts["train"]:
+        raise ValueError(f"'{left[0].path}': no stretch between gaps is long enough: {short}")
+    if (validated or tested) and any(whole.record.period for whole in left):
+        reader.note(
+            "",
+            "the parts of a record have the same input in every period: validation and test show "
+            "noise rather than how the model does on other inputs; give them records of their own",
+        )
+    for use, records in parts.items():
+        if len(records) == 1:
+            parts[use] = [replace(records[0], name=use)]
+    return Dataset(
+        _name(paths), parts["train"], parts["validation"], parts["test"], notes=reader.notes
+    )
+
+
+class _Reader:
+    """Reads files into whole records, all of one kind, and keeps what was found."""
+
+    def __init__(self, wanted: Wanted, start: Start, period: Period, skip: int | None) -> None:
+        if start not in get_args(Start):
+            raise ValueError(f"data.start is {start!r}; use 'zero', 'estimated' or 'periodic'.")
+        if period not in (None, "auto"):
+            integer("data.period", period, 1)
+        if skip is not None:
+            integer("data.skip", skip, 0)
+        self.wanted, self.period, self.skip = wanted, period, skip
+        self.start: Start = start
+        self.all: list[_Whole] = []
+        self._first: Measurement | None = None
+        self._notes: dict[str, list[str]] = {}
+
+    def note(self, name: str, text: str) -> None:
+        """Keep what is to be known of a record, or of all where the name is empty."""
+        self._notes.setdefault(text, []).append(name)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence each, with the records it is about where that is not clear."""
+        return tuple(
+            text if len(self.all) == 1 or names == [""] else f"{_some(names)}: {text}"
+            for text, names in self._notes.items()
+        )
+
+    def read(self, paths: Sequence[Path]) -> list[_Whole]:
+        """The records of some files."""
+        found = []
+        stems = _stems(paths, {whole.stem for whole in self.all})
+        for path, stem in zip(paths, stems, strict=True):
+            measured = self._measured(path)
+            several = len(measured.stretches) > 1
+            self._note_all(stem, measured.notes)
+            if several:
+                self.note(stem, f"{len(measured.stretches)} stretches between gaps, a record each")
+            before = len(found)
+            for i, stretch in enumerate(measured.stretches, 1):
+                name = f"{stem}_{i}" if several else stem
+                try:
+                    record, notes = self._record(name, measured, stretch)
+                except TooShort as error:
+                    if not several:
+                        raise ValueError(f"'{path}': {error}") from error
+                    self.note(name, _LEFT_OUT)
+                else:
+                    self._note_all(name, notes)
+                    found.append(_Whole(record, path, stem, several))
+            if len(found) == before:
+                raise ValueError(f"'{path}': no stretch between its gaps is long enough to score.")
+        self.all += found
+        return found
+
+    def _note_all(self, name: str, texts: Iterable[str]) -> None:
+        for text in texts:
+            self.note(name, text)
+
+    def _measured(self, path: Path) -> Measurement:
+        """What a file measured, checked to be of a kind with the first."""
+        try:
+            measured = read_measurement(path, self.wanted)
+        except NoColumn as error:
+            if self._first is None:
+                raise
+            raise ValueError(f"{error} '{self._first.path}' has it.") from error
+        if self._first is None:
+            self._first = measured
+        first = self._first
+        for side in ("inputs", "outputs"):
+            here, there = getattr(measured, side), getattr(first, side)
+            if here != there:
+                raise ValueError(
+                    f"the {side} of '{path}' are {', '.join(map(str, here))} and those of "
+                    f"'{first.path}' {', '.join(map(str, there))}; give files of the same columns "
+                    "and units."
+                )
+        if abs(measured.fs / first.fs - 1) > _SAME:
+            raise ValueError(
+                f"'{path}' is sampled at {measured.fs:g} Hz and '{first.path}' at {first.fs:g} Hz; "
+                "resample them to one rate."
+            )
+        return replace(measured, fs=first.fs)
+
+    def _record(
+        self, name: str, measured: Measurement, stretch: Stretch
+    ) -> tuple[Record, list[str]]:
+        """The record of a stretch, and what was found of its period."""
+        u, y, T = stretch.u, stretch.y, len(stretch.u)
+        automatic = self.period == "auto"
+        N = find_period(u) if automatic else cast("int | None", self.period)
+        settling = 0 if N is None or self.skip is not None else find_transient(y, N)
+        start: Start = self.start
+        if start == "periodic":
+            if N is None:
+                raise ValueError(
+                    f"data.start is periodic and the input of '{measured.path}' does not repeat; "
+                    "give data.period in samples, or data.start=zero."
+                )
+            begin = settling if self.skip is None else self.skip
+            if T - begin < N:
+                raise TooShort(
+                    f"record '{name}' has no whole period of {N} samples: {T} samples, of which "
+                    f"{begin} are left out at the start."
+                )
+            kept, skip = slice(begin, begin + (T - begin) // N * N), 0
+        else:
+            if settling > _LONGEST_TRANSIENT * T:
+                settling = 0
+            kept = slice(0, T)
+            skip = (settling or round(_WARM_UP * T)) if self.skip is None else self.skip
+            start = "estimated" if stretch.first else start
+            if T - skip < SHORTEST:
+                raise TooShort(
+                    f"record '{name}' has {max(T - skip, 0)} scored samples of {T}, with "
+                    f"skip={skip}; it needs {SHORTEST}."
+                )
+        notes = []
+        if N is not None and (automatic or settling):
+            said = f"the input repeats every {N} samples, {T / N:.3g} times"
+            count = settling // N
+            if count == 1:
+                said += "; the first period is the transient and is not fitted"
+            elif count:
+                said += f"; the first {count} periods are the transient and are not fitted"
+            elif start == "zero" and self.skip is None and not find_transient(y, N):
+                said += "; the output is settled from the first sample on: use data.start=periodic"
+            notes.append(said)
+        record = Record(
+            u[kept],
+            y[kept],
+            fs=measured.fs,
+            start=start,
+            skip=skip,
+            name=name,
+            source="file",
+            inputs=measured.inputs,
+            outputs=measured.outputs,
+            period=N,
+        )
+        return record, notes
+
+
+def listed_files(given: Paths | None, option: str) -> list[Path]:
+    """The files of paths and patterns, those of a pattern in the order of people's counting."""
+    listed = [given] if isinstance(given, str | Path) else list(given or [])
+    if not listed or not all(isinstance(path, str | Path) for path in listed):
+        raise ValueError(
+            f"{option} is {given!r}; give the path of a file, a pattern as 'runs/*.csv', or a list "
+            "of these."
+        )
+    found: list[Path] = []
+    for entry in listed:
+        path = Path(entry).expanduser()
+        if path.exists() or not glob.has_magic(str(path)):
+            found.append(path)
+            continue
+        matches = [Path(p) for p in glob.glob(str(path), recursive=True) if Path(p).is_file()]
+        if not matches:
+            raise FileNotFoundError(f"no file is as '{path}', {option}, says{similar(path)}.")
+        found += sorted(matches, key=lambda p: _counting(str(p)))
+    return list({path.resolve(): path for path in found}.values())
+
+
+def _counting(text: str) -> list[tuple[int, str]]:
+    """A key that sorts run2 before run10."""
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)
+    ]
+
+
+def _stem(path: Path) -> str:
+    name = path.name
+    return Path(name[:-3] if name.lower().endswith(".gz") else name).stem
+
+
+def _stems(paths: Sequence[Path], taken: Container[str]) -> list[str]:
+    """Names of files, with as many of their folders as make them unlike one another."""
+    full = [path.resolve() for path in paths]
+    names = []
+    for depth in range(1, max(len(path.parts) for path in full) + 1):
+        names = ["_".join([*path.parts[-depth:-1], _stem(path)]).lstrip("/") for path in full]
+        if len(set(names)) == len(names) and not any(name in taken for name in names):
+            return names
+    return [f"{name}{path.suffix}" for name, path in zip(names, paths, strict=True)]
+
+
+def _name(paths: Sequence[Path]) -> str:
+    """Of a data set: its file's, or what its files' names begin with."""
+    if len(paths) == 1:
+        return _stem(paths[0])
+    letters = zip(*map(_stem, paths), strict=False)
+    common = "".join(some[0] for some in takewhile(lambda some: len(set(some)) == 1, letters))
+    return common.rstrip("0123456789_-. ") or paths[0].resolve().parent.name or "files"
+
+
+def _some(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:4])
+    return shown if len(names) <= 4 else f"{shown} and {len(names) - 4} more"
+
+
+def _taken(
+    option: str, use: Use, wholes: list[_Whole], reader: _Reader
+) -> tuple[list[Record], list[_Whole], float]:
+    """Records for a use, those that are left, and the fraction of these that is for it, too."""
+    if use is None:
+        return [], wholes, 0.0
+    if isinstance(use, str | Path | Sequence):
+        return *_named(option, [use] if isinstance(use, str | Path) else use, wholes, reader), 0.0
+    number(option, use)
+    if use < 1:
+        return [], wholes, float(use)
+    if use != int(use):
+        raise ValueError(
+            f"{option} is {use}; give a fraction below 1, a whole number of records, or names of "
+            "records or files."
+        )
+    count = int(use)
+    if count >= len(wholes):
+        raise ValueError(
+            f"{option}={count} takes the last {count} of the {len(wholes)} record(s) there are, "
+            "which leaves none for training; give more files, or a fraction below 1."
+        )
+    return [whole.record for whole in wholes[-count:]], wholes[:-count], 0.0
+
+
+def _named(
+    option: str, names: Sequence[str | Path], wholes: list[_Whole], reader: _Reader
+) -> tuple[list[Record], list[_Whole]]:
+    """Records by their names, or of other files, and those that are left."""
+    left, records = list(wholes), []
+    known = list(reader.all)
+    for name in names:
+        found = [whole for whole in known if str(name) in (whole.record.name, whole.stem)]
+        if not found:
+            path = Path(name).expanduser()
+            if not (path.exists() or path.suffix or glob.has_magic(str(name))):
+                raise ValueError(
+                    f"{option} names {str(name)!r}, which is neither a file nor one of the "
+                    f"records: {', '.join(whole.record.name for whole in known)}."
+                )
+            paths = listed_files(name, option)
+            same = {path.resolve() for path in paths}
+            found = [whole for whole in known if whole.path.resolve() in same]
+            own = [p for p in paths if p.resolve() not in {w.path.resolve() for w in found}]
+            fresh = reader.read(own) if own else []
+            records += [whole.record for whole in fresh]
+        used = [whole.record.name for whole in found if whole not in left]
+        if used:
+            raise ValueError(
+                f"{option} names {', '.join(map(repr, used))}, which has a use already; name every "
+                "record once in data.validation and data.test."
+            )
+        records += [whole.record for whole in found]
+        left = [whole for whole in left if whole not in found]
+    return records, left

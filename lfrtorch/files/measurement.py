@@ -1,0 +1,238 @@
+"""What one file measured: inputs and outputs on an even grid of time, in stretches without gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfrtorch._checks import number
+from lfrtorch.files.formats import Table, open_table
+from lfrtorch.files.time_stamps import Sampling, Uneven, in_seconds, is_time, sampling
+from lfrtorch.records import Channel
+
+Columns = str | int | Sequence[str | int]
+Gaps = Literal["error", "split"]
+
+_SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is read of every file; see :func:`lfrtorch.load_records`."""
+
+    inputs: Columns | None
+    outputs: Columns | None
+    fs: float | None = None
+    time: str | int | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    gaps: Gaps = "error"
+
+    def __post_init__(self) -> None:
+        if self.fs is not None:
+            number("data.fs", self.fs, positive=True)
+        if self.gaps not in get_args(Gaps):
+            raise ValueError(f"data.gaps is {self.gaps!r}; use 'error' or 'split'.")
+
+
+class Stretch(NamedTuple):
+    """Consecutive samples: u (T, nu), y (T, ny), and which sample of the file is the first."""
+
+    u: NDArray[np.float64]
+    y: NDArray[np.float64]
+    first: int
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One file."""
+
+    path: Path
+    fs: float
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    stretches: list[Stretch]
+    notes: list[str]
+
+
+def read_measurement(path: Path, wanted: Wanted) -> Measurement:
+    """Inputs and outputs of a file, and its sampling frequency.
+
+    Raises:
+        ValueError: columns that are not there, infinite values, gaps that are not to be split at,
+            time stamps that are no even grid, or no sampling frequency or two of them.
+    """
+    table = open_table(path)
+    u = table.find(wanted.inputs, "data.inputs")
+    y = table.find(wanted.outputs, "data.outputs")
+    stamps = () if wanted.time is None else table.find(wanted.time, "data.time")
+    if len(stamps) > 1:
+        raise ValueError(f"data.time is {wanted.time!r}, which is {len(stamps)} columns; name one.")
+    columns = (*u, *y, *stamps)
+    twice = [table.headers[i] for i in dict.fromkeys(columns) if columns.count(i) > 1]
+    if twice:
+        raise ValueError(
+            f"'{path}': {', '.join(map(repr, twice))} stands twice in data.inputs, data.outputs "
+            "and data.time; name every column once."
+        )
+    if wanted.fs is None and not stamps:
+        raise ValueError(
+            f"the sampling frequency of '{path}' is not given; say it in Hz with "
+            f"data.fs{_suggested(table, columns)}."
+        )
+    known = {name for i in (*u, *y) for name in (table.headers[i], table.columns[i].name)}
+    strange = [name for name in wanted.units if name not in known]
+    if strange:
+        raise ValueError(
+            f"data.units names {', '.join(map(repr, strange))}, which is none of the inputs and "
+            f"outputs: {', '.join(table.columns[i].name for i in (*u, *y))}."
+        )
+    notes = []
+    values = table.read(columns)
+    present = np.flatnonzero(~np.isnan(values).all(axis=1))
+    values = values[: present[-1] + 1 if present.size else 0]  # spreadsheets end in empty lines
+    _refuse_infinite(table, values, columns)
+    missing = np.asarray(np.isnan(values).any(axis=1))
+    grid = None
+    if stamps and not missing.all():
+        grid = _grid(table, values[:, -1], stamps[0])
+        _agree(wanted, grid, table, stamps[0])
+    elif wanted.fs is not None:
+        notes += _doubts(table, columns, wanted.fs)
+    stretches = _stretches(missing, np.array([], np.int64) if grid is None else grid.gaps)
+    if len(values) and (missing.any() or len(stretches) > 1) and wanted.gaps == "error":
+        raise _gap(table, values, columns, grid)
+    if not stretches:
+        raise ValueError(f"'{path}' has no sample in which all columns have a value.")
+    nu, ny = len(u), len(u) + len(y)
+    fs = wanted.fs if grid is None else grid.fs
+    assert fs is not None
+    return Measurement(
+        path,
+        fs,
+        _channels(table, u, wanted.units),
+        _channels(table, y, wanted.units),
+        [Stretch(values[a:b, :nu], values[a:b, nu:ny], int(a)) for a, b in stretches],
+        notes,
+    )
+
+
+def _channels(
+    table: Table, columns: Sequence[int], units: Mapping[str, str]
+) -> tuple[Channel, ...]:
+    """Channels with the units that are given by name or by header."""
+    listed = [(table.columns[i], table.headers[i]) for i in columns]
+    return tuple(
+        Channel(channel.name, units.get(channel.name, units.get(header, channel.unit)))
+        for channel, header in listed
+    )
+
+
+def _stretches(missing: NDArray[np.bool_], gaps: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """First and last sample + 1 of the stretches without a missing value or a gap between."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], missing, [True]]).astype(np.int8)))
+    edges = np.union1d(edges, gaps)
+    return [(int(a), int(b)) for a, b in pairwise(edges) if not missing[a]]
+
+
+def _refuse_infinite(table: Table, values: NDArray, columns: Sequence[int]) -> None:
+    infinite = np.isinf(values)
+    if infinite.any():
+        sample, i = np.argwhere(infinite)[0]
+        raise ValueError(
+            f"'{table.path}': {infinite.sum()} infinite value(s), the first at "
+            f"{table.where(int(sample))} in column {table.headers[columns[i]]!r}; correct them, or "
+            "leave the cells empty."
+        )
+
+
+def _gap(
+    table: Table, values: NDArray, columns: Sequence[int], grid: Sampling | None
+) -> ValueError:
+    """What is missing, and what to do."""
+    empty = np.isnan(values)
+    rows = empty.any(axis=1)
+    said = []
+    if rows.any():
+        sample = int(np.argmax(rows))
+        places = int(np.count_nonzero(np.diff(np.append(False, rows).astype(np.int8)) == 1))
+        column = table.headers[columns[int(np.argmax(empty[sample]))]]
+        said.append(
+            f"{rows.sum()} sample(s) have missing values, in {places} place(s), the first at "
+            f"{table.where(sample)} in column {column!r}"
+        )
+    if grid is not None and grid.gaps.size:
+        said.append(
+            f"the time stamps have {grid.gaps.size} gap(s) of {grid.missing.sum()} sample(s) in "
+            f"all, the first before {table.where(int(grid.gaps[0]))}"
+        )
+    return ValueError(
+        f"'{table.path}': {', and '.join(said)}; data.gaps=split takes every stretch between for a "
+        "record of its own, or fill the gaps."
+    )
+
+
+def _grid(table: Table, t: NDArray[np.float64], column: int) -> Sampling:
+    """The grid of time stamps, those that are missing filled in."""
+    known = np.isfinite(t)
+    k = np.arange(len(t))
+    try:
+        return sampling(in_seconds(np.interp(k, k[known], t[known]), table.columns[column]))
+    except Uneven as error:
+        raise ValueError(
+            f"'{table.path}': the time column {table.headers[column]!r} {error}, at "
+            f"{table.where(error.sample)}; resample the signals to an even grid, or give data.fs "
+            "without data.time where the column is wrong."
+        ) from error
+
+
+def _agree(wanted: Wanted, grid: Sampling, table: Table, column: int) -> None:
+    if wanted.fs is not None and abs(wanted.fs / grid.fs - 1) > max(_SAME, grid.uncertainty):
+        raise ValueError(
+            f"fs is {wanted.fs:g} Hz and the time column {table.headers[column]!r} of "
+            f"'{table.path}' says {grid.fs:g} Hz; leave data.fs or data.time out, whichever is "
+            "wrong."
+        )
+
+
+def _beside(table: Table, columns: Sequence[int]) -> list[tuple[int, Sampling]]:
+    """Columns that are none of those, and an even grid of time as far as their first block goes."""
+    found = []
+    for column, channel in enumerate(table.columns):
+        if column in columns:
+            continue
+        try:
+            t = next(table.blocks([column]))[:, 0]
+            if np.isfinite(t).all():
+                found.append((column, sampling(in_seconds(t, channel))))
+        except (ValueError, StopIteration):  # no numbers, or no grid
+            continue
+    return found
+
+
+def _suggested(table: Table, columns: Sequence[int]) -> str:
+    """The column that may be time, as the end of a message."""
+    # A counter of samples is a grid of 1 Hz.
+    grids = [(c, g) for c, g in _beside(table, columns) if is_time(table.columns[c]) or g.fs != 1]
+    grids.sort(key=lambda found: not is_time(table.columns[found[0]]))
+    if not grids:
+        return ""
+    column, grid = grids[0]
+    return (
+        f", or by a column of time stamps: data.time={table.columns[column].name} ({grid.fs:g} Hz)"
+    )
+
+
+def _doubts(table: Table, columns: Sequence[int], fs: float) -> list[str]:
+    """A note where a column is named as time is and contradicts ``fs``."""
+    return [
+        f"data.fs is {fs:g} Hz and the column {table.headers[column]!r} says {grid.fs:g} Hz; where "
+        f"that is right, give data.time={table.columns[column].name} in place of data.fs"
+        for column, grid in _beside(table, columns)
+        if is_time(table.columns[column]) and abs(fs / grid.fs - 1) > max(_SAME, grid.uncertainty)
+    ]

@@ -1,0 +1,159 @@
+"""A file as a model takes it: its channels found, its samples checked block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfrtorch.files.formats import BLOCK, open_table
+from lfrtorch.files.table import NoColumn
+from lfrtorch.files.time_stamps import Uneven, in_seconds, sampling
+from lfrtorch.records import Channel
+
+Array = NDArray[np.float64]
+Columns = str | int | Sequence[str | int]
+
+SAME = 1e-3
+"""Relative difference of sampling frequencies that counts as none: clocks differ."""
+
+OVERLAP = 1000
+"""Time stamps of the block before that are looked at again, so that a short one shows its rate."""
+
+
+class Block(NamedTuple):
+    """Consecutive samples of a file: times (n, 1), or (n, 0), in s, u (n, nu), y (n, ny)."""
+
+    times: Array
+    u: Array
+    y: Array
+
+
+class FileStream:
+    """Inputs of a model in a file, and outputs where it has them.
+
+    Args:
+        path: the file, of any format that ``open_table`` reads.
+        inputs, outputs: the model's channels.
+        fs: its sampling frequency in Hz.
+        u, y: columns of the inputs and outputs, names or numbers from 0; where left out, those that
+            are called as the model's channels, no output unless all of them are there.
+        times: column of time stamps, which must run evenly at ``fs``.
+
+    Raises:
+        ValueError: a file that cannot be read, or columns that are not there, too many, too few or
+            in another unit.
+        FileNotFoundError: no such file.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        inputs: Sequence[Channel],
+        outputs: Sequence[Channel],
+        fs: float,
+        *,
+        u: Columns | None = None,
+        y: Columns | None = None,
+        times: str | int | None = None,
+    ) -> None:
+        self.table, self.fs = open_table(path), fs
+        self.u = self._found(u, inputs, "data.inputs")
+        there = {column.name for column in self.table.columns}
+        self.missing = [channel.name for channel in outputs if channel.name not in there]
+        """The model's outputs that are not in the file, by their own names."""
+        unmeasured = y is None and self.missing
+        self.y = () if unmeasured else self._found(y, outputs, "data.outputs")
+        self.times = () if times is None else self.table.find(times, "data.time")
+        if len(self.times) > 1:
+            raise ValueError(f"data.time is {times!r}, {len(self.times)} columns; name one.")
+        self.clock = self.table.columns[self.times[0]] if self.times else Channel("sample")
+        """Of the time stamps, or of sample numbers where there are none."""
+
+    def blocks(self, samples: int = BLOCK) -> Iterator[Block]:
+        """At most so many samples at a time; an output that is missing in one is NaN.
+
+        Raises:
+            ValueError: a sample without an input or a time, or times that do not run at ``fs``.
+        """
+        first, seen = 0, np.empty(0)
+        columns = [*self.times, *self.u, *self.y]
+        ends = [len(self.times), len(self.times) + len(self.u)]
+        for block in self.table.blocks(columns, samples):
+            if not len(block):
+                continue
+            missing = ~np.isfinite(block[:, : ends[1]])
+            if missing.any():
+                k, i = np.argwhere(missing)[0]
+                raise ValueError(
+                    f"{self._at(first + k)}: column {self.table.headers[columns[i]]!r} has no "
+                    "finite number; interpolate the gap, or cut the file there and simulate the "
+                    "parts."
+                )
+            times, u, y = np.split(block, ends, axis=1)
+            times = in_seconds(times, self.clock)
+            if self.times:
+                seen = np.concatenate([seen[-OVERLAP:], times[:, 0]])
+                self._check(seen, first + len(block) - len(seen))
+            yield Block(times, u, y)
+            first += len(block)
+
+    def _found(
+        self, wanted: Columns | None, channels: Sequence[Channel], option: str
+    ) -> tuple[int, ...]:
+        """Column numbers of the model's channels."""
+        listed = ", ".join(map(str, channels))
+        try:
+            found = self.table.find(
+                [c.name for c in channels] if wanted is None else wanted, option
+            )
+        except NoColumn as error:
+            if wanted is not None:
+                raise
+            raise ValueError(
+                f"{str(error).replace(f', as {option} says', '')} The model has {listed}; "
+                f"say which columns these are with {option}=[...]."
+            ) from error
+        if len(found) != len(channels):
+            raise ValueError(
+                f"{option} is {len(found)} column(s) of '{self.table.path}' and the model has "
+                f"{len(channels)} ({listed}); give one for each."
+            )
+        for channel, number in zip(channels, found, strict=True):
+            column = self.table.columns[number]
+            if channel.unit and column.unit and channel.unit != column.unit:
+                raise ValueError(
+                    f"column {column} of '{self.table.path}' is in another unit than the model's "
+                    f"{channel}; convert it, or correct its header."
+                )
+        return found
+
+    def _check(self, times: Array, first: int) -> None:
+        """Refuse time stamps, those of the samples from ``first`` on, that do not run at ``fs``."""
+        if len(times) < 2:
+            return
+        try:
+            grid = sampling(times)
+        except Uneven as error:
+            raise ValueError(
+                f"{self._at(first + error.sample)}: the time column {self.clock} {error}; resample "
+                "the signals to an even grid, or leave out data.time where the column is wrong."
+            ) from error
+        if abs(grid.fs / self.fs - 1) > max(SAME, grid.uncertainty):
+            raise ValueError(
+                f"the time column {self.clock} of '{self.table.path}' says {grid.fs:g} Hz and the "
+                f"model runs at {self.fs:g} Hz; resample the signals, or correct the column or its "
+                "unit."
+            )
+        if grid.gaps.size:
+            raise ValueError(
+                f"{self._at(first + grid.gaps[0])}: {grid.missing[0]} sample(s) are missing before "
+                f"it, as the time column {self.clock} says; fill the gap, or cut the file there "
+                "and simulate the parts."
+            )
+
+    def _at(self, sample: int) -> str:
+        return f"'{self.table.path}', {self.table.where(int(sample))}"

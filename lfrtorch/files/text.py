@@ -1,0 +1,395 @@
+"""A text file as a table, one line a sample, as spreadsheets, loggers and programs write it."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import gzip
+import io
+import re
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfrtorch.files.table import BLOCK, Clock, Table, bracketed, is_unit
+
+_HEAD = 1 << 18  # characters that tell the layout
+_DELIMITERS = ("\t", ";", ",", "|", " ")  # " ": any blanks; the first of those that do as well
+_MARKS = "#%"  # of comment lines
+_COMMENT = re.compile(r"^[ \t]*[#%](?!N/?A\b|[A-Z]+/?0?[!?]).*(?:\n|$)", re.MULTILINE)  # no #N/A
+_MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-nan", "<na>", "#na", "-")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE)
+_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")  # a number with a decimal comma
+_DATE = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?(Z|[+-]\d\d:?\d\d)?")
+
+_DAMAGED = (OSError, EOFError, zlib.error, UnicodeError)
+
+
+class _Line(NamedTuple):
+    number: int  # from 1
+    cells: list[str]
+    comment: bool
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How a file is written."""
+
+    encoding: str
+    delimiter: str
+    comma: bool  # decimal
+    first: int  # line number of the first sample, from 1
+    headers: tuple[str, ...]
+    units: dict[str, str]
+    dates: frozenset[int]  # columns of date-times
+
+
+class TextTable(Table):
+    """A text file (.csv, .tsv, .txt, .dat, .lvm, also as .gz), read by pandas in blocks.
+
+    The delimiter is a tab, ";", ",", "|" or blanks, whichever makes the most cells numbers; the
+    decimal comma is known where the delimiter is another. Lines that begin with # or % are
+    comments. The samples begin where lines of numbers do; the line above names the columns, one of
+    units may stand between, and what is further above is not read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.layout = _layout(path)
+        super().__init__(path, self.layout.headers, units=self.layout.units)
+
+    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[NDArray[np.float64]]:
+        """See :meth:`Table.blocks`; a line's missing cells are missing values."""
+        import pandas as pd  # slow to import
+
+        layout, beyond = self.layout, len(self.columns)
+        dates = layout.dates.intersection(columns)
+        clocks = {column: Clock() for column in dates}
+        try:
+            with _Samples(self.path, layout) as stream:
+                reader = pd.read_csv(
+                    stream,
+                    sep=r"\s+" if layout.delimiter == " " else layout.delimiter,
+                    decimal="," if layout.comma else ".",
+                    header=None,
+                    names=range(beyond + 1),
+                    usecols=sorted({*columns, beyond}),
+                    index_col=False,
+                    dtype=dict.fromkeys(columns, np.float64) | dict.fromkeys((*dates, beyond), str),
+                    na_values=[
+                        *_MISSING,
+                        *map(str.upper, _MISSING),
+                        *map(str.capitalize, _MISSING),
+                    ],
+                    skipinitialspace=layout.delimiter != " ",
+                    chunksize=samples,
+                    **_exact(pd.__version__),
+                )
+                reader.get_chunk(1)  # of no sample
+                while (part := _next(reader)) is not None:
+                    if part[beyond].notna().any():
+                        self._explain(columns)
+                    found = np.empty((len(part), len(columns)))
+                    for i, column in enumerate(columns):
+                        values = part[column]
+                        found[:, i] = clocks[column](_times(values)) if column in dates else values
+                    yield found
+        except (ValueError, *_DAMAGED) as error:  # pandas says which cell, and not where
+            if str(error).startswith(f"'{self.path}'"):
+                raise
+            if isinstance(error, ValueError):
+                self._explain(columns)
+            raise ValueError(
+                f"'{self.path}' is damaged or no text ({error}); write it again."
+            ) from error
+
+    def where(self, sample: int) -> str:
+        """The line of a sample."""
+        for i, line in enumerate(self._lines()):
+            if i == sample:
+                return f"line {line.number}"
+        return super().where(sample)
+
+    def _lines(self) -> Iterator[_Line]:
+        """The lines of samples."""
+        with _opened(self.path, self.layout.encoding) as stream:
+            for line in _split(stream, self.layout.delimiter):
+                if line.number >= self.layout.first and not line.comment:
+                    yield line
+
+    def _explain(self, columns: Sequence[int]) -> None:
+        """Refuse the first cell that is none of what a sample has."""
+        width = len(self.columns)
+        for line in self._lines():
+            cells = line.cells
+            if any(cells[width:]):
+                raise ValueError(
+                    f"'{self.path}', line {line.number}: {len(cells)} cells, where there are "
+                    f"{width} columns; give every line the same columns"
+                    + (", and numbers a decimal point." if self.layout.delimiter == "," else ".")
+                )
+            for column in sorted(columns):
+                cell = cells[column] if column < len(cells) else ""
+                known = _is_date if column in self.layout.dates else self._is_number
+                if not (_is_missing(cell) or known(cell)):
+                    kind = "date-time" if column in self.layout.dates else "number"
+                    raise ValueError(
+                        f"'{self.path}', line {line.number}: {cell!r} in column "
+                        f"{self.headers[column]!r} is not a {kind}; correct it, or leave the cell "
+                        "empty where the value is missing."
+                    )
+
+    def _is_number(self, cell: str) -> bool:
+        return _is_number(cell, self.layout.comma)
+
+
+def _next(reader: Any) -> Any:
+    """The next block; a line of more cells than names is no warning, but refused later."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return next(reader, None)
+
+
+def _exact(version: str) -> dict[str, Any]:
+    """Options that make pandas read numbers to the last bit; from 3.1 on it needs none."""
+    old = tuple(map(int, version.split(".")[:2])) < (3, 1)
+    return {"float_precision": "round_trip"} if old else {}
+
+
+class _Samples(io.TextIOBase):
+    """The text from the first sample on, without comment lines.
+
+    One line of one more missing value than there are columns comes first: pandas takes the number
+    of columns from there.
+    """
+
+    def __init__(self, path: Path, layout: _Layout) -> None:
+        self._stream = _opened(path, layout.encoding)
+        for _ in range(layout.first - 1):
+            self._stream.readline()
+        self._first = layout.delimiter.join(["nan"] * (len(layout.headers) + 1)) + "\n"
+
+    def read(self, size: int = -1) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """At least ``size`` characters, to the end of a line."""
+        if self._first:
+            text, self._first = self._first, ""
+            return text
+        while text := self._stream.read(size) + self._stream.readline():
+            if any(mark in text for mark in _MARKS):
+                text = _COMMENT.sub("", text)
+            if text:  # else there were only comments
+                break
+        return text
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+def _opened(path: Path, encoding: str) -> IO[str]:
+    return io.TextIOWrapper(_bytes(path), encoding, errors="replace")
+
+
+def _bytes(path: Path) -> gzip.GzipFile | io.BufferedReader:
+    return gzip.open(path) if path.suffix.lower() == ".gz" else path.open("rb")
+
+
+def _encoding(path: Path) -> str:
+    """UTF-8 or UTF-16 as their marks or their bytes say, else Latin-1."""
+    with _bytes(path) as stream:
+        start = stream.read(_HEAD)
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    if b"\0" in start:
+        for encoding, zeros in (("utf-16-le", start[1::2]), ("utf-16-be", start[::2])):
+            if zeros.count(0) > 0.9 * len(zeros):
+                return encoding
+        raise ValueError(
+            f"'{path}' is not text, as its zero bytes show; give it the extension of its format, "
+            "or save it as text."
+        )
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError:
+        return "cp1252" if _decodes(start, "cp1252") else "latin-1"
+    return "utf-8-sig"
+
+
+def _decodes(text: bytes, encoding: str) -> bool:
+    try:
+        text.decode(encoding)
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _split(lines: Iterator[str] | IO[str], delimiter: str) -> Iterator[_Line]:
+    """Cells of the lines that are not blank."""
+    for number, text in enumerate(lines, 1):
+        text = text.rstrip("\r\n")
+        if not text.strip(" " if delimiter == "\t" else None):
+            continue
+        comment = _COMMENT.match(text) is not None
+        if comment:
+            text = text.lstrip().lstrip(_MARKS)
+        yield _Line(number, _cells(text, delimiter), comment)
+
+
+def _cells(text: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        # The unit in brackets belongs to the name before it.
+        return [cell.strip('"') for cell in re.split(r"\s+(?![(\[])", text.strip())]
+    cells = next(csv.reader([text.strip(" ")], delimiter=delimiter, skipinitialspace=True), [])
+    return [cell.strip() for cell in cells]
+
+
+def _layout(path: Path) -> _Layout:
+    try:
+        encoding = _encoding(path)
+        with _opened(path, encoding) as stream:
+            head = stream.read(_HEAD)
+            head += stream.readline()
+    except _DAMAGED as error:
+        raise ValueError(f"'{path}' is damaged ({error}); write it again.") from error
+    text = head.splitlines()
+    if not any(line.strip() for line in text):
+        raise ValueError(f"'{path}' is empty; give a file with data.")
+    try:
+        delimiter, lines = max(
+            ((d, list(_split(iter(text), d))) for d in _DELIMITERS),
+            key=lambda split: _order(split[0], split[1]),
+        )
+    except csv.Error as error:
+        raise ValueError(f"'{path}' is not a readable table ({error}); save it again.") from error
+    return _found(path, encoding, delimiter, lines)
+
+
+def _bulk(lines: Sequence[_Line]) -> list[list[str]]:
+    """Cells of the second half of the lines: samples, but for the longest preambles."""
+    samples = [line.cells for line in lines if not line.comment]
+    return samples[len(samples) // 2 :]
+
+
+def _order(delimiter: str, lines: Sequence[_Line]) -> tuple[float, float]:
+    """How well a delimiter does: the share of cells that are numbers, then their count."""
+    bulk = _bulk(lines)
+    comma = delimiter != ","
+    known = [
+        sum(_is_number(c, comma) or _is_date(c) or _is_missing(c) for c in cells) / len(cells)
+        for cells in bulk
+        if cells
+    ]
+    return (
+        (round(sum(known) / len(known), 6), sum(map(len, bulk)) / len(bulk))
+        if known
+        else (0.0, 0.0)
+    )
+
+
+def _found(path: Path, encoding: str, delimiter: str, lines: list[_Line]) -> _Layout:
+    """The layout of a file from its first lines."""
+    bulk = _bulk(lines)
+    decimal = delimiter != ","
+    width = Counter(map(len, bulk)).most_common(1)[0][0] if bulk else 0
+    whole = [cells for cells in bulk if len(cells) == width]
+
+    def numeric(cell: str) -> bool:
+        return _is_number(cell, decimal) or _is_date(cell)
+
+    # Columns that hold numbers, and the first line that has them in these.
+    most = set()
+    for i in range(width):
+        given = [numeric(cells[i]) for cells in whole if not _is_missing(cells[i])]
+        if 2 * sum(given) > len(given):
+            most.add(i)
+    clean = (
+        i
+        for i, line in enumerate(lines)
+        if not line.comment
+        and len(line.cells) == width
+        and any(numeric(line.cells[c]) for c in most)
+        and all(numeric(line.cells[c]) or _is_missing(line.cells[c]) for c in most)
+    )
+    start = next(clean, None)
+    if start is None:
+        shown = delimiter.join(lines[0].cells)
+        raise ValueError(
+            f"'{path}' has no samples: no line of numbers follows its first line, "
+            f"{shown[:80]!r}; give a file with data."
+        )
+    # A number that cannot be read makes no header of its line.
+    while (
+        start and not lines[start - 1].comment and _similar(lines[start - 1].cells, width, numeric)
+    ):
+        start -= 1
+
+    above = [
+        line.cells
+        for line in lines[:start]
+        if len(line.cells) >= width and not any(map(numeric, line.cells[:width]))
+    ]
+    if width > 1 and not any(cells[-1] for cells in whole) and _short(above, width):
+        width -= 1  # every sample ends with a delimiter
+        above = [line.cells for line in lines[:start] if len(line.cells) >= width]
+    headers, units = _names(above, width)
+    first = lines[start]
+    dates = frozenset(i for i in range(width) if any(_is_date(cells[i]) for cells in whole))
+    comma = decimal and any(_COMMA.fullmatch(c) for cells in whole for c in cells)
+    return _Layout(encoding, delimiter, comma, first.number, headers, units, dates)
+
+
+def _similar(cells: list[str], width: int, numeric) -> bool:
+    return len(cells) == width and any(map(numeric, cells))
+
+
+def _short(above: list[list[str]], width: int) -> bool:
+    """Whether no name is above the last column."""
+    return not above or not above[-1][width - 1]
+
+
+def _names(above: list[list[str]], width: int) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Headers and units by header from the lines above the samples."""
+    units: list[str] = []
+    if len(above) > 1 and all(not c or is_unit(c) or bracketed(c) for c in above[-1]):
+        *above, units = above
+    if len(above) > 1 and _doubled(above[-1]) and not _doubled(above[-2]):
+        above.pop()  # words for units, as "Volt, Volt"
+    names = above[-1] if above else []
+    names = names[: max([width, *(i + 1 for i, name in enumerate(names) if name)])]
+    headers = tuple(name or f"column {i}" for i, name in enumerate(names)) or tuple(
+        f"column {i}" for i in range(width)
+    )
+    return headers, {
+        header: bracketed(unit) or unit
+        for header, unit in zip(headers, units, strict=False)
+        if unit
+    }
+
+
+def _doubled(names: list[str]) -> bool:
+    return len(set(names)) < len(names)
+
+
+def _is_number(cell: str, comma: bool) -> bool:
+    return bool(_NUMBER.fullmatch(cell) or (comma and _COMMA.fullmatch(cell)))
+
+
+def _is_date(cell: str) -> bool:
+    return _DATE.fullmatch(cell) is not None
+
+
+def _is_missing(cell: str) -> bool:
+    return cell.lower() in _MISSING
+
+
+def _times(values) -> NDArray[np.datetime64]:
+    import pandas as pd
+
+    times = pd.to_datetime(values.str.replace(",", "."), format="ISO8601", utc=True)
+    return times.dt.tz_localize(None).to_numpy().astype("M8[ns]")

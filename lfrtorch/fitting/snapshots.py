@@ -1,0 +1,105 @@
+"""The starts of a fit on disk, as far as they came, for a program that takes them up again."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from time import monotonic
+
+from lfrtorch._atomic import whole_file
+from lfrtorch.fitting import state_file
+from lfrtorch.fitting.trainer import Fit, Keep, nothing
+
+EVERY = 10.0
+"""Least seconds between two files of one start."""
+
+ROUNDS = "rounds.json"
+
+
+class Snapshots:
+    """A folder with a file for each start, and one that says which went on after each round.
+
+    Args:
+        folder: where they are; without one nothing is kept.
+        every: least seconds between two files of one start; there is one at each of its ends.
+        writes: whether files are written; of several processes the first one's are.
+
+    Raises:
+        ValueError: damaged files.
+    """
+
+    def __init__(
+        self, folder: Path | None = None, every: float = EVERY, *, writes: bool = True
+    ) -> None:
+        self.folder, self.every = folder, every
+        self._writes = writes and folder is not None
+        self.rounds: list[list[int]] = []
+        """Numbers of the starts that went on after each round that has ended."""
+        self._count: int | None = None
+        if folder is not None and (folder / ROUNDS).is_file():
+            try:
+                found = json.loads((folder / ROUNDS).read_text())
+                self._count, self.rounds = found["starts"], found["rounds"]
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(
+                    f"'{folder / ROUNDS}' is damaged ({error}); start from the best model of the "
+                    "run instead: init_from=DIR."
+                ) from None
+
+    @property
+    def least(self) -> float:
+        """Normalised squared error of the best iterate of all; infinite where there is none."""
+        files = [] if self.folder is None else sorted(self.folder.glob("*.safetensors"))
+        return min((state_file.read(file)[0]["best"] for file in files), default=math.inf)
+
+    def restore(self, fits: Sequence[Fit]) -> None:
+        """Bring fits to where they stood, those of them that had begun.
+
+        Raises:
+            ValueError: another number of starts, or other fits.
+        """
+        if self.folder is None:
+            return
+        if self._count is None:
+            self._count = len(fits)
+            self._write()
+        if self._count != len(fits):
+            raise ValueError(
+                f"the run that is to go on has {self._count} start(s), and now there are "
+                f"{len(fits)}; go on with as many, or begin a new run."
+            )
+        for number, fit in enumerate(fits):
+            if self._file(number).is_file():
+                fit.restore(self._file(number))
+
+    def keeper(self, number: int) -> Keep:
+        """What writes the file of a start, where it is time."""
+        if not self._writes:
+            return nothing
+        due = monotonic() + self.every
+
+        def keep(fit: Fit, paused: bool) -> None:
+            nonlocal due
+            if fit.history and (paused or monotonic() >= due):
+                fit.save(self._file(number))
+                due = monotonic() + self.every
+
+        return keep
+
+    def decided(self, numbers: list[int]) -> None:
+        """Note which starts go on after a round."""
+        self.rounds.append(numbers)
+        self._write()
+
+    def _file(self, number: int) -> Path:
+        assert self.folder is not None
+        return self.folder / f"{number}.safetensors"
+
+    def _write(self) -> None:
+        if not self._writes:
+            return
+        assert self.folder is not None
+        with whole_file(self.folder / ROUNDS) as fresh:
+            fresh.write_text(json.dumps({"starts": self._count, "rounds": self.rounds}) + "\n")

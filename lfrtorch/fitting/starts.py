@@ -1,0 +1,151 @@
+"""Best linear approximation -> weights of an NL-LFR model that starts exactly there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import Module
+
+from lfrtorch._checks import integer, number
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.modes import MINOR, without_slow_minor_modes
+from lfrtorch.model import Model
+from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
+
+OUTPUT_RANGE = 0.3
+"""Bw, Dyw ~ U(-0.3, 0.3) of the ``"zero_output"`` start."""
+
+OUTPUT_WEIGHTS: dict[type[Module], tuple[str, ...]] = {Network: ("Ww", "bw"), Polynomial: ("C",)}
+"""The weights of a static map that make its output vanish."""
+
+
+def initialise(
+    bla: LinearModel,
+    records: Record | Sequence[Record],
+    *,
+    nz: int,
+    nw: int,
+    nn: int | None = None,
+    activation: str = "tanh",
+    static: Module | None = None,
+    method: Literal["zero_output", "paper"] = "zero_output",
+    seed: int = 0,
+    minor: float | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> Model:
+    """NL-LFR model whose output is that of the linear model.
+
+    But for modes of the linear model that add next to nothing to the output and are slower than all
+    others: those are made as fast first (:func:`lfrtorch.linear.modes.without_slow_minor_modes`).
+
+    Signals and states are scaled to unit standard deviation over the records, and so is every z:
+    C*, D* ~ U(-1, 1), then Cz, Dzu = C*, D* over the standard deviation of C* x + D* u. The static
+    map is one hidden layer, Wz and bz ~ U(-1, 1), bw = 0, or a module of the caller's own with its
+    weights as they are. The two methods differ in what keeps w out of the start:
+
+    - ``"paper"``: Bw = Dyw = 0 and Ww ~ U(-1, 1) (Schoukens and Tóth 2020);
+    - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021), for a polynomial
+      C = 0. The more reliable one. A module of another class starts so where its output vanishes on
+      the data, with the weights that it has, and else as with ``"paper"``.
+
+    Args:
+        bla: stable linear model, best in balanced coordinates.
+        records: the data that are to be fitted.
+        nz, nw: inputs and outputs of the static nonlinearity.
+        nn, activation: neurons of the hidden layer and their function.
+        static: the map z -> w in the layer's place, copied: a ``Network``, a ``Polynomial`` or any
+            module from (..., nz) to (..., nw); nn and activation are then of no use.
+        method: which of the two starts.
+        seed: of the random weights.
+        minor: what counts as next to nothing: the part of a mode in the output over the model's
+            error; 0 leaves the linear model as it is. Where left out 0 for ``"paper"``, else 1/3.
+        dtype: of the weights.
+
+    Raises:
+        ValueError: sizes below 1, an unknown method or a static map of other sizes.
+
+    References:
+        Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
+        Schoukens, "Improved initialization of state-space artificial neural networks", ECC 2021.
+    """
+    for name, size in (("nz", nz), ("nw", nw)):
+        integer(name, size, 1)
+    integer("seed", seed, 0)
+    if method not in ("zero_output", "paper"):
+        raise ValueError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
+    if minor is None:
+        minor = 0.0 if method == "paper" else MINOR
+    number("minor", minor)
+    data = [without_coordinates(record) for record in as_records(records)]
+    bla = without_slow_minor_modes(bla, data, minor) if minor else bla
+    scaler = Scaler(
+        bla.u_offset,
+        rms_scale([r.u for r in data], bla.u_offset),
+        bla.y_offset,
+        rms_scale([r.y for r in data], bla.y_offset),
+    )
+    generator = torch.Generator().manual_seed(seed)
+    if static is None:
+        integer("nn", nn, 1)
+        assert nn is not None
+        static = Network(nz, nw, nn, activation, dtype=dtype)
+        static.reset_parameters(generator)
+    else:
+        static = deepcopy(static).to(dtype)
+        _check_sizes(static, nz, nw, dtype)
+    sizes = len(bla.inputs), len(bla.outputs), len(bla.A)
+    linear, cell = LFRCell(*sizes, dtype=dtype), LFRCell(*sizes, nz, nw, static, dtype=dtype)
+    for target in (linear, cell):
+        bla.write(target, scaler)
+    response, model = (
+        Model(LFR(c), scaler, bla.fs, bla.inputs, bla.outputs) for c in (linear, cell)
+    )
+
+    def uniform(parameter: Tensor, limit: float = 1.0) -> None:
+        parameter.uniform_(-limit, limit, generator=generator)
+
+    with torch.no_grad():
+        x = torch.cat([response.signals(record).x[0, :-1] for record in data])
+        u = torch.cat([torch.as_tensor(scaler.normalise_u(r.u)).to(x) for r in data])
+        std = _deviation(x)
+        cell.A.copy_(cell.A * std / std[:, None])
+        cell.Bu.div_(std[:, None])
+        cell.Cy.mul_(std)
+        uniform(cell.Cz)
+        uniform(cell.Dzu)
+        z = (x / std) @ cell.Cz.mT + u @ cell.Dzu.mT
+        spread = _deviation(z)[:, None]
+        cell.Cz.div_(spread)
+        cell.Dzu.div_(spread)
+        for name in OUTPUT_WEIGHTS.get(type(static), ()) if method == "zero_output" else ():
+            static.get_parameter(name).zero_()
+        if method == "zero_output" and not static((z / spread.mT).unsqueeze(0)).any():
+            uniform(cell.Bw, OUTPUT_RANGE)
+            uniform(cell.Dyw, OUTPUT_RANGE)
+    return model
+
+
+def _check_sizes(static: Module, nz: int, nw: int, dtype: torch.dtype) -> None:
+    """Refuse a static map that does not take nz to nw signals with a ValueError."""
+    try:
+        with torch.no_grad():
+            found: object = tuple(static(torch.zeros(1, 2, nz, dtype=dtype)).shape)
+    except (RuntimeError, IndexError) as error:
+        found = error
+    if found != (1, 2, nw):
+        raise ValueError(
+            f"static gives {found} for z of shape (1, 2, {nz}); with nz={nz} and nw={nw} it must "
+            f"give w of shape (1, 2, {nw})."
+        )
+
+
+def _deviation(signal: Tensor) -> Tensor:
+    std = signal.std(dim=0, correction=0)
+    return torch.where(std > 0, std, torch.ones_like(std))

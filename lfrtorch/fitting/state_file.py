@@ -1,0 +1,87 @@
+"""A search on disk, in one file: its numbers as JSON, its tensors beside them, no pickle."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from lfrtorch._atomic import whole_file
+
+State = TypeVar("State")
+Tensors = dict[str, Tensor]
+Numbers = dict[str, Any]
+
+FORMAT = "lfrtorch snapshot 1"
+
+
+def write(path: Path, numbers: Numbers, tensors: Tensors) -> None:
+    """Replace the file at once."""
+    held = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
+    with whole_file(path) as fresh:
+        save_file(held, fresh, metadata={"format": FORMAT, "numbers": json.dumps(numbers)})
+
+
+def read(path: Path) -> tuple[Numbers, Tensors]:
+    """Numbers and tensors of a file.
+
+    Raises:
+        ValueError: a damaged file, or one of another program or version.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ValueError(
+            f"'{path}', where a fit stood, is damaged ({error}); start from the best model of the "
+            "run instead: init_from=DIR."
+        ) from None
+    if about.get("format") != FORMAT:
+        raise ValueError(
+            f"'{path}' was written by another version ({about.get('format')}); start from the best "
+            "model of the run instead: init_from=DIR."
+        )
+    return json.loads(about["numbers"]), tensors
+
+
+def packed(state: Any) -> tuple[Numbers, Tensors]:
+    """The fields of a dataclass: numbers and texts, and tensors (those of dicts as name.key)."""
+    numbers: Numbers = {}
+    tensors: Tensors = {}
+    for field in fields(state):
+        value = getattr(state, field.name)
+        if isinstance(value, Tensor):
+            tensors[field.name] = value
+        elif isinstance(value, dict):
+            tensors |= {f"{field.name}.{key}": tensor for key, tensor in value.items()}
+        else:
+            numbers[field.name] = value
+    return numbers, tensors
+
+
+def unpacked(like: State, numbers: Numbers, tensors: Tensors) -> State:
+    """A dataclass like the given one with the fields that were packed."""
+    values: Numbers = dict(numbers)
+    for name, tensor in tensors.items():
+        field, _, key = name.partition(".")
+        if key:
+            values.setdefault(field, {})[key] = tensor
+        else:
+            values[field] = tensor
+    return replace(like, **values)  # pyright: ignore[reportArgumentType]
+
+
+def within(prefix: str, tensors: Tensors, device: torch.device | str = "cpu") -> Tensors:
+    """The tensors whose names begin with ``prefix``, under the rest of their names."""
+    return {
+        name.removeprefix(prefix): tensor.to(device)
+        for name, tensor in tensors.items()
+        if name.startswith(prefix)
+    }

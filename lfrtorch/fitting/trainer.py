@@ -1,0 +1,433 @@
+"""The one training loop: step, log, keep the best on validation, stop."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from lfrtorch._threads import spread_by_hand
+from lfrtorch.distributed import ProcessLost, Ranks
+from lfrtorch.fitting import state_file
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.simulation_problem import Ridge, SimulationError
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+INTERRUPTED = "interrupted"
+
+EXPLOSION = 100.0
+"""Growth of the squared validation error, beyond the start's, in a step that is taken back."""
+
+_KEPT = ("best", "_chosen", "_first", "_score", "_seconds", "_durations")
+"""Numbers of a fit that are saved with it."""
+
+
+class StartDiverges(ValueError):
+    """The model diverges on the training records at the start."""
+
+
+class OptimiserState(Protocol):
+    """What the loop reads of an optimiser's state."""
+
+    @property
+    def theta(self) -> Tensor:
+        """Parameters (P,)."""
+        ...
+
+    @property
+    def residual(self) -> Tensor:
+        """r (M,) at θ."""
+        ...
+
+    @property
+    def iteration(self) -> int:
+        """Steps so far."""
+        ...
+
+    @property
+    def reason(self) -> str:
+        """Why the search is over; empty while it is not."""
+        ...
+
+    @property
+    def report(self) -> dict[str, float]:
+        """Scalars of the last step, for the monitors."""
+        ...
+
+
+class Optimiser(Protocol):
+    """A search in steps: Levenberg-Marquardt or Adam."""
+
+    @property
+    def limit(self) -> int:
+        """Most iterations."""
+        ...
+
+    def init(self, problem: Any, theta: Tensor) -> Any:
+        """State at the start."""
+        ...
+
+    def step(self, problem: Any, state: Any) -> Any:
+        """Next state."""
+        ...
+
+    def refused(self, before: Any, after: Any) -> Any:
+        """State to go on from where a step led to a model that explodes on validation."""
+        ...
+
+    def prolonged(self, state: Any) -> Any:
+        """State to go on from where all iterations were spent and there are more now."""
+        ...
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One line of the history.
+
+    Args:
+        iteration: 0 is the start.
+        limit: most iterations.
+        train, validation: root mean squared simulation errors, output unit; validation is NaN
+            where there is no validation record or the model diverges on it.
+        seconds: since the start of the fit.
+        best: whether this iterate is the best so far, on validation where there is one.
+        report: scalars of the optimiser.
+        score: normalised squared error that chooses: on validation, or on training without it.
+    """
+
+    iteration: int
+    limit: int
+    train: float
+    validation: float
+    seconds: float
+    best: bool
+    report: dict[str, float]
+    score: float
+
+    @property
+    def seconds_left(self) -> float:
+        """Time that the remaining iterations would take."""
+        return self.seconds / max(1, self.iteration) * (self.limit - self.iteration)
+
+
+Monitor = Callable[[Model, Progress], None]
+"""Called at the start and after each iteration, the iterate in the model's weights."""
+
+Keep = Callable[["Fit", bool], None]
+"""Called with a fit after each iteration, and where it pauses (then with True)."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """How far one of several starts came.
+
+    Args:
+        number: its place in the order given, from 0.
+        iterations: it had.
+        train, validation: errors of its best iterate, output unit.
+        selection: its error on all records that choose among starts; NaN where there are none.
+        reason: why it ended.
+    """
+
+    number: int
+    iterations: int
+    train: float
+    validation: float
+    selection: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Outcome of a fit; the best iterate is in ``model``.
+
+    Args:
+        model: the fitted model, the object that was given.
+        history: one entry an iteration, the start first.
+        chosen_iteration: the iterate that ``model`` holds.
+        seconds: duration of the whole fit.
+        seconds_per_iteration: median over the accepted iterations but the first, which may compile.
+        reason: why the search ended.
+        starts: of several starts all, the best first.
+        averaged: of how many starts the model is the mean; history and iterate are those of the
+            best one.
+    """
+
+    model: Model
+    history: list[Progress] = field(repr=False)
+    chosen_iteration: int
+    seconds: float
+    seconds_per_iteration: float
+    reason: str
+    starts: tuple[Start, ...] = ()
+    averaged: int = 1
+
+    @property
+    def iterations(self) -> int:
+        """Number of iterations."""
+        return self.history[-1].iteration
+
+
+def nothing(fit: Fit, paused: bool) -> None:
+    """Keep no fit."""
+
+
+class Fit:
+    """A fit that goes on for as many iterations as it is asked for, and keeps the best iterate.
+
+    Args:
+        model, train, validation, optimiser, ridge, ranks: see :func:`fit`.
+        keep: called with the fit after every iteration, when it may be saved, and with True where
+            it pauses.
+
+    Raises:
+        ValueError: see :func:`fit`.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        train: Record | Sequence[Record],
+        validation: Record | Sequence[Record] = (),
+        *,
+        optimiser: Optimiser | None = None,
+        ridge: Ridge = 0.0,
+        ranks: Ranks | None = None,
+        keep: Keep = nothing,
+    ) -> None:
+        self.model, self.keep = model, keep
+        self.optimiser = LevenbergMarquardt() if optimiser is None else optimiser
+        self.ranks = ranks = Ranks() if ranks is None else ranks
+        if ranks.world > 1:
+            weights = parameters_to_vector(model.lfr.parameters())
+            vector_to_parameters(ranks.first(weights), model.lfr.parameters())
+        self.problem = SimulationError(model, train, ridge=ridge, ranks=ranks)
+        self.judge = SimulationError(model, validation, solved_starts=True) if validation else None
+        if not math.isfinite(self.problem.cost(self.problem.residual(self.problem.theta))):
+            raise StartDiverges(
+                "the model diverges on the training records at the start; start from a stable "
+                "model."
+            )
+        self.state: Any = None
+        """The optimiser's; None before the first call of ``advance``."""
+        self.history: list[Progress] = []
+        self.reason = "no iterations asked for"
+        self.best = math.inf
+        """Normalised squared error of the best iterate, on validation where there is one."""
+        self._theta_best, self._chosen = self.problem.theta, 0
+        self._first = self._score = math.inf
+        self._seconds = 0.0
+        self._durations: list[float] = []
+
+    @property
+    def kept(self) -> Progress:
+        """The best iterate."""
+        return self.history[self._chosen]
+
+    @property
+    def over(self) -> bool:
+        """Whether there is no more to come."""
+        if not self.history:
+            return False
+        return bool(self.state.reason) or self.state.iteration >= self.optimiser.limit
+
+    @spread_by_hand()
+    def advance(self, until: int | None = None, monitors: Sequence[Monitor] = ()) -> Self:
+        """Go on to an iteration, the optimiser's last where left out; the best is in the model.
+
+        Raises:
+            ProcessLost: before there was an iterate to keep.
+        """
+        until = self.optimiser.limit if until is None else until
+        try:
+            if not self.history:
+                self.begin(monitors)
+            while not self.over and self.state.iteration < until:
+                clock = time.perf_counter()
+                after = self.optimiser.step(self.problem, self.state)
+                self.take(after, time.perf_counter() - clock, monitors)
+        except KeyboardInterrupt:
+            if not self.history:
+                raise
+            self.reason = INTERRUPTED
+        except ProcessLost as lost:
+            if not self.history:
+                raise
+            self.reason = str(lost)
+        finally:
+            self.pause()
+        return self
+
+    def pause(self) -> None:
+        """Put the best iterate into the model, and let go of memory."""
+        self.problem.write(self._theta_best)
+        self.problem.release()
+        self.keep(self, True)
+
+    def save(self, path: Path) -> None:
+        """Write where the fit stands to a file, from which ``restore`` goes on to the same bits."""
+        state, tensors = state_file.packed(self.state)
+        problem = self.problem.state_dict()
+        tensors = {f"state.{name}": tensor for name, tensor in tensors.items()}
+        tensors |= {f"problem.{name}": tensor for name, tensor in problem.items()}
+        numbers = {
+            "state": state,
+            "history": [asdict(progress) for progress in self.history],
+            **{name: getattr(self, name) for name in _KEPT},
+        }
+        state_file.write(path, numbers, tensors | {"best": self._theta_best})
+
+    def restore(self, path: Path) -> None:
+        """Take over where a fit of the same model, records and optimiser stood.
+
+        Raises:
+            ValueError: a damaged file, or another fit.
+        """
+        numbers, tensors = state_file.read(path)
+        device = self.problem.theta.device
+        like = self.optimiser.init(self.problem, self.problem.theta)
+        # After init, which may evaluate gradients and leave guesses of periodic orbits behind.
+        self.problem.load_state_dict(state_file.within("problem.", tensors, device))
+        try:
+            state = state_file.within("state.", tensors, device)
+            state = state_file.unpacked(like, numbers["state"], state)
+        except TypeError:
+            raise ValueError(
+                f"'{path}' was left by another optimiser than {type(self.optimiser).__name__}; go "
+                "on with the one that the run had."
+            ) from None
+        if state.iteration > self.optimiser.limit:
+            raise ValueError(
+                f"the fit that is to go on has had {state.iteration} iterations, more than the "
+                f"{self.optimiser.limit} asked for; ask for more."
+            )
+        if self.ranks.world > 1:  # what was kept is the first one's part
+            self.problem.guesses = [None] * len(self.problem.batches)
+            state = replace(state, residual=self.problem.residual(state.theta))
+        self.state = self.optimiser.prolonged(state)
+        self.reason = self.state.reason
+        self.history = [Progress(**entry) for entry in numbers["history"]]
+        self._theta_best = tensors["best"].to(device)
+        for name in _KEPT:
+            setattr(self, name, numbers[name])
+        self.problem.write(self._theta_best)
+
+    def begin(self, monitors: Sequence[Monitor] = ()) -> None:
+        """Judge the start."""
+        clock = time.perf_counter()
+        start = self.optimiser.init(self.problem, self.problem.theta)
+        progress = self._judged(start, time.perf_counter() - clock)
+        self._first = progress.score
+        self._enter(start, progress)
+        self._show(progress, monitors)
+
+    def take(self, after: Any, seconds: float, monitors: Sequence[Monitor] = ()) -> None:
+        """Go on from the optimiser's next state, which took so many seconds to find.
+
+        Not where the model there explodes on validation: the search goes back, and treads softly.
+        """
+        before, last = self.state, self._score
+        progress = self._judged(after, seconds)
+        if after.theta is not before.theta:
+            self._durations.append(seconds)
+        self._enter(after, progress)
+        self.reason = after.reason
+        if math.isfinite(last) and not progress.score <= max(EXPLOSION * last, self._first):
+            self.state, self._score = self.optimiser.refused(before, after), last
+        self._show(progress, monitors)
+        self.keep(self, False)
+
+    def result(self) -> FitResult:
+        """What was found."""
+        usual = self._durations[1:] or self._durations
+        return FitResult(
+            model=self.model,
+            history=self.history,
+            chosen_iteration=self._chosen,
+            seconds=self._seconds,
+            seconds_per_iteration=float(np.median(usual)) if usual else 0.0,
+            reason=self.reason,
+        )
+
+    def _judged(self, state: OptimiserState, seconds: float) -> Progress:
+        """The progress that an iterate is, which took so many seconds to find."""
+        clock, problem = time.perf_counter(), self.problem
+        train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")
+        score = problem.cost(state.residual)
+        if self.judge is not None:
+            problem.write(state.theta)
+            theta = self.judge.theta
+            score = self.judge.cost(self.judge.residual(theta))  # every output counts alike
+            # Each process has all of these records, and its own rounding errors.
+            score = float(self.ranks.first(torch.tensor(score, dtype=torch.float64)))
+            validation_rmse = self.judge.rmse(theta)
+        better = score < self.best  # False for the NaN of a model that diverges on validation
+        seconds += self._seconds + time.perf_counter() - clock
+        problem.write(state.theta)
+        return Progress(
+            state.iteration, self.optimiser.limit, train_rmse, validation_rmse, seconds, better,
+            state.report, score,
+        )  # fmt: skip
+
+    def _enter(self, state: OptimiserState, progress: Progress) -> None:
+        """Note an iterate, and keep it where it is the best."""
+        if progress.best:
+            self._theta_best, self.best, self._chosen = (
+                state.theta,
+                progress.score,
+                len(self.history),
+            )
+        self.state, self._score, self._seconds = state, progress.score, progress.seconds
+        self.history.append(progress)
+
+    def _show(self, progress: Progress, monitors: Sequence[Monitor]) -> None:
+        """Call the monitors, with the latest iterate in the model."""
+        for monitor in monitors:
+            monitor(self.model, progress)
+
+
+@spread_by_hand()
+def fit(
+    model: Model,
+    train: Record | Sequence[Record],
+    validation: Record | Sequence[Record] = (),
+    *,
+    optimiser: Optimiser | None = None,
+    ridge: Ridge = 0.0,
+    monitors: Sequence[Monitor] = (),
+    ranks: Ranks | None = None,
+) -> FitResult:
+    """Minimise the simulation error of a model over records.
+
+    The iterate with the smallest error on the validation records (without them: on the training
+    records) is kept, also when the search is interrupted by Ctrl-C, or one of the processes that
+    share the records is lost: ``reason`` then begins with "a process was lost".
+
+    Args:
+        model: where to start; its weights are changed in place.
+        train: records that are fitted.
+        validation: records that choose among the iterates.
+        optimiser: Levenberg-Marquardt with its defaults where left out.
+        ridge: weight of |θ - θ_start|², see ``SimulationError``.
+        monitors: called with the model and its progress after every iteration. Each process calls
+            its own: give those that print or write files to the first alone.
+        ranks: the processes that share the training records, ``distributed.connect()``; each calls
+            this function with the same arguments, starts from the first one's weights and returns
+            the same fit.
+
+    Raises:
+        ValueError: the model diverges on the training records at the start, or there are fewer
+            records than processes.
+        ProcessLost: before there was an iterate to keep.
+    """
+    begun = Fit(model, train, validation, optimiser=optimiser, ridge=ridge, ranks=ranks)
+    return begun.advance(monitors=monitors).result()

@@ -1,0 +1,1 @@
+"""Minimising |r(θ)|²: problems, their Jacobians, linear systems and searches."""

@@ -1,0 +1,90 @@
+"""Adam on the full batch, the baseline beside Levenberg-Marquardt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from lfrtorch._checks import integer, number
+
+SPENT = "maximum number of epochs"
+
+
+class Differentiable(Protocol):
+    """A residual with the gradient of its mean square."""
+
+    def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """r (M,) and the gradient (P,) of its mean square at θ (P,)."""
+        ...
+
+
+@dataclass
+class AdamState:
+    """Where the search stands: θ (P,), r(θ) (M,), the optimiser's moments, and why it ended."""
+
+    theta: Tensor
+    residual: Tensor
+    gradient: Tensor
+    iteration: int = 0
+    reason: str = ""
+    moments: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def report(self) -> dict[str, float]:
+        """What the monitors show of a step."""
+        return {"gradient_norm": float(self.gradient.norm())}
+
+
+@dataclass(frozen=True)
+class Adam:
+    """Options of ``torch.optim.Adam``; ``init`` and ``step`` run it.
+
+    Args:
+        epochs: steps; each sees all the data.
+        learning_rate: step size, in normalised units.
+    """
+
+    epochs: int = 2000
+    learning_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        number("learning_rate", self.learning_rate, positive=True)
+        integer("epochs", self.epochs, 0)
+
+    @property
+    def limit(self) -> int:
+        """Most iterations."""
+        return self.epochs
+
+    def init(self, problem: Differentiable, theta: Tensor) -> AdamState:
+        """State at the start θ."""
+        return AdamState(theta, *problem.gradient(theta))
+
+    def step(self, problem: Differentiable, state: AdamState) -> AdamState:
+        """One epoch."""
+        parameter = torch.nn.Parameter(state.theta.clone())
+        optimiser = torch.optim.Adam([parameter], lr=self.learning_rate)
+        if state.moments:
+            optimiser.state[parameter] = {k: v.clone() for k, v in state.moments.items()}
+        parameter.grad = state.gradient
+        optimiser.step()
+        theta = parameter.detach()
+        residual, gradient = problem.gradient(theta)
+        iteration = state.iteration + 1
+        reason = SPENT if iteration >= self.epochs else ""
+        if not torch.isfinite(gradient).all():
+            reason = "diverged: lower the learning rate"
+        moments = dict(optimiser.state[parameter])
+        return AdamState(theta, residual, gradient, iteration, reason, moments)
+
+    def prolonged(self, state: AdamState) -> AdamState:
+        """State to go on from where all epochs were spent and there are more now."""
+        spent = state.reason == SPENT and state.iteration < self.epochs
+        return replace(state, reason="") if spent else state
+
+    def refused(self, before: AdamState, after: AdamState) -> AdamState:
+        """State to go on from where a step might be taken back: its small steps lead out again."""
+        return after

@@ -1,0 +1,139 @@
+"""Several models of one structure through the engine at once: the starts of a multi-start search.
+
+Simulations and rows of all models are computed together, records of all models side by side; each
+model then has its own least-squares system.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import Stacked, is_network
+from lfrtorch.engine.sensitivity import Linearisation
+from lfrtorch.engine.simulate import Trajectory
+from lfrtorch.least_squares.jacobian import Jacobian
+from lfrtorch.least_squares.simulation_problem import SimulationError
+
+
+def stacked(cells: Sequence[LFRCell], repeat: int = 1) -> LFRCell:
+    """One cell with the weights of all along a leading axis, each repeated for so many records.
+
+    Args:
+        cells: of one structure.
+        repeat: records of each cell; those of the first come first.
+
+    Shape:
+        each weight (n, m): (len(cells) * repeat, n, m).
+    """
+    first = cells[0]
+    weights = {
+        name: torch.stack([cell.get_parameter(name).detach() for cell in cells])
+        for name, _ in first.named_parameters()
+    }
+    weights = {name: w.repeat_interleave(repeat, dim=0) for name, w in weights.items()}
+    own = {n.removeprefix("static."): w for n, w in weights.items() if n.startswith("static.")}
+    if first.static is None:
+        static = None
+    elif is_network(first.static):
+        static = copy.deepcopy(first.static)
+        for name, w in own.items():  # vectors are broadcast over time
+            setattr(static, name, Parameter(w if w.ndim == 3 else w.unsqueeze(1)))
+    else:
+        static = Stacked(first.static, own)
+    stack = LFRCell(first.nu, first.ny, first.nx, first.nz, first.nw, static)
+    for name, w in weights.items():
+        if not name.startswith("static."):
+            setattr(stack, name, Parameter(w))
+    for mine, theirs in zip(stack.parameters(), first.parameters(), strict=True):
+        mine.requires_grad_(theirs.requires_grad)
+    return stack
+
+
+class Stack:
+    """Simulation errors of several models of one structure over the same records.
+
+    Args:
+        problems: one a model, all of the same records.
+
+    Raises:
+        ValueError: problems that share a model, or differ in records, scaling or parameters.
+    """
+
+    def __init__(self, problems: Sequence[SimulationError]) -> None:
+        self.problems = list(problems)
+        first = self.problems[0]
+        if len({id(problem.model) for problem in problems}) < len(self.problems):
+            raise ValueError("two problems share one model; give each a model of its own.")
+        for problem in self.problems:
+            alike = len(problem.theta) == len(first.theta)
+            alike &= len(problem.batches) == len(first.batches)
+            for mine, other in zip(problem.batches, first.batches, strict=False):
+                alike &= torch.equal(mine.u, other.u) and torch.equal(mine.y, other.y)
+            if not alike:
+                raise ValueError(
+                    "the problems differ in records, scaling or free parameters; "
+                    "a stack is of models of one structure over the same records."
+                )
+
+    def residuals(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[Tensor]:
+        """r (M,) of some of the models (by their numbers), each at its own θ (P,)."""
+        problems = [self.problems[i] for i in models]
+        for problem, theta in zip(problems, thetas, strict=True):
+            problem.write(theta)
+        found: list[list[Trajectory]] = [[] for _ in problems]
+        for i, batch in enumerate(problems[0].batches):
+            R = len(batch.u)
+            lfr = LFR(stacked([p.model.lfr.cell for p in problems], R))
+            u = batch.u.repeat(len(problems), 1, 1)
+            starts = [p.start_of(i) for p in problems]
+            x0 = None if starts[0] is None else torch.cat([x for x in starts if x is not None])
+            near = [x for p in problems if (x := p.guesses[i]) is not None]
+            trajectory = lfr.trajectory(
+                u,
+                x0,
+                "periodic" if batch.start == "periodic" else "zero",
+                guess=torch.cat(near) if len(near) == len(problems) else None,
+            )
+            for mine, signals in zip(
+                found, zip(*(s.split(R) for s in trajectory), strict=True), strict=True
+            ):
+                mine.append(Trajectory(*signals))
+        for problem, theta, trajectories in zip(problems, thetas, found, strict=True):
+            problem.remember(theta, trajectories)
+        return [problem.residual(theta) for problem, theta in zip(problems, thetas, strict=True)]
+
+    def linearise(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[Jacobian]:
+        """dr/dθ of some of the models, their rows computed together."""
+        problems = [self.problems[i] for i in models]
+        # The same columns for all: none is left out.
+        jacobians = [
+            p.linearise(theta, reduce=False) for p, theta in zip(problems, thetas, strict=True)
+        ]
+        for i, batch in enumerate(problems[0].batches):
+            parts = [jacobian.parts[i] for jacobian in jacobians]
+            R, T, ny = batch.y.shape
+            each = [part.linearisation.trajectory for part in parts]
+            trajectory = Trajectory(*(torch.cat(signals) for signals in zip(*each, strict=True)))
+            linearisation = Linearisation(
+                stacked([p.model.lfr.cell for p in problems], R),
+                batch.u.repeat(len(problems), 1, 1),
+                trajectory,
+                periodic=batch.start == "periodic",
+            )
+            everything = torch.arange(linearisation.parameters)
+            start = parts[0].has_start
+            columns = len(everything) + start * trajectory.x.shape[2] + 1
+            rows = trajectory.y.new_empty(len(trajectory.y), T, ny, columns)
+            end = linearisation.rows(everything, lambda *_: None, start=start, spare=1, out=rows)
+            for part, computed in zip(
+                parts, zip(rows.split(R), end.split(R), strict=True), strict=True
+            ):
+                part.computed = computed
+        return jacobians

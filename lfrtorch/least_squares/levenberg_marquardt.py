@@ -1,0 +1,343 @@
+"""Levenberg-Marquardt with geodesic acceleration, for any least-squares problem.
+
+Minimises |r(θ)|² with the damping λI, so that the coordinates of θ decide: signals and states
+should be scaled to unit variance. (Marquardt's scaling by column norms stalled at 7e-5 m where
+this one reaches 3e-6 m: saturated neurons have vanishing columns and their weights run off.)
+
+References:
+    Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05 (the damping rule).
+    Transtrum, Machta and Sethna, "Geometry of nonlinear least squares with applications to sloppy
+    models and optimization", Phys. Rev. E 83, 2011 (geodesic acceleration).
+    Wills and Ninness, "On gradient-based search for multivariable system estimates", IEEE Trans.
+    Automatic Control 53, 2008 (singular values leave out the gauge directions).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from lfrtorch._checks import integer, number
+from lfrtorch.least_squares.linear_systems import Orthogonal, System
+
+FASTEST_DECREASE = 0.2
+"""Smallest factor on λ after a good step; Nielsen has 1/3."""
+
+TAKEN_BACK = 10.0
+"""Factor on λ after a step that is taken back; what it decreased at the most, and twice more."""
+
+SPENT = "maximum number of iterations"
+
+
+class Jacobian(Protocol):
+    """The Jacobian J (M, P) of a residual as far as the search needs it: never the whole of it."""
+
+    def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
+        """The system (JᵀJ + λI) δ = -gradient, and the gradient Jᵀr (P,) where J was taken.
+
+        Args:
+            damping: that of the next trial relative to the largest eigenvalue of JᵀJ, as far as it
+                is known: the system may have errors that are small against it.
+            truncation: relative size of singular values that are left out.
+        """
+        ...
+
+    def tangent(self, d_theta: Tensor) -> Tensor:
+        """J d_theta (M,)."""
+        ...
+
+    def adjoint(self, residual: Tensor) -> Tensor:
+        """Jᵀ residual (P,)."""
+        ...
+
+
+class LeastSquares(Protocol):
+    """A residual and its slope; where the residual is undefined it is infinite or NaN."""
+
+    def residual(self, theta: Tensor) -> Tensor:
+        """r (M,) at θ (P,)."""
+        ...
+
+    def linearise(self, theta: Tensor) -> Jacobian:
+        """dr/dθ at θ (P,)."""
+        ...
+
+    def cost(self, residual: Tensor) -> float:
+        """|r|²: of all parts of r, where processes share it."""
+        ...
+
+
+class ManyLeastSquares(Protocol):
+    """Several such problems, evaluated together."""
+
+    @property
+    def problems(self) -> Sequence[LeastSquares]:
+        """Each of them."""
+        ...
+
+    def residuals(self, models: Sequence[int], thetas: Sequence[Tensor]) -> Sequence[Tensor]:
+        """r of some of them (by their numbers), each at its own θ."""
+        ...
+
+    def linearise(self, models: Sequence[int], thetas: Sequence[Tensor]) -> Sequence[Jacobian]:
+        """dr/dθ of some of them."""
+        ...
+
+
+JACOBIAN, RESIDUAL = "jacobian", "residual"
+
+
+class DenseJacobian:
+    """A Jacobian (M, P) that is held whole, and the residual (M,) there."""
+
+    def __init__(self, jacobian: Tensor, residual: Tensor) -> None:
+        self.jacobian, self.residual = jacobian, residual
+
+    def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
+        """The system and the gradient."""
+        R = torch.linalg.qr(self.jacobian, mode="r").R
+        return Orthogonal(R, truncation), self.jacobian.mT @ self.residual
+
+    def tangent(self, d_theta: Tensor) -> Tensor:
+        """J d_theta (M,)."""
+        return self.jacobian @ d_theta
+
+    def adjoint(self, residual: Tensor) -> Tensor:
+        """Jᵀ residual (P,)."""
+        return self.jacobian.mT @ residual
+
+
+@dataclass(frozen=True)
+class LMState:
+    """Where the search stands.
+
+    Args:
+        theta: parameters (P,).
+        residual: r(θ), (M,).
+        cost: |r|².
+        damping: λ of the next trial; ``None`` before the first step.
+        scale: largest squared singular value of the Jacobian in the last step.
+        growth: factor of λ on the next rejection.
+        iteration: accepted and refused steps so far.
+        gain_ratio: actual over predicted decrease of the last trial.
+        trials: dampings tried in the last step.
+        rank: directions that the Jacobian of the last step saw.
+        quiet: steps in a row that changed the cost by less than the tolerance.
+        reason: why the search is over; empty while it is not.
+    """
+
+    theta: Tensor
+    residual: Tensor
+    cost: float
+    damping: float | None = None
+    scale: float = 1.0
+    growth: float = 2.0
+    iteration: int = 0
+    gain_ratio: float = float("nan")
+    trials: int = 0
+    rank: int = 0
+    quiet: int = 0
+    reason: str = ""
+
+    @property
+    def report(self) -> dict[str, float]:
+        """What the monitors show of a step."""
+        if self.damping is None:
+            return {}
+        return {
+            "damping": self.damping,
+            "gain_ratio": self.gain_ratio,
+            "trials": self.trials,
+            "rank": self.rank,
+        }
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardt:
+    """Options of the search; ``init`` and ``step`` run it.
+
+    Args:
+        max_iter: most steps.
+        acceleration: geodesic acceleration, one more residual a trial.
+        damping: first λ relative to the largest squared singular value of the Jacobian.
+        tolerance: relative decrease of the cost that counts as no progress ...
+        patience: ... and the number of such steps in a row that ends the search.
+        floor: root mean square of the residual that counts as zero.
+        truncation: singular values below this part of the largest are left out as gauge, where
+            they are computed: not while the damping is far above rounding errors.
+        finite_step: h of the directional second derivative (Transtrum et al. use 0.1).
+        acceleration_limit: largest 2|a| / |δ| at which the acceleration is trusted.
+        max_damping: λ relative to the largest squared singular value that ends the search.
+    """
+
+    max_iter: int = 200
+    acceleration: bool = True
+    damping: float = 1e-2
+    tolerance: float = 1e-7
+    patience: int = 5
+    floor: float = 1e-13
+    truncation: float = 1e-12
+    finite_step: float = 0.1
+    acceleration_limit: float = 0.75
+    max_damping: float = 1e12
+
+    def __post_init__(self) -> None:
+        for name in ("damping", "truncation", "finite_step", "acceleration_limit", "max_damping"):
+            number(name, getattr(self, name), positive=True)
+        for name in ("tolerance", "floor"):
+            number(name, getattr(self, name))
+        integer("max_iter", self.max_iter, 0)
+        integer("patience", self.patience, 1)
+
+    @property
+    def limit(self) -> int:
+        """Most iterations."""
+        return self.max_iter
+
+    def init(self, problem: LeastSquares, theta: Tensor) -> LMState:
+        """State at the start θ.
+
+        Raises:
+            ValueError: the residual at the start is not finite.
+        """
+        residual = problem.residual(theta)
+        cost = problem.cost(residual)
+        if not math.isfinite(cost):
+            raise ValueError(
+                "the residual is not finite at the start of the search; start from a stable model."
+            )
+        return LMState(theta, residual, cost)
+
+    def step(self, problem: LeastSquares, state: LMState) -> LMState:
+        """One iteration: linearise, then raise the damping until a step lowers the cost."""
+        search = self._search(problem.cost, state)
+        answer = None
+        while True:
+            try:
+                wanted, theta = search.send(answer)
+            except StopIteration as end:
+                return end.value
+            answer = problem.linearise(theta) if wanted is JACOBIAN else problem.residual(theta)
+
+    def refused(self, before: LMState, after: LMState) -> LMState:
+        """State to go on from where a step is taken back: it was too long."""
+        assert after.damping is not None
+        return replace(
+            before,
+            damping=TAKEN_BACK * after.damping,
+            scale=after.scale,
+            iteration=after.iteration,
+            trials=after.trials,
+            rank=after.rank,
+            reason=after.reason,
+        )
+
+    def prolonged(self, state: LMState) -> LMState:
+        """State to go on from where all iterations were spent and there are more now."""
+        spent = state.reason == SPENT and state.iteration < self.max_iter
+        return replace(state, reason="") if spent else state
+
+    def steps(self, stack: ManyLeastSquares, states: Sequence[LMState]) -> list[LMState]:
+        """One iteration of each of several searches, evaluated together.
+
+        The searches go in step: each round answers what all of them ask for. A search that is over
+        stays as it is.
+        """
+        after = list(states)
+        searches = {
+            i: self._search(stack.problems[i].cost, state)
+            for i, state in enumerate(states)
+            if not state.reason
+        }
+        answers: dict[int, Any] = dict.fromkeys(searches)
+        while answers:
+            asked: dict[str, list[tuple[int, Tensor]]] = {JACOBIAN: [], RESIDUAL: []}
+            for i, answer in answers.items():
+                try:
+                    wanted, theta = searches[i].send(answer)
+                    asked[wanted].append((i, theta))
+                except StopIteration as end:
+                    after[i] = end.value
+            answers = {}
+            for wanted, evaluate in ((JACOBIAN, stack.linearise), (RESIDUAL, stack.residuals)):
+                if asked[wanted]:
+                    models, thetas = zip(*asked[wanted], strict=True)
+                    answers |= dict(zip(models, evaluate(models, thetas), strict=True))
+        return after
+
+    def _search(
+        self, cost_of: Callable[[Tensor], float], state: LMState
+    ) -> Generator[tuple[str, Tensor], Any, LMState]:
+        """One iteration that asks for the residuals and Jacobians it needs."""
+        jacobian: Jacobian = yield JACOBIAN, state.theta
+        relative = self.damping if state.damping is None else state.damping / state.scale
+        system, gradient = jacobian.system(relative, self.truncation)
+        scale = system.scale
+        if not scale > 0:
+            return replace(state, reason="the Jacobian vanishes or is not finite")
+        damping = self.damping * scale if state.damping is None else state.damping
+        growth, cost = state.growth, state.cost
+
+        trials, gain_ratio = 0, float("nan")
+        while damping <= self.max_damping * scale:
+            trials += 1
+            delta = system.solve(gradient, damping)
+            predicted = float(damping * delta.square().sum() - gradient @ delta)
+            theta = state.theta + delta
+            if self.acceleration:
+                h = self.finite_step
+                ahead = yield RESIDUAL, state.theta + h * delta
+                if math.isfinite(cost_of(ahead)):
+                    second = 2.0 / h * ((ahead - state.residual) / h - jacobian.tangent(delta))
+                    theta = theta + self._acceleration(second, delta, jacobian, system, damping)
+            residual = yield RESIDUAL, theta
+            new_cost = cost_of(residual)
+            actual = cost - new_cost
+            gain_ratio = actual / predicted if predicted > 0 else float("nan")
+            if actual > 0:  # False for NaN: a diverging trial is a rejected step
+                damping *= max(FASTEST_DECREASE, 1.0 - (2.0 * gain_ratio - 1.0) ** 3)
+                quiet = state.quiet + 1 if actual <= self.tolerance * cost else 0
+                accepted = replace(
+                    state,
+                    theta=theta,
+                    residual=residual,
+                    cost=new_cost,
+                    damping=damping,
+                    scale=scale,
+                    growth=2.0,
+                    iteration=state.iteration + 1,
+                    gain_ratio=gain_ratio,
+                    trials=trials,
+                    rank=system.rank,
+                    quiet=quiet,
+                )
+                if accepted.cost <= self.floor**2 * cost_of(torch.ones_like(residual)):
+                    return replace(accepted, reason="converged: the residual vanishes")
+                if quiet >= self.patience:
+                    return replace(accepted, reason="converged: the cost no longer falls")
+                if accepted.iteration >= self.max_iter:
+                    return replace(accepted, reason=SPENT)
+                return accepted
+            damping *= growth
+            growth *= 2.0
+        return replace(
+            state,
+            iteration=state.iteration + 1,
+            gain_ratio=gain_ratio,
+            trials=trials,
+            rank=system.rank,
+            reason="converged: no step lowers the cost",
+        )
+
+    def _acceleration(
+        self, second: Tensor, delta: Tensor, jacobian: Jacobian, system: System, damping: float
+    ) -> Tensor:
+        """Second-order correction a = ½ argmin |J a + r''|² + λ|a|², or 0 where it is too long."""
+        a = 0.5 * system.solve(jacobian.adjoint(second), damping)
+        trusted = 2.0 * a.norm() <= self.acceleration_limit * delta.norm()  # False for NaN
+        return a if trusted else torch.zeros_like(delta)

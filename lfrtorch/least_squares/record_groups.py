@@ -1,0 +1,133 @@
+"""Records of one length and start side by side, and how their errors are weighted."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lfrtorch.distributed import Ranks
+from lfrtorch.model import Model
+from lfrtorch.records import Record, Start
+
+EVERY = slice(None)
+
+
+@dataclass
+class Batch:
+    """Records of one length and start, normalised, and how their errors are weighted.
+
+    Shape:
+        u: (R, T, nu), y: (R, T, ny), x0: (R, nx) of given starts; estimated: (R,), which of the
+        estimated start states is each record's.
+        scored: (R, T), 1 where a sample counts in the score.
+        weight: (R, T, ny), or by spectral line (R, F, ny), F = T // 2 + 1: the factors of the
+            errors, 0 where a sample or a line does not count.
+        start_weight: (R, T, ny), the same where the start state of a given model is estimated.
+    """
+
+    u: Tensor
+    y: Tensor
+    x0: Tensor | None
+    estimated: Tensor | None
+    scored: Tensor
+    weight: Tensor
+    start_weight: Tensor | None
+    spectral: bool
+    start: Start
+
+    def weigh(self, errors: Tensor, records: slice = EVERY, time: slice = EVERY) -> Tensor:
+        """Weighted errors (R, m, ny) of errors (R, T, ny), or rows (..., P) of them.
+
+        A part of the samples will do where the weights are not spectral.
+        """
+        weight = self.weight[records]
+        if not self.spectral:
+            weight = weight[:, time]
+            return errors if self.plain else _columns(weight, errors) * errors
+        spectrum = torch.fft.rfft(errors, dim=1)
+        spectrum = _columns(weight, spectrum) * spectrum
+        return torch.cat([spectrum.real, spectrum.imag], dim=1)
+
+    @cached_property
+    def plain(self) -> bool:
+        """Whether every sample counts alike."""
+        return not self.spectral and bool((self.weight == 1).all())
+
+    @property
+    def residual_shape(self) -> torch.Size:
+        """(R, m, ny)."""
+        R, m, ny = self.weight.shape
+        return torch.Size((R, 2 * m if self.spectral else m, ny))
+
+    def unweigh(self, r: Tensor) -> Tensor:
+        """The adjoint of ``weigh``: (R, m, ny) to (R, T, ny)."""
+        if not self.spectral:
+            return self.weight * r
+        T = self.u.shape[1]
+        spectrum = self.weight * torch.complex(*r.chunk(2, dim=1))
+        # irfft counts the lines between 0 and fs / 2 twice.
+        spectrum[:, 1 : (T + 1) // 2] /= 2
+        return T * torch.fft.irfft(spectrum, T, dim=1)
+
+
+def batches_of(model: Model, records: list[Record], ranks: Ranks) -> list[Batch]:
+    """A process's share of the records, grouped and normalised, in the model's dtype and device."""
+    like = model.lfr.cell.A
+    groups: dict[tuple[int, Start, bool], list[Record]] = defaultdict(list)
+    estimated: dict[tuple[int, Start, bool], list[int]] = defaultdict(list)
+    count = itertools.count()
+    numbers = [next(count) if record.start == "estimated" else 0 for record in records]
+    for record, number in ranks.share(list(zip(records, numbers, strict=True))):
+        kind = record.samples, record.start, record.line_weight is not None
+        groups[kind].append(record)
+        estimated[kind].append(number)
+    batches = []
+
+    def stacked(arrays: list[NDArray]) -> Tensor:
+        return torch.tensor(np.stack(arrays)).to(like)
+
+    for kind, group in groups.items():
+        _, start, spectral = kind
+        batches.append(
+            Batch(
+                u=stacked([model.scaler.normalise_u(record.u) for record in group]),
+                y=stacked([model.scaler.normalise_y(record.y) for record in group]),
+                x0=stacked([r.x0 for r in group if r.x0 is not None]) if start == "given" else None,
+                estimated=torch.tensor(estimated[kind]) if start == "estimated" else None,
+                scored=stacked([np.arange(record.samples) >= record.skip for record in group]),
+                weight=stacked([_factors(record) for record in group]),
+                start_weight=stacked([record.start_factors for record in group])
+                if start == "estimated"
+                else None,
+                spectral=spectral,
+                start=start,
+            )
+        )
+    return batches
+
+
+def _factors(record: Record) -> NDArray:
+    """What multiplies the errors, (T, ny), or their spectrum by ``rfft``, (F, ny)."""
+    T, ny = record.y.shape
+    if record.line_weight is None:
+        return record.factors
+    # Parseval: Σ e² = Σ |E|² / T over all T lines; those between 0 and fs / 2 stand for two.
+    twice = np.full((T // 2 + 1, 1), 2.0)
+    twice[0] = 1.0
+    if T % 2 == 0:
+        twice[-1] = 1.0
+    return np.broadcast_to(
+        np.sqrt(record.weight * record.line_weight * twice / T), (len(twice), ny)
+    )
+
+
+def _columns(weight: Tensor, like: Tensor) -> Tensor:
+    """The weight (R, m, ny) with as many axes as what it multiplies."""
+    return weight.reshape(*weight.shape, *[1] * (like.ndim - weight.ndim))

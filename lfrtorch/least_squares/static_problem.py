@@ -1,0 +1,52 @@
+"""The error of a static map over samples of its input and output."""
+
+from __future__ import annotations
+
+from torch import Tensor
+from torch.nn import Module
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from lfrtorch.engine.static_jacobian import static_slopes
+from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian
+
+
+class StaticError:
+    """Residual and slope of static(z) - w, for ``LevenbergMarquardt``.
+
+    θ is the vector of all parameters of the map, which holds the θ that was evaluated last.
+
+    Args:
+        static: the map.
+        z, w: samples of its input and output.
+
+    Shape:
+        z: (T, nz), w: (T, nw).
+    """
+
+    def __init__(self, static: Module, z: Tensor, w: Tensor) -> None:
+        self.static, self.z, self.w = static, z.unsqueeze(0), w.unsqueeze(0)
+
+    @property
+    def theta(self) -> Tensor:
+        """Parameters (P,) as they stand in the module."""
+        return parameters_to_vector(self.static.parameters()).detach()
+
+    def write(self, theta: Tensor) -> None:
+        """Put θ (P,) into the module."""
+        vector_to_parameters(theta.clone(), self.static.parameters())
+
+    def cost(self, residual: Tensor) -> float:
+        """|r|²."""
+        return float(residual.square().sum())
+
+    def residual(self, theta: Tensor) -> Tensor:
+        """r (M,) at θ."""
+        self.write(theta)
+        return (self.static(self.z) - self.w).detach().flatten()
+
+    def linearise(self, theta: Tensor) -> DenseJacobian:
+        """dr/dθ at θ."""
+        r = self.residual(theta)
+        weights = {name: p.detach() for name, p in self.static.named_parameters()}
+        slopes = static_slopes(self.static, self.z, weights)
+        return DenseJacobian(slopes.by_weight().flatten(0, 2), r)

@@ -1,0 +1,1 @@
+"""The best linear approximation: nonparametric and parametric, from signals or spectra."""

@@ -1,0 +1,475 @@
+"""Nonparametric best linear approximation: frequency response, noise and nonlinear distortion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lfrtorch import _checks
+from lfrtorch._checks import integer
+from lfrtorch._checks import lines as checked_lines
+from lfrtorch._threads import spread_by_hand
+from lfrtorch.linear.local_polynomial import half_width, local_polynomial
+from lfrtorch.linear.regression import Complex, Regression, covariance, outer, regress
+from lfrtorch.linear.spectra import (
+    Array,
+    Lines,
+    Removal,
+    Spectra,
+    excited_lines,
+    in_band,
+    powered_lines,
+    spectra_of_periods,
+    spectra_of_records,
+)
+from lfrtorch.records import Channel, Record, as_records
+
+Method = Literal["auto", "robust", "fast", "local_polynomial"]
+
+ORTHOGONAL = 1e-6
+"""Relative deviation up to which the experiments of a block are orthogonal, of equal powers."""
+
+SPARE_FREEDOM = 4
+"""The windows of the local polynomial method leave ny + this many degrees of freedom: the estimated
+variance then has a standard deviation of 45 % with one output, and covariances are regular."""
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Power of the outputs at some lines, and what of it is noise.
+
+    A power is a mean square in squared units of the output: |Y|² of Y = √2 / N · DFT over one
+    period, so that the powers of all lines add up to the variance of the signal.
+
+    Args:
+        frequencies: of the lines, Hz.
+        power: of the mean over the periods, as a mean over the records.
+        noise: expected share of the disturbing noise in it.
+
+    Shape:
+        frequencies: (F,), power, noise: (F, ny).
+    """
+
+    frequencies: Array
+    power: Array
+    noise: Array
+
+    @property
+    def distortion(self) -> Array:
+        """Power beyond the noise, at least 0."""
+        return np.maximum(self.power - self.noise, 0.0)
+
+    def restricted(self, f_low: float, f_high: float) -> Level:
+        """The lines from ``f_low`` to ``f_high`` Hz."""
+        inside = (self.frequencies >= f_low) & (self.frequencies <= f_high)
+        return Level(self.frequencies[inside], self.power[inside], self.noise[inside])
+
+
+@dataclass(frozen=True, eq=False)
+class Distortion:
+    """Nonlinear distortion at the output under an odd excitation, even and odd apart.
+
+    Args:
+        output: the output at the excited lines.
+        odd, even: what the linear model leaves, Y - G U, at the odd and even lines left out.
+    """
+
+    output: Level
+    odd: Level
+    even: Level
+
+    def restricted(self, f_low: float, f_high: float) -> Distortion:
+        """The lines from ``f_low`` to ``f_high`` Hz."""
+        levels = (self.output, self.odd, self.even)
+        return Distortion(*(level.restricted(f_low, f_high) for level in levels))
+
+
+@dataclass(frozen=True, eq=False)
+class FRF:
+    """Best linear approximation at some frequencies, in physical units, with its covariances.
+
+    The covariance of a line is E[d dᴴ] of the error d of vec(G) = ``G[f].reshape(-1)`` (output,
+    then input), for the estimate as it is, a mean over periods and experiments.
+
+    Args:
+        frequencies: Hz.
+        G: frequency response.
+        fs: sampling frequency in Hz.
+        u_offset, y_offset: means of the records.
+        inputs, outputs: channel names and units.
+        cov_noise: what the disturbing noise makes of it, ``None`` if not available.
+        cov_total: noise and stochastic nonlinear distortion together.
+        experiments: records that were used.
+        periods: of the record that has fewest; 1 without periods.
+        method: ``"robust"``, ``"fast"`` or ``"local_polynomial"``.
+        distortion: levels at the output, of the fast method alone.
+        notes: what is not available, why, and what would give it.
+
+    Shape:
+        frequencies: (F,), G: (F, ny, nu), u_offset: (nu,), y_offset: (ny,),
+        cov_noise, cov_total: (F, ny nu, ny nu).
+    """
+
+    frequencies: Array
+    G: Complex
+    fs: float
+    u_offset: Array
+    y_offset: Array
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    cov_noise: Complex | None
+    cov_total: Complex | None
+    experiments: int
+    periods: int
+    method: str
+    distortion: Distortion | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def realisations(self) -> int:
+        """Independent realisations M: whole blocks of nu experiments."""
+        return self.experiments // len(self.inputs)
+
+    @property
+    def var_noise(self) -> Array | None:
+        """Variance (F, ny, nu) of G due to the noise, or ``None``."""
+        return self._variance(self.cov_noise)
+
+    @property
+    def var_total(self) -> Array | None:
+        """Variance (F, ny, nu) of G due to noise and nonlinear distortion, or ``None``."""
+        return self._variance(self.cov_total)
+
+    @property
+    def var_distortion(self) -> Array | None:
+        """Variance (F, ny, nu) of G due to nonlinear distortion in one realisation, or ``None``.
+
+        M (total - noise), at least 0, for M = experiments / nu realisations: it does not fall
+        with their number, and the floor at 0 puts it too high where there is little distortion.
+        """
+        total, noise = self.var_total, self.var_noise
+        if total is None or noise is None:
+            return None
+        return np.maximum(total - noise, 0.0) * (self.experiments / len(self.inputs))
+
+    def _variance(self, cov: Complex | None) -> Array | None:
+        if cov is None:
+            return None
+        return np.diagonal(cov, axis1=1, axis2=2).real.reshape(self.G.shape)
+
+    def restricted(self, f_low: float, f_high: float) -> FRF:
+        """The lines from ``f_low`` to ``f_high`` Hz.
+
+        Raises:
+            ValueError: there is none.
+        """
+        inside = (self.frequencies >= f_low) & (self.frequencies <= f_high)
+        if not inside.any():
+            raise ValueError(
+                f"no line from {f_low} to {f_high} Hz; the lines go from "
+                f"{self.frequencies[0]:g} to {self.frequencies[-1]:g} Hz."
+            )
+        return replace(
+            self,
+            frequencies=self.frequencies[inside],
+            G=self.G[inside],
+            cov_noise=None if self.cov_noise is None else self.cov_noise[inside],
+            cov_total=None if self.cov_total is None else self.cov_total[inside],
+            distortion=self.distortion and self.distortion.restricted(f_low, f_high),
+        )
+
+
+@spread_by_hand()
+def estimate_frf(
+    records: Record | Sequence[Record],
+    *,
+    method: Method = "auto",
+    lines: ArrayLike | None = None,
+    band: tuple[float, float] | None = None,
+    order: int = 2,
+    degrees_of_freedom: int | None = None,
+    transient: bool = False,
+) -> FRF:
+    """Frequency response of the best linear approximation, with the variances the data allow.
+
+    ``"robust"``: the records are experiments with one period length, in steady state after
+    ``skip``; the last whole periods of each are used. G is the least-squares fit of the spectra
+    over the experiments (one input: the mean of their ratios weighted by input power). What
+    changes from period to period is noise; what changes from experiment to experiment is noise and
+    distortion. Experiments weigh equally, whatever their number of periods. The total covariance
+    comes from the scatter of the blocks of nu experiments where these are orthogonal multisines,
+    and else from the residuals, as if these had one covariance in all experiments.
+
+    ``"fast"``: the same estimate from as little as one experiment, with a random odd multisine.
+    The outputs at the odd lines left out, less the linear response to what input there is, are
+    odd distortion and noise; interpolated, they give the total covariance at the excited lines.
+    Even distortion falls on even lines and does not disturb G.
+
+    ``"local_polynomial"``: any excitation, transients included, records cut to the shortest one.
+    Noise and distortion are known together only.
+
+    ``"auto"``: robust where every record has periods, and else local polynomials.
+
+    Args:
+        records: data; ``Record.period`` says that a record is periodic, as does
+            ``start="periodic"`` (of one period, where it names none).
+        method: see above.
+        lines: DFT lines of the period (or, for local polynomials, of the record), 0 < line < N / 2;
+            by default those that are found to be excited. The fast method needs all of these.
+        band: lowest and highest frequency in Hz; all lines by default.
+        order: of the local polynomials.
+        degrees_of_freedom: that a window of local polynomials leaves at least; ny + 4 by default.
+        transient: whether the transient of periodic records is removed, by local polynomials at
+            the lines between those of the period. It takes two periods, and adds to the noise.
+
+    Shape:
+        lines: (F,).
+
+    Raises:
+        ValueError: a constant input, records of different periods or without, an input that does
+            not repeat or leaves lines without power, too few experiments, periods or lines.
+
+    References:
+        Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,
+        2012, chapters 2, 3.4, 4.3 (robust and fast method) and 7 (local polynomial method).
+    """
+    data = as_records(records)
+    if method not in get_args(Method):
+        raise ValueError(
+            f"method is {method!r}; use 'auto', 'robust', 'fast' or 'local_polynomial'."
+        )
+    integer("order", order, 0)
+    if degrees_of_freedom is not None:
+        integer("degrees_of_freedom", degrees_of_freedom, 1)
+    if band is not None:
+        _checks.band(band)
+    if band is not None and not 0 <= band[0] <= band[1]:
+        raise ValueError(
+            f"the band is {band[0]} to {band[1]} Hz; give a lower and an upper frequency."
+        )
+    if method == "auto":
+        periodic = all(record.period or record.start == "periodic" for record in data)
+        method = "robust" if periodic else "local_polynomial"
+    freedom = degrees_of_freedom or len(data[0].outputs) + SPARE_FREEDOM
+    if method == "local_polynomial":
+        return _local_polynomial(data, lines, band, order, freedom)
+    spectra = spectra_of_periods(data, Removal(order, freedom) if transient else None)
+    chosen = in_band(excited_lines(spectra, data, lines), spectra.resolution, band)
+    frf = (_robust if method == "robust" else _fast)(spectra, data, chosen)
+    at_once = [
+        f"noise: record '{record.name}' is used from its first sample on; a transient there counts "
+        "as noise (Record.skip leaves it out, transient=True removes it)."
+        for record, P in zip(data, spectra.P, strict=True)
+        if record.start != "periodic" and record.samples == P * spectra.N
+    ]
+    return (
+        frf if transient or not spectra.freedom else replace(frf, notes=(*frf.notes, *at_once[:1]))
+    )
+
+
+def _robust(spectra: Spectra, data: list[Record], lines: Lines) -> FRF:
+    """Distortion from the scatter over experiments, noise from that over periods."""
+    fitted = _response(spectra, lines)
+    R, nu = spectra.U.shape[1:]
+    spare = R - nu
+    cov_noise = cov_total = None
+    notes = []
+    if spectra.freedom:
+        cov_noise = _noise(spectra, lines, fitted)
+    else:
+        notes.append(
+            "noise: not available from one period a record; two or more periods give it "
+            "(Record.period)."
+        )
+    if spare > 0:
+        cov_total = _block_covariance(spectra, lines)
+        if cov_total is None:
+            cov_total = covariance(outer(fitted.residual) / spare, fitted.weights)
+    else:
+        notes.append(
+            f"total: not available, as {R} experiment(s) of {nu} input(s) leave no freedom beside "
+            "G; more realisations give it, or a random odd multisine and method='fast'."
+        )
+    return FRF(
+        spectra.frequencies(lines),
+        fitted.G,
+        cov_noise=cov_noise,
+        cov_total=cov_total,
+        method="robust",
+        notes=tuple(notes),
+        **_about(spectra, data),
+    )
+
+
+def _fast(spectra: Spectra, data: list[Record], lines: Lines) -> FRF:
+    """Distortion from the lines left out, noise from the scatter over periods."""
+    if spectra.P.min() < 2:
+        record = data[int(np.argmin(spectra.P))]
+        raise ValueError(
+            f"record '{record.name}' has one period of {spectra.N} samples after skip; "
+            "method='fast' needs two or more to know the noise."
+        )
+    advice = (
+        "method='fast' needs a random odd multisine (lfrtorch.multisine, grid='random_odd'); "
+        "or use method='robust'."
+    )
+    if (lines % 2 == 0).any():
+        raise ValueError(f"line {lines[lines % 2 == 0][0]} is even and excited; {advice}")
+    left_out = np.setdiff1d(np.arange(lines[0], lines[-1]), lines)
+    odd, even = left_out[left_out % 2 == 1], left_out[left_out % 2 == 0]
+    if not odd.size:
+        raise ValueError(f"no odd line is left out between the excited ones; {advice}")
+    fitted = _response(spectra, lines)
+
+    def level(at: Lines, G: Complex) -> tuple[Level, Complex]:
+        """Power of Y - G U at the lines, and its matrix (F, ny, ny)."""
+        C = outer(spectra.Y[at] - spectra.U[at] @ G.swapaxes(1, 2)) / len(data)
+        noise = _residual_noise(spectra.C[at], G) * np.mean(1 / spectra.P)
+        return Level(spectra.frequencies(at), _diagonal(C), _diagonal(noise)), C
+
+    output, _ = level(lines, np.zeros_like(fitted.G))
+    odd_level, C_odd = level(odd, _interpolated(odd, lines, fitted.G))
+    even_level, _ = level(even, _interpolated(even, lines, fitted.G))
+    return FRF(
+        spectra.frequencies(lines),
+        fitted.G,
+        cov_noise=_noise(spectra, lines, fitted),
+        cov_total=covariance(_interpolated(lines, odd, C_odd), fitted.weights),
+        method="fast",
+        distortion=Distortion(output, odd_level, even_level),
+        **_about(spectra, data),
+    )
+
+
+def _local_polynomial(
+    data: list[Record],
+    given: ArrayLike | None,
+    band: tuple[float, float] | None,
+    order: int,
+    degrees_of_freedom: int,
+) -> FRF:
+    """Noise and distortion together from what smooth functions of frequency leave."""
+    spectra = spectra_of_records(data)
+    last = (spectra.N - 1) // 2
+    n = half_width(order, degrees_of_freedom, len(data[0].inputs), len(data))
+    if 2 * n + 1 > last:
+        raise ValueError(
+            f"{spectra.N} samples have {last} lines and a window of local polynomials takes "
+            f"{2 * n + 1}; use longer records, a lower order or fewer degrees_of_freedom."
+        )
+    lines = powered_lines(spectra, n)
+    if given is not None:
+        chosen = checked_lines(given, spectra.N)
+        missing = np.setdiff1d(chosen, lines)
+        if missing.size:
+            raise ValueError(
+                f"an input has no power about line {missing[0]}; give lines about which all "
+                "inputs are excited."
+            )
+        lines = chosen
+    lines = in_band(lines, spectra.resolution, band)
+    # Line 0 holds the offsets and stays out of all windows.
+    U, Y = spectra.U[1 : last + 1], spectra.Y[1 : last + 1]
+    G, cov, determined = local_polynomial(U, Y, lines - 1, order=order, n=n)
+    if not determined.any():
+        raise ValueError(
+            "the inputs determine the response at no line: they depend on each other, or excite "
+            "too few lines; use richer inputs, another band or a lower order."
+        )
+    notes = [
+        "noise: not told apart from nonlinear distortion without periods; two or more periods of "
+        "a multisine tell them apart (Record.period)."
+    ]
+    if any(record.samples - record.skip > spectra.N for record in data):
+        notes.append(f"the records were cut to the shortest one, {spectra.N} samples.")
+    if not determined.all():
+        notes.append(f"{np.sum(~determined)} line(s) are left out: the inputs do not determine G.")
+    return FRF(
+        spectra.frequencies(lines[determined]),
+        G[determined],
+        cov_noise=None,
+        cov_total=cov[determined],
+        method="local_polynomial",
+        notes=tuple(notes),
+        **_about(spectra, data),
+    )
+
+
+def _about(spectra: Spectra, data: list[Record]) -> dict[str, Any]:
+    return {
+        "fs": data[0].fs,
+        "u_offset": np.mean(spectra.U[0].real, axis=0) / np.sqrt(2),
+        "y_offset": np.mean(spectra.Y[0].real, axis=0) / np.sqrt(2),
+        "inputs": data[0].inputs,
+        "outputs": data[0].outputs,
+        "experiments": len(data),
+        "periods": int(spectra.P.min()),
+    }
+
+
+def _response(spectra: Spectra, lines: Lines) -> Regression:
+    """G at the lines by least squares over the experiments; the rows are experiments."""
+    R, nu = spectra.U.shape[1:]
+    if nu > R:
+        raise ValueError(
+            f"{R} record(s) cannot tell {nu} inputs apart at one line; give at least {nu} "
+            "experiments, best of orthogonal multisines (lfrtorch.multisine), or use "
+            "method='local_polynomial'."
+        )
+    fitted = regress(spectra.U[lines], spectra.Y[lines], nu)
+    if not fitted.determined.all():
+        line = lines[np.argmin(fitted.determined)]
+        raise ValueError(
+            f"the inputs of the {R} experiments depend on each other at line {line} "
+            f"({line * spectra.resolution:g} Hz); use orthogonal multisines (lfrtorch.multisine), "
+            "or leave the line out."
+        )
+    return fitted
+
+
+def _noise(spectra: Spectra, lines: Lines, fitted: Regression) -> Complex:
+    """Covariance of vec(G) due to the noise: P periods have 1 / P of that of one."""
+    C = _residual_noise(spectra.C[lines], fitted.G)
+    return covariance(C, fitted.weights / np.sqrt(spectra.P))
+
+
+def _residual_noise(C: Complex, G: Complex) -> Complex:
+    """Covariance (F, ny, ny) of the noise of Y - G U, from that of [Y, U]."""
+    eye = np.broadcast_to(np.eye(G.shape[1]), (len(G), G.shape[1], G.shape[1]))
+    H = np.concatenate([eye, -G], axis=2)
+    return H @ C @ H.conj().swapaxes(1, 2)
+
+
+def _block_covariance(spectra: Spectra, lines: Lines) -> Complex | None:
+    """Covariance of the mean over blocks of orthogonal experiments, ``None`` for other designs."""
+    R, nu = spectra.U.shape[1:]
+    M = R // nu
+    if nu == 1 or R % nu:  # with one input the residuals give the same
+        return None
+    X = spectra.U[lines].reshape(len(lines), M, nu, nu)  # (line, block, experiment, input)
+    products = X.conj().swapaxes(2, 3) @ X
+    power = np.diagonal(products[:, :1], axis1=2, axis2=3).real  # of the first block
+    unit = products / np.sqrt(power[..., :, None] * power[..., None, :])
+    if np.abs(unit - np.eye(nu)).max() > ORTHOGONAL:
+        return None
+    blocks = np.linalg.solve(X, spectra.Y[lines].reshape(len(lines), M, nu, -1)).swapaxes(2, 3)
+    d = (blocks - blocks.mean(axis=1, keepdims=True)).reshape(len(lines), M, -1)
+    return outer(d) / (M * (M - 1))
+
+
+def _interpolated(at: Lines, lines: Lines, matrices: Complex) -> Complex:
+    """Matrices (F, n, m) at other lines, piecewise linear and constant beyond the ends."""
+    if len(lines) == 1:
+        return np.repeat(matrices, len(at), axis=0)
+    left = np.clip(np.searchsorted(lines, at, side="right") - 1, 0, len(lines) - 2)
+    share = np.clip((at - lines[left]) / (lines[left + 1] - lines[left]), 0.0, 1.0)
+    share = share[:, None, None]
+    return (1 - share) * matrices[left] + share * matrices[left + 1]
+
+
+def _diagonal(matrices: Complex) -> Array:
+    return np.diagonal(matrices, axis1=1, axis2=2).real.copy()

@@ -1,0 +1,78 @@
+"""Local polynomial method: frequency response and transient as polynomials in a window of lines."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfrtorch.linear.regression import DEPENDENT, Complex, covariance, outer, regress
+
+CHUNK = 2**21
+"""Complex numbers of the windows that are in memory at a time: 32 MiB, and as much in copies."""
+
+
+def half_width(order: int, degrees_of_freedom: int, nu: int, records: int) -> int:
+    """Smallest n of which a window of 2 n + 1 lines leaves so many degrees of freedom.
+
+    R (2 n + 1) equations have (order + 1) (nu + R) unknowns: G, and the transient of each record.
+    """
+    rows = -(-((order + 1) * nu + degrees_of_freedom) // records)  # of a record, without transient
+    return (rows + order + 1) // 2
+
+
+def local_polynomial(
+    U: Complex, Y: Complex, centres: NDArray[np.int64], *, order: int, n: int
+) -> tuple[Complex, Complex, NDArray[np.bool_]]:
+    """Frequency response at lines of spectra that hold transients, and its covariance.
+
+    About each centre k, for the 2 n + 1 lines k + r nearest to it (shifted at the ends)::
+
+        Y(k + r) = (Σ_s g_s rˢ) U(k + r) + Σ_s t_s rˢ + V(k + r),    s = 0 .. order
+
+    with g shared by the records and t of each one. The polynomials t are taken out by projection
+    on their orthogonal complement, which is the same for all windows; g_0 = G(k).
+
+    Args:
+        U, Y: spectra at successive lines.
+        centres: lines wanted, counted from the first one of the spectra.
+        order: of the polynomials.
+        n: half width of the window.
+
+    Returns:
+        G, the covariance of vec(G) from the residuals (noise and nonlinear distortion together),
+        and the centres about which the input determines G.
+
+    Shape:
+        U: (lines, R, nu), Y: (lines, R, ny), centres: (F,) ->
+        (F, ny, nu), (F, ny nu, ny nu), (F,).
+
+    References:
+        Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,
+        2012, chapter 7.
+    """
+    records, nu = U.shape[1:]
+    width = 2 * n + 1
+    powers = np.arange(order, -1, -1)  # g_0 last: see regress
+    vandermonde = (np.arange(-n, n + 1)[:, None] / n) ** powers
+    complement = np.linalg.qr(vandermonde, mode="complete")[0][:, order + 1 :]
+    rows = records * complement.shape[1]
+    freedom = rows - (order + 1) * nu
+    first = np.clip(centres - n, 0, len(U) - width)
+
+    parts = []
+    size = max(1, CHUNK // (records * width * (order + 1) * (nu + Y.shape[2])))
+    for start in range(0, len(centres), size):
+        part = slice(start, start + size)
+        window = first[part, None] + np.arange(width)
+        r = ((window - centres[part, None]) / n)[:, :, None] ** powers
+        X = np.einsum("wm,fwru,fws->frmsu", complement, U[window], r, optimize=True)
+        projected = np.einsum("wm,fwry->frmy", complement, Y[window], optimize=True)
+        shape = len(window), rows, -1
+        fitted = regress(X.reshape(shape), projected.reshape(shape), nu)
+        C = outer(fitted.residual) / freedom
+        # One line of power alone leaves columns of rounding errors, which do not depend.
+        sizes = np.linalg.norm(X, axis=(1, 2))  # (line, s, input)
+        determined = (sizes > DEPENDENT * sizes.max(axis=1, keepdims=True)).all(axis=(1, 2))
+        parts.append((fitted.G, covariance(C, fitted.weights), fitted.determined & determined))
+    G, cov, determined = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return G, cov, determined

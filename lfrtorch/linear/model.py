@@ -1,0 +1,400 @@
+"""The linear state-space model in physical units: what a best linear approximation is."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.signal
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from lfrtorch import _checkpoint
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.linear.resolvent import frequency_response, resolvents, slopes
+from lfrtorch.model import Model
+from lfrtorch.records import Channel, Record, Scaler, without_coordinates
+
+Array = NDArray[np.float64]
+
+SINGULAR = 1e-12
+"""Singular value, relative to the size of the system, that counts as zero where zeros at infinity
+are told from finite ones."""
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """How a linear model was found.
+
+    Args:
+        criterion: ``"simulation"``, ``"prediction"`` or ``"frequency"``.
+        rmse: root mean squared error of the criterion over the data, in normalised units: of
+            outputs of unit rms, or of weighted responses.
+        iterations: of the refinement.
+        reason: why it ended.
+        seconds: duration of the estimation.
+        singular_values: of the subspace, relative to the size of the outputs: they fall off behind
+            the order that the data carry.
+        notes: what a user should know about data and result.
+    """
+
+    criterion: str
+    rmse: float
+    iterations: int
+    reason: str
+    seconds: float
+    singular_values: tuple[float, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """Linear state-space model in physical units, about an operating point::
+
+        x+ = A x + B (u - u_offset) + K e
+        y  = C x + D (u - u_offset) + y_offset + e
+
+    Args:
+        A, B, C, D: system matrices.
+        fs: sampling frequency in Hz.
+        u_offset, y_offset: operating point.
+        inputs, outputs: channel names and units.
+        K: gain of the innovations e, where they were modelled.
+        innovation_covariance: of e, where it was modelled.
+        covariance: of the entries of A, B, C and D, each by rows, one after another.
+        fit: how the model was found.
+
+    Shape:
+        A: (nx, nx), B: (nx, nu), C: (ny, nx), D: (ny, nu), u_offset: (nu,), y_offset: (ny,),
+        K: (nx, ny), innovation_covariance: (ny, ny), covariance: (P, P), P = (nx + ny) (nx + nu).
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    fs: float
+    u_offset: Array
+    y_offset: Array
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    K: Array | None = None
+    innovation_covariance: Array | None = None
+    covariance: Array | None = None
+    fit: LinearFit | None = None
+
+    @property
+    def nx(self) -> int:
+        """Order."""
+        return len(self.A)
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """Poles (nx,), in the z plane."""
+        return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
+
+    def zeros(self, output: int | None = None, input: int | None = None) -> NDArray[np.complex128]:
+        """Finite zeros in the z plane: those of one channel, or the transmission zeros of all.
+
+        Args:
+            output, input: numbers of a channel; left out for the whole model, which then needs as
+                many outputs as inputs.
+
+        Raises:
+            ValueError: other numbers of outputs and inputs (there are no zeros in general).
+        """
+        B, C, D = self.B, self.C, self.D
+        if output is not None:
+            C, D = C[[output]], D[[output]]
+        if input is not None:
+            B, D = B[:, [input]], D[:, [input]]
+        if D.shape[0] != D.shape[1]:
+            raise ValueError(
+                f"a model of {D.shape[1]} input(s) and {D.shape[0]} output(s) has no transmission "
+                "zeros in general; ask for those of a channel: zeros(output, input)."
+            )
+        return _zeros(self.A, B, C, D)
+
+    def frf(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
+        """Frequency response C (zI - A)⁻¹ B + D.
+
+        Shape:
+            frequencies: (F,) in Hz -> (F, ny, nu).
+        """
+        return frequency_response(self.A, self.B, self.C, self.D, self._z(frequencies))
+
+    def frf_std(self, frequencies: ArrayLike) -> Array:
+        """Standard deviation of the frequency response from the covariance of the parameters.
+
+        Shape:
+            frequencies: (F,) in Hz -> (F, ny, nu); physical units.
+
+        Raises:
+            ValueError: a model without covariance.
+        """
+        if self.covariance is None:
+            raise ValueError(
+                "the covariance of this model is not known: estimate_bla finds it in a refinement."
+            )
+        z = self._z(frequencies)
+        X, L = resolvents(self.A, self.B, self.C, z)
+        nu = len(self.inputs)
+        J = slopes(X, L, np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu)))
+        variance = np.einsum("foip,pq,foiq->foi", J, self.covariance, J.conj(), optimize=True)
+        return np.sqrt(np.maximum(variance.real, 0.0))
+
+    def simulate(self, data: Record | ArrayLike) -> Array:
+        """Simulated output (T, ny) in physical units, from the record's own start.
+
+        A bare input (T, nu) is simulated from rest. A start state that is given is in other
+        coordinates; the one that fits best takes its place.
+        """
+        data = without_coordinates(data) if isinstance(data, Record) else data
+        return self.to_model().simulate(data)
+
+    def predict(self, record: Record) -> Array:
+        """Output (T, ny) predicted one sample ahead from the outputs before, physical units.
+
+        A record in steady state is predicted from the state that fits best: noise does not repeat.
+
+        Raises:
+            ValueError: a model without K, or a record of other channels or another rate.
+        """
+        if self.K is None:
+            raise ValueError(
+                "this model has no innovation gain K: estimate it with refine='prediction'."
+            )
+        self.to_model().check(without_coordinates(record))
+        ny = len(self.outputs)
+        predictor = replace(
+            self,
+            A=self.A - self.K @ self.C,
+            B=np.hstack([self.B - self.K @ self.D, self.K]),
+            D=np.hstack([self.D, np.zeros((ny, ny))]),
+            u_offset=np.concatenate([self.u_offset, self.y_offset]),
+            inputs=(*self.inputs, *self.outputs),
+        )
+        u = np.hstack([record.u, record.y])
+        start = "estimated" if record.start == "periodic" else record.start
+        driven = replace(
+            record, u=u, inputs=predictor.inputs, start=start, period=None, line_weight=None
+        )
+        return predictor.simulate(driven)
+
+    def transformed(self, T: Array, inverse: Array | None = None) -> LinearModel:
+        """The same system in the coordinates T x.
+
+        Args:
+            T: the transformation.
+            inverse: T⁻¹, where it is known better than by inverting T.
+
+        Shape:
+            T, inverse: (nx, nx).
+        """
+        back = np.asarray(np.linalg.inv(T) if inverse is None else inverse, dtype=np.float64)
+        covariance = self.covariance
+        if covariance is not None:
+            nu, ny = np.eye(len(self.inputs)), np.eye(len(self.outputs))
+            blocks = np.kron(T, back.T), np.kron(T, nu), np.kron(ny, back.T), np.kron(ny, nu)
+            change = scipy.linalg.block_diag(*blocks)
+            covariance = change @ covariance @ change.T
+        return replace(
+            self,
+            A=T @ self.A @ back,
+            B=T @ self.B,
+            C=self.C @ back,
+            K=None if self.K is None else T @ self.K,
+            covariance=covariance,
+        )
+
+    def write(self, cell: LFRCell, scaler: Scaler) -> None:
+        """Put A, B, C, D into A, Bu, Cy, Dyu of a cell, in the scaler's normalised units."""
+        with torch.no_grad():
+            for weight, value in (
+                (cell.A, self.A),
+                (cell.Bu, self.B * scaler.u_scale),
+                (cell.Cy, self.C / scaler.y_scale[:, None]),
+                (cell.Dyu, self.D * scaler.u_scale / scaler.y_scale[:, None]),
+            ):
+                weight.copy_(torch.as_tensor(np.ascontiguousarray(value)))
+
+    def to_model(self) -> Model:
+        """The same as a ``Model`` without static nonlinearity, in the same coordinates."""
+        nu, ny = len(self.inputs), len(self.outputs)
+        unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
+        cell = linear_cell(self.A, self.B, self.C, self.D)
+        return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs)
+
+    def to_scipy(self) -> scipy.signal.StateSpace:
+        """The deviations from the operating point as a ``scipy.signal.StateSpace``."""
+        return scipy.signal.StateSpace(self.A, self.B, self.C, self.D, dt=1.0 / self.fs)
+
+    def to_control(self) -> Any:
+        """The deviations from the operating point as a ``control.StateSpace``.
+
+        Dots in channel names, which that package does not allow, become underscores.
+
+        Raises:
+            ImportError: the package ``control`` is not installed.
+        """
+        try:
+            import control
+        except ImportError as error:
+            raise ImportError(
+                "to_control needs the package control: pip install 'lfrtorch[control]'."
+            ) from error
+        return control.ss(
+            self.A, self.B, self.C, self.D, 1.0 / self.fs,
+            inputs=[c.name.replace(".", "_") for c in self.inputs],
+            outputs=[c.name.replace(".", "_") for c in self.outputs],
+        )  # fmt: skip
+
+    def save(self, folder: str | Path) -> Path:
+        """Write a checkpoint folder; ``LinearModel.load`` reads it back to the same bits."""
+        description = {
+            "linear": {"fs": self.fs, "fit": None if self.fit is None else asdict(self.fit)},
+            "inputs": [c._asdict() for c in self.inputs],
+            "outputs": [c._asdict() for c in self.outputs],
+        }
+        arrays = {name: getattr(self, name) for name in (*_ARRAYS, *_OPTIONAL)}
+        weights = {k: torch.tensor(v) for k, v in arrays.items() if v is not None}
+        return _checkpoint.write(folder, description, weights)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> LinearModel:
+        """The linear model in a checkpoint folder, or in the ``linear/`` folder of a run's folder.
+
+        Raises:
+            ValueError: no checkpoint, a damaged one, or one that holds another kind of model.
+        """
+        description, weights = _checkpoint.read(folder, ("linear", "model"))
+        if "linear" not in description:
+            raise ValueError(f"'{folder}' holds no linear model; lfrtorch.load reads an NL-LFR.")
+        try:
+            made, fit = description["linear"], description["linear"]["fit"]
+            if fit is not None:
+                fit = LinearFit(
+                    **fit | {name: tuple(fit[name]) for name in ("singular_values", "notes")}
+                )
+            arrays = {name: weights[name].numpy() for name in _ARRAYS}
+            optional = {name: weights[name].numpy() for name in _OPTIONAL if name in weights}
+            inputs, outputs = (
+                tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")
+            )
+            nx, nu, ny = len(arrays["A"]), len(inputs), len(outputs)
+            P = (nx + ny) * (nx + nu)
+            for name, shape in (
+                ("A", (nx, nx)), ("B", (nx, nu)), ("C", (ny, nx)), ("D", (ny, nu)),
+                ("u_offset", (nu,)), ("y_offset", (ny,)), ("K", (nx, ny)),
+                ("innovation_covariance", (ny, ny)), ("covariance", (P, P)),
+            ):  # fmt: skip
+                found = (arrays | optional).get(name)
+                if found is not None and found.shape != shape:
+                    raise ValueError(f"{name} is {found.shape}, not {shape}")
+            return cls(
+                **arrays, fs=float(made["fs"]), inputs=inputs, outputs=outputs, **optional, fit=fit
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"'{folder}' is damaged: its description and weights do not fit ({error})."
+            ) from None
+
+    def _z(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
+        f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+        if f.ndim != 1:
+            raise ValueError(f"the frequencies have shape {f.shape}; give one dimension, in Hz.")
+        return np.exp(2j * np.pi * f / self.fs)
+
+
+_ARRAYS = ("A", "B", "C", "D", "u_offset", "y_offset")
+_OPTIONAL = ("K", "innovation_covariance", "covariance")
+
+
+def linear_cell(A: Array, B: Array, C: Array, D: Array) -> LFRCell:
+    """A cell without static nonlinearity."""
+    cell = LFRCell(B.shape[1], C.shape[0], len(A), dtype=torch.float64)
+    with torch.no_grad():
+        for parameter, value in ((cell.A, A), (cell.Bu, B), (cell.Cy, C), (cell.Dyu, D)):
+            parameter.copy_(torch.as_tensor(np.ascontiguousarray(value)))
+    return cell
+
+
+def _zeros(A: Array, B: Array, C: Array, D: Array) -> NDArray[np.complex128]:
+    """Finite invariant zeros, after those at infinity are taken out one by one.
+
+    The eigenvalues of the pencil [A - zI, B; C, D] will not do: rounding moves one at infinity of
+    multiplicity k to a radius of eps^(-1/k), 2e7 for a delay of five samples.
+
+    References:
+        Emami-Naeini and Van Dooren, "Computation of zeros of linear multivariable systems",
+        Automatica 18, 1982.
+    """
+    by_y = np.linalg.norm(np.hstack([C, D]), axis=1)
+    C, D = (M / np.where(by_y > 0, by_y, 1.0)[:, None] for M in (C, D))
+    by_u = np.linalg.norm(np.vstack([B, D]), axis=0)
+    B, D = (M / np.where(by_u > 0, by_u, 1.0) for M in (B, D))
+    limit = SINGULAR * float(np.linalg.norm(np.block([[A, B], [C, D]]), 2))
+    A, B, C, D = _outputs_reduced(A, B, C, D, limit)
+    A, C, B, D = (M.T for M in _outputs_reduced(A.T, C.T, B.T, D.T, limit))
+    zeros = np.linalg.eigvals(A - B @ np.linalg.solve(D, C))  # D is square and regular now
+    return np.asarray(zeros, dtype=np.complex128)
+
+
+def _outputs_reduced(
+    A: Array, B: Array, C: Array, D: Array, limit: float
+) -> tuple[Array, Array, Array, Array]:
+    """A system with the same finite zeros whose D has full row rank."""
+    while True:
+        U, rank = _range(D, limit)
+        C, D = U.T @ C, (U.T @ D)[:rank]
+        V, free = _range(C[rank:].T, limit)
+        C = C[:rank]
+        if not free:
+            return A, B, C, D
+        # Outputs without direct term are 0: the states that they see are, and stay so.
+        V = np.roll(V, -free, axis=1)
+        A, B, C = V.T @ A @ V, V.T @ B, C @ V
+        n = len(A) - free
+        C, D = np.vstack([C[:, :n], A[n:, :n]]), np.vstack([D, B[n:]])
+        A, B = A[:n, :n], B[:n]
+
+
+def _range(M: Array, limit: float) -> tuple[Array, int]:
+    """Orthogonal matrix whose first columns, so many, span the range of M."""
+    U, s, _ = np.linalg.svd(M)
+    return U, int((s > limit).sum())
+
+
+def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
+    """T and T⁻¹ to balanced coordinates by the square-root method (Laub et al. 1987).
+
+    Shape:
+        A: (nx, nx), B: (nx, nu), C: (ny, nx) -> (nx, nx).
+    """
+    Lp, Lq = _square_root(_gramian(A, B @ B.T)), _square_root(_gramian(A.T, C.T @ C))
+    U, s, Vh = np.linalg.svd(Lq.T @ Lp)
+    # A state that is all but uncontrollable or unobservable would be scaled by its rounding error.
+    root = np.sqrt(np.maximum(s, s[0] * np.finfo(float).eps))
+    return (U / root).T @ Lq.T, Lp @ (Vh.T / root)
+
+
+def _gramian(A: Array, Q: Array) -> Array:
+    """P = A P Aᵀ + Q by Smith's doubling.
+
+    scipy's solver forms I - A ⊗ A, which is singular to rounding where two poles are close to the
+    unit circle; the sum of A^k Q A^kᵀ stays positive semidefinite there.
+    """
+    P = Q
+    while np.abs(A).max() > np.finfo(float).eps:
+        P = P + A @ P @ A.T
+        A = A @ A
+    return P
+
+
+def _square_root(gramian: Array) -> Array:
+    values, vectors = np.linalg.eigh((gramian + gramian.T) / 2)
+    return vectors * np.sqrt(np.maximum(values, 0.0))

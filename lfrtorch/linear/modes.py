@@ -1,0 +1,114 @@
+"""Modes of a linear model: which of them matter, and those that only spoil a start.
+
+An order above what the linear approximation carries, as nonlinear systems ask for, leaves the
+estimate modes that fit a few lines of the distortion: close to the unit circle, and next to nothing
+of the output. As part of the start of a nonlinear fit they are of huge sensitivity and hold every
+step short: on the parallel Wiener-Hammerstein stand-in three starts of ten were at 0.6 to 2.5 mV
+after 100 iterations, and with such modes pulled in all of 22 at 0.42 or less after 60.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfrtorch.linear.model import LinearModel, balancing
+from lfrtorch.records import Channel, Record, as_records, without_coordinates
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+DEFECTIVE = 1e8
+"""Condition of the eigenvectors above which modes cannot be told apart."""
+
+MINOR = 1 / 3
+"""Largest share in the output that counts as minor. Of the linear models of Bouc-Wen,
+Wiener-Hammerstein, Silverbox and the parallel Wiener-Hammerstein stand-in (orders 2 to 12, 10
+realisations) spurious modes have 0.01 to 0.29, the others 0.40 and more."""
+
+
+def shares(model: LinearModel, data: Record | Sequence[Record]) -> tuple[Complex, Array]:
+    """Poles, and what the mode of each adds to the output, beside the model's error.
+
+    Args:
+        model: linear model.
+        data: records that it is looked at on.
+
+    Returns:
+        Poles λ, and the rms of what the mode (with its conjugate) adds to the simulated output over
+        the rms of the simulation error; of several outputs the largest.
+
+    Shape:
+        (nx,) and (nx,).
+    """
+    poles, right, left = _modes(model)
+    nx, ny = len(poles), len(model.outputs)
+    # With its conjugate: twice the real part.
+    parts = [
+        (1 + (poles[i].imag != 0)) * (model.C @ np.outer(right[:, i], left[i])).real
+        for i in range(nx)
+    ]
+    outputs = tuple(Channel(f"mode{i}") for i in range(nx * ny))
+    split = replace(
+        model,
+        C=np.concatenate(parts),
+        D=np.zeros((nx * ny, len(model.inputs))),
+        y_offset=np.zeros(nx * ny),
+        outputs=outputs,
+    )
+    added, error = np.zeros((nx, ny)), np.zeros(ny)
+    for record in map(without_coordinates, as_records(data)):
+        driven = replace(
+            record,
+            y=np.zeros((record.samples, nx * ny)),
+            outputs=outputs,
+            start="periodic" if record.start == "periodic" else "zero",
+            weight=1.0,
+            line_weight=None,
+        )
+        added += np.square(split.simulate(driven)[record.skip :]).sum(axis=0).reshape(nx, ny)
+        error += np.square((record.y - model.simulate(record))[record.skip :]).sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.sqrt(added / error)
+    return poles, np.nan_to_num(share, nan=0.0, posinf=np.inf).max(axis=1)
+
+
+def without_slow_minor_modes(
+    model: LinearModel, data: Record | Sequence[Record], minor: float = MINOR
+) -> LinearModel:
+    """The model with no minor mode slower than the slowest one that matters.
+
+    The poles of slower ones are moved onto that one's radius at the same angle, their inputs scaled
+    to the same part in the output under white noise.
+
+    Args:
+        model: linear model.
+        data: records that it is a start for.
+        minor: largest of the ``shares`` that counts as minor; 0 changes nothing.
+
+    Returns:
+        The model in balanced coordinates, without covariance; as it was where nothing is moved.
+    """
+    old, share = shares(model, data)
+    matters = share > minor
+    _, right, left = _modes(model)
+    if not matters.any() or np.linalg.cond(right) > DEFECTIVE:
+        return model
+    radius = np.abs(old[matters]).max()
+    slow = ~matters & (np.abs(old) > radius)
+    if not slow.any() or radius == 0:
+        return model
+    new = np.where(slow, radius * np.exp(1j * np.angle(old)), old)
+    gain = np.sqrt((1 - np.abs(new) ** 2) / (1 - np.abs(old) ** 2))
+    A, B = ((right * new) @ left).real, ((right * gain) @ left @ model.B).real
+    quick = replace(model, A=A, B=B, K=None, innovation_covariance=None, covariance=None)
+    return quick.transformed(*balancing(A, B, model.C))
+
+
+def _modes(model: LinearModel) -> tuple[Complex, Complex, Complex]:
+    """Poles (nx,), right eigenvectors as columns and left as rows: A = right · poles @ left."""
+    poles, right = (np.asarray(part, dtype=np.complex128) for part in np.linalg.eig(model.A))
+    return poles, right, np.linalg.inv(right).astype(np.complex128)

@@ -1,0 +1,128 @@
+"""Order of the best linear approximation: a scan over nx, scored on records that are not fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lfrtorch._checks import integer
+from lfrtorch.linear.bla import data_scaler, estimate_bla
+from lfrtorch.linear.frf import FRF
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.records import Record, as_records
+
+ORDERS = range(1, 13)
+
+MARGIN = 0.01
+"""Relative validation score above the best up to which a lower order is taken."""
+
+
+@dataclass(frozen=True)
+class OrderScan:
+    """Linear models of several orders.
+
+    Args:
+        models: one an order.
+        scores: what chooses: the rms of the simulation error over the validation records, each
+            output relative to its rms; without them the error over the data fitted, times
+            √(1 + p ln M / M) for p parameters and M equations (minimum description length).
+        validated: which of the two.
+        chosen: the lowest order whose validation score is within 1 % of the best; without records
+            for validation that of the best score.
+    """
+
+    models: tuple[LinearModel, ...]
+    scores: tuple[float, ...]
+    validated: bool
+    chosen: int
+
+    @property
+    def orders(self) -> tuple[int, ...]:
+        """nx of each model."""
+        return tuple(model.nx for model in self.models)
+
+    @property
+    def best(self) -> LinearModel:
+        """The model of the order chosen."""
+        return self.models[self.orders.index(self.chosen)]
+
+    @property
+    def singular_values(self) -> tuple[float, ...]:
+        """Of the subspace of the largest order, relative to the size of the outputs."""
+        fit = self.models[-1].fit
+        return () if fit is None else fit.singular_values
+
+    def table(self) -> str:
+        """One line an order."""
+        how = "validation" if self.validated else "MDL"
+        lines = [f"{'nx':>4}  {'fitted':>10}  {how:>10}  {'singular value':>14}  {'pole':>7}"]
+        for model, score in zip(self.models, self.scores, strict=True):
+            s = self.singular_values
+            value = f"{s[model.nx - 1]:.1e}" if model.nx <= len(s) else "-"
+            assert model.fit is not None
+            lines.append(
+                f"{model.nx:4}  {model.fit.rmse:10.5f}  {score:10.5f}  {value:>14}  "
+                f"{np.abs(model.poles).max():7.4f}{'  chosen' if model.nx == self.chosen else ''}"
+            )
+        return "\n".join(lines)
+
+
+def scan_orders(
+    data: Record | Sequence[Record] | FRF,
+    orders: Sequence[int] = ORDERS,
+    *,
+    validation: Record | Sequence[Record] = (),
+    **options: Any,
+) -> OrderScan:
+    """Best linear approximations of several orders, and the lowest that is good enough.
+
+    Args:
+        data: as for ``estimate_bla``.
+        orders: nx of each; those that the data do not reach for are left out.
+        validation: records that choose.
+        options: of ``estimate_bla``.
+
+    Raises:
+        ValueError: no order, or data that reach for none of them.
+    """
+    if not len(orders):
+        raise ValueError("orders is empty; give at least one, for example range(1, 13).")
+    for nx in orders:
+        integer("orders", nx, 1)
+    judges = as_records(validation) if validation else []
+    models: list[LinearModel] = []
+    for nx in sorted(set(orders)):
+        try:
+            models.append(estimate_bla(data, nx, **options))
+        except ValueError:
+            if not models:
+                raise
+            break
+    if judges:
+        scale = data_scaler(judges, offset=True).y_scale
+        scores = [_validation(model, judges, scale) for model in models]
+    else:
+        scores = [_description_length(model, data) for model in models]
+    best = min(scores)
+    limit = best * (1 + MARGIN) if judges else best
+    chosen = next(m.nx for m, s in zip(models, scores, strict=True) if s <= limit)
+    return OrderScan(tuple(models), tuple(scores), bool(judges), chosen)
+
+
+def _validation(model: LinearModel, records: list[Record], scale: np.ndarray) -> float:
+    errors = [((r.y - model.simulate(r)) / scale)[r.skip :] for r in records]
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+
+def _description_length(model: LinearModel, data: Record | Sequence[Record] | FRF) -> float:
+    assert model.fit is not None
+    nx, nu, ny = model.nx, len(model.inputs), len(model.outputs)
+    if isinstance(data, FRF):
+        M = 2 * data.G.size
+    else:
+        M = sum(r.samples - r.skip for r in as_records(data)) * ny
+    p = nx * (nu + ny) + nu * ny
+    return model.fit.rmse * float(np.sqrt(1.0 + p * np.log(M) / M))

@@ -1,0 +1,72 @@
+"""What data must have for a linear model of an order: excitation, length, lines."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lfrtorch.linear.spectral_data import Lines
+from lfrtorch.linear.subspace import shortest, suffice
+from lfrtorch.records import Record
+
+NARROW = 1e-10
+"""Relative size of a direction that the input does not excite."""
+
+
+def check_signals(records: list[Record]) -> None:
+    """Refuse a channel that is constant in all records with a ValueError."""
+    for signals, channels in (
+        ([r.u for r in records], records[0].inputs),
+        ([r.y for r in records], records[0].outputs),
+    ):
+        everything = np.concatenate(signals)
+        for channel, span in zip(channels, np.ptp(everything, axis=0), strict=True):
+            if span == 0:
+                raise ValueError(
+                    f"signal '{channel.name}' is constant in all records; "
+                    "a model needs an input that excites and an output that responds: "
+                    "check the columns."
+                )
+
+
+def check_length(records: list[Record], nx: int) -> None:
+    """Refuse records that are too short for a subspace of the order with a ValueError."""
+    nu, ny = len(records[0].inputs), len(records[0].outputs)
+    lengths = [r.samples for r in records]
+    if not suffice(lengths, nx, nu, ny):
+        raise ValueError(
+            f"the longest of {len(records)} record(s) has {max(lengths)} samples; order nx={nx} "
+            f"with {nu} input(s) and {ny} output(s) needs one of {shortest(nx, nu, ny)}, or many "
+            "shorter ones: record more, or lower nx."
+        )
+
+
+def check_lines(lines: Lines, nx: int) -> None:
+    """Refuse fewer lines than unknowns with a ValueError."""
+    nu, ny = lines.U.shape[1], lines.Y.shape[1]
+    unknowns, equations = nx * (nu + ny) + nu * ny, lines.equations
+    if equations < unknowns:
+        raise ValueError(
+            f"{len(lines.z)} excited line(s) make {equations} equations; order nx={nx} with {nu} "
+            f"input(s) and {ny} output(s) has {unknowns} unknowns: excite more lines, or lower nx."
+        )
+
+
+def narrow(records: list[Record], nx: int) -> list[str]:
+    """A note where the input moves in too few directions to tell all parameters apart."""
+    nu = records[0].u.shape[1]
+    wanted = 2 * nx + 1
+    windows = [
+        np.lib.stride_tricks.sliding_window_view(r.u - r.u.mean(axis=0), wanted, axis=0)
+        for r in records
+        if r.samples >= wanted
+    ]
+    rows = np.concatenate([w.reshape(len(w), -1) for w in windows])
+    rows = rows / np.maximum(np.sqrt((rows**2).mean(axis=0)), 1e-300)
+    size = np.linalg.eigvalsh(rows.T @ rows)
+    rank = int((size > NARROW * size[-1]).sum())
+    if rank == nu * wanted:
+        return []
+    return [
+        f"the input is too narrow: it excites {rank} of the {nu * wanted} directions that "
+        f"order {nx} has (one a frequency and phase); between its frequencies the model is a guess."
+    ]

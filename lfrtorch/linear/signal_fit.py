@@ -1,0 +1,311 @@
+"""Fit of a linear model to signals: simulation error, or prediction error with innovations.
+
+The one-step-ahead predictor of the innovation model x+ = A x + B u + K e, y = C x + D u + e is a
+linear model, too, driven by u and y: x+ = (A - K C) x + (B - K D) u + K y. Both errors are
+therefore simulation errors of a linear cell; a constant among its inputs is the output's offset.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import scipy.linalg
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.linearised import spectral_radius
+from lfrtorch.least_squares.linear_systems import Orthogonal
+from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.linear.model import linear_cell
+from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
+from lfrtorch.linear.subspace import LARGEST_POLE, Start, from_signals
+from lfrtorch.model import Model
+from lfrtorch.records import Record, Scaler
+
+Array = NDArray[np.float64]
+
+MOST_STARTS, SHORT = 8, 200_000
+"""Starts that are refined, up to so many samples times squared states."""
+
+LARGEST_ROWS = 50_000_000
+"""Entries of a Jacobian that is formed whole for a covariance: 400 MB."""
+
+ROUNDING = 1e-12
+"""Relative variance of a state that the inputs do not move."""
+
+OBSERVERS = (0.0, 1e-4, 1e-2, 1.0)
+"""Variance of the state noise over that of the states, times the output error's, of the innovation
+models that a prediction-error fit may start from."""
+
+
+class SignalFit:
+    """Linear fits to records.
+
+    Args:
+        us, ys: normalised signals of each record.
+        records: their starts, windows and weights.
+        offset: whether a constant in the output is free.
+        prediction: whether the error is that of the one-step-ahead prediction.
+        feedthrough: whether D is a parameter; it is 0 otherwise.
+
+    Shape:
+        us: of (T, nu), ys: of (T, ny).
+    """
+
+    def __init__(
+        self,
+        us: Sequence[Array],
+        ys: Sequence[Array],
+        records: Sequence[Record],
+        *,
+        offset: bool,
+        prediction: bool,
+        feedthrough: bool = True,
+    ) -> None:
+        self._us, self._ys = us, ys
+        self.nu, self.ny = us[0].shape[1], ys[0].shape[1]
+        self._offset, self._prediction, self._feedthrough = offset, prediction, feedthrough
+        self._records = [self._driven(*signals) for signals in zip(us, ys, records, strict=True)]
+        nu, ny = self._records[0].u.shape[1], self.ny
+        self._unit = Scaler(np.zeros(nu), np.ones(nu), np.zeros(ny), np.ones(ny))
+
+    def contenders(self, nx: int) -> int:
+        """Starts that are worth a refinement: one of long records, whose starts are good."""
+        return MOST_STARTS if sum(map(len, self._us)) * nx**2 <= SHORT else 1
+
+    def starts(self, nx: int) -> list[Start]:
+        """Subspace estimates of A and C."""
+        return from_signals(self._us, self._ys, nx)
+
+    def with_input_matrices(self, A: Array, C: Array) -> tuple[float, Matrices]:
+        """Cost and system with the best B and D for A and C: y is linear in them."""
+        nu, ny, nx = self.nu, self.ny, len(A)
+        matrices = A, np.zeros((nx, nu)), C, np.zeros((ny, nu))
+        problem = self._problem(matrices, np.zeros((nx, ny)), observed=False)
+        cell = problem.model.lfr.cell
+        cost = problem.cost(problem.residual(problem.theta))
+        if np.isfinite(cost):
+            system, gradient = problem.linearise(problem.theta).system(0.0, TRUNCATION)
+            if np.isfinite(system.scale):
+                theta = problem.theta + system.solve(gradient, 0.0)
+                cost = problem.cost(problem.residual(theta))
+        B, D = (m.detach().numpy()[:, :nu].copy() for m in (cell.Bu, cell.Dyu))
+        return (cost if np.isfinite(cost) else np.inf), (A, B, C, D)
+
+    def state_deviation(self, matrices: Matrices) -> Array:
+        """Standard deviation (nx,) of the states over the records."""
+        A, B, C, D = matrices
+        nu, ny = self.nu, self.ny
+        unit = Scaler(np.zeros(nu), np.ones(nu), np.zeros(ny), np.ones(ny))
+        first = self._records[0]
+        model = Model(LFR(linear_cell(A, B, C, D)), unit, first.fs, (), ())
+        states = []
+        for u, y, record in zip(self._us, self._ys, self._records, strict=True):
+            of_record = replace(record, u=u, y=y, inputs=(), outputs=())
+            model = replace(model, inputs=of_record.inputs, outputs=of_record.outputs)
+            states.append(model.signals(of_record).x[0, :-1].numpy())
+        return np.concatenate(states).std(axis=0)
+
+    def search(self, matrices: Matrices) -> Search:
+        """A search over A, B, C, D and K from the given ones and the best of some observers."""
+        gains = [np.zeros((len(matrices[0]), self.ny))]
+        if self._prediction:
+            gains = [self._observer(matrices, part) for part in OBSERVERS]
+        problems = [self._problem(matrices, K) for K in gains]
+        problem = min(problems, key=lambda p: p.cost(p.residual(p.theta)))
+        return Search(problem, problem.theta)
+
+    def improbability(self, search: Search) -> float:
+        """The cost, and x0ᵀ P⁻¹ x0 of each estimated start state, times the error's variance.
+
+        P is the covariance of the states that the inputs lead to from rest: the cost of the most
+        probable model and start states, where the inputs before the records were like those in it.
+        """
+        problem, state = search.problem, search.state
+        x0 = problem.start_states(state.theta)
+        if self._prediction or not len(x0):
+            return state.cost
+        problem.write(state.theta)
+        driven = torch.cat(
+            [problem.model.lfr.trajectory(batch.u).x.flatten(0, 1) for batch in problem.batches]
+        )
+        spread, axes = torch.linalg.eigh(driven.mT @ driven / len(driven))
+        variances = spread.clamp_min(ROUNDING * float(spread[-1]))
+        unlikely = float(((x0 @ axes).square() / variances).sum())
+        return state.cost * (1.0 + unlikely / problem.size)
+
+    def refined(self, search: Search) -> Refined:
+        """Where a search stands, with the covariance there."""
+        problem, state = search.problem, search.state
+        problem.write(state.theta)
+        cell = problem.model.lfr.cell
+        A, Bu, C, Dyu = (m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu))
+        nu, ny = self.nu, self.ny
+        B, D, K = Bu[:, :nu].copy(), Dyu[:, :nu].copy(), np.zeros((len(A), ny))
+        constant = Dyu[:, -1].copy() if self._offset else None
+        if self._prediction:
+            K = Bu[:, nu : nu + ny].copy()
+            if constant is not None:  # at rest, where the output that enters by K is itself
+                driven = K @ constant + Bu[:, -1]
+                at_rest = np.linalg.solve(np.eye(len(A)) - A - K @ C, driven)
+                constant = np.asarray(constant + C @ at_rest, dtype=np.float64)
+        system, _ = problem.linearise(state.theta).system(0.0, TRUNCATION)
+        assert isinstance(system, Orthogonal)
+        covariance = None
+        if state.iteration:
+            spread = self._spread(problem, state.theta, state.cost, system)
+            covariance = self._of_system(spread, C, D, K)
+        found = Refined(
+            A + K @ C,
+            B + K @ D,
+            C.copy(),
+            D,
+            covariance=covariance,
+            rmse=math.sqrt(state.cost / problem.size),
+            iterations=state.iteration,
+            reason=search.reason,
+            constant=constant,
+        )
+        if not self._prediction:
+            return found
+        pairs = zip(problem.batches, problem.trajectories(state.theta), strict=True)
+        errors = torch.cat([(b.y - t.y)[b.scored.bool()] for b, t in pairs])
+        innovations = np.atleast_2d(np.cov(errors.numpy().T, bias=True))
+        return replace(found, K=K, innovation_covariance=innovations)
+
+    def _spread(
+        self, problem: SimulationError, theta: Tensor, cost: float, system: Orthogonal
+    ) -> Array:
+        """Covariance of θ: of white innovations, or of simulation errors of any spectrum.
+
+        The lines of a stationary error are all but independent, whatever its spectrum: each counts
+        with its own error (White's estimate), unless rows by all parameters take too much room.
+        """
+        inverse, spare = system.inverse.numpy(), max(1, problem.size - system.rank)
+        if self._prediction or problem.size * len(theta) > LARGEST_ROWS:
+            return inverse * (cost / spare)
+        rows, errors = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
+        meat, first = np.zeros_like(inverse), 0
+        for batch in problem.batches:
+            shape = batch.residual_shape
+            last = first + shape.numel()
+            if batch.spectral:  # lines already
+                scores = (rows[first:last] * errors[first:last, None]).reshape(*shape, -1).sum(2)
+            else:
+                J = np.fft.rfft(rows[first:last].reshape(*shape, -1), axis=1)
+                r = np.fft.rfft(errors[first:last].reshape(shape), axis=1)
+                scores = np.einsum("rfop,rfo->rfp", J.conj(), r).real * (2.0 / shape[1])
+                scores[:, 0] /= 2.0
+                if shape[1] % 2 == 0:
+                    scores[:, -1] /= 2.0
+            flat = scores.reshape(-1, scores.shape[-1])
+            meat += flat.T @ flat
+            first = last
+        return inverse @ meat @ inverse * (problem.size / spare)
+
+    def _driven(self, u: Array, y: Array, record: Record) -> Record:
+        """The record with all inputs of the cell: u, for a prediction y, and a constant."""
+        inputs = [u]
+        if self._prediction:
+            inputs.append(y)
+        if self._offset:
+            inputs.append(np.ones((len(u), 1)))
+        start = record.start
+        if self._prediction and start == "periodic":
+            start = "estimated"
+        weights = {"line_weight": None} if start != record.start else {}
+        return replace(
+            record, u=np.hstack(inputs), y=y, start=start, inputs=(), outputs=(), **weights
+        )
+
+    def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> SimulationError:
+        """The simulation error of the cell; unless observed, by B, D and the constant alone."""
+        A, B, C, D = matrices
+        nu, ny = self.nu, self.ny
+        width = self._records[0].u.shape[1]
+        Bu, Dyu = np.zeros((len(A), width)), np.zeros((ny, width))
+        Bu[:, :nu], Dyu[:, :nu] = B - K @ D, D
+        free_B, free_D = np.zeros_like(Bu, dtype=bool), np.zeros_like(Dyu, dtype=bool)
+        free_B[:, :nu], free_D[:, :nu] = True, self._feedthrough
+        if self._prediction:
+            Bu[:, nu : nu + ny] = K
+            free_B[:, nu : nu + ny] = observed
+        if self._offset:
+            free_D[:, -1] = True
+            free_B[:, -1] = observed and self._prediction  # what y0 makes of the states by K
+        first = self._records[0]
+        cell = linear_cell(A - K @ C, Bu, C, Dyu)
+        for parameter in (cell.A, cell.Cy):
+            parameter.requires_grad_(observed)
+        model = Model(LFR(cell), self._unit, first.fs, first.inputs, first.outputs)
+        problem = SimulationError(model, self._records)
+        if observed:
+            measured = slice(nu, nu + ny) if self._prediction else None
+            problem = _Stable(model, self._records, measured)
+        free = {"Bu": free_B, "Dyu": free_D}
+        problem.fixed = torch.cat(
+            [
+                torch.as_tensor(~free[name].ravel())
+                if name in free
+                else torch.zeros(p.numel(), dtype=torch.bool)
+                for name, p in cell.named_parameters()
+                if p.requires_grad
+            ]
+        )
+        return problem
+
+    def _observer(self, matrices: Matrices, part: float) -> Array:
+        """Kalman gain (nx, ny) for state noise of so much of the states' variance."""
+        A, _, C, _ = matrices
+        if part == 0.0:
+            return np.zeros((len(A), self.ny))
+        Q = part * np.diag(self.state_deviation(matrices) ** 2)
+        P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, np.eye(self.ny))
+        return np.linalg.solve(C @ P @ C.T + np.eye(self.ny), C @ P @ A.T).T
+
+    def _of_system(self, covariance: Array, C: Array, D: Array, K: Array) -> Array:
+        """Covariance of A, B, C, D from that of the cell's parameters and start states."""
+        nx, nu, ny, width = len(K), self.nu, self.ny, self._records[0].u.shape[1]
+        sizes = [nx * nx, nx * width, ny * nx, ny * width]
+        ends = np.cumsum(sizes)
+        cells = np.split(np.eye(ends[-1], len(covariance)), ends[:-1])
+        Bu = cells[1].reshape(nx, width, -1)
+        Dyu = cells[3].reshape(ny, width, -1)[:, :nu].reshape(ny * nu, -1)
+        dB = Bu[:, :nu].reshape(nx * nu, -1)
+        dA, dC = cells[0], cells[2]
+        if self._prediction:
+            dK = Bu[:, nu : nu + ny].reshape(nx * ny, -1)
+            eye = np.eye(nx)
+            dA = dA + np.kron(eye, C.T) @ dK + np.kron(K, eye) @ dC
+            dB = dB + np.kron(eye, D.T) @ dK + np.kron(K, np.eye(nu)) @ Dyu
+        change = np.vstack([dA, dB, dC, Dyu])
+        return change @ covariance @ change.T
+
+
+class _Stable(SimulationError):
+    """Simulation error of a linear cell, undefined where a pole passes LARGEST_POLE.
+
+    Args:
+        model, records: as for ``SimulationError``.
+        outputs: which inputs are the measured outputs of a predictor; its system is then stable,
+            too.
+    """
+
+    def __init__(self, model: Model, records: Sequence[Record], outputs: slice | None) -> None:
+        super().__init__(model, records)
+        self._outputs = outputs
+
+    def residual(self, theta: Tensor) -> Tensor:
+        r = super().residual(theta)
+        self.write(theta)
+        cell = self.model.lfr.cell
+        matrices = [cell.A.detach()]
+        if self._outputs is not None:
+            matrices.append((cell.A + cell.Bu[:, self._outputs] @ cell.Cy).detach())
+        stable = all(spectral_radius(A) < LARGEST_POLE for A in matrices)
+        return r if stable else torch.full_like(r, torch.inf)

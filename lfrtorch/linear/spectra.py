@@ -1,0 +1,278 @@
+"""Spectra of records by period, and the lines where their inputs have power."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lfrtorch._checks import lines as checked_lines
+from lfrtorch.linear.regression import Complex, outer
+from lfrtorch.records import Record
+
+Array = NDArray[np.float64]
+Lines = NDArray[np.int64]
+
+RELATIVE_POWER = 1e-4
+"""A line is excited where each input has more than this (-40 dB) of its power at its best line."""
+
+NOISE_RATIO = 30.0
+"""And more than this many times the noise that the periods show, as a mean over NOISE_LINES lines:
+with two periods of one record, a line of noise alone passes once in 1e8."""
+
+NOISE_LINES = 21
+
+NO_POWER = 1e-12
+"""An input has no power at a line where it has less than this of the power of its largest line."""
+
+LARGEST_CHANGE = 0.1
+"""Largest rms deviation of a period of an input from the mean period, relative to the input's rms
+over all records."""
+
+
+class Spectra(NamedTuple):
+    """Spectra Y = √2 / N · DFT of R records, lines 0 to N / 2.
+
+    So |Y|² is the mean square of the sine at a line, and their sum the variance of the signal.
+
+    Args:
+        U, Y: means over the periods of a record.
+        C: covariance of the noise of [Y, U] in one period (P times that of the mean over P
+            periods), pooled over the records.
+        freedom: degrees of freedom of C, which is 0 where there are none.
+        P: numbers of periods.
+        N: samples of a period.
+        resolution: fs / N, Hz.
+
+    Shape:
+        U: (F, R, nu), Y: (F, R, ny), C: (F, ny + nu, ny + nu), P: (R,).
+    """
+
+    U: Complex
+    Y: Complex
+    C: Complex
+    freedom: int
+    P: Lines
+    N: int
+    resolution: float
+
+    def frequencies(self, lines: Lines) -> Array:
+        """Frequencies (F,) of the lines, Hz."""
+        return np.asarray(lines * self.resolution, dtype=np.float64)
+
+
+class Removal(NamedTuple):
+    """How transients are removed: local polynomials of an order, and the freedom these leave."""
+
+    order: int
+    degrees_of_freedom: int
+
+
+def spectra_of_periods(data: Sequence[Record], removal: Removal | None = None) -> Spectra:
+    """Spectra of the last whole periods after ``skip``, less their transients if wanted.
+
+    Raises:
+        ValueError: a record without a period or of another one, or shorter than it (with removal:
+            than two); an input that is constant or does not repeat.
+    """
+    N = _period(data[0])
+    windows = []
+    for record in data:
+        if _period(record) != N:
+            raise ValueError(
+                f"records '{data[0].name}' and '{record.name}' have periods of {N} and "
+                f"{_period(record)} samples; give records of one period."
+            )
+        count = (record.samples - record.skip) // N
+        if not count:
+            raise ValueError(
+                f"record '{record.name}': skip={record.skip} leaves less than one period of {N} "
+                f"out of {record.samples} samples; skip less or measure longer."
+            )
+        if removal and count == 1:
+            raise ValueError(
+                f"record '{record.name}' has one period of {N} samples after skip; "
+                "transient=True needs two or more, as it shows between the lines of the period."
+            )
+        windows.append(slice(record.samples - count * N, record.samples))
+    return _spectra(data, windows, N, removal)
+
+
+def spectra_of_records(data: Sequence[Record]) -> Spectra:
+    """Spectra after ``skip``, over as many samples as the shortest record has there.
+
+    Raises:
+        ValueError: an input that is constant.
+    """
+    N = min(record.samples - record.skip for record in data)
+    return _spectra(data, [slice(record.skip, record.skip + N) for record in data], N)
+
+
+def _period(record: Record) -> int:
+    if record.period is None and record.start != "periodic":
+        raise ValueError(
+            f"record '{record.name}' has no period; give Record.period, or use "
+            "method='local_polynomial'."
+        )
+    return int(record.period or record.samples)
+
+
+def _spectra(
+    data: Sequence[Record], windows: list[slice], N: int, removal: Removal | None = None
+) -> Spectra:
+    """Spectra of whole periods of N samples in a window of each record."""
+    if N < 3:
+        raise ValueError(f"{N} samples have no line between 0 and fs / 2; give more.")
+    constant = np.all(
+        [
+            np.ptp(record.u[window], axis=0) == 0
+            for record, window in zip(data, windows, strict=True)
+        ],
+        axis=0,
+    )
+    if constant.any():
+        raise ValueError(
+            f"input '{data[0].inputs[int(np.argmax(constant))].name}' is constant in all records; "
+            "leave it out, or give records in which it is excited."
+        )
+    ny = data[0].y.shape[1]
+    size = ny + data[0].u.shape[1]
+    C = np.zeros((N // 2 + 1, size, size), np.complex128)
+    means, P, changes, freedom = [], [], [], 0
+    for record, window in zip(data, windows, strict=True):
+        signals = np.concatenate([record.y[window], record.u[window]], axis=1)
+        Z = np.fft.rfft(signals.reshape(-1, N, size), axis=1) * (np.sqrt(2) / N)
+        mean = Z.mean(axis=0)
+        D = (Z - mean).swapaxes(0, 1)
+        count = len(Z) - 1
+        # Without line 0: a drift of the offset is no change of the input.
+        change = np.sum(np.abs(D[1:, :, ny:]) ** 2, axis=(0, 1)) / max(count, 1)
+        if removal:
+            mean, D = _without_transient(signals, N, removal)
+            count = D.shape[1]
+        if count:
+            C += outer(D)
+        freedom += count
+        means.append(mean)
+        P.append(len(Z))
+        changes.append(change)
+    both = np.stack(means, axis=1)
+    Y, U = both[:, :, :ny], both[:, :, ny:]
+    rms = np.sqrt(np.sum(np.abs(U[1:]) ** 2, axis=(0, 1)) / len(data))
+    _check_repetition(data, np.sqrt(changes) / rms, N)
+    C /= max(freedom, 1)
+    return Spectra(U, Y, C, freedom, np.array(P), N, data[0].fs / N)
+
+
+def _without_transient(signals: Array, N: int, removal: Removal) -> tuple[Complex, Complex]:
+    """Mean spectrum over P periods less the transient, and errors with the covariance of one.
+
+    In the spectrum of all P N samples the periods have power at every P-th line only. What the
+    lines about each of these hold is transient and noise: polynomials in the line r, of which the
+    value at r = 0 is taken off (Pintelon and Schoukens, 2012, chapter 7). The window is the same
+    about each line, and so are the weights b of this value; it adds |b|² to the noise.
+
+    Shape:
+        signals: (P N, n) -> (F, n), (F, degrees of freedom, n).
+    """
+    P = len(signals) // N
+    Z = np.fft.fft(signals, axis=0) * (np.sqrt(2) / len(signals))
+    least = removal.order + 1 + removal.degrees_of_freedom
+    n = 1
+    while 2 * (n - n // P) < least:
+        n += 1
+    if 2 * n + 1 > len(signals):
+        raise ValueError(
+            f"{len(signals)} samples have no {2 * n + 1} lines to remove a transient by; use "
+            "longer records, a lower order or fewer degrees_of_freedom."
+        )
+    r = np.arange(-n, n + 1)
+    r = r[r % P != 0]
+    vandermonde = (r[:, None] / n) ** np.arange(removal.order + 1)
+    b = np.linalg.pinv(vandermonde)[0]
+    complement = np.linalg.qr(vandermonde, mode="complete")[0][:, removal.order + 1 :]
+    at = np.arange(N // 2 + 1) * P
+    window = Z[(at[:, None] + r) % len(signals)]
+    D = complement.T @ window * np.sqrt(P * (1 + b @ b))
+    return Z[at] - b @ window, D
+
+
+def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
+    """Refuse an input whose periods change, by the relative deviations (R, nu) of a period."""
+    if change.max() > LARGEST_CHANGE:
+        r, channel = (int(i) for i in np.unravel_index(np.argmax(change), change.shape))
+        raise ValueError(
+            f"record '{data[r].name}': the periods of {N} samples of input "
+            f"'{data[r].inputs[channel].name}' deviate from their mean by "
+            f"{100 * change[r, channel]:.0f} % of its rms; correct Record.period, set Record.skip "
+            "if the periods begin later, or use method='local_polynomial'."
+        )
+
+
+def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | None) -> Lines:
+    """The lines between 0 and fs / 2 where all inputs are excited, or the given ones.
+
+    Raises:
+        ValueError: there is none, or a given one has no power in an input.
+    """
+    last = (spectra.N - 1) // 2
+    inputs = data[0].inputs
+    power = np.mean(np.abs(spectra.U[1 : last + 1]) ** 2, axis=1)  # (lines, nu), from line 1
+    if given is not None:
+        lines = checked_lines(given, spectra.N)
+        weak = np.argwhere(power[lines - 1] <= NO_POWER * power.max(axis=0))
+        if weak.size:
+            line, channel = weak[0]
+            raise ValueError(
+                f"input '{inputs[channel].name}' has no power at line {lines[line]}; give lines "
+                "where all inputs are excited."
+            )
+        return lines
+    noise = np.diagonal(spectra.C, axis1=1, axis2=2).real[1 : last + 1, -len(inputs) :]
+    shown = _smooth(noise, NOISE_LINES) * np.mean(1 / spectra.P)
+    excited = power > np.maximum(RELATIVE_POWER * power.max(axis=0), NOISE_RATIO * shown)
+    lines = 1 + np.flatnonzero(excited.all(axis=1))
+    if not lines.size:
+        counts = zip(inputs, excited.sum(axis=0), strict=True)
+        raise ValueError(
+            "no line is excited in every input (lines excited: "
+            + ", ".join(f"{count} in '{channel.name}'" for channel, count in counts)
+            + "); give the lines, or excite all inputs at the same ones."
+        )
+    return lines
+
+
+def powered_lines(spectra: Spectra, n: int) -> Lines:
+    """The lines between 0 and fs / 2 within n lines of which every input has power.
+
+    What is left out would be estimated from rounding errors.
+    """
+    last = (spectra.N - 1) // 2
+    power = _smooth(np.mean(np.abs(spectra.U[1 : last + 1]) ** 2, axis=1), 2 * n + 1)
+    return 1 + np.flatnonzero((power > NO_POWER * power.max(axis=0)).all(axis=1))
+
+
+def _smooth(power: Array, width: int) -> Array:
+    """Means (F, n) over ``width`` lines about each one, over fewer at the ends."""
+    window = np.ones(min(width, len(power)))
+    count = np.convolve(np.ones(len(power)), window, "same")
+    return np.stack([np.convolve(channel, window, "same") / count for channel in power.T], axis=1)
+
+
+def in_band(lines: Lines, resolution: float, band: tuple[float, float] | None) -> Lines:
+    """The lines in a band of frequencies in Hz, or all of them.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if band is None:
+        return lines
+    inside = lines[(lines * resolution >= band[0]) & (lines * resolution <= band[1])]
+    if not inside.size:
+        raise ValueError(
+            f"no line from {band[0]} to {band[1]} Hz is excited; the excited ones go from "
+            f"{lines[0] * resolution:g} to {lines[-1] * resolution:g} Hz."
+        )
+    return inside

@@ -1,0 +1,224 @@
+"""Spectral lines that a linear model is fitted to: those of records, or a frequency response.
+
+Lines Y = G(z) U are all that a linear model is asked for: a response (U = I, weighted by its
+variance), or periodic records, whose mean squared simulation error is the sum over their lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfrtorch.linear.frf import FRF
+from lfrtorch.records import Record, Scaler, rms_scale
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Weight = Literal["total", "noise", "none"]
+
+DEGREES_OF_FREEDOM = 20
+"""Of a variance that is used as a weight."""
+
+VANISHING = 1e-12
+"""Smallest variance of a line, relative to the largest, that counts as a weight."""
+
+SILENT = 1e-10
+"""Relative amplitude below which a line of the input is not excited."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """What is fitted: Y = G(z) U, and the weight of each error.
+
+    Args:
+        z: points on the unit circle.
+        U, Y: spectra, scaled so that the sum of squared errors is their mean square.
+        weight: of the errors Y - G U, where they do not count alike.
+
+    Shape:
+        z: (F,), U: (F, nu, m), Y: (F, ny, m), weight: (F, ny, m).
+    """
+
+    z: Complex
+    U: Complex
+    Y: Complex
+    weight: Array | None = None
+
+    def weighted(self, errors: Complex) -> Complex:
+        """√weight times errors (F, ny, m), or rows (F, ny, m, K) of them."""
+        if self.weight is None:
+            return errors
+        root = np.sqrt(self.weight)
+        return errors * root.reshape(*root.shape, *[1] * (errors.ndim - 3))
+
+    @property
+    def equations(self) -> int:
+        """Real equations: two a line, one at 0 and fs / 2, for each output and excited column."""
+        real = np.abs(self.z.imag) < 1e-12
+        counts = np.broadcast_to((np.abs(self.U) ** 2).sum(axis=1, keepdims=True) > 0, self.Y.shape)
+        if self.weight is not None:
+            counts = counts & (self.weight > 0)
+        return int((counts.sum(axis=(1, 2)) * np.where(real, 1, 2)).sum())
+
+
+def lines_of(
+    us: Sequence[Array], ys: Sequence[Array], records: Sequence[Record], *, offset: bool
+) -> Lines | None:
+    """The lines of periodic records, or None where their simulation error is no sum over lines.
+
+    As many columns as inputs carry all that matters of any number of records: what is left of the
+    outputs no linear model changes.
+
+    Args:
+        us, ys: normalised signals of each record.
+        records: how they are weighted.
+        offset: whether a constant in the output is free, which takes it out of line 0.
+
+    Shape:
+        us: of (T, nu), ys: of (T, ny).
+    """
+    ny = ys[0].shape[1]
+    if any(r.start != "periodic" or r.skip for r in records):
+        return None
+    if ny > 1 and any(np.ptp(r.weight) > 0 or r.line_weight is not None for r in records):
+        return None
+    groups: dict[int, list[tuple[Complex, Complex]]] = {}
+    means: list[tuple[Complex, Complex, float]] = []
+    total = sum(map(len, us))
+    for u, y, record in zip(us, ys, records, strict=True):
+        N = record.period or len(u)
+        U, Y = (np.fft.rfft(s.reshape(-1, N, s.shape[1]).mean(0), axis=0) / N for s in (u, y))
+        twice = np.full((len(U), 1), 2.0)
+        twice[0] = 1.0
+        if N % 2 == 0:
+            twice[-1] = 1.0
+        weight = np.max(record.weight) * twice * len(u) / total
+        if record.line_weight is not None:
+            weight = weight * record.line_weight[:: len(u) // N]
+        root = np.sqrt(weight)
+        means.append((root[0] * U[0], root[0] * Y[0], float(root[0, 0])))
+        groups.setdefault(N, []).append((root[1:] * U[1:], root[1:] * Y[1:]))
+    parts = [_line_0(means, offset=offset)]
+    for N, group in groups.items():
+        U, Y = (np.stack([pair[side] for pair in group], axis=-1) for side in (0, 1))
+        z = np.exp(2j * np.pi * np.arange(1, len(U) + 1) / N)
+        parts.append((z, *_compressed(U, Y)))
+    m = max(U.shape[2] for _, U, _ in parts)
+
+    def together(which: int) -> Complex:
+        wide = [np.pad(p[which], ((0, 0), (0, 0), (0, m - p[which].shape[2]))) for p in parts]
+        return np.concatenate(wide)
+
+    z, U, Y = np.concatenate([z for z, _, _ in parts]), together(1), together(2)
+    size = np.abs(U).max(axis=(1, 2))
+    excited = size > SILENT * size.max(initial=0.0)
+    return Lines(z[excited], U[excited], Y[excited])
+
+
+def _line_0(
+    means: list[tuple[Complex, Complex, float]], *, offset: bool
+) -> tuple[Complex, Complex, Complex]:
+    """Line 0 of all records, less what a constant common to them makes."""
+    U, Y = (np.stack([mean[side] for mean in means], axis=-1) for side in (0, 1))
+    if offset:
+        one = np.array([weight for _, _, weight in means])
+        one /= max(float(np.linalg.norm(one)), np.finfo(float).tiny)
+        U, Y = (S - np.outer(S @ one, one) for S in (U, Y))
+    return np.ones(1, dtype=complex), *_compressed(U[None], Y[None])
+
+
+def _compressed(U: Complex, Y: Complex) -> tuple[Complex, Complex]:
+    """As many columns as inputs with the same normal equations, where there are more."""
+    nu = U.shape[1]
+    if U.shape[2] <= nu:
+        return U, Y
+    stacked = np.concatenate([U, Y], axis=1).swapaxes(1, 2).conj()
+    R = np.asarray(np.linalg.qr(stacked, mode="r"))[:, :nu].conj().swapaxes(1, 2)
+    return R[:, :nu], R[:, nu:]
+
+
+def lines_of_response(
+    frf: FRF, weight: Weight | Array | None, *, offset: bool
+) -> tuple[Lines, Scaler, bool, list[str]]:
+    """The lines of a response, scaled to channels of unit size.
+
+    Args:
+        frf: the response.
+        weight: as for ``estimate_bla``.
+        offset: whether the means of the records are its operating point.
+
+    Returns:
+        The lines, the scaling, whether the weights are inverse variances, and notes on the choice.
+    """
+    weights, known, notes = _weights(frf, weight)
+    u_scale = 1.0 / rms_scale([np.abs(frf.G).reshape(-1, frf.G.shape[2])], np.zeros(1))
+    G = frf.G * u_scale
+    y_scale = rms_scale([np.abs(G).swapaxes(1, 2).reshape(-1, G.shape[1])], np.zeros(1))
+    size = y_scale[:, None] / u_scale
+    nu, ny = len(u_scale), len(y_scale)
+    offsets = (frf.u_offset, frf.y_offset) if offset else (np.zeros(nu), np.zeros(ny))
+    z = np.exp(2j * np.pi * frf.frequencies / frf.fs)
+    U = np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu))
+    lines = Lines(z, U, frf.G / size, None if weights is None else weights * size**2)
+    return lines, Scaler(offsets[0], u_scale, offsets[1], y_scale), known, notes
+
+
+def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, bool, list[str]]:
+    """Weights (F, ny, nu) of the errors of G, whether they are inverse variances, and notes."""
+    notes: list[str] = []
+    if isinstance(weight, list | tuple):
+        weight = np.asarray(weight, dtype=np.float64)
+    if isinstance(weight, np.ndarray):
+        if weight.shape != frf.G.shape or not (np.isfinite(weight).all() and (weight >= 0).all()):
+            raise ValueError(
+                f"weight has shape {weight.shape}; give finite numbers of at least 0 in the shape "
+                f"of the response, {frf.G.shape}."
+            )
+        if not weight.any():
+            raise ValueError("weight is 0 everywhere; give some lines a positive one.")
+        return weight.astype(np.float64), False, notes
+    variances = {"total": frf.var_total, "noise": frf.var_noise}
+    if weight is None:
+        if frf.var_total is not None:
+            weight = "total"
+        else:
+            weight = "none" if frf.var_noise is None else "noise"
+        if weight == "noise":
+            notes.append("the fit is weighted by the noise alone: the total variance is not known.")
+        elif weight == "none":
+            notes.append("all lines count alike in the fit: no variance is known.")
+    if weight == "none":
+        return None, False, notes
+    if not isinstance(weight, str) or weight not in variances:
+        raise ValueError(
+            f"weight is {weight!r}; use 'total', 'noise', 'none' or an array (F, ny, nu)."
+        )
+    variance = variances[weight]
+    if variance is None:
+        raise ValueError(
+            f"the {weight} variance of the response is not known: {' '.join(frf.notes)} "
+            "Use another weight, or measure more."
+        )
+    if not (variance > 0).any():
+        notes.append("the variance is 0 at all lines, so that they count alike in the fit.")
+        return None, False, notes
+    freedom = frf.realisations - 1 if weight == "total" else frf.experiments * (frf.periods - 1)
+    smooth = _smoothed(variance, 1 if frf.method == "local_polynomial" else freedom)
+    return 1.0 / np.maximum(smooth, VANISHING * smooth.max()), True, notes
+
+
+def _smoothed(variance: Array, degrees_of_freedom: int) -> Array:
+    """Variances (F, ny, nu) averaged over neighbouring lines: a weight must not be drawn by lot.
+
+    One over an estimate of few degrees of freedom has no finite mean.
+    """
+    half = min((DEGREES_OF_FREEDOM // max(1, degrees_of_freedom)) // 2, (len(variance) - 1) // 2)
+    if half == 0:
+        return variance
+    padded = np.pad(variance, ((half, half), (0, 0), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
+    return windows.mean(axis=-1)

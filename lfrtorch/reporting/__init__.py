@@ -1,0 +1,1 @@
+"""Scores, figures, advice and the report of a run."""

@@ -1,0 +1,376 @@
+"""The report of a run as one HTML file that needs no network: numbers, figures, advice."""
+
+from __future__ import annotations
+
+import base64
+import math
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Any, NamedTuple
+
+import jinja2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lfrtorch.analysis.amplitude_margin import LOUDER
+from lfrtorch.analysis.poles import poles_at_rest, roots
+from lfrtorch.dataset import Dataset
+from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.reporting.advice import Advice
+from lfrtorch.reporting.simulations import Response, rms
+
+USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
+"""What the records that are no tests were for."""
+
+FEW = 3
+"""Most tests that the verdict names one by one."""
+
+ALL = "all"
+"""Name of several outputs together."""
+
+Rows = list[list[str]]
+
+
+class Errors(NamedTuple):
+    """RMSE of the linear model and of the NL-LFR, lti / error, and both over the deviation."""
+
+    lti: float
+    error: float
+    ratio: float
+    lti_relative: float
+    relative: float
+
+
+def render(
+    metrics: Mapping[str, Any],
+    result: FitResult,
+    bla: LinearModel,
+    dataset: Dataset,
+    responses: Sequence[Response],
+    images: Mapping[str, bytes],
+    advice: Sequence[Advice],
+    *,
+    views: Mapping[str, Mapping[str, str]] | None = None,
+    config: str = "",
+) -> str:
+    """The page.
+
+    Args:
+        metrics: see :func:`lfrtorch.reporting.scores.metrics`.
+        result: the fit.
+        bla: linear model of all training records.
+        dataset: the records and what others reached on them.
+        responses: all records beside their simulations.
+        images: figures as PNG by name; ``static_map``, ``convergence``, ``frequency_response`` and
+            ``poles_and_zeros`` have their places, and those of ``views`` theirs.
+        advice: what to try next.
+        views: of each test, by its name, captions by the names of its figures.
+        config: of the run.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("lfrtorch.reporting"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html").render(
+        name=dataset.name,
+        date=datetime.now().strftime("%d %B %Y, %H:%M"),
+        sizes=_sizes(metrics),
+        verdict=verdict(responses),
+        advice=advice,
+        scores=_scores(metrics, dataset, responses),
+        data=_data(dataset, responses),
+        tests=[
+            {
+                "name": test,
+                "views": [{"figure": name, "caption": text} for name, text in own.items()],
+            }
+            for test, own in (views or {}).items()
+        ],
+        linear=_linear(bla, result),
+        fit=_fit(metrics, bool(dataset.validation)),
+        search=_search(metrics["sizes_search"]),
+        parameters=_parameters(metrics, result),
+        stability=_stability(metrics["stable_to"]),
+        run=_run(metrics, result, bla, config),
+        images={
+            name: f"data:image/png;base64,{base64.b64encode(png).decode()}"
+            for name, png in images.items()
+        },
+    )
+
+
+def verdict(responses: Sequence[Response]) -> list[str]:
+    """How far the NL-LFR came, beside the linear model: a line for each of a few tests.
+
+    Where there is no test it is said of the validation records, or else of the training ones.
+    """
+    uses = ("test", "validation", "train")
+    use = next(use for use in uses if any(response.use == use for response in responses))
+    shown = []
+    for response in (response for response in responses if response.use == use):
+        channels, name = _channels(response), response.record.name
+        if channels[0][0] == ALL or len(channels) == 1:
+            shown.append((name, channels[0][1], _errors(response, channels[0][2])))
+        else:
+            shown += [(f"{name}, {c}", unit, _errors(response, of)) for c, unit, of in channels]
+    scored = sorted((item for item in shown if item[2].ratio > 0), key=lambda item: item[2].ratio)
+    if len(shown) <= FEW or not scored:
+        return [_line(*item) for item in shown]
+    least, most = (f"{number(e.ratio)} × ({name})" for name, _, e in (scored[0], scored[-1]))
+    relative = [errors.relative for _, _, errors in scored]
+    line = (
+        f"{len(scored)} {use} errors: {least} to {most} below the linear model's, "
+        f"NRMSE {percent(min(relative))} to {percent(max(relative))}"
+    )
+    return [line, *(_line(*item) for item in shown if item not in scored)]
+
+
+def _line(name: str, unit: str, errors: Errors) -> str:
+    if not math.isfinite(errors.error):
+        return f"{name}: the NL-LFR diverges"
+    lower = _to_three_digits(errors.ratio) > 1  # a ratio of 1 + rounding errors is none
+    below = f"error {number(errors.ratio)} × below" if lower else "no error below"
+    error, lti = (f"{number(value)} {unit}".strip() for value in (errors.error, errors.lti))
+    relative = percent(errors.relative)
+    return f"{name}: {below} the linear model's ({error} beside {lti}), NRMSE {relative}"
+
+
+def number(value: float | None) -> str:
+    """Three digits; a dash where it is not known or not finite."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    mantissa, exponent = f"{value:.2e}".split("e")  # the exponent is that of the rounded value
+    if value == 0 or 1e-3 <= abs(_to_three_digits(value)) < 1e5:
+        digits = max(0, 2 - int(exponent)) if value else 0
+        return f"{value:.{digits}f}"
+    return f"{mantissa}e{int(exponent)}"
+
+
+def _to_three_digits(value: float) -> float:
+    return float(f"{value:.2e}")
+
+
+def percent(ratio: float | None) -> str:
+    """100 times the ratio, with its sign."""
+    known = ratio is not None and math.isfinite(ratio)
+    return f"{number(100 * ratio)} %" if known and ratio is not None else "–"
+
+
+def _sizes(metrics: Mapping[str, Any]) -> str:
+    """In words."""
+    sizes = dict(metrics["sizes"])
+    static = (
+        f"polynomial of degree {sizes['degree']}" if "degree" in sizes else f"{sizes['nn']} neurons"
+    )
+    return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
+
+
+def _scores(
+    metrics: Mapping[str, Any], dataset: Dataset, responses: Sequence[Response]
+) -> dict[str, Any]:
+    sizes = metrics["sizes"]["nz"], metrics["sizes"]["nw"]
+    published = [p for p in dataset.published if p.sizes in (None, sizes)]
+    outputs = responses[0].record.outputs
+    several, units = len(outputs) > 1, any(channel.unit for channel in outputs)
+    what = [*["output"] * several, *["unit"] * (several and units)]
+    errors = ["LTI", "NL-LFR", "ratio", "LTI NRMSE", "NRMSE"]
+    tests, others = [], []
+    for response in responses:
+        name, use = response.record.name, response.use
+        for row, (channel, unit, of) in enumerate(_channels(response)):
+            cells = [*[channel, unit][: len(what)], *_cells(_errors(response, of))]
+            if use == "test":
+                known = [number(p.scores.get(name)) if row == 0 else "" for p in published]
+                tests.append([name if row == 0 else "", *cells, *known])
+            else:
+                others.append([*([name, USES[use]] if row == 0 else ["", ""]), *cells])
+    references = [f"{p.label}: {p.reference}" for p in published if tests]
+    if metrics["linear"]:
+        own = ", ".join(f"{test} of {'+'.join(used)}" for test, used in metrics["linear"].items())
+        references.insert(0, f"LTI: a model for each of these: {own}")
+    return {
+        "unit": "" if several else outputs[0].unit,
+        "words": 1 + len(what),
+        "head": ["record", *what, *errors, *(p.label for p in published)],
+        "tests": tests,
+        "references": references,
+        "others_head": ["record", "use", *what, *errors],
+        "others": others,
+    }
+
+
+def _channels(response: Response) -> list[tuple[str, str, slice]]:
+    """Name, unit and columns of each output; before several of one unit all together."""
+    outputs = response.record.outputs
+    units = {channel.unit for channel in outputs}
+    single = [(c.name, c.unit, slice(i, i + 1)) for i, c in enumerate(outputs)]
+    if len(outputs) == 1 or len(units) > 1:
+        return single
+    return [(ALL, units.pop(), slice(None)), *single]
+
+
+def _errors(response: Response, of: slice) -> Errors:
+    """Of some outputs."""
+    lti, error = (
+        float(np.sqrt(np.mean(rms(signal[:, of]) ** 2)))
+        for signal in (response.lti_error, response.error)
+    )
+    deviation = float(np.sqrt(np.mean(np.var(response.scored[:, of], axis=0)))) or math.nan
+    ratio = lti / error if error > 0 else math.nan
+    return Errors(lti, error, ratio, lti / deviation, error / deviation)
+
+
+def _cells(errors: Errors) -> list[str]:
+    shown = number(errors.error) if math.isfinite(errors.error) else "diverges"
+    relative = percent(errors.lti_relative), percent(errors.relative)
+    return [number(errors.lti), shown, number(errors.ratio), *relative]
+
+
+def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
+    train = dataset.train
+    fs, samples = train[0].fs, sum(record.samples for record in train)
+    summary = f"{_count(len(train), 'training record')}, {samples} samples"
+    summary += f", sampled at {fs:g} Hz: {number(samples / fs)} s." if fs != 1.0 else "."
+    if dataset.noise_rms is not None:
+        noise = f"{number(dataset.noise_rms)} {train[0].outputs[0].unit}".strip()
+        summary += f" Noise of {noise} rms was added."
+    channels = []
+    for side, named in (("input", train[0].inputs), ("output", train[0].outputs)):
+        signals = [r.u if side == "input" else r.y for r in train]
+        signal = np.concatenate([s[r.skip :] for s, r in zip(signals, train, strict=True)])
+        channels += [
+            [channel.name, side, channel.unit] + [number(value) for value in _moments(x)]
+            for channel, x in zip(named, signal.T, strict=True)
+        ]
+    records = []
+    for use, r in ((response.use, response.record) for response in responses):
+        counts = str(r.samples), str(r.skip), str(r.period or "–")
+        records.append([r.name, USES.get(use, use), r.source, r.start, *counts])
+    return {
+        "summary": summary,
+        "notes": dataset.notes,
+        "channels": channels,
+        "records": records,
+    }
+
+
+def _moments(x: NDArray[np.float64]) -> list[float]:
+    """Mean, rms about it, smallest and largest sample; a mean that is rounding errors is 0."""
+    mean, deviation = float(np.mean(x)), float(np.std(x))
+    mean = 0.0 if abs(mean) < 1e-12 * deviation else mean
+    return [mean, deviation, float(np.min(x)), float(np.max(x))]
+
+
+def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
+    summary, notes = f"Order {bla.nx}.", ()
+    if bla.fit is not None:
+        notes = bla.fit.notes
+        summary = (
+            f"Order {bla.nx}, {bla.fit.criterion} error {number(bla.fit.rmse)} (normalised), "
+            f"{_count(bla.fit.iterations, 'iteration')}, {bla.fit.reason}."
+        )
+    caption = "Frequency response of the model, over the measured one where the records give one"
+    if bla.covariance is not None:
+        caption += "; band: ± 2 standard deviations"
+    poles: Rows = []
+    for model, values in (("LTI", bla.poles), ("NL-LFR", poles_at_rest(result.model))):
+        poles += [
+            [
+                model,
+                *(number(p[key]) for key in ("frequency", "damping", "radius")),
+                "pair" if p["imag"] else "",
+            ]
+            for p in roots(values, bla.fs)
+        ]
+    return {"summary": summary, "notes": notes, "caption": f"{caption}.", "poles": poles}
+
+
+def _fit(metrics: Mapping[str, Any], validated: bool) -> dict[str, Any]:
+    fit, ranking = metrics["fit"], metrics["ranking"]
+    starts = [
+        [str(s["seed"]), s["reason"], str(s["iterations"])]
+        + [number(s[error]) for error in ("train", "validation", "selection")]
+        for s in ranking
+    ]
+    judge = "validation" if validated else "training"
+    summary = (
+        f"{fit['reason'].capitalize()}; kept iteration {metrics['chosen_iteration']} of "
+        f"{fit['iterations']}, the best on {judge}."
+    )
+    if len(ranking) > 1:
+        summary += f" The best of {len(ranking)} starts."
+    if metrics["averaged"] > 1:
+        summary += f" The model is the mean of the best {metrics['averaged']}, side by side."
+    return {"summary": summary, "starts": starts}
+
+
+def _search(tried: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The sizes that were tried, by rising number of net parameters."""
+    rising = sorted(tried, key=lambda entry: entry["parameters_net"])
+    sizes = [name for name in ("nz", "nw", "nn", "degree") if tried and name in tried[0]]
+    rows = [
+        [str(entry[name]) for name in (*sizes, "parameters", "parameters_net")]
+        + [number(entry[name]) for name in ("seconds", "error", "error_std", "ratio")]
+        + [number(entry["standard_errors_above"]), "chosen" if entry["chosen"] else ""]
+        for entry in rising
+    ]
+    head = [*sizes, "parameters", "net", "seconds", "validation error", "±", "/ LTI", "above", ""]
+    return {"head": head, "rows": rows}
+
+
+def _parameters(metrics: Mapping[str, Any], result: FitResult) -> dict[str, Any]:
+    return {
+        "summary": f"{metrics['parameters']} parameters, {metrics['parameters_net']} without the "
+        "directions that change the parameters and not the output.",
+        "groups": [
+            [name, " × ".join(map(str, weight.shape)), str(weight.numel())]
+            for name, weight in result.model.lfr.cell.named_parameters()
+            if weight.numel()
+        ],
+    }
+
+
+def _stability(stable_to: float) -> str:
+    tried = ", ".join(f"{factor:g}" for factor in LOUDER)
+    if stable_to >= max(LOUDER):
+        return (
+            f"Stable on the training inputs {stable_to:g} times as loud, the most that was tried "
+            f"({tried}). That says nothing of the accuracy there."
+        )
+    stable = f"{stable_to:g} times as loud" if stable_to > 1 else "as they are"
+    return (
+        f"Stable on the training inputs {stable}, and no longer on the next louder ones tried "
+        f"({tried} times): validate at the amplitudes you will use."
+    )
+
+
+def _run(
+    metrics: Mapping[str, Any], result: FitResult, bla: LinearModel, config: str
+) -> dict[str, Any]:
+    fit = metrics["fit"]
+    weight = result.model.lfr.cell.A
+    facts = [
+        ["time of the fit", f"{number(fit['seconds'])} s"],
+        ["an iteration", f"{number(1e3 * fit['seconds_per_iteration'])} ms"],
+    ]
+    if bla.fit is not None:
+        facts.append(["time of the linear model", f"{number(bla.fit.seconds)} s"])
+    facts += [
+        ["machine", f"{platform.machine()}, {_count(os.cpu_count() or 1, 'CPU')}"],
+        ["threads, device, dtype", f"{torch.get_num_threads()}, {weight.device}, "
+         f"{str(weight.dtype).removeprefix('torch.')}"],
+        ["platform", platform.platform()],
+        *([name, number_] for name, number_ in metrics["versions"].items()),
+    ]  # fmt: skip
+    return {"command": metrics["command"] or "–", "facts": facts, "config": config}
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"

@@ -1,0 +1,263 @@
+"""Figures of a linear model and of the response it was found from: they read results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+from numpy.typing import ArrayLike, NDArray
+
+from lfrtorch.linear.frf import FRF
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.order_scan import OrderScan
+from lfrtorch.records import Channel
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+MEASURED, MODEL, DIFFERENCE = "tab:blue", "black", "tab:green"
+TOTAL, NOISE, ODD, EVEN = "tab:red", "0.5", "tab:red", "tab:green"
+
+GRID = 500
+"""Frequencies at which a model is drawn, beside those of its poles."""
+
+LOG_DECADES = 1.5
+"""Band from which on the frequency axis is logarithmic."""
+
+LOWEST = 1e-3
+"""First frequency of a model drawn alone, relative to half the sampling frequency."""
+
+RANGE = 120.0
+"""Most dB that an axis shows: a zero on a grid point is no information."""
+
+STRETCHES = 200
+"""Of the frequency axis: a variance is drawn as its mean over each. Line by line it hid the dots of
+a record of 50000 samples."""
+
+FAR = 2.0
+"""Half width of the z plane that is drawn: sampling puts zeros far out that say little."""
+
+MANY = 2000
+"""Dots from which on they are drawn small."""
+
+TURNS = (1, 1.8, 4.5, 9, 10)
+"""Ticks of a phase: 45, 90, 180 degrees."""
+
+
+def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
+    """Magnitude and phase of the model, and the nonparametric response with its uncertainty.
+
+    Two panels a channel. The model's band is ± 2 standard deviations from the covariance of its
+    parameters, where that is known. Without ``frf`` the model is drawn alone.
+    """
+    ny, nu = len(model.outputs), len(model.inputs)
+    figure = Figure(figsize=(2.5 + 5.5 * nu, 5.5 * ny), layout="constrained")
+    grid = figure.subplots(
+        2 * ny, nu, squeeze=False, sharex=True, height_ratios=[3, 1.5] * ny
+    )  # a row of magnitudes and a row of phases for each output
+    smooth = frequencies(model, frf)
+    f = smooth if frf is None else np.union1d(smooth, frf.frequencies)
+    lines = None if frf is None else np.searchsorted(f, frf.frequencies)
+    G_hat = model.frf(f)
+    std = None if model.covariance is None else model.frf_std(smooth)
+    centre = np.abs(G_hat[np.searchsorted(f, smooth)])
+    for i, output in enumerate(model.outputs):
+        for j, source in enumerate(model.inputs):
+            magnitude, phase = grid[2 * i, j], grid[2 * i + 1, j]
+            fit = G_hat[:, i, j]
+            angle = np.unwrap(np.angle(fit))
+            if frf is not None and lines is not None:
+                G = frf.G[:, i, j]
+                _dots(magnitude, frf.frequencies, _decibel(G), "nonparametric", MEASURED)
+                difference = _decibel(G - fit[lines])
+                _dots(magnitude, frf.frequencies, difference, "difference", DIFFERENCE)
+                for variance, label, colour in (
+                    (frf.var_total, "total std", TOTAL),
+                    (frf.var_noise, "noise std", NOISE),
+                ):
+                    if variance is not None:
+                        level = _mean(frf.frequencies, variance[:, i, j])
+                        magnitude.plot(*level, lw=1.2, color=colour, label=label)
+                # Measured phases stand in the turn of the model's: noise makes no jumps of 360°.
+                turned = angle[lines] + np.angle(G * fit[lines].conj())
+                _dots(phase, frf.frequencies, np.degrees(turned), "nonparametric", MEASURED)
+            magnitude.plot(f, _decibel(fit), lw=1.0, color=MODEL, label="model")
+            phase.plot(f, np.degrees(angle), lw=1.0, color=MODEL, label="model")
+            limits = _limit(magnitude)
+            if std is not None:
+                low, high = (centre[:, i, j] + sign * 2 * std[:, i, j] for sign in (-1, 1))
+                low = np.maximum(low, 10 ** (-RANGE / 20) * high.max())
+                band = _decibel(low), _decibel(high)
+                magnitude.fill_between(
+                    smooth, *band, color=MODEL, alpha=0.25, lw=0, label="model ± 2 std"
+                )
+                magnitude.set_ylim(limits)  # a band may reach down to zero
+            title = f"{output.name} / {source.name}"
+            magnitude.set(title=title, ylabel=_unit_label("magnitude", output, source))
+            phase.set(ylabel="phase (deg)")
+            phase.yaxis.set_major_locator(MaxNLocator(5, steps=TURNS))
+    _frequency_axis(grid, f[0], f[-1])
+    _legend(figure, grid[0, 0])
+    return figure
+
+
+def poles_and_zeros(model: LinearModel) -> Figure:
+    """Poles and zeros in the z plane, as ``zeros`` names them, with the unit circle."""
+    figure = Figure(figsize=(7.5, 5.5), layout="compressed")
+    ax = figure.subplots()
+    angle = np.linspace(0, 2 * np.pi, 361)
+    ax.plot(np.cos(angle), np.sin(angle), lw=0.8, color="0.6")
+    ax.axhline(0, lw=0.5, color="0.8", zorder=0)
+    ax.axvline(0, lw=0.5, color="0.8", zorder=0)
+    found = zeros(model)
+    for k, (channel, values) in enumerate(found.items()):
+        label = f"zeros {channel}" if channel else "zeros"
+        colour = MEASURED if len(found) == 1 else f"C{k % 10}"
+        ax.plot(values.real, values.imag, "o", mfc="none", ms=7, color=colour, label=label)
+    ax.plot(model.poles.real, model.poles.imag, "x", ms=7, color=MODEL, label="poles")
+    every = np.concatenate(list(found.values()))
+    reach = np.maximum(np.abs(every.real), np.abs(every.imag))
+    width = min(FAR, 1.1 * float(reach.max(initial=1.0)))
+    ax.set(xlim=(-width, width), ylim=(-width, width), aspect="equal")
+    if (reach > width).any():
+        ax.set_title(f"{(reach > width).sum()} zero(s) beyond the frame")
+    ax.set(xlabel="real part", ylabel="imaginary part")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    return figure
+
+
+def distortion(frf: FRF) -> Figure:
+    """Levels at the output of the fast method: signal, odd and even distortion, noise.
+
+    The distortions are drawn as they were measured, noise included: what stands out of the noise is
+    nonlinear. One panel an output.
+
+    Raises:
+        ValueError: a response that was estimated by another method.
+    """
+    levels = frf.distortion
+    if levels is None:
+        raise ValueError(
+            f"the response was estimated by the method '{frf.method}', which does not tell odd and "
+            "even distortion apart; use estimate_frf(records, method='fast')."
+        )
+    ny = len(frf.outputs)
+    figure = Figure(figsize=(8, 1.5 + 3.0 * ny), layout="constrained")
+    grid = figure.subplots(ny, 1, squeeze=False, sharex=True)
+    for i, (output, ax) in enumerate(zip(frf.outputs, grid[:, 0], strict=True)):
+        for level, label, colour in (
+            (levels.output, "output", MEASURED),
+            (levels.odd, "odd distortion and noise", ODD),
+            (levels.even, "even distortion and noise", EVEN),
+        ):
+            _dots(ax, level.frequencies, _decibel(np.sqrt(level.power[:, i])), label, colour)
+        noise = _mean(levels.output.frequencies, levels.output.noise[:, i])
+        ax.plot(*noise, lw=1.2, color=NOISE, label="noise")
+        _limit(ax)
+        ax.set(ylabel=f"{output.name} (dB{_reference(output.unit)} rms)")
+    _frequency_axis(grid, frf.frequencies[0], frf.frequencies[-1])
+    _legend(figure, grid[0, 0])
+    return figure
+
+
+def order_scan(scan: OrderScan) -> Figure:
+    """Scores and errors of the fit against order, the order chosen marked; singular values."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    errors, carried = figure.subplots(1, 2)
+    score = "validation" if scan.validated else "score (MDL)"
+    fitted = [np.nan if m.fit is None else m.fit.rmse for m in scan.models]
+    errors.semilogy(scan.orders, fitted, "s-", ms=4, lw=0.8, color="0.5", label="fitted")
+    errors.semilogy(scan.orders, scan.scores, "o-", ms=5, color=MEASURED, label=score)
+    errors.set(ylabel="error, normalised")
+    s = np.asarray(scan.singular_values)[: 2 * max(scan.orders)]
+    carried.semilogy(np.arange(1, len(s) + 1), s, "o-", ms=5, color=MEASURED, label="_")
+    carried.set(ylabel="singular value of the subspace, relative")
+    for ax in (errors, carried):
+        ax.axvline(scan.chosen, color=TOTAL, ls=":", label=f"chosen: {scan.chosen}")
+        ax.set(xlabel="order nx")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.grid(True, which="both", alpha=0.2)
+        ax.legend()
+    return figure
+
+
+def zeros(model: LinearModel) -> dict[str, Complex]:
+    """Transmission zeros of a square model under the name ``""``, else the zeros by channel."""
+    if len(model.inputs) == len(model.outputs):
+        return {"": model.zeros()}
+    return {
+        f"{output.name}/{source.name}": model.zeros(i, j)
+        for i, output in enumerate(model.outputs)
+        for j, source in enumerate(model.inputs)
+    }
+
+
+def frequencies(model: LinearModel, frf: FRF | None = None) -> Array:
+    """Hz at which a model is drawn: a grid over the band of the response, and the resonances."""
+    lines = np.array([LOWEST, 1.0]) * model.fs / 2 if frf is None else frf.frequencies
+    first, last = float(lines[0]), float(lines[-1])
+    spaced = np.geomspace if _wide(first, last) else np.linspace
+    resonances = np.abs(np.angle(model.poles)) * model.fs / (2 * np.pi)
+    f = np.union1d(spaced(first, last, GRID), resonances)
+    return f[(f >= first) & (f <= last)]
+
+
+def _wide(first: float, last: float) -> bool:
+    return first > 0 and last > first * 10**LOG_DECADES
+
+
+def _frequency_axis(grid: NDArray[np.object_], first: float, last: float) -> None:
+    for ax in grid.ravel():
+        if _wide(first, last):
+            ax.set_xscale("log")
+            steps = (1.0,) if last > first * 1e3 else (1.0, 2.0, 5.0)
+            ax.xaxis.set_major_locator(LogLocator(subs=steps))
+            ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            ax.xaxis.set_minor_formatter(NullFormatter())
+        if last > first:
+            ax.set_xlim(first, last)
+        ax.grid(True, which="major", alpha=0.2)
+    for ax in grid[-1]:
+        ax.set_xlabel("frequency (Hz)")
+
+
+def _dots(ax: Axes, f: Array, level: Array, label: str, colour: str) -> None:
+    ax.plot(f, level, ".", ms=2.5 if len(f) < MANY else 1.0, color=colour, label=label)
+
+
+def _mean(f: Array, variance: Array) -> tuple[Array, Array]:
+    """Frequencies and dB of a variance, its mean over each stretch of the axis that has lines."""
+    spaced = np.geomspace if _wide(f[0], f[-1]) else np.linspace
+    stretch = np.searchsorted(spaced(f[0], f[-1], STRETCHES + 1)[1:-1], f, side="right")
+    _, first, count = np.unique(stretch, return_index=True, return_counts=True)
+    at, mean = (np.add.reduceat(values, first) / count for values in (f, variance))
+    return at, _decibel(np.sqrt(mean))
+
+
+def _legend(figure: Figure, ax: Axes) -> None:
+    """One legend beside the panels, which all have the same lines."""
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper", markerscale=5)
+
+
+def _limit(ax: Axes) -> tuple[float, float]:
+    """The limits of the axis, no more than RANGE apart."""
+    low, high = ax.get_ylim()
+    return ax.set_ylim(max(low, high - RANGE), high)
+
+
+def _decibel(amplitude: ArrayLike) -> Array:
+    """Amplitude in dB; gaps where it is 0."""
+    amplitude = np.abs(np.asarray(amplitude))
+    return 20.0 * np.log10(np.where(amplitude > 0, amplitude, np.nan))
+
+
+def _unit_label(what: str, output: Channel, source: Channel) -> str:
+    units: Sequence[str] = (output.unit, source.unit)
+    return f"{what} (dB{_reference('/'.join(u or '1' for u in units) if any(units) else '')})"
+
+
+def _reference(unit: str) -> str:
+    return f", re 1 {unit}" if unit else ""

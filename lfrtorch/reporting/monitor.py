@@ -1,0 +1,192 @@
+"""What a user sees while a fit runs, a progress line and TensorBoard, and what is left of it."""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from time import monotonic
+from typing import TextIO
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+from torch.utils.tensorboard import SummaryWriter
+
+from lfrtorch.engine.simulate import spectral_radius
+from lfrtorch.fitting.multistart import Round
+from lfrtorch.fitting.trainer import Progress
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+from lfrtorch.reporting import plots
+
+
+class ProgressLine:
+    """One live line on a terminal; elsewhere a line now and then.
+
+    Args:
+        every: iterations between lines where the output is not a terminal.
+        stream: where to write; standard output where left out.
+    """
+
+    def __init__(self, every: int = 10, stream: TextIO | None = None) -> None:
+        self.every = every
+        self.stream = sys.stdout if stream is None else stream
+        self._unseen = ""
+
+    def __call__(self, model: Model, progress: Progress) -> None:
+        """Show the progress."""
+        live = self.stream.isatty()
+        text = progress_text(progress, model.outputs[0].unit)
+        shown = live or progress.iteration % self.every == 0
+        self._unseen = "" if shown else text + "\n"
+        if shown:
+            self.stream.write(f"\r{text}\033[K" if live else text + "\n")
+            self.stream.flush()
+
+    def close(self) -> None:
+        """End the live line; elsewhere show the last iteration."""
+        self.stream.write("\n" if self.stream.isatty() else self._unseen)
+
+
+def progress_text(progress: Progress, unit: str) -> str:
+    """Iteration, errors (a star marks the best so far), optimiser's scalars, time left."""
+    parts = [
+        f"{progress.iteration:>{len(str(progress.limit))}}/{progress.limit}",
+        f"train {progress.train:.3e} {unit}".rstrip(),
+    ]
+    if not math.isnan(progress.validation):
+        star = "*" if progress.best else " "
+        parts.append(f"validation {progress.validation:.3e} {unit}".rstrip() + star)
+    shown = {"damping": "damping", "gain_ratio": "gain", "gradient_norm": "|gradient|"}
+    for key, label in shown.items():
+        if key in progress.report and math.isfinite(progress.report[key]):
+            parts.append(f"{label} {progress.report[key]:.2g}")
+    if progress.iteration:
+        parts.append(f"{progress.seconds_left:.0f} s left")
+    return "  ".join(parts)
+
+
+class StartsLine:
+    """A line for each round of several starts; on a terminal the count of iterations between.
+
+    Args:
+        starts: how many there are.
+        unit: of the errors.
+        stream: where to write; standard output where left out.
+    """
+
+    def __init__(self, starts: int, unit: str = "", stream: TextIO | None = None) -> None:
+        self.starts, self.unit, self._count = starts, unit, 0
+        self.stream = sys.stdout if stream is None else stream
+
+    def __call__(self, model: Model, progress: Progress) -> None:
+        """Count an iteration of any of the starts."""
+        self._count += 1
+        if self.stream.isatty():
+            self.stream.write(f"\r{self._count} iterations of {self.starts} starts\033[K")
+            self.stream.flush()
+
+    def round(self, ended: Round) -> None:
+        """Show a round that has ended."""
+        judged = [(s.selection, s.validation, s.train) for s in ended.starts]
+        errors = [next(e for e in each if not math.isnan(e)) for each in judged]
+        numbers = {"best": errors[0], "median": median(errors), "worst": max(errors)}
+        text = (
+            f"round {ended.number} of {ended.count}: {len(errors)} start(s) to iteration "
+            f"{max(s.iterations for s in ended.starts)}, "
+            + ", ".join(f"{name} {value:.3e}" for name, value in numbers.items())
+        )
+        text = f"{text} {self.unit}".rstrip() + f", {ended.seconds:.0f} s"
+        self.stream.write(f"\r{text}\033[K\n" if self.stream.isatty() else text + "\n")
+        self.stream.flush()
+
+
+class TensorBoard:
+    """Scalars of every iteration, and figures of the validation record now and then.
+
+    Args:
+        folder: of the event file.
+        record: record whose spectrum and static map are drawn, usually the validation record; left
+            out for scalars alone.
+        y_lti: output of the linear model on it, (T, ny), for the error beside ours.
+        every: iterations between figures; they cost about half a second.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        record: Record | None = None,
+        y_lti: plots.Array | None = None,
+        every: int = 50,
+    ) -> None:
+        self.writer = SummaryWriter(str(folder))
+        self.record, self.y_lti, self.every = record, y_lti, every
+
+    def history(self, history: Sequence[Progress]) -> None:
+        """Log iterations of the past."""
+        for progress in history:
+            step = progress.iteration
+            self.writer.add_scalar("rmse/train", progress.train, step)
+            if not math.isnan(progress.validation):
+                self.writer.add_scalar("rmse/validation", progress.validation, step)
+            for name, value in progress.report.items():
+                self.writer.add_scalar(f"optimiser/{name}", value, step)
+
+    def __call__(self, model: Model, progress: Progress) -> None:
+        """Log one iteration."""
+        step = progress.iteration
+        self.history([progress])
+        radius = spectral_radius(model.lfr.cell.A.detach())
+        self.writer.add_scalar("model/spectral_radius_A", radius, step)
+        if self.record is not None and self.y_lti is not None and step % self.every == 0:
+            y_hat, signals = model.simulate(self.record), model.signals(self.record)
+            self.figure("validation/spectrum", plots.spectrum(self.record, self.y_lti, y_hat), step)
+            drawn = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
+            self.figure("validation/static_map", drawn, step)
+
+    def figure(self, name: str, figure: Figure, step: int) -> None:
+        """Add a figure."""
+        self.writer.add_figure(name, figure, step, close=False)
+
+    def image(self, name: str, png: bytes, step: int) -> None:
+        """Add a figure that is drawn already."""
+        pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+        self.writer.add_image(name, pixels, step, dataformats="HWC")
+
+    def text(self, name: str, text: str) -> None:
+        """Add a text in a fixed-width font."""
+        self.writer.add_text(name, "\n".join("    " + line for line in text.splitlines()))
+
+    def close(self) -> None:
+        """Write what is pending."""
+        self.writer.close()
+
+
+class Checkpoint:
+    """The best iterate so far as a checkpoint on disk: what is left of a run that is killed.
+
+    One may be called by several starts of a fit: it keeps the best of all.
+
+    Args:
+        folder: of the checkpoint.
+        every: least seconds between two of them, the first is that of the start.
+        least: score that an iterate must beat, that of the checkpoint there.
+    """
+
+    def __init__(self, folder: str | Path, every: float = 5.0, least: float = math.inf) -> None:
+        self.folder, self.every = Path(folder), every
+        self._due, self._least = -math.inf, least
+        self._unwritten: Model | None = None
+
+    def __call__(self, model: Model, progress: Progress) -> None:
+        """Keep the iterate where it is the best; write the best one where it is time."""
+        if progress.best and progress.score < self._least:
+            self._unwritten, self._least = copy.deepcopy(model), progress.score
+        if self._unwritten is not None and monotonic() >= self._due:
+            self._unwritten.save(self.folder)
+            self._unwritten, self._due = None, monotonic() + self.every

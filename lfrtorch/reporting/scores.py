@@ -1,0 +1,240 @@
+"""Scores of a run: one entry a test record, as a table for people and as JSON for programs."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from typing import Any
+
+from lfrtorch.analysis.amplitude_margin import loudest
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.fitting.size_search import SizeSearch
+from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.metrics import nrmse, rmse
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+SEED_STEP = 1000
+"""Between the seeds of several starts."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Simulation errors on one record, after its skip window.
+
+    Args:
+        rmse, lti_rmse: of the model and of the linear model, in ``unit``; None without the latter.
+        nrmse: rmse over the standard deviation of the measured output.
+        unit: of the outputs.
+        source: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
+        samples, skip: length of the record, and how many at its beginning do not count.
+    """
+
+    rmse: float
+    lti_rmse: float | None
+    nrmse: float
+    unit: str
+    source: str
+    samples: int
+    skip: int
+
+
+def score(model: Model, bla: LinearModel | None, record: Record) -> Score:
+    """Scores of the model and of the linear model, where there is one, on one record."""
+    y_hat = model.simulate(record)
+    return Score(
+        rmse=rmse(record, y_hat),
+        lti_rmse=None if bla is None else rmse(record, bla.simulate(record)),
+        nrmse=nrmse(record, y_hat),
+        unit=", ".join(dict.fromkeys(c.unit for c in record.outputs)),
+        source=record.source,
+        samples=record.samples,
+        skip=record.skip,
+    )
+
+
+def seeds(seed: int, starts: int) -> list[int]:
+    """Seeds of several random starts; those of neighbouring seeds have none in common."""
+    return [seed + SEED_STEP * number for number in range(starts)]
+
+
+def metrics(
+    result: FitResult,
+    bla: LinearModel,
+    dataset: Dataset,
+    *,
+    own: Mapping[str, LinearModel] | None = None,
+    seed: int,
+    data_seed: int | None,
+    command: str,
+    search: SizeSearch | None = None,
+) -> dict:
+    """What ``metrics.json`` holds, scores by test record; None where a number is not finite.
+
+    Args:
+        result: the fit.
+        bla: linear model of all training records.
+        dataset: what was fitted, chosen on and is scored.
+        own: linear models of single tests, by name (see ``Dataset.linear``).
+        seed: of the first random start.
+        data_seed: of simulated data.
+        command: that made it.
+        search: for the sizes, where they were not given.
+    """
+    model = result.model
+    entries = evaluation(model, bla, dataset, own=own, command=command)
+    entries["data"] |= {
+        "samples": sum(record.samples for record in dataset.train),
+        "seed": data_seed,
+    }
+    entries |= {
+        "sizes_search": [] if search is None else search.entries(),
+        "fit": {
+            "iterations": result.iterations,
+            "seconds": result.seconds,
+            "seconds_per_iteration": result.seconds_per_iteration,
+            "reason": result.reason,
+        },
+        "chosen_iteration": result.chosen_iteration,
+        "stable_to": loudest(model, dataset.train),
+        "starts": max(1, len(result.starts)),
+        "averaged": result.averaged,
+        "ranking": [
+            {"seed": seeds(seed, start.number + 1)[-1], **asdict(start)} for start in result.starts
+        ],
+    }
+    return _finite(entries)
+
+
+def evaluation(
+    model: Model,
+    bla: LinearModel | None,
+    dataset: Dataset,
+    *,
+    own: Mapping[str, LinearModel] | None = None,
+    command: str,
+) -> dict:
+    """What ``metrics`` has without a fit: a model, beside a linear one where there is one, on data.
+
+    Args:
+        model, bla: what is scored.
+        dataset, own, command: see :func:`metrics`.
+    """
+    own = own or {}
+    validation = [score(model, bla, record) for record in dataset.validation]
+    selection = [score(model, bla, record) for record in dataset.selection]
+    entries = {
+        "bench": dataset.name,
+        "sizes": model.sizes,
+        "parameters": model.parameters,
+        "parameters_net": model.parameters_net,
+        "data": {"noise_rms": dataset.noise_rms, "notes": list(dataset.notes)},
+        "validation": {
+            "rmse": _pooled([s.rmse for s in validation], validation),
+            "lti_rmse": _pooled([s.lti_rmse for s in validation], validation),
+            "records": {
+                record.name: asdict(s)
+                for record, s in zip(
+                    (*dataset.validation, *dataset.selection),
+                    (*validation, *selection),
+                    strict=True,
+                )
+            },
+        },
+        "scores": {
+            record.name: asdict(score(model, own.get(record.name, bla), record))
+            for record in dataset.tests
+        },
+        "linear": {name: list(dataset.linear[name]) for name in own},
+        "command": command,
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("lfrtorch", "torch", "numpy", "scipy", "numba")},
+        },
+    }
+    return _finite(entries)
+
+
+def table(result: dict, published: Sequence[Published]) -> str:
+    """The benchmark's table: our linear model and NL-LFR beside the published ones, in one unit."""
+    sizes = result["sizes"]
+    mine = (sizes["nz"], sizes["nw"])
+    others = [p for p in published if p.sizes in (None, mine)]
+    head = ["record", "source", "samples", "skip", "LTI", "NL-LFR", *(p.label for p in others)]
+    rows = [
+        [name, s["source"], str(s["samples"]), str(s["skip"])]
+        + [_number(s["lti_rmse"]), _number(s["rmse"])]
+        + [_number(p.scores.get(name)) for p in others]
+        for name, s in result["scores"].items()
+    ]
+    for name, s in result["validation"]["records"].items():
+        chosen = [name, "not fitted", str(s["samples"]), str(s["skip"])]
+        chosen += [_number(s["lti_rmse"]), _number(s["rmse"])]
+        rows.append(chosen + [_number(None)] * len(others))
+    first, *lines = _aligned([head, *rows], left=(0, 1))
+    scored = {**result["validation"]["records"], **result["scores"]}
+    units = {s["unit"] for s in scored.values()} - {""}
+    title = f"Simulation RMSE{f' ({next(iter(units))})' if len(units) == 1 else ''}"
+    static = f"degree {sizes['degree']}" if "degree" in sizes else f"{sizes['nn']} neurons"
+    title += f", nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
+    if not rows:
+        return f"{title}: nothing is scored, as there is no test and no validation record"
+    references = [f"{p.label}: {p.reference}" for p in others]
+    if result["linear"]:
+        models = ", ".join(f"{n} of {'+'.join(r)}" for n, r in result["linear"].items())
+        references.insert(0, f"LTI: a model for each of these: {models}")
+    rule = "-" * max(map(len, [first, *lines]))
+    return "\n".join([title, rule, first, rule, *lines, rule, *references])
+
+
+def starts_table(result: dict) -> str:
+    """All starts of a fit, the best first."""
+    head = ["seed", "iterations", "training", "validation", "selection", ""]
+    rows = [
+        [
+            str(s["seed"]),
+            str(s["iterations"]),
+            _number(s["train"]),
+            _number(s["validation"]),
+            _number(s["selection"]),
+            s["reason"],
+        ]
+        for s in result["ranking"]
+    ]
+    return "\n".join(["Starts, the best iterate of each", *_aligned([head, *rows], left=(5,))])
+
+
+def _aligned(rows: Sequence[Sequence[str]], left: Sequence[int]) -> list[str]:
+    """Lines of a table with columns of one width, some of them flush left."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.ljust(w) if i in left else cell.rjust(w)
+            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _pooled(values: list[float | None], scores: list[Score]) -> float | None:
+    """RMSE over several records, each with the weight of its scored samples."""
+    counts = [s.samples - s.skip for s in scores]
+    squares = [n * v**2 for n, v in zip(counts, values, strict=True) if v is not None]
+    return (sum(squares) / sum(counts)) ** 0.5 if squares else None
+
+
+def _finite(entry: Any) -> Any:
+    """The same nested entries with None for every number that JSON cannot hold."""
+    if isinstance(entry, dict):
+        return {key: _finite(value) for key, value in entry.items()}
+    if isinstance(entry, list):
+        return [_finite(value) for value in entry]
+    return None if isinstance(entry, float) and not math.isfinite(entry) else entry
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if 1e-3 <= abs(value) < 1e4 else f"{value:.2e}"

@@ -1,0 +1,82 @@
+"""A record beside its simulations: errors of each output, in its unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfrtorch.dataset import Dataset
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What the linear model and the NL-LFR make of a record, in physical units.
+
+    Args:
+        record: the measurement.
+        use: ``"train"``, ``"validation"`` or ``"test"``.
+        y_lti, y_hat: simulated outputs.
+
+    Shape:
+        y_lti, y_hat: (T, ny).
+    """
+
+    record: Record
+    use: str
+    y_lti: Array
+    y_hat: Array
+
+    @property
+    def scored(self) -> Array:
+        """Measured output after the skip window (scored samples, ny)."""
+        return self.record.y[self.record.skip :]
+
+    @property
+    def error(self) -> Array:
+        """Of the NL-LFR, after the skip window (scored samples, ny)."""
+        return self.scored - self.y_hat[self.record.skip :]
+
+    @property
+    def lti_error(self) -> Array:
+        """Of the linear model, after the skip window (scored samples, ny)."""
+        return self.scored - self.y_lti[self.record.skip :]
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the NL-LFR's output has samples that are not finite."""
+        return not bool(np.isfinite(self.y_hat).all())
+
+
+def respond(
+    model: Model,
+    bla: LinearModel,
+    dataset: Dataset,
+    own: Mapping[str, LinearModel],
+) -> list[Response]:
+    """All records beside their simulations; tests with linear models of their own have those."""
+    used = {
+        "train": dataset.train,
+        "validation": dataset.validation,
+        "selection": dataset.selection,
+        "test": dataset.tests,
+    }
+    found = []
+    for use, records in used.items():
+        for record in records:
+            lti = own.get(record.name, bla) if use == "test" else bla
+            found.append(Response(record, use, lti.simulate(record), model.simulate(record)))
+    return found
+
+
+def rms(signal: Array) -> Array:
+    """Root mean square (n,) of the channels of a signal (T, n); not finite where it diverges."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.sqrt(np.mean(np.square(signal), axis=0))

@@ -1,0 +1,94 @@
+"""Figure of a measurement before any fit: signals, amplitudes and spectra."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.signal
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from lfrtorch.reporting.plots import envelope
+from lfrtorch.survey.measurement import Survey
+from lfrtorch.survey.signal import LEAST, SignalSurvey, longest_run
+
+Array = NDArray[np.float64]
+
+INPUT, OUTPUT, BAND, CLIPPED = "tab:blue", "tab:green", "0.9", "tab:red"
+
+RANGE = 120.0
+"""Most dB that a spectrum shows."""
+
+STRETCHES = 3000
+"""Of the frequency axis: the largest line of each is drawn."""
+
+BELOW = 3.0
+"""The frequency axis begins at the lowest end of a band divided by this."""
+
+BINS = 60
+
+
+def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
+    """A row a signal: against time, how often which value, amplitude spectrum with the band.
+
+    Args:
+        found: the survey.
+        signals: the inputs, then the outputs; NaN leaves a gap.
+        title: above all.
+
+    Shape:
+        signals: (T, nu + ny).
+    """
+    rows = len(found.signals)
+    figure = Figure(figsize=(13, 1.2 + 2.0 * rows), layout="constrained")
+    grid = figure.subplots(rows, 3, squeeze=False, sharex="col", width_ratios=[3.2, 0.8, 2.6])
+    fs = 1.0 if found.fs is None else found.fs
+    t = np.arange(len(signals)) / fs
+    for one, signal, (time, values, lines) in zip(found.signals, signals.T, grid, strict=True):
+        colour = INPUT if one in found.inputs else OUTPUT
+        time.plot(*envelope(t, signal), lw=0.6, color=colour)
+        for end in one.clipped:
+            time.axhline(end.value, lw=1.0, ls="--", color=CLIPPED)
+        time.set(ylabel=str(one.channel), xlim=(0, max(t[-1], 1 / fs)))
+        known = signal[np.isfinite(signal)]
+        share = np.full(len(known), 100 / max(len(known), 1))
+        values.hist(known, BINS, weights=share, orientation="horizontal", color=colour)
+        values.set_ylim(time.get_ylim())
+        values.tick_params(labelleft=False)
+        _spectrum(lines, one, signal, fs, colour)
+    clipped = any(one.clipped for one in found.signals)
+    heads = (
+        f"signal{' (red: clipped)' if clipped else ''}",
+        "",
+        "spectrum (grey: 99 % of the power)",
+    )
+    for ax, head in zip(grid[0], heads, strict=True):
+        ax.set_title(head, fontsize="medium")
+    time, values, lines = grid[-1]
+    time.set_xlabel("sample" if found.fs is None else "time (s)")
+    values.set_xlabel("% of samples")
+    lowest = min((one.band[0] for one in found.signals if one.band is not None), default=fs / 100)
+    lines.set(xscale="log", xlim=(lowest / BELOW, fs / 2))
+    lines.set_xlabel(f"frequency ({'cycles/sample' if found.fs is None else 'Hz'})")
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def _spectrum(ax: Axes, one: SignalSurvey, signal: Array, fs: float, colour: str) -> None:
+    """Amplitude in dB against frequency of the longest part without gaps; its band in grey."""
+    unit = one.channel.unit
+    ax.set_ylabel(f"dB, re 1 {unit}" if unit else "dB")
+    ax.grid(True, which="major", alpha=0.2)
+    first, length = longest_run(np.isfinite(signal))
+    if length < LEAST or one.band is None:
+        return
+    part = signal[first : first + length]
+    f, power = scipy.signal.periodogram(part, fs, window="hann", scaling="spectrum")
+    edges = np.geomspace(f[1], f[-1], STRETCHES)
+    starts = np.unique(np.searchsorted(f, edges[edges <= f[-1]]))
+    level = 10 * np.log10(np.maximum(2 * np.maximum.reduceat(power, starts), 1e-300))
+    ax.plot(f[starts], level, lw=0.6, color=colour)
+    ax.axvspan(*one.band, color=BAND, zorder=0, lw=0)
+    top = float(level.max())
+    ax.set_ylim(max(float(level.min()) - 5, top - RANGE), top + 5)

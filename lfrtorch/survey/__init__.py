@@ -1,0 +1,1 @@
+"""What data look like before a fit."""

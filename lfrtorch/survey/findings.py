@@ -1,0 +1,363 @@
+"""What in a measurement will hurt a model, and what to do about it, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+
+from lfrtorch.records import Record, as_records
+from lfrtorch.survey.causality import Lags, lags
+from lfrtorch.survey.measurement import Survey, survey
+from lfrtorch.survey.signal import SignalSurvey, longest_run
+
+Array = NDArray[np.float64]
+
+SHORT = 300
+"""Samples below which a record is short: a small NL-LFR model has 50 to 100 parameters."""
+
+ENOUGH = 100
+"""Samples from which on it can be said what a record excites."""
+
+MOST = 2**21
+"""Samples of a record that are looked at by ``findings``, its first ones after ``skip``."""
+
+STILL, STRETCHES, REST = 0.2, 200, 0.05
+"""Inputs stand still where all of them stay within REST of their rms for this share of the record,
+as seen in so many stretches."""
+
+STUCK = 0.1
+"""Share of the record in which an output does not change at all, while an input does."""
+
+OVERSAMPLED, WANTED = 50, 10
+"""All power lies below fs over the first; decimation leaves it below fs over the second."""
+
+COARSE, FEW = 0.05, 200
+"""An output is coarse where its steps are more than this of its rms, in records of more samples."""
+
+FEW_FREQUENCIES, LINE = 5, 1e-4
+"""An input of fewer frequencies is narrow; one counts where it has this share of the power of the
+strongest."""
+
+LOBE = 6
+"""Lines, in a row, that one sine has in the spectrum of a record, windowed."""
+
+NARROW = 0.1
+"""Or an input whose band is narrower than this times its centre."""
+
+SAME = 0.999
+"""Correlation of two inputs that carry the same signal."""
+
+DRIFT, ALIKE, OTHERS = 0.2, 3.0, 0.05
+"""An output drifts where a straight line explains this share of its variance, with slopes in each
+third of the record within this factor, and no more than the last of an input or its magnitude."""
+
+BEFORE, AFTER, CERTAIN = -0.15, 0.5, -0.4
+"""The output comes first where the causality is below the first and in reverse above the second.
+A reverse gain that rises with frequency speaks against it: an integrator, fed through, has it."""
+
+COHERENT, UNRELATED = 0.1, 0.05
+"""Coherence beyond chance from which on lags mean something, and below which nothing follows."""
+
+DELAY, SHARP = 8, 0.5
+"""Least samples of a delay that is worth a shift, and its share of the lag of the peak."""
+
+
+class Finding(NamedTuple):
+    """A sentence, and its kind: what it would be called in all records."""
+
+    kind: str
+    text: str
+
+
+def examine(found: Survey, u: Array, y: Array) -> list[Finding]:
+    """What is found in a measurement; nothing in one that was made well.
+
+    Args:
+        found: its survey.
+        u, y: its signals, NaN where a sample is missing. Without inputs it is not known which
+            signals are outputs, and nothing is said of what lies between them.
+
+    Shape:
+        u: (T, nu), y: (T, ny).
+    """
+    findings = [*_levels(found, u, y)]
+    u, y = u[found.whole], y[found.whole]
+    if len(y) >= ENOUGH:
+        findings += _excitation(found, u)
+        findings += _relations(found, u, y)
+    return findings
+
+
+def findings(records: Record | Sequence[Record]) -> list[str]:
+    """What will hurt a model of the records, and what to do about it, a sentence each.
+
+    A sentence names a record where there are several.
+
+    Raises:
+        ValueError: no records, or records of different channels.
+    """
+    data = as_records(records)
+    by_kind: dict[str, list[tuple[str, str]]] = {}
+    for r in data:
+        scored = slice(r.skip, r.skip + MOST)
+        found = survey(
+            r.u[scored], r.y[scored], r.fs, inputs=r.inputs, outputs=r.outputs, period=r.period
+        )
+        for kind, text in examine(found, r.u[scored], r.y[scored]):
+            by_kind.setdefault(kind, []).append((r.name, text))
+    sentences = []
+    for (name, text), *more in by_kind.values():
+        others = f" and {len(more)} more" if more else ""
+        sentences.append(text if len(data) == 1 else f"record '{name}'{others}: {text}")
+    return sentences
+
+
+def _levels(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
+    """Missing samples, constant, stuck, clipped and coarse signals, a short record."""
+    roles = bool(found.inputs)
+    T = len(y)
+    for one in found.signals:
+        name = one.channel.name
+        if one.missing == T:
+            yield Finding(f"missing {name}", f"'{name}' has no values at all; leave it out.")
+        elif one.missing:
+            yield Finding(
+                f"missing {name}",
+                f"'{name}' misses {one.missing} of {T} samples, up to {one.gap} in a row; "
+                "fill short gaps by interpolation; data.gaps=split cuts the record at them.",
+            )
+        if one.values == 1:
+            told = f"'{name}' is constant at {one.mean:.6g}"
+            if not roles:
+                text = f"{told}: it tells nothing."
+            elif one in found.inputs:
+                text = (
+                    f"input {told}: it has no power and tells nothing; leave it out of the inputs."
+                )
+            else:
+                text = f"output {told}: it does not respond; check the sensor and the column."
+            yield Finding(f"constant {name}", text)
+    still = _still(found.inputs, u)
+    if still[1] >= STILL * max(T, ENOUGH):
+        yield Finding(
+            "still",
+            f"{_listed(found.inputs)} {'is' if len(found.inputs) == 1 else 'are'} constant in "
+            f"{100 * still[1] / T:.0f} % of the record (samples {still[0]} to {sum(still)}): "
+            "little is learnt there; cut it off, or excite the system all the time.",
+        )
+    for one, signal in zip(found.outputs, y.T, strict=True):
+        name, kind = one.channel.name, "output " if roles else ""
+        for end in one.clipped:
+            what = "largest" if end is one.maximum else "smallest"
+            yield Finding(
+                f"clipped {name} {what}",
+                f"{kind}'{name}' has its {what} value {end.value:.6g} in {end.samples} samples "
+                f"({100 * end.samples / T:.2g} %), {end.run} in a row: it is clipped. Where the "
+                "sensor does it, measure again with more range; where the system does, a model "
+                "can learn it.",
+            )
+        first, length = longest_run(np.diff(signal) == 0)
+        length += 1
+        stuck = length >= STUCK * T and one.values > 2 and not one.clipped
+        if stuck and not (roles and _rests(found.inputs, u[first : first + length])):
+            yield Finding(
+                f"stuck {name}",
+                f"{kind}'{name}' stays at {signal[first]:.6g} for {length} samples "
+                f"({100 * length / T:.0f} % of the record)"
+                f"{' while the input moves' if roles else ''}: check the sensor.",
+            )
+        if T > FEW and one.values > 2 and one.step > COARSE * one.rms:
+            yield Finding(
+                f"coarse {name}",
+                f"{kind}'{name}' has {one.values} different values, in steps of {one.step:.3g} "
+                f"({100 * one.step / one.rms:.0f} % of its rms): no model comes below an rms error "
+                f"of about {one.step / np.sqrt(12):.2g}; use more of the converter's range.",
+            )
+    if T < SHORT:
+        yield Finding(
+            "short",
+            f"the record has {T} samples, which is short: a small nonlinear model has 50 to 100 "
+            "parameters; measure longer.",
+        )
+
+
+def _excitation(found: Survey, u: Array) -> Iterator[Finding]:
+    """What inputs in a stretch (T, nu) without gaps excite, and how fast it was sampled."""
+    T, fs, unit = len(u), found.fs or 1.0, _unit(found)
+    for one, signal in zip(found.inputs, u.T, strict=True):
+        if one.band is None:
+            continue
+        name, (low, high) = one.channel.name, one.band
+        if one.values == 2:
+            yield Finding(
+                f"binary {name}",
+                f"input '{name}' has two values only: of a nonlinearity at the input nothing shows "
+                "between them; use a signal of many levels, as a multisine.",
+            )
+        count = _frequencies(signal)
+        if count < FEW_FREQUENCIES:
+            yield Finding(
+                f"narrow {name}",
+                f"input '{name}' excites {count} frequenc{'y' if count == 1 else 'ies'} or so, "
+                f"{low:.4g} to {high:.4g} {unit}: enough for a linear model of order {count} and "
+                "no more; excite the band where the model is used.",
+            )
+        elif high - low < NARROW * (high + low) / 2:
+            yield Finding(
+                f"narrow {name}",
+                f"input '{name}' excites {low:.4g} to {high:.4g} {unit} only: elsewhere a model is "
+                "a guess; excite the band where it is used.",
+            )
+    bands = [one.band for one in found.signals]
+    if bands and all(b is not None and b[1] < fs / OVERSAMPLED for b in bands):
+        highest = max(b[1] for b in bands if b is not None)
+        factor = int(fs / (WANTED * highest)) if highest > 0 else 1
+        yield Finding(
+            "oversampled",
+            f"all power lies below {highest:.3g} {unit}, fs / {fs / highest:.0f}: the record is "
+            f"oversampled; decimate by {factor} (scipy.signal.decimate) for a fit that is "
+            "faster and better conditioned.",
+        )
+    period = found.inputs[0].period if found.inputs else None
+    if period is not None and period < T < 2 * period:
+        yield Finding(
+            "periods",
+            f"the record has {T / period:.2f} periods of {period} samples: less than two tell no "
+            "noise from distortion; measure more, or cut it to one in steady state.",
+        )
+    for i in range(u.shape[1]):
+        for j in range(i):
+            if bands[i] is None or bands[j] is None:
+                continue
+            correlation = float(np.corrcoef(u[:, i], u[:, j])[0, 1])
+            if abs(correlation) > SAME:
+                names = found.inputs[j].channel.name, found.inputs[i].channel.name
+                yield Finding(
+                    f"same {names}",
+                    f"inputs '{names[0]}' and '{names[1]}' carry the same signal (correlation "
+                    f"{correlation:.4f}): what each does cannot be told; leave one out.",
+                )
+
+
+def _relations(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
+    """What lies between inputs (T, nu) and outputs (T, ny) without gaps: order, delay, drift."""
+    between = {
+        (i, j): pair
+        for i in range(y.shape[1])
+        for j in range(u.shape[1])
+        if (pair := lags(u[:, j], y[:, i])) is not None
+    }
+    if between:
+        (i, j), pair = max(between.items(), key=lambda item: item[1].coherence)
+        if _first(pair):
+            names = found.outputs[i].channel.name, found.inputs[j].channel.name
+            yield Finding(
+                "swapped",
+                f"output '{names[0]}' comes before input '{names[1]}': are inputs and outputs "
+                "swapped? (Or a controller makes the input from the output.)",
+            )
+            return
+    for i, output in enumerate(found.outputs):
+        pairs = {j: pair for (k, j), pair in between.items() if k == i}
+        name = output.channel.name
+        if pairs and sum(p.coherence - p.chance for p in pairs.values()) < UNRELATED:
+            yield Finding(
+                f"unrelated {name}",
+                f"hardly anything of output '{name}' follows from the inputs linearly: other "
+                "columns, times that do not fit, noise, or a purely even nonlinearity, where there "
+                "is no linear model to start from.",
+            )
+        for j, pair in pairs.items():
+            if (
+                pair.coherence - pair.chance > COHERENT
+                and pair.causality > AFTER
+                and pair.delay >= max(DELAY, SHARP * pair.peak)
+            ):
+                lasting = "" if found.fs is None else f" ({pair.delay / found.fs:.3g} s)"
+                yield Finding(
+                    f"delay {name} {j}",
+                    f"a delay of about {pair.delay} samples{lasting} from input "
+                    f"'{found.inputs[j].channel.name}' to output '{name}': shift the output by it, "
+                    "or a model spends as many states on it.",
+                )
+        yield from _drift(output, y[:, i], u)
+
+
+def _first(pair: Lags) -> bool:
+    """Whether the output comes before the input."""
+    return (
+        pair.coherence - pair.chance > COHERENT
+        and pair.causality < BEFORE
+        and pair.reverse > AFTER
+        and (pair.rise < 1 or pair.causality < CERTAIN)
+    )
+
+
+def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Finding]:
+    """Whether an output (T,) drifts, and the inputs (T, nu) and their magnitudes do not."""
+    share, slope = _trend(y)
+    thirds = [_trend(part)[1] for part in np.array_split(y, 3)] if len(y) >= SHORT else [0.0]
+    steady = all(slope * third > 0 and 1 / ALIKE < third / slope < ALIKE for third in thirds)
+    centred = u - u.mean(axis=0)
+    others = [_trend(v)[0] for v in (*centred.T, *np.abs(centred).T)]
+    if share > DRIFT and steady and max(others, default=1.0) < OTHERS:
+        yield Finding(
+            f"drift {output.channel.name}",
+            f"output '{output.channel.name}' drifts by {slope * len(y):.3g} over the record, "
+            f"{abs(slope) * len(y) / output.rms:.1f} times its rms, and no input does: take the "
+            "line off (scipy.signal.detrend) where the sensor drifts; leave it where the system "
+            "integrates.",
+        )
+
+
+def _trend(signal: Array) -> tuple[float, float]:
+    """Share of the variance that a straight line explains, and its slope per sample."""
+    k = np.arange(len(signal)) - (len(signal) - 1) / 2
+    slope = float(k @ signal) / float(k @ k)
+    variance = float(np.var(signal))
+    return (slope**2 * float(k @ k) / (len(k) * variance) if variance else 0.0), slope
+
+
+def _still(inputs: Sequence[SignalSurvey], u: Array) -> tuple[int, int]:
+    """First sample and length of the longest part of inputs (T, nu) in which none moves."""
+    if not any(one.rms > 0 for one in inputs):
+        return 0, 0
+    rest = REST * np.array([one.rms for one in inputs])
+    edges = np.linspace(0, len(u), min(STRETCHES, len(u)) + 1).astype(int)
+    low, high = (extreme.reduceat(u, edges[:-1]) for extreme in (np.fmin, np.fmax))
+    longest, last = (0, 0), 0
+    for first in range(len(low)):
+        last = max(first, last)
+        while last < len(low) and np.all(
+            high[first : last + 1].max(axis=0) - low[first : last + 1].min(axis=0) <= rest
+        ):
+            last += 1
+        longest = max(longest, (int(edges[last] - edges[first]), int(edges[first])))
+    return longest[1], longest[0]
+
+
+def _rests(inputs: Sequence[SignalSurvey], part: Array) -> bool:
+    """Whether no input moves in a part (T, nu) of the record."""
+    spread = np.fmax.reduce(part) - np.fmin.reduce(part)
+    return not np.any(spread > REST * np.array([one.rms for one in inputs]))
+
+
+def _frequencies(signal: Array) -> int:
+    """How many frequencies a signal (T,) excites, about."""
+    _, power = scipy.signal.periodogram(signal, window="hann")
+    excited = power > LINE * power.max()
+    groups = np.sum(np.diff(excited.astype(np.int8), prepend=0) == 1)
+    return int(max(groups, np.ceil(np.sum(excited) / LOBE)))
+
+
+def _listed(signals: Sequence[SignalSurvey]) -> str:
+    kind = "input" if len(signals) == 1 else "inputs"
+    return f"{kind} " + ", ".join(f"'{one.channel.name}'" for one in signals)
+
+
+def _unit(found: Survey) -> str:
+    return "cycles/sample" if found.fs is None else "Hz"

@@ -1,0 +1,93 @@
+"""A measurement before any fit: the numbers of its signals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lfrtorch.periods import find_period
+from lfrtorch.records import Channel
+from lfrtorch.survey.signal import SignalSurvey, longest_run, survey_signal
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a measurement is like.
+
+    Args:
+        inputs, outputs: numbers of each signal.
+        fs: sampling frequency in Hz; None where unknown: frequencies are in cycles per sample.
+        whole: the longest part without missing samples.
+    """
+
+    inputs: tuple[SignalSurvey, ...]
+    outputs: tuple[SignalSurvey, ...]
+    fs: float | None
+    whole: slice
+
+    @property
+    def signals(self) -> tuple[SignalSurvey, ...]:
+        """Inputs, then outputs."""
+        return self.inputs + self.outputs
+
+
+def survey(
+    u: ArrayLike,
+    y: ArrayLike,
+    fs: float | None = None,
+    *,
+    inputs: Sequence[Channel] = (),
+    outputs: Sequence[Channel] = (),
+    period: int | None = None,
+) -> Survey:
+    """Numbers of each signal.
+
+    Args:
+        u: inputs as measured, NaN where a sample is missing; no channel where it is not known which
+            signals are inputs.
+        y: outputs, likewise.
+        fs: sampling frequency in Hz.
+        inputs, outputs: names and units; u1, u2 ... and y1, y2 ... where left out.
+        period: samples of a period of the inputs; looked for where left out.
+
+    Shape:
+        u: (T, nu), y: (T, ny); (T,) is one channel.
+
+    Raises:
+        ValueError: different lengths, or other numbers of names than of channels.
+    """
+    u, y = _columns(u), _columns(y)
+    if len(u) != len(y):
+        raise ValueError(
+            f"the inputs have {len(u)} samples and the outputs {len(y)}; "
+            "give the signals of one record."
+        )
+    named = [*_named(inputs, u, "u"), *_named(outputs, y, "y")]
+    signals = np.hstack([u, y])
+    first, length = longest_run(np.asarray(np.isfinite(signals).all(axis=1)))
+    whole, nu = slice(first, first + length), u.shape[1]
+    if period is None and nu and length:
+        period = find_period(u[whole])
+    surveys = []
+    for signal, channel in zip(signals.T, named, strict=True):
+        part = signal[whole]
+        own = period if nu or not length else find_period(part)
+        surveys.append(survey_signal(signal, part, channel, fs=fs or 1.0, period=own))
+    return Survey(tuple(surveys[:nu]), tuple(surveys[nu:]), fs, whole)
+
+
+def _columns(signals: ArrayLike) -> Array:
+    array = np.asarray(signals, dtype=np.float64)
+    return array[:, None] if array.ndim == 1 else array
+
+
+def _named(given: Sequence[Channel], signals: Array, prefix: str) -> tuple[Channel, ...]:
+    count = signals.shape[1]
+    if given and len(given) != count:
+        raise ValueError(f"{len(given)} names are given for {count} channels; name each of them.")
+    return tuple(given) or tuple(Channel(f"{prefix}{i + 1}") for i in range(count))

@@ -1,0 +1,167 @@
+"""Scores of a checkpoint from the command line: the table of a run, JSON, messages."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import configuration, file_overrides
+from reference import measure, random_cell, random_model
+
+import lfrtorch
+import train
+from lfrtorch.dataset import Dataset, Published
+from scripts import evaluate
+
+MODEL = random_model(random_cell(), fs=50.0)
+LINEAR = lfrtorch.LinearModel(
+    *(getattr(MODEL.lfr.cell, name).detach().numpy() for name in ("A", "Bu", "Cy", "Dyu")),
+    fs=50.0, u_offset=np.zeros(1), y_offset=np.zeros(1),
+    inputs=MODEL.inputs, outputs=MODEL.outputs,
+)  # fmt: skip
+
+
+def dataset(fs: float = 50.0, name: str = "u1", unit: str = "N") -> Dataset:
+    """A steady state and a record from rest, both off by 0.25 mm where they are scored."""
+    periodic, rest = measure(MODEL, 64, start="periodic"), measure(MODEL, 80, seed=1, skip=30)
+    inputs = (lfrtorch.Channel(name, unit),)
+    tests = [
+        replace(record, y=record.y + 0.25, fs=fs, name=called, source="simulated", inputs=inputs)
+        for record, called in ((periodic, "steady"), (rest, "rest"))
+    ]
+    validation = replace(tests[1], name="validation")
+    paper = Published("paper", {"rest": 0.125}, "A (2001)")
+    return Dataset(
+        "small", [validation], [validation], tests, published=(paper,), notes=("a note",),
+        linear={"rest": ("validation",)},
+    )  # fmt: skip
+
+
+DATA = "+data={_target_: cli.test_evaluate.dataset}"
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Path:
+    MODEL.save(tmp_path / "run" / "model")
+    LINEAR.save(tmp_path / "run" / "linear")
+    return tmp_path / "run"
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *words])
+    evaluate.main()
+
+
+@pytest.mark.numeric
+def test_scores_are_those_of_the_model_from_the_start_of_each_record(
+    run_folder: Path, tmp_path: Path, monkeypatch, capsys
+):
+    out = tmp_path / "scores.json"
+    run(monkeypatch, f"checkpoint={run_folder}", DATA, f"out={out}", "nx=7")
+    found = json.loads(out.read_text())
+    assert found["checkpoint"] == str(run_folder)
+    assert set(found["scores"]) == {"steady", "rest"}
+    for record in dataset().tests:
+        score = found["scores"][record.name]
+        assert score["rmse"] == pytest.approx(0.25, rel=1e-8)
+        assert score["lti_rmse"] == lfrtorch.rmse(record, LINEAR.simulate(record))
+        assert (score["samples"], score["skip"]) == (record.samples, record.skip)
+    assert found["validation"]["rmse"] == pytest.approx(0.25, rel=1e-8)
+    assert found["sizes"]["nx"] == 2
+    assert "scripts/evaluate.py" in found["command"]
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    for words in ("note: a note", "Simulation RMSE (mm), nx 2, nz 1", "steady ", "paper: A (2001)"):
+        assert words in printed.out
+    assert "note: the linear model is that of all training records" in printed.out
+    rest = next(line for line in printed.out.splitlines() if line.startswith("rest "))
+    assert rest.split()[1:4] == ["simulated", "80", "30"]
+    assert rest.split()[-2:] == ["0.25", "0.125"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "scores.json"]
+
+
+def test_the_model_folder_of_a_run_will_do(run_folder: Path, monkeypatch, capsys):
+    run(monkeypatch, f"checkpoint={run_folder / 'model'}", DATA)
+    assert "no linear model is scored" not in capsys.readouterr().out
+
+
+def test_without_a_linear_model_its_column_is_empty(tmp_path: Path, monkeypatch, capsys):
+    MODEL.save(tmp_path / "alone")
+    run(monkeypatch, f"checkpoint={tmp_path / 'alone'}", DATA, f"out={tmp_path / 'a.json'}")
+    found = json.loads((tmp_path / "a.json").read_text())
+    assert found["scores"]["rest"]["lti_rmse"] is None
+    assert found["validation"]["lti_rmse"] is None
+    printed = capsys.readouterr().out
+    assert "has no folder linear/, so no linear model is scored" in printed
+    rest = next(line for line in printed.splitlines() if line.startswith("rest "))
+    assert rest.split()[-3:] == ["-", "0.25", "0.125"]
+
+
+@pytest.mark.numeric
+def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypatch, capsys):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    words = [*file_overrides(csv), "nx=1", "nn=2", "trainer.max_iter=1"]
+    train.identify(configuration(*words), folder)
+    run(monkeypatch, f"checkpoint={folder}", *words, f"out={tmp_path / 'scores.json'}")
+    found = json.loads((tmp_path / "scores.json").read_text())
+    metrics = json.loads((folder / "metrics.json").read_text())
+    for part in ("scores", "validation", "sizes", "parameters_net"):
+        assert found[part] == metrics[part]
+    table = capsys.readouterr().out.split("Simulation RMSE")
+    assert table[1].split("\nnext: ")[0].strip() == table[2].split("\n\n")[0].strip()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([DATA], "no model chosen: add checkpoint=DIR"),
+        (["checkpoint=/nowhere", DATA], "there is no '/nowhere'; give the folder of a run"),
+        (["checkpoint=RUN"], "no data chosen: add +bench=boucwen"),
+        (["checkpoint=RUN", DATA, "out=scores.txt"], "the scores are JSON: name it FILE.json"),
+        (["checkpoint=RUN", DATA, "out=RUN/there.json"], "there.json' exists; give another name"),
+        (["checkpoint=RUN/linear", DATA], "holds a linear model"),
+        (["checkpoint=RUN", DATA[:-1] + ", fs: 25}"], "sampled at 25 Hz and the model at 50.0 Hz"),
+        (["checkpoint=RUN", DATA[:-1] + ", name: v}"], "has the inputs u1 (N) and the data v (N);"),
+        (
+            ["checkpoint=RUN", DATA[:-1] + ", unit: kN}"],
+            "has the inputs u1 (N) and the data u1 (kN);",
+        ),
+        (["checkpoint=RUN", "+bench=nonsense"], "nonsense"),
+    ],
+)
+@pytest.mark.usefixtures("untraced")
+def test_user_errors_are_one_message(
+    words: list[str], message: str, run_folder: Path, monkeypatch, capsys
+):
+    (run_folder / "there.json").write_text("old")
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, *(word.replace("RUN", str(run_folder)) for word in words))
+    printed = capsys.readouterr()
+    assert stop.value.code == 1
+    assert message in printed.err
+    assert "Traceback" not in printed.err + printed.out
+    assert (run_folder / "there.json").read_text() == "old"
+
+
+def test_scores_are_replaced_where_that_is_said(run_folder: Path, monkeypatch, capsys):
+    out = run_folder / "scores.json"
+    out.write_text("old")
+    run(monkeypatch, f"checkpoint={run_folder}", DATA, f"out={out}", "overwrite=true")
+    assert json.loads(out.read_text())["bench"] == "small"
+    assert f"Scores in {out}" in capsys.readouterr().out
+
+
+def test_help_says_how_to_use_it_and_leaves_nothing_behind(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, "--help")
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out
+    for word in ("checkpoint=", "out=", "overwrite=true", "+bench=", "data=file", "without effect"):
+        assert word in printed
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,554 @@
+"""The command line: every configuration runs, and user errors are messages without a traceback."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_line import (
+    BENCHES,
+    CONF,
+    PERIOD,
+    ROOT,
+    SHORTER,
+    SIMULATED,
+    SWEEP,
+    configuration,
+    file_overrides,
+    launched,
+)
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import InstantiationException
+from hydra.utils import get_object, instantiate
+from matplotlib.figure import Figure
+from omegaconf import DictConfig, OmegaConf
+
+import lfrtorch
+import train
+from lfrtorch.cli import interrupts
+from lfrtorch.datasets import boucwen, official
+from lfrtorch.reporting import plots
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All figures of a run are empty, which takes no time."""
+    empty = plots.png(Figure(figsize=(0.1, 0.1)))
+    monkeypatch.setattr(plots, "png", lambda _: empty)
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The Bouc-Wen system is simulated, official files at hand or not, and for short."""
+    nothing = tmp_path_factory.mktemp("nothing")
+    monkeypatch.setattr(official, "cache", lambda: nothing)
+    monkeypatch.setattr(boucwen, "_PERIOD", PERIOD)
+    monkeypatch.setattr(boucwen, "_SWEEP", SWEEP)
+
+
+@pytest.fixture
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All figures are drawn, of few pixels."""
+    monkeypatch.setattr(plots, "DPI", 40)
+
+
+ROUNDING = 1e-12
+"""Of outputs of about 5, a thousand units in the last place: sums in another order."""
+
+
+@pytest.mark.parametrize("bench", BENCHES)
+def test_every_bench_composes(bench: str):
+    cfg = configuration(f"+bench={bench}")
+    assert cfg.name == bench
+    train.require(cfg)
+    dataset = bench.removesuffix("_record")
+    assert cfg.data["_target_"] == f"lfrtorch.datasets.{dataset}.load"
+    assert (cfg.bla.nx, cfg.init.nz, cfg.init.nw) == (cfg.nx, cfg.nz, cfg.nw)
+    arguments = inspect.signature(get_object(cfg.data["_target_"])).parameters
+    for name, argument in arguments.items():  # a bench is the loader's own default, spelt out
+        default = argument.default
+        if (bench, name) == ("boucwen_record", "rms"):
+            assert cfg.data[name] == [*8 * [50], *4 * [25], *4 * [10]]
+            continue
+        assert cfg.data[name] == (list(default) if isinstance(default, tuple) else default)
+
+
+ADAM = "init=paper trainer=adam trainer.epochs=2"
+INFERENCE = "init=inference trainer.max_iter=2"
+
+
+@pytest.mark.parametrize(
+    ("bench", "choice"),
+    [
+        *((bench, "trainer.max_iter=2") for bench in BENCHES),
+        ("boucwen", ADAM),
+        ("boucwen", INFERENCE),
+    ],
+)
+@pytest.mark.numeric
+@pytest.mark.usefixtures("short", "coarse")
+def test_every_bench_runs_two_iterations(
+    bench: str, choice: str, tmp_path: Path, request: pytest.FixtureRequest
+):
+    cfg = configuration(f"+bench={bench}", *SHORTER.get(bench, "").split(), *choice.split())
+    if bench not in SIMULATED:
+        cfg.data.root = str(request.getfixturevalue("benchmark_root"))
+    cfg.figures = (bench, choice) == ("boucwen", "trainer.max_iter=2")  # of whole periods, once
+    try:
+        train.identify(cfg, tmp_path)
+    except InstantiationException as failed:
+        if bench not in SIMULATED and isinstance(failed.__cause__, FileNotFoundError):
+            pytest.skip(str(failed.__cause__))
+        raise
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["fit"]["iterations"] == 2
+    for name, score in metrics["scores"].items():
+        assert 0 < score["rmse"] < np.inf
+        assert score["source"] in ("official", "simulated", "stand-in")
+        assert (tmp_path / "figures" / f"{name}.png").is_file() == cfg.figures
+    assert (tmp_path / "report.html").is_file() == cfg.figures
+
+
+def test_notes_on_the_data_are_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(official, "cache", lambda: tmp_path)  # without files
+    data = train.loaded(configuration("+bench=parwh", "data.levels=[100]"))
+    assert data.tests[0].source == "stand-in"
+    assert capsys.readouterr().out == f"note: {data.notes[0]}\n"
+
+
+@pytest.mark.parametrize("group", ["bla", "data", "init", "trainer"])
+def test_every_option_of_a_group_is_an_argument_of_its_target(group: str):
+    for path in (CONF / group).glob("*.yaml"):
+        node = OmegaConf.load(path)
+        assert isinstance(node, DictConfig)
+        parameters = inspect.signature(get_object(node["_target_"])).parameters
+        assert set(node) - {"_target_"} <= set(parameters)
+
+
+def test_the_paper_cases_are_one_override():
+    for nz, nw in ((1, 1), (2, 1), (2, 2)):
+        cfg = configuration("+bench=boucwen", f"nz={nz}", f"nw={nw}")
+        assert (cfg.init.nz, cfg.init.nw, cfg.init.nn) == (nz, nw, 15)
+
+
+@pytest.mark.numeric
+@pytest.mark.usefixtures("coarse")
+def test_run_writes_its_folder_and_the_checkpoint_simulates(
+    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words = [f"hydra.run.dir='{tmp_path}'", *file_overrides(csv), "nx=1", "trainer.max_iter=20"]
+    launched(monkeypatch, *words)
+    for name in ("metrics.json", "config.yaml", "model/model.json", "figures/test.png"):
+        assert (tmp_path / name).is_file()
+    assert list(tmp_path.glob("events.out.tfevents.*"))
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 7  # three of the test, BLA, poles, map, history
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "starts=8" in line]
+    assert line.startswith("next: ")
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["command"].startswith("python train.py data=file ")
+    score = metrics["scores"]["test"]
+    assert score["source"] == "file"
+    assert score["rmse"] < 0.5 * score["lti_rmse"]  # the saturation is found: 0.2, and falling
+
+    test = instantiate(configuration(*file_overrides(csv), "nx=1").data).tests[0]
+    model = lfrtorch.load(tmp_path)
+    assert lfrtorch.rmse(test, model.simulate(test)) == pytest.approx(score["rmse"], abs=ROUNDING)
+    assert [c.name for c in model.inputs + model.outputs] == ["u", "y"]
+
+
+@pytest.mark.numeric
+def test_init_from_continues_where_the_run_ended(csv: Path, tmp_path: Path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+    arguments = [*file_overrides(csv), "nx=1"]
+    train.identify(configuration(*arguments, "trainer.max_iter=5"), first)
+    validation = train.identify(
+        configuration(*arguments, f"init_from={first}", "trainer.max_iter=0"), second
+    )
+    before = json.loads((first / "metrics.json").read_text())["validation"]["rmse"]
+    assert validation == pytest.approx(before, abs=ROUNDING)
+
+
+def test_polynomial_is_chosen_and_continued(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+    arguments = [*file_overrides(csv), "nx=1", "nz=1", "trainer.max_iter=2"]
+    train.identify(configuration(*arguments, "init=polynomial", "degree=2"), first)
+    cfg = configuration(*arguments, f"init_from={first}")
+    train.identify(cfg, second)
+    assert cfg.degree == 2
+    sizes = json.loads((second / "metrics.json").read_text())["sizes"]
+    assert sizes == {"nx": 1, "nz": 1, "nw": 1, "degree": 2}
+    assert "nx 1, nz 1, nw 1, degree 2" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("short")
+def test_init_from_says_which_sizes_it_takes(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+    arguments = [*file_overrides(csv), "nx=1", "trainer.max_iter=1"]
+    train.identify(configuration(*arguments, "nz=1", "nn=4"), first)
+    cfg = configuration(*arguments, "nn=auto", f"init_from={first}")
+    train.identify(cfg, second)
+    assert (cfg.nz, cfg.nn) == (1, 4)
+    assert "nz is 1, that of the model in" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"has the inputs u and the data u \(N\)"):
+        train.identify(configuration("+bench=boucwen", f"init_from={first}"), second)
+
+
+@pytest.mark.numeric
+def test_a_resting_test_part_gives_a_score_that_is_null(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    u = np.concatenate([rng.standard_normal(400), np.zeros(200)])
+    y = np.convolve(u, [0.5, 0.3, 0.1])[: len(u)]
+    y[-200:] = 0.0
+    np.savez(tmp_path / "rest.npz", u=u, y=y)
+    overrides = ["data=file", f"data.path={tmp_path / 'rest.npz'}", "data.inputs=[u]"]
+    overrides += ["data.outputs=[y]", "data.fs=1", "data.test=0.1", "nx=1", "trainer.max_iter=1"]
+    train.identify(configuration(*overrides), tmp_path)
+    score = json.loads((tmp_path / "metrics.json").read_text())["scores"]["test"]
+    assert score["nrmse"] is None
+    assert score["rmse"] >= 0
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_run_without_test_and_validation_records(tmp_path: Path, capsys):
+    u = np.random.default_rng(0).standard_normal(300)
+    y = np.convolve(u, [0.0, 0.5, 0.3])[: len(u)]
+    np.savez(tmp_path / "all.npz", u=u, y=y)
+    overrides = ["data=file", f"data.path={tmp_path / 'all.npz'}", "data.inputs=[u]"]
+    overrides += ["data.outputs=[y]", "data.fs=1", "nx=1", "trainer.max_iter=1"]
+    overrides += ["data.test=0", "data.validation=0", "figures=true"]
+    train.identify(configuration(*overrides), tmp_path)
+    assert "nothing is scored" in capsys.readouterr().out
+    assert json.loads((tmp_path / "metrics.json").read_text())["scores"] == {}
+    assert (tmp_path / "figures" / "convergence.png").is_file()
+
+
+def judged_when_interrupted(folder: Path) -> None:
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["fit"]["reason"] == "interrupted"
+    assert metrics["fit"]["iterations"] >= 3
+    assert metrics["scores"]["test"]["rmse"] < metrics["scores"]["test"]["lti_rmse"]
+    assert lfrtorch.load(folder).sizes["nx"] == 1
+
+
+@pytest.mark.numeric
+def test_the_interrupt_key_keeps_the_best_model_and_its_scores(
+    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words = [*file_overrides(csv), "nx=1", "trainer._target_=cli.test_fit.Interrupted"]
+    launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words, "figures=false")
+    assert f"to go on: python train.py resume={tmp_path}" in capsys.readouterr().out
+    judged_when_interrupted(tmp_path)
+
+
+@pytest.mark.slow
+def test_the_interrupt_key_reaches_the_program(csv: Path, tmp_path: Path):
+    """Of Adam, which has no end of its own."""
+    words = [*file_overrides(csv), "nx=1", "trainer=adam", "trainer.epochs=1000000"]
+    words += ["trainer.learning_rate=0.01", "threads=1", "figures=false"]
+    with subprocess.Popen(
+        [sys.executable, str(ROOT / "train.py"), f"hydra.run.dir='{tmp_path}'", *words],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        # A shell's background job, which a test run may be, hands down an ignored SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.lstrip().startswith("50/"):
+                break
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        rest = process.stdout.read()
+        assert process.wait(timeout=60) == 0
+    assert "interrupted" in rest
+    judged_when_interrupted(tmp_path)
+
+
+class Terminated(lfrtorch.LevenbergMarquardt):
+    """Levenberg-Marquardt whose process is asked to end in its third iteration."""
+
+    def step(self, problem: Any, state: Any) -> Any:
+        if state.iteration == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().step(problem, state)
+
+
+@pytest.mark.numeric
+def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, tmp_path: Path):
+    usual = signal.getsignal(signal.SIGTERM)
+    cfg = configuration(*file_overrides(csv), "nx=1", "trainer._target_=cli.test_fit.Terminated")
+    with pytest.raises(interrupts.Terminated, match="the best model so far is in"):
+        train.identify(cfg, tmp_path)
+    assert signal.getsignal(signal.SIGTERM) == usual
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["fit"]["reason"] == "interrupted"
+    assert metrics["fit"]["iterations"] == 3
+    assert metrics["scores"]["test"]["rmse"] < metrics["scores"]["test"]["lti_rmse"]
+
+
+@pytest.mark.numeric
+def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: Path):
+    settings = [*file_overrides(csv), "nx=1", "starts=2", "trainer.max_iter=8", "threads=1"]
+    cut, whole = tmp_path / "cut", tmp_path / "whole"
+    for folder in (cut, whole):
+        folder.mkdir()
+    train.identify(configuration(*settings), whole)
+    with pytest.raises(interrupts.Terminated, match=f"python train.py resume={cut}"):
+        train.identify(configuration(*settings, "trainer._target_=cli.test_fit.Terminated"), cut)
+    assert json.loads((cut / "metrics.json").read_text())["fit"]["reason"] == "interrupted"
+    train.identify(configuration(*settings, f"resume={cut}"), cut)
+    ends = [json.loads((folder / "metrics.json").read_text()) for folder in (cut, whole)]
+    assert ends[0]["scores"] == ends[1]["scores"]
+    assert ends[0]["ranking"] == ends[1]["ranking"]
+    weights = [(f / "model" / "weights.safetensors").read_bytes() for f in (cut, whole)]
+    assert weights[0] == weights[1]
+
+
+@pytest.mark.numeric
+@pytest.mark.usefixtures("undrawn")
+def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
+    settings = [*file_overrides(csv), "nx=1", "starts=3", "average=3", "trainer.max_iter=3"]
+    judged = train.identify(configuration(*settings, "data.validation=0", "figures=true"), tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["averaged"], metrics["sizes"]["nx"]) == (3, 3)
+    assert judged == metrics["ranking"][0]["train"]
+    model = lfrtorch.load(tmp_path)
+    assert model.sizes == metrics["sizes"]
+    assert "mean of the best 3" in (tmp_path / "report.html").read_text()
+
+
+def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    settings = [*file_overrides(csv), "nx=1", "starts=2", "average=2", "trainer.max_iter=1"]
+    train.identify(configuration(*settings, "init=polynomial", "figures=false"), tmp_path)
+    assert "note: average is for networks" in capsys.readouterr().out
+    assert json.loads((tmp_path / "metrics.json").read_text())["averaged"] == 1
+
+
+def test_a_new_run_forgets_the_one_that_it_replaces(csv: Path, tmp_path: Path):
+    settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=2", "threads=3"]
+    for seed in (0, 1):
+        train.identify(configuration(*settings, f"seed={seed}"), tmp_path)
+    assert torch.get_num_threads() == 3
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["fit"]["iterations"] == 2
+
+
+def test_resume_takes_the_settings_of_the_run(tmp_path: Path):
+    run_folder = tmp_path / "it's a run"
+    (run_folder / ".hydra").mkdir(parents=True)
+    text = "- +bench=boucwen\n- trainer.max_iter=60\n- resume=before\n"
+    (run_folder / ".hydra" / "overrides.yaml").write_text(text)
+    given = [f"resume={run_folder}", "trainer.max_iter=90"]
+    found = train.arguments(given)
+    assert found[:-1] == ["+bench=boucwen", "trainer.max_iter=60", *given]
+    parser = OverridesParser.create()
+    assert parser.parse_override(found[-1]).value() == str(run_folder)
+
+
+def test_resume_needs_a_run(tmp_path: Path):
+    with pytest.raises(ValueError, match="not the folder of a run"):
+        train.arguments([f"resume={tmp_path}"])
+
+
+@pytest.mark.parametrize(
+    ("option", "mark"), [("hydra.run.dir", "config.yaml"), ("hydra.sweep.dir", "multirun.yaml")]
+)
+def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path, option: str, mark: str):
+    given = [f"{option}='{tmp_path}'"]
+    assert train.arguments(given) == given
+    (tmp_path / mark).touch()
+    with pytest.raises(ValueError, match="overwrite=true"):
+        train.arguments(given)
+    assert train.arguments([*given, "overwrite=true"]) == [*given, "overwrite=true"]
+
+
+@pytest.mark.numeric
+def test_sizes_are_searched_for(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    arguments = ["nx=auto", "nx_max=2", "nz=auto", "nw=1", "nn=auto", "trainer.max_iter=20"]
+    cfg = configuration(*file_overrides(csv), *arguments, "sizes_search.nn=[1,3]")
+    train.identify(cfg, tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    tried = metrics["sizes_search"]
+    assert [(t["nz"], t["nw"], t["nn"]) for t in tried][:2] == [(1, 1, 3), (2, 1, 3)]
+    (chosen,) = (t for t in tried if t["chosen"])
+    assert metrics["sizes"] == {"nx": cfg.nx} | {name: chosen[name] for name in ("nz", "nw", "nn")}
+    assert metrics["parameters_net"] == chosen["parameters_net"]
+    assert chosen["ratio"] < 0.5
+    saved = OmegaConf.load(tmp_path / "config.yaml")
+    assert (saved.nz, saved.init.nn) == (chosen["nz"], chosen["nn"])
+    printed = capsys.readouterr().out
+    assert "2 starts of 5 iterations for each model" in printed
+    assert f"nz {chosen['nz']}, nw 1, nn {chosen['nn']}: {chosen['parameters']} par" in printed
+    assert printed.count("  chosen\n") == 2  # the order, and these
+
+
+@pytest.mark.numeric
+def test_degree_is_searched_for_with_adam(csv: Path, tmp_path: Path):
+    arguments = [*file_overrides(csv), "nx=1", "nz=1", "init=polynomial", "degree=auto"]
+    arguments += ["sizes_search.degree=[1,2]", "trainer=adam", "trainer.epochs=4"]
+    cfg = configuration(*arguments)
+    train.identify(cfg, tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert [t["degree"] for t in metrics["sizes_search"]] == [2, 1]
+    assert metrics["sizes"]["degree"] == cfg.degree
+
+
+class Interrupted(lfrtorch.LevenbergMarquardt):
+    """Levenberg-Marquardt with Ctrl-C in its third iteration."""
+
+    def step(self, problem: Any, state: Any) -> Any:
+        if state.iteration == 2:
+            signal.raise_signal(signal.SIGINT)
+        return super().step(problem, state)
+
+
+class AtOnce(lfrtorch.LevenbergMarquardt):
+    """Levenberg-Marquardt that Ctrl-C ends amid its third iteration, as a second one does."""
+
+    def step(self, problem: Any, state: Any) -> Any:
+        if state.iteration == 2:
+            raise KeyboardInterrupt
+        return super().step(problem, state)
+
+
+@pytest.mark.parametrize(
+    ("trainer", "code", "message"),
+    [
+        ("AtOnce", 130, "interrupted while sizes were searched: nothing to keep"),
+        ("Terminated", 143, "terminated while sizes were searched: nothing to keep"),
+    ],
+)
+def test_a_search_for_sizes_that_is_ended_says_so(
+    trainer: str,
+    code: int,
+    message: str,
+    csv: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    words = [*file_overrides(csv), "nx=1", "nn=auto", f"trainer._target_=cli.test_fit.{trainer}"]
+    with pytest.raises(SystemExit) as stop:
+        launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words)
+    assert stop.value.code == code
+    assert capsys.readouterr().err == f"{message}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["trainer=adam", "trainer.max_iter=5"],
+            "no trainer.max_iter; its iterations are trainer.e",
+        ),
+        (["trainer.epochs=5"], "no trainer.epochs; its iterations are trainer.max_iter"),
+    ],
+)
+def test_iterations_of_the_other_trainer_are_named(
+    words: list[str], message: str, monkeypatch: pytest.MonkeyPatch
+):
+    with pytest.raises(SystemExit, match=message):
+        launched(monkeypatch, "+bench=boucwen", *words)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([], "no data chosen"),
+        (["+bench=nonsense"], "nonsense"),
+        (["+bench=boucwen", "nz=0"], "nz is 0"),
+        (["+bench=boucwen", "trainer.speed=3"], "speed"),
+        (["+bench=boucwen", "data.root=/nowhere"], "no Bouc-Wen test files in '/nowhere'"),
+        (["+bench=boucwen", "timeout=-1"], "timeout is -1"),
+    ],
+)
+@pytest.mark.usefixtures("untraced")
+def test_user_errors_are_one_message(
+    overrides: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    with pytest.raises(SystemExit) as stop:
+        launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *overrides)
+    printed = capsys.readouterr()
+    assert stop.value.code == 1
+    assert message in printed.err
+    assert "Traceback" not in printed.err + printed.out
+    assert not (tmp_path / ".hydra").exists()  # no folder is left behind
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["nz=many"], "nz is 'many'; give a whole number of at least 1, or auto"),
+        (["degree=auto"], "degree is auto, and this init has none; give nn=auto"),
+        (["nn=auto", "init=polynomial"], "nn is auto, and this init has none"),
+        (["nn=auto", "sizes_search.nn=[]"], "nn is empty"),
+        (["sizes_search.starts=0"], "sizes_search.starts is 0"),
+        (["init.method=magic"], "init method is 'magic'"),
+        (["init=polynomial", "degree=0"], "degree is 0"),
+        (["activation=softsign"], "activation is 'softsign'"),
+        (["trainer.damping=-1"], "damping is -1"),
+        (["bla.coordinates=polar"], "coordinates is 'polar'"),
+        (["+bench=boucwen", "data.samples=ten"], "a period of ten samples"),
+        (["+bench=boucwen", "data.seed=x"], "data.seed is 'x'"),
+        (["+bench=silverbox", "data.root=/nowhere"], "there is no 'Silverbox/"),
+        (["+bench=parwh", "data.levels=[200]"], "data.levels is [200]; give one or more of 100"),
+        (["+bench=parwh", "data.root=/nowhere"], "there is no 'ParWH/ParWHFiles/ParWHData.mat'"),
+        (["init_from=/nowhere"], "there is no '/nowhere'; give the folder of a run"),
+        (["ridge=-1"], "ridge is -1"),
+        (["ridge=abc"], "ridge is 'abc'"),
+        (["ridge={B: 1.0}"], "ridge has a group 'B'"),
+        (["threads=0"], "threads is 0"),
+        (["dtype=float16"], "dtype is float16; give float64 or float32"),
+        (["device=abacus"], "device is abacus, which torch cannot use here"),
+        (["nx=2.5"], "nx is 2.5"),
+        (["nn=x"], "nn is 'x'"),
+        (["seed=a"], "seed is 'a'"),
+        (["data=boucwen"], "+bench=boucwen"),
+        (["data=file", "data.path=/nowhere.csv", "nx=1"], "there is no file '/nowhere.csv'"),
+        (["nx=null"], "nx, the number of states, is not set"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_message(
+    overrides: list[str],
+    message: str,
+    csv: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    """Of the short file, where no other data are given."""
+    given = any(word.startswith(("+bench=", "data=")) for word in overrides)
+    cfg = configuration(*([] if given else [*file_overrides(csv), "nx=1"]), *overrides)
+    with pytest.raises(SystemExit) as stop, train.user_errors():
+        train.identify(cfg, tmp_path)
+    assert stop.value.code == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "metrics.json").exists()

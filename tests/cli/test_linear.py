@@ -1,0 +1,284 @@
+"""The linear model from the command line: table, figures, checkpoint, messages."""
+
+from __future__ import annotations
+
+import copy
+import json
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.signal
+from command_line import configuration
+from hydra import compose, initialize_config_dir
+from matplotlib.figure import Figure
+from omegaconf import DictConfig, OmegaConf
+
+import lfrtorch
+import train
+from lfrtorch.dataset import Dataset
+from lfrtorch.records import Record
+from scripts import bla
+
+ROOT = Path(__file__).resolve().parents[2]
+T, FS, SKIP = 1200, 50.0, 100
+RESONANCE = 0.9 * np.exp(2j * np.pi * 0.1)  # z plane
+NOISE = 0.01
+
+
+def written(path: Path, **columns: np.ndarray) -> Path:
+    rows = "\n".join(",".join(f"{v:.12g}" for v in row) for row in np.stack([*columns.values()], 1))
+    path.write_text(f"{','.join(columns)}\n{rows}\n")
+    return path
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of figures are empty, which takes no time."""
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).touch())
+
+
+@pytest.fixture(scope="module")
+def csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two inputs, a constant, and two outputs of one resonance and of a delayed input."""
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((2, T))
+    denominator = np.poly([RESONANCE, RESONANCE.conj()]).real
+    x = 5.0 + scipy.signal.lfilter([0.0, 1.0], denominator, a + 0.5 * b)
+    phi = scipy.signal.lfilter([0.0, 0.3], [1.0], a - b)
+    x, phi = x + NOISE * rng.standard_normal(T), phi + NOISE * rng.standard_normal(T)
+    path = tmp_path_factory.mktemp("csv") / "lab.csv"
+    return written(path, a=a, b=b, rest=np.ones(T), x=x, phi=phi)
+
+
+def overrides(csv: Path, inputs: str, outputs: str, *more: str) -> list[str]:
+    columns = [f"data.inputs=[{inputs}]", f"data.outputs=[{outputs}]"]
+    return ["data=file", f"data.path={csv}", *columns, f"data.fs={FS}", f"data.skip={SKIP}", *more]
+
+
+def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> dict:
+    """linear.json of a run."""
+    monkeypatch.setattr(sys, "argv", ["bla.py", f"hydra.run.dir='{folder}'", *words])
+    bla.main()
+    return json.loads((folder / "linear.json").read_text())
+
+
+@pytest.mark.numeric
+def test_one_command_gives_table_figures_and_checkpoint(
+    csv: Path, tmp_path: Path, monkeypatch, capsys
+):
+    # Order 3 finds noise only, and validates worse than 2 by 0.6 %.
+    found = run(monkeypatch, tmp_path, *overrides(csv, "a,b", "x", "nx=auto", "nx_max=3"))
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    for name in ("frequency_response", "poles_and_zeros", "order_scan", "test"):
+        assert (tmp_path / "figures" / f"{name}.png").is_file()
+    assert (tmp_path / "config.yaml").is_file()
+    for line in ("  chosen", "BLA: order 2", "note: noise: not told apart", "% of std", "x/a"):
+        assert line in printed.out
+    assert (found["nx"], found["scan"]["chosen"]) == (2, 2)
+    assert found["scan"]["orders"] == [1, 2, 3]
+    assert "scripts/bla.py data=file" in found["command"]
+    model = lfrtorch.LinearModel.load(tmp_path / "linear")
+    assert model.nx == 2
+    assert [c.name for c in model.inputs + model.outputs] == ["a", "b", "x"]
+
+
+@pytest.mark.numeric
+@pytest.mark.usefixtures("undrawn")
+def test_numbers_are_those_of_the_system(csv: Path, tmp_path: Path, monkeypatch):
+    found = run(monkeypatch, tmp_path, *overrides(csv, "a,b", "x,phi", "nx=3"))
+    assert [(s["use"], s["record"]) for s in found["scores"]] == [
+        ("train", "train"), ("validation", "validation"), ("test", "test"),
+    ]  # fmt: skip
+    dataset = lfrtorch.load_records(csv, inputs=["a", "b"], outputs=["x", "phi"], fs=FS, skip=SKIP)
+    model = lfrtorch.LinearModel.load(tmp_path / "linear")
+    for score, record in zip(
+        found["scores"], (*dataset.train, *dataset.validation, *dataset.tests), strict=True
+    ):
+        y, y_hat = (signal[record.skip :] for signal in (record.y, model.simulate(record)))
+        for i, output in enumerate(score["outputs"]):
+            error = y[:, i] - y_hat[:, i]
+            assert output["rmse"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-9)
+            assert output["nrmse"] == pytest.approx(output["rmse"] / np.std(y[:, i]), rel=1e-9)
+            assert output["rmse"] == pytest.approx(NOISE, rel=0.25)
+    pole = max(found["poles"], key=lambda p: p["imag"])
+    s = np.log(RESONANCE) * FS
+    assert pole["frequency"] == pytest.approx(abs(s) / (2 * np.pi), rel=1e-2)
+    assert pole["damping"] == pytest.approx(-s.real / abs(s), rel=2e-2)
+    assert pole["radius"] == pytest.approx(0.9, rel=1e-2)
+    offsets = {o["channel"]: o["offset"] for o in found["offsets"]}
+    assert set(offsets) == {"a", "b", "x", "phi"}
+    gain = model.frf([0.0])[0].real  # at the operating point
+    x = offsets["x"] - gain[0] @ [offsets["a"], offsets["b"]]
+    assert x == pytest.approx(5.0, abs=0.01)
+    assert {r["channel"] for r in found["response_std"]} == {"x/a", "x/b", "phi/a", "phi/b"}
+    assert all(0 < r["std"] < 0.1 for r in found["response_std"])
+    assert found["frf"]["method"] == "local_polynomial"
+    assert found["scan"] is None
+
+
+@pytest.mark.numeric
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("refine", ["prediction", "frequency"])
+def test_refinements_and_zeros_by_channel(refine: str, csv: Path, tmp_path: Path, monkeypatch):
+    words = overrides(csv, "a,b", "x", "nx=2", f"bla.refine={refine}", "bla.max_iter=20")
+    found = run(monkeypatch, tmp_path, *words)
+    assert found["fit"]["criterion"] == refine
+    assert set(found["zeros"]) == {"x/a", "x/b"}
+    # The operating point of a response is the means, which a finite record has not settled to.
+    limit = {"prediction": 1.1, "frequency": 2.0}[refine]
+    assert found["scores"][-1]["outputs"][0]["rmse"] < limit * NOISE
+    assert (lfrtorch.LinearModel.load(tmp_path / "linear").K is not None) == (
+        refine == "prediction"
+    )
+
+
+def odd_multisine() -> Dataset:
+    """Two periods of a random odd multisine through a cubic system, and one of another."""
+
+    def record(seed: int) -> Record:
+        u = np.tile(lfrtorch.multisine(512, grid="random_odd", seed=seed).u[0], (4, 1))
+        x = scipy.signal.lfilter([0.0, 1.0], [1.0, -0.6], u[:, 0])
+        y = x + 0.01 * x**3 + 1e-4 * np.random.default_rng(seed).standard_normal(len(x))
+        return Record(u[1024:], y[1024:], start="periodic", period=512, name="odd")
+
+    return Dataset("odd", [record(0)], [record(1)], [record(2)])
+
+
+@pytest.mark.numeric
+@pytest.mark.usefixtures("undrawn")
+def test_fast_method_draws_the_distortion(tmp_path: Path, monkeypatch, capsys):
+    words = ["+data={_target_: cli.test_linear.odd_multisine}", "nx=1", "bla.refine=frequency"]
+    found = run(monkeypatch, tmp_path, *words, "frf.method=fast")
+    assert found["frf"] == {"method": "fast", "experiments": 1, "periods": 2, "lines": 96}
+    assert (tmp_path / "figures" / "distortion.png").is_file()
+    assert found["poles"][0]["radius"] == pytest.approx(0.6, abs=0.01)
+    capsys.readouterr()
+
+
+def two_inputs_at_once() -> Dataset:
+    """One periodic experiment, which cannot tell two inputs apart at one line."""
+    u = np.random.default_rng(0).standard_normal((256, 2))
+    y = np.roll(u, 1, axis=0) @ [[1.0], [0.5]]
+    records = [Record(u, y, start="periodic", name="once")]
+    return Dataset("once", records, [], records)
+
+
+@pytest.mark.numeric
+@pytest.mark.usefixtures("undrawn")
+def test_without_a_response_the_model_is_found_all_the_same(tmp_path: Path, monkeypatch, capsys):
+    words = ["+data={_target_: cli.test_linear.two_inputs_at_once}", "nx=1"]
+    found = run(monkeypatch, tmp_path, *words)
+    assert found["frf"] is None
+    assert (
+        "note: no measured frequency response: 1 record(s) cannot tell" in capsys.readouterr().out
+    )
+    assert found["notes"][0].startswith("no measured frequency response")
+    assert found["scores"][0]["outputs"][0]["nrmse"] < 1e-6
+    assert (tmp_path / "figures" / "frequency_response.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("inputs", "more", "message"),
+    [
+        ("force", ["nx=2"], "has no column 'force'"),
+        ("a", [], "nx, the number of states, is not set"),
+    ],
+)
+def test_user_errors_are_one_message(
+    inputs: str, more: list[str], message: str, csv: Path, tmp_path: Path, monkeypatch, capsys
+):
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, tmp_path, *overrides(csv, inputs, "x", *more))
+    printed = capsys.readouterr()
+    assert stop.value.code == 1
+    assert message in printed.err
+    assert "Traceback" not in printed.err + printed.out
+    assert not (tmp_path / "linear.json").exists()
+
+
+@cache
+def composed() -> DictConfig:
+    with initialize_config_dir(version_base="1.3", config_dir=str(ROOT / "conf")):
+        return compose("linear", ["data=file"])
+
+
+@pytest.mark.parametrize(
+    ("inputs", "more", "message"),
+    [
+        ("a", ["nx=automatic"], "nx is 'automatic'; give a whole number"),
+        ("a", ["nx=auto", "nx_max=0"], "nx_max is 0; give a whole number"),
+        ("a", ["nx=auto", "bla.speed=3"], "speed"),
+        ("a", ["nx=2", "bla.refine=magic"], "refine is 'magic'"),
+        ("a", ["nx=2", "frf.method=magic"], "method is 'magic'"),
+        ("a", ["nx=2", "frf.method=fast"], "record 'train' has no period"),
+        ("rest", ["nx=2"], "signal 'rest' is constant"),
+        ("rest", ["nx=auto"], "signal 'rest' is constant"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_message(
+    inputs: str, more: list[str], message: str, csv: Path, tmp_path: Path, capsys
+):
+    cfg = copy.deepcopy(composed())
+    OmegaConf.set_struct(cfg, False)  # as + does on the command line
+    cfg.merge_with_dotlist(overrides(csv, inputs, "x", *more)[1:])
+    with pytest.raises(SystemExit) as stop, train.user_errors():
+        bla.identify(cfg, tmp_path)
+    assert stop.value.code == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "linear.json").exists()
+
+
+HELP = ("data.path=", "nx=auto", "bla.refine=", "frf.method=", "+bench=", "linear.json")
+
+
+def test_help_says_how_to_use_it(tmp_path: Path, monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, tmp_path, "--help")
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in HELP)
+
+
+@pytest.mark.slow
+def test_it_is_a_script_that_runs_anywhere(tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "bla.py"), "--help"],
+        capture_output=True, text=True, check=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert all(word in done.stdout for word in HELP)
+
+
+@pytest.mark.numeric
+def test_train_takes_the_order_of_a_scan(csv: Path, tmp_path: Path, capsys):
+    words = overrides(csv, "a,b", "x", "nx=auto", "nx_max=3", "nn=2", "trainer.max_iter=1")
+    cfg = configuration(*words)
+    train.identify(cfg, tmp_path)
+    assert cfg.nx == 2
+    assert json.loads((tmp_path / "metrics.json").read_text())["sizes"]["nx"] == 2
+    assert "nx: 2\n" in (tmp_path / "config.yaml").read_text()
+    printed = capsys.readouterr().out
+    assert "  chosen" in printed
+    assert "BLA: order 2, simulation error" in printed
+
+
+@pytest.mark.parametrize(
+    ("z", "frequency", "damping"),
+    [
+        (0.5, np.log(2) / (2 * np.pi), 1.0),
+        (-0.5, abs(np.log(-0.5 + 0j)) / (2 * np.pi), np.log(2) / abs(np.log(-0.5 + 0j))),
+        (1j, 0.25, 0.0),
+        (2.0, np.log(2) / (2 * np.pi), -1.0),
+        (1.0, 0.0, None),
+        (0.0, None, 1.0),
+    ],
+)
+def test_frequency_and_damping(z: complex, frequency: float | None, damping: float | None):
+    (root,) = bla.roots(np.array([z], dtype=complex), 1.0)
+    assert root["frequency"] == (None if frequency is None else pytest.approx(frequency))
+    assert root["damping"] == (None if damping is None else pytest.approx(damping))
+    assert root["radius"] == pytest.approx(abs(z))

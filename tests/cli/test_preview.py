@@ -1,0 +1,256 @@
+"""Measurements looked at from the command line: columns, remarks, table, findings, figure."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import configuration
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from scipy.io import savemat
+from scipy.signal import lfilter
+
+import train
+from lfrtorch.reporting.survey_plots import survey_figure
+from lfrtorch.survey.findings import examine
+from lfrtorch.survey.measurement import survey
+from scripts import preview
+
+ROOT = Path(__file__).resolve().parents[2]
+T, FS = 2000, 50.0
+
+
+@pytest.fixture(scope="module")
+def signals() -> dict[str, np.ndarray]:
+    """Times, an input and the clipped output of a first-order system, NaN in one sample."""
+    u = np.random.default_rng(0).standard_normal(T)
+    y = np.minimum(lfilter([0, 0.1], [1, -0.9], u), 0.3)
+    y[5] = np.nan
+    return {"time": np.arange(T) / FS, "force": u, "level": y}
+
+
+def written(path: Path, columns: dict[str, np.ndarray], **units: str) -> Path:
+    heads = [f"{name} ({units[name]})" if name in units else name for name in columns]
+    rows = np.stack([*columns.values()], axis=1)
+    lines = [",".join("" if np.isnan(v) else f"{v:.10g}" for v in row) for row in rows]
+    path.write_text("\n".join([",".join(heads), *lines, ""]))
+    return path
+
+
+@pytest.fixture
+def file(tmp_path: Path, signals, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return written(tmp_path / "lab.csv", signals, force="N", level="mm")
+
+
+@pytest.fixture
+def run(capsys):
+    def run(*words: str | Path) -> str:
+        preview.main([str(word) for word in words])
+        printed = capsys.readouterr()
+        assert printed.err == ""
+        return printed.out
+
+    return run
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """An empty figure, which is written in no time."""
+    monkeypatch.setattr(preview, "survey_figure", lambda *_: Figure())
+
+
+def refused(capsys, *words: str | Path) -> str:
+    with pytest.raises(SystemExit) as stop:
+        preview.main([str(word) for word in words])
+    assert stop.value.code == 1
+    return capsys.readouterr().err
+
+
+@pytest.mark.numeric
+def test_one_command_gives_table_findings_and_figure(file: Path, run):
+    out = run(file, "--inputs", "force", "--outputs", "level")
+    assert f"{file}: {T} samples at 50 Hz" in out
+    assert "'time' is taken for the time, 50 Hz" in out
+    head, rule, force, level = out.splitlines()[3:7]
+    assert head.split()[:4] == ["signal", "use", "samples", "missing"]
+    assert set(rule) == {"-"}
+    assert force.split()[:5] == ["force", "(N)", "input", str(T), "0"]
+    assert level.split()[:5] == ["level", "(mm)", "output", str(T), "1"]
+    said = " ".join(out.split())
+    assert "- 'level' misses 1 of 2000 samples" in said
+    assert "- output 'level' has its largest value 0.3" in said
+    assert out.count("\n- ") == 2
+    assert len(np.asarray(imread(file.parent / "lab_preview.png"))[0]) > 1000
+
+
+@pytest.mark.numeric
+def test_numbers_of_the_table(signals):
+    found = survey(signals["force"], signals["level"], FS)
+    row = dict(
+        zip(["mean", "rms", "min", "max"], preview.row(found.outputs[0], found)[4:8], strict=True)
+    )
+    y = signals["level"]
+    assert (row.pop("min"), row.pop("max")) == (np.nanmin(y), 0.3)
+    expected = {"mean": np.nanmean(y), "rms": np.nanstd(y)}
+    assert row == pytest.approx(expected, rel=1e-9, abs=1e-12)  # sums in another order
+    top = np.nansum(y == 0.3)
+    assert preview.row(found.outputs[0], found)[9] == pytest.approx(100 * top / T, abs=0.005)
+    assert "~" in preview.numbers(found)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_without_roles_all_columns_are_shown(file: Path, run):
+    out = run(file, "--out", "sub/look.svg")
+    assert "no --inputs and --outputs: what lies between them is not looked at" in out
+    assert "- 'level' has its largest value 0.3" in out
+    assert (file.parent / "sub" / "look.svg").read_text().lstrip().startswith("<?xml")
+    assert not list(file.parent.glob("*.png"))
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_other_columns_are_outputs(file: Path, run):
+    assert "outputs: level, all other columns" in run(file, "--inputs", "1")
+    assert "inputs: force, all other columns" in run(file, "--outputs", "level")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_another_sampling_frequency_than_the_times_say(file: Path, run):
+    out = run(file, "--inputs", "force", "--fs", "750")
+    assert "- fs looks like 50 Hz, not 750, by the times in 'time'; correct one of them." in out
+    assert "at 750 Hz" in out
+    assert "fs looks" not in run(file, "--inputs", "force", "--fs", "50")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_times_in_milliseconds(tmp_path: Path, signals, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    columns = signals | {"time": 1000 * signals["time"]}
+    assert "at 50 Hz" in run(written(tmp_path / "a.csv", columns, time="ms"))
+    out = run(written(tmp_path / "b.csv", columns), "--fs", "50")
+    assert "unless they are in milliseconds" in " ".join(out.split())
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_sample_numbers_and_uneven_times(tmp_path: Path, signals, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    numbered = {"n": np.arange(T, dtype=float), **signals}
+    del numbered["time"]
+    out = run(written(tmp_path / "a.csv", numbered))
+    assert "'n' is taken for sample numbers" in out
+    assert "no sampling frequency: give --fs" in out
+    steps = np.random.default_rng(1).uniform(0.5, 1.5, T) / FS
+    out = run(written(tmp_path / "b.csv", signals | {"time": np.cumsum(steps)}))
+    assert "- the time column 'time' is not evenly spaced: its steps go from" in out
+    gaps = np.delete(np.arange(T + 3) / FS, [500, 501, 900])
+    out = run(written(tmp_path / "c.csv", signals | {"time": gaps}))
+    assert (
+        "- the times in 'time' have 2 gap(s) of 3 sample(s) in all, the first after sample 499"
+        in out
+    )
+    assert "at 50 Hz" in out
+    out = run(written(tmp_path / "d.csv", signals), "--time", "force")
+    assert "- the time column 'force' does not rise" in out
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_several_files_and_patterns(file: Path, signals, run):
+    savemat(file.parent / "other.mat", {"force": signals["force"], "level": signals["force"]})
+    out = run(file.parent / "*.*", file, "--inputs", "force", "--outputs", "level", "--fs", 50)
+    assert out.count("Figure in") == 2
+    assert {p.name for p in file.parent.glob("*.png")} == {"lab_preview.png", "other_preview.png"}
+    run(file, file.parent / "other.mat", "--out", "x.png")
+    assert {p.name for p in file.parent.glob("x*")} == {"x_lab.png", "x_other.png"}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_empty_lines_at_the_end_are_no_samples(tmp_path: Path, signals, run, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    longer = {name: np.append(values, np.full(30, np.nan)) for name, values in signals.items()}
+    path = written(tmp_path / "a.csv", longer)
+    assert f"{path}: {T} samples at 50 Hz" in run(path)
+
+
+def test_columns_without_values_are_refused(tmp_path: Path, capsys):
+    savemat(tmp_path / "a.mat", {"u": np.full((30, 1), np.nan)})
+    assert "has no values in the columns to show" in refused(capsys, tmp_path / "a.mat")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_column_of_text_is_left_out(tmp_path: Path, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lines = [f"{v:.6f},good" for v in np.random.default_rng(0).standard_normal(400)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["u,state", *lines]))
+    out = run(path)
+    assert "left out: " in out
+    assert "'state'" in out
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_only_the_beginning_of_a_long_file_is_read(file: Path, run, monkeypatch):
+    monkeypatch.setattr(preview, "LARGEST", 3 * 700)
+    out = run(file, "--inputs", "force", "--outputs", "level")
+    assert "the first 700 samples are read, and no more" in out
+    assert f"{file}: 700 samples" in out
+    monkeypatch.setattr(preview, "LARGEST", 3 * T)
+    assert "no more" not in run(file, "--inputs", "force", "--outputs", "level")
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--inputs", "mass"], "has no column 'mass', as --inputs says"),
+        (["--inputs", "force", "--outputs", "force"], "'force (N)' stands for several"),
+        (["--out", "x.csv"], "--out is 'x.csv'; give a name that ends with .png"),
+        (["--fs", "-3"], "--fs is -3.0; give a positive number"),
+        (["nothing*.csv"], "no file matches 'nothing*.csv'"),
+        (["gone.csv"], "there is no file 'gone.csv'"),
+    ],
+)
+def test_user_errors_are_one_message(words, message, file: Path, capsys):
+    assert message in refused(capsys, file, *words)
+
+
+def test_figure_of_signals_that_say_little():
+    signals = np.column_stack([np.full(40, np.nan), np.ones(40), np.arange(40.0)])
+    found = survey(signals[:, :1], signals[:, 1:])
+    figure = survey_figure(found, signals, "odd")
+    figure.draw_without_rendering()
+    assert len(figure.axes) == 9
+
+
+def test_figure_marks_where_a_signal_is_clipped(signals):
+    found = survey(signals["force"], signals["level"], FS)
+    figure = survey_figure(found, np.column_stack([signals["force"], signals["level"]]))
+    time = figure.axes[3]
+    assert np.asarray(time.lines[-1].get_ydata())[0] == 0.3
+    assert "clipped" in figure.axes[0].get_title()
+    assert examine(found, signals["force"][:, None], signals["level"][:, None])
+
+
+def test_train_says_the_findings_of_a_file(file: Path, signals, capsys):
+    clean = written(file.parent / "clean.csv", signals | {"level": np.roll(signals["force"], 1)})
+    clipped = written(
+        file.parent / "clipped.csv", signals | {"level": np.nan_to_num(signals["level"])}
+    )
+    words = ["data=file", "data.inputs=[force]", "data.outputs=[level]", "data.fs=50"]
+    train.loaded(configuration(*words, f"data.path={clipped}"))
+    assert "note: output 'level' has its largest value 0.3" in capsys.readouterr().out
+    train.loaded(configuration(*words, f"data.path={clean}"))
+    assert "note: output" not in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_help_says_how_to_use_it(tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "preview.py"), "--help"],
+        capture_output=True, text=True, check=True, cwd=tmp_path,
+    )  # fmt: skip
+    for word in ("--inputs", "--outputs", "--fs", "--time", "--out", "PATH"):
+        assert word in done.stdout

@@ -1,0 +1,60 @@
+"""Configurations and command lines of tests."""
+
+from __future__ import annotations
+
+import copy
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+import train
+
+ROOT = Path(__file__).resolve().parents[1]
+CONF = ROOT / "conf"
+BENCHES = sorted(path.stem for path in (CONF / "bench").glob("*.yaml"))
+PERIOD, SWEEP = 1024, 3000
+"""Samples of the Bouc-Wen system, where it is simulated."""
+SHORTER = {  # fewer samples and iterations, so that two iterations take a second
+    "boucwen": f"data.samples={PERIOD} starts=2 bla.max_iter=1",
+    "boucwen_record": f"data.samples={PERIOD} data.rms=[50,25] bla.max_iter=1 starts=1",
+    "cascaded_tanks": "bla.max_iter=1 starts=1",
+    "ced": "bla.max_iter=1 starts=1",
+    "emps": "data.validation=0.8 bla.max_iter=1",
+    "f16": "data.levels=[3] nx=6 bla.max_iter=1 starts=1",
+    "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1 starts=1",
+    "silverbox": "data.validation=0.8 bla.max_iter=1 starts=1",
+    "wh_process_noise": "bla.max_iter=1 starts=1",
+    "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1 starts=1",
+}
+SIMULATED = ("boucwen", "boucwen_record", "parwh")
+"""All others are measured."""
+GROUPS = ("+bench", "data", "bla", "init", "trainer")
+
+
+@cache
+def composed(*groups: str) -> DictConfig:
+    """By Hydra, which takes a tenth of a second; without figures, which take seconds."""
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        return compose("config", ["figures=false", *groups])
+
+
+def configuration(*overrides: str) -> DictConfig:
+    """Of a run without figures, unless they are asked for."""
+    groups = [word for word in overrides if word.split("=")[0] in GROUPS]
+    cfg = copy.deepcopy(composed(*groups))
+    cfg.merge_with_dotlist([word for word in overrides if word not in groups])
+    return cfg
+
+
+def launched(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    """The command line in this process."""
+    monkeypatch.setattr(sys, "argv", ["train.py", *words])
+    train.launch()
+
+
+def file_overrides(csv: Path) -> list[str]:
+    return ["data=file", f"data.path={csv}", "data.inputs=[u]", "data.outputs=[y]", "data.fs=10"]

@@ -1,0 +1,167 @@
+"""Coupled electric drives: the split, the file, and a run on simulated drives."""
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from scipy.io import savemat
+from scipy.signal import cont2discrete, lfilter
+
+import train
+from lfrtorch.datasets import ced
+
+FILE = "CED/DATAUNIF.MAT"
+ARCHIVE = "CED/FULLTEXT01.zip"
+CONF = Path(__file__).resolve().parents[2] / "conf"
+
+
+def write(root: Path, **signals) -> Path:
+    """A file of the official layout; its root."""
+    path = root / FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    savemat(path, signals)
+    return root
+
+
+def numbers() -> dict[str, np.ndarray]:
+    """Samples are their numbers, counted from 1; of the high level 1000 more."""
+    number = np.arange(1.0, 501)[:, None]
+    return {"u11": number, "z11": -number, "u12": 1000 + number, "z12": -1000 - number}
+
+
+@pytest.fixture
+def numbered(tmp_path):
+    return write(tmp_path, **numbers())
+
+
+def scored(record):
+    """First and last scored sample."""
+    return int(record.u[record.skip, 0]), int(record.u[-1, 0])
+
+
+def test_split(numbered):
+    data = ced.load(root=numbered)
+    assert [r.name for r in data.train] == ["train_low", "train_high"]
+    assert [r.name for r in data.validation] == ["validation_low", "validation_high"]
+    assert [r.name for r in data.tests] == ["low", "high"]
+    for records, samples, first, last in (
+        (data.train, 320, 1, 320),
+        (data.validation, 400, 321, 400),
+        (data.tests, 500, 401 + 10, 500),
+    ):
+        for record, level in zip(records, (0, 1000), strict=True):
+            assert scored(record) == (level + first, level + last)
+            assert (record.samples, record.u[0, 0]) == (samples, level + 1)  # all the past
+            assert np.array_equal(record.y, -record.u)
+            assert (record.fs, record.start, record.source) == (50.0, "estimated", "official")
+            channels = [str(c) for c in (*record.inputs, *record.outputs)]
+            assert channels == ["u (V)", "z (ticks/s)"]
+    for record, test in zip(data.leaderboard, data.tests, strict=True):
+        assert (record.name, record.start, record.samples) == (test.name, "estimated", 100)
+        assert (scored(record), record.skip) == (scored(test), 10)
+    assert (data.name, data.noise_rms) == ("ced", None)
+    assert {p.label: p.scores for p in data.published} == {
+        "CT-SUBNET, best": {"low": 0.094, "high": 0.0735},
+        "CT-SUBNET, median": {"low": 0.143, "high": 0.1},
+        "pNARX": {"low": 0.1, "high": 0.141},
+    }
+
+
+def test_the_rule_of_the_validation_part(numbered):
+    data = ced.load(root=str(numbered), validation=0.5)
+    assert [scored(r) for r in data.train] == [(1, 200), (1001, 1200)]
+    assert [scored(r) for r in data.validation] == [(201, 400), (1201, 1400)]
+    assert [scored(r) for r in data.tests] == [(411, 500), (1411, 1500)]
+
+
+@pytest.mark.parametrize("archive", ced._ARCHIVES)
+def test_the_archive_does_as_well(tmp_path, archive):
+    write(tmp_path, **numbers())
+    with ZipFile(tmp_path / archive, "w") as packed:
+        packed.write(tmp_path / FILE, "drives/DATAUNIF.MAT")
+    (tmp_path / FILE).unlink()
+    assert scored(ced.load(root=tmp_path).tests[1]) == (1411, 1500)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"validation": 0}, "data.validation is 0"),
+        ({"validation": 1.0}, "leaves 0 of the 400"),
+        ({"download": "no"}, "data.download is 'no'; give true or false"),
+    ],
+)
+def test_refused_arguments(arguments, match):
+    with pytest.raises(ValueError, match=match):
+        ced.load(**arguments)
+
+
+def test_a_missing_file_is_one_message(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no 'CED/DATAUNIF.MAT'.*data.root=DIR"):
+        ced.load(root=tmp_path)
+
+
+def test_a_missing_file_is_downloaded(tmp_path, monkeypatch):
+    def CED(*, data_file_locations: bool, dir_placement: Path):
+        assert data_file_locations
+        write(dir_placement, **numbers())
+
+    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", SimpleNamespace(CED=CED))
+    assert scored(ced.load(root=tmp_path, download=True).tests[0]) == (411, 500)
+
+
+def test_a_wrong_file_is_refused_with_advice(tmp_path):
+    write(tmp_path, **numbers() | {"z12": np.zeros((400, 1))})
+    with pytest.raises(ValueError, match=r"'z12' has shape \(400, 1\).*remove 'CED/DATAUNIF.MAT'"):
+        ced.load(root=tmp_path)
+
+
+def drives(mean: float, swing: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Input and output of simulated drives: a lag, a lightly damped mode, the absolute value."""
+    rng = np.random.default_rng(seed)
+    held = rng.integers(3, 20, 200)  # samples, as a PRBS of random amplitude
+    u = mean + np.repeat(rng.uniform(-swing, swing, 200), held)[:1500]
+    denominator = np.polymul([0.3, 1], [1 / 8**2, 2 * 0.1 / 8, 1])  # 0.3 s; 8 rad/s, damping 0.1
+    b, a, _ = cont2discrete(([1.0], denominator), 1 / 50)
+    z = np.abs(lfilter(b[0], a, u)) + 0.01 * rng.standard_normal(1500)
+    return u[-500:, None], z[-500:, None]  # amid the measurement
+
+
+@pytest.mark.numeric
+@pytest.mark.slow
+def test_drives_are_identified(tmp_path):
+    """The sign is found: the error falls to a few times the noise of 0.01; linear: 0.3 and 0.8.
+
+    Of order 3 alone the errors stay at 0.3 and 0.4: the linear model spends a state on the means of
+    the absolute values, which differ from record to record.
+    """
+    (u11, z11), (u12, z12) = drives(0.5, 1.5, 0), drives(1.0, 2.5, 1)
+    write(tmp_path, u11=u11, z11=z11, u12=u12, z12=z12)
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        words = ["+bench=ced", f"data.root='{tmp_path}'", "figures=false", "starts=4"]
+        cfg = compose("config", [*words, "trainer.max_iter=80"])
+    train.identify(cfg, tmp_path)
+    scores = json.loads((tmp_path / "metrics.json").read_text())["scores"]
+    for level in ("low", "high"):
+        assert scores[level]["rmse"] < 0.05
+        assert scores[level]["lti_rmse"] > 0.2
+
+
+@pytest.mark.data
+def test_official_file(official):
+    """The sensor is blind to the sign, but for an error of its zero of a few hundredths.
+
+    The input of the high level is that of the low one, half a volt higher.
+    """
+    data = official(ced.load)
+    low, high = data.tests
+    for record in (low, high):
+        assert np.mean(record.u < -0.1) > 0.15  # the motors are driven both ways
+        assert -0.03 < record.y.min() < 0.02 * record.y.max()
+    assert np.allclose(high.u - low.u, 0.5, rtol=0, atol=1e-12)
+    assert np.mean(high.y) > 1.2 * np.mean(low.y)

@@ -1,0 +1,212 @@
+"""Electro-mechanical positioning system: the split, the files, and a run on a simulated axis."""
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from scipy.io import savemat
+
+import lfrtorch
+import train
+from lfrtorch.datasets import emps
+
+ESTIMATION, TEST = FILES = ("EMPS/DATA_EMPS.mat", "EMPS/DATA_EMPS_PULSES.mat")
+SAMPLES = 24_841
+CONF = Path(__file__).resolve().parents[2] / "conf"
+
+
+def write(root: Path, estimation: dict[str, np.ndarray], test: dict[str, np.ndarray]) -> Path:
+    """Files of the official layout; their root."""
+    (root / "EMPS").mkdir(parents=True, exist_ok=True)
+    for file, signals in zip(FILES, (estimation, test), strict=True):
+        savemat(root / file, {"gtau": GAIN, **{k: v[:, None] for k, v in signals.items()}})
+    return root
+
+
+def numbers(sign: int = 1) -> dict[str, np.ndarray]:
+    """Samples are their numbers, counted from 1."""
+    number = np.arange(1.0, SAMPLES + 1)
+    return {"t": number / 1000, "qg": 0 * number, "qm": -sign * number, "vir": sign * number}
+
+
+@pytest.fixture
+def numbered(tmp_path):
+    return write(tmp_path, numbers(), numbers(-1))
+
+
+def scored(record):
+    """First and last scored sample."""
+    return int(record.u[record.skip, 0]), int(record.u[-1, 0])
+
+
+def test_split(numbered):
+    data = emps.load(root=numbered)
+    (training,), (validation,), (test,) = data.train, data.validation, data.tests
+    assert [r.name for r in (training, validation, test)] == ["train", "validation", "test"]
+    assert scored(training) == (1, 19_873)
+    assert scored(validation) == (19_873 + 21, SAMPLES)
+    assert scored(test) == (-21, -SAMPLES)  # of the other file
+    assert [r.samples for r in (training, validation, test)] == [19_873, 4968, SAMPLES]
+    for record in (training, validation, test):
+        assert np.array_equal(record.y, -record.u)
+        assert (record.fs, record.start, record.source) == (1000.0, "estimated", "official")
+        assert [str(c) for c in (*record.inputs, *record.outputs)] == ["vir (V)", "qm (m)"]
+    assert data.leaderboard == data.tests
+    assert (data.name, data.noise_rms) == ("emps", None)
+    published = {p.label: p.scores["test"] for p in data.published}
+    assert published == {"dynoNet": 2.64e-3, "CT-SUBNET": 4.61e-3, "LSTM": 74e-3}
+
+
+def test_the_rules_of_the_cuts(numbered):
+    data = emps.load(root=str(numbered), validation=0.5, warm_up=1000)
+    assert scored(data.train[0]) == (1, 12_421)
+    assert scored(data.validation[0]) == (13_422, SAMPLES)
+    assert data.validation[0].u[0, 0] == 12_422
+    assert data.validation[0].skip == 1000
+    assert scored(data.tests[0]) == (-21, -SAMPLES)
+
+
+def test_the_archive_does_as_well(tmp_path):
+    write(tmp_path, numbers(), numbers(-1))
+    with ZipFile(tmp_path / "EMPS" / "EMPS.zip", "w") as packed:
+        for file in FILES:
+            packed.write(tmp_path / file, Path(file).name)
+            (tmp_path / file).unlink()
+    data = emps.load(root=tmp_path)
+    assert scored(data.train[0]) == (1, 19_873)
+    assert scored(data.tests[0]) == (-21, -SAMPLES)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"validation": 0}, "data.validation is 0"),
+        ({"validation": 1.0}, "leaves 0 of the 24841"),
+        ({"warm_up": 0}, "data.warm_up is 0"),
+        ({"warm_up": 4968}, "data.warm_up is 4968, which leaves none of the 4968"),
+        ({"download": "no"}, "data.download is 'no'; give true or false"),
+    ],
+)
+def test_refused_arguments(arguments, match):
+    with pytest.raises(ValueError, match=match):
+        emps.load(**arguments)
+
+
+def test_a_missing_file_is_one_message(numbered):
+    for file in reversed(FILES):
+        (numbered / file).unlink()
+        with pytest.raises(FileNotFoundError, match=rf"no '{file}'.*data.root=DIR"):
+            emps.load(root=numbered)
+
+
+def test_missing_files_are_downloaded(tmp_path, monkeypatch):
+    def EMPS(*, data_file_locations: bool, dir_placement: Path):
+        assert data_file_locations
+        write(dir_placement, numbers(), numbers(-1))
+
+    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", SimpleNamespace(EMPS=EMPS))
+    assert scored(emps.load(root=tmp_path, download=True).tests[0]) == (-21, -SAMPLES)
+
+
+def test_a_wrong_file_is_refused_with_advice(numbered):
+    savemat(numbered / TEST, {"vir": np.zeros((1, SAMPLES)), "qm": np.zeros((SAMPLES, 1))})
+    match = r"'vir' has shape \(1, 24841\).*remove 'EMPS/DATA_EMPS_PULSES.mat' and 'EMPS/EMPS.zip'"
+    with pytest.raises(ValueError, match=match):
+        emps.load(root=numbered)
+
+
+GAIN, MASS, VISCOUS, DRY, LOAD = 35.15, 95.1, 203.5, 20.4, -3.2  # N/V, kg, N s/m, N, N
+NOISE = 1e-6  # m rms
+
+
+def axis(
+    targets: list[float], pulses: np.ndarray, seed: int, *, dry: float = DRY, load: float = LOAD
+) -> dict[str, np.ndarray]:
+    """A mass with viscous and dry friction that a controller moves to a target every 3.5 s.
+
+    Pulses (V) are added to the controller's output. Every move takes 2 s.
+    """
+    t = np.arange(SAMPLES) / 1000
+    move, s = (t // 3.5).astype(int), np.clip(t % 3.5 / 2.0, 0.0, 1.0)
+    levels = np.array([0.0, *targets])
+    qg = levels[move] + (levels[move + 1] - levels[move]) * s**3 * (10 - 15 * s + 6 * s**2)
+    q, v, signals = 0.0, 0.0, []
+    for reference, pulse in zip(qg.tolist(), pulses.tolist(), strict=True):
+        volts = min(10.0, max(-10.0, 240.0 * (20.0 * (reference - q) - v) + pulse))
+        signals.append((q, volts))
+        v += 1e-3 / MASS * (GAIN * volts - VISCOUS * v - dry * math.tanh(v / 1e-3) - load)
+        q += 1e-3 * v
+    qm, vir = np.array(signals).T
+    noise = NOISE * np.random.default_rng(seed).standard_normal(SAMPLES)
+    return {"t": t, "qg": qg, "qm": qm + noise, "vir": vir}
+
+
+@pytest.fixture
+def simulated(tmp_path):
+    """Root of files with a simulated axis; the test has pulses of 1.5 V for 0.1 s."""
+    pulses, rng = np.zeros(SAMPLES), np.random.default_rng(0)
+    for first in range(1500, SAMPLES, 1750):
+        pulses[first : first + 100] = 1.5 * rng.choice([-1, 1])
+    estimation = axis([0.2, 0.05, 0.24, 0.0, 0.1, 0.02, 0.2, 0.1], 0 * pulses, 0)
+    return write(tmp_path, estimation, axis(4 * [0.24, 0.0], pulses, 1))
+
+
+def scores(root: Path, *words: str) -> dict[str, dict[str, float]]:
+    """Of a run on the files below ``root``."""
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        given = ["+bench=emps", f"data.root='{root}'", "figures=false", "starts=1"]
+        cfg = compose("config", [*given, *words])
+    train.identify(cfg, root)
+    metrics = json.loads((root / "metrics.json").read_text())
+    return metrics["scores"] | {"validation": metrics["validation"]}
+
+
+@pytest.mark.numeric
+def test_start_states_of_an_integrator(tmp_path):
+    """The window of 20 samples finds them; from zero state the position is wrong for good."""
+    moves = 4 * [0.24, 0.0]
+    free = axis(moves, np.zeros(SAMPLES), 0, dry=0.0, load=0.0)
+    data = emps.load(root=write(tmp_path, free, free), validation=0.396)
+    (record,) = data.validation  # begins in the middle of a move
+    keep = 1 - VISCOUS / MASS / 1000
+    exact = lfrtorch.LinearModel(
+        A=np.array([[1.0, keep / 1000], [0.0, keep]]),  # position, velocity
+        B=GAIN / MASS * np.array([[1e-6], [1e-3]]),
+        C=np.array([[1.0, 0.0]]),
+        D=np.zeros((1, 1)),
+        fs=1000.0,
+        u_offset=np.zeros(1),
+        y_offset=np.zeros(1),
+        inputs=record.inputs,
+        outputs=record.outputs,
+    )
+    # 20 noisy positions give the velocity to NOISE / 0.026 s, and the mass rolls on for 0.47 s.
+    assert np.abs(exact.simulate(record) - record.y).max() < 5 * NOISE * 0.47 / 0.026
+    from_zero = np.abs(exact.simulate(replace(record, start="zero")) - record.y)
+    assert from_zero[-1000:].min() > 0.1
+
+
+@pytest.mark.numeric
+@pytest.mark.slow
+def test_friction_is_identified(simulated, capsys):
+    """From 15 mm of the linear model to less than 1 mm (27 µm after 150 iterations)."""
+    found = scores(simulated, "trainer.max_iter=60")
+    assert "data that drift or integrate" in capsys.readouterr().out
+    assert found["test"]["lti_rmse"] > 1e-2
+    assert found["test"]["rmse"] < 1e-3
+    assert found["validation"]["rmse"] < 1e-3
+
+
+@pytest.mark.data
+def test_official_files(official):
+    data = official(emps.load)
+    for record in (*data.train, *data.tests):
+        assert np.abs(record.u).max() <= 10.0  # V, where the controller saturates
+        assert 0.1 < np.ptp(record.y) < 1.0  # m

@@ -1,0 +1,71 @@
+"""The three ways of the one recurrence agree."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import normal
+from torch import Tensor
+from torch.testing import assert_close
+
+from lfrtorch.engine.recurrence import compiled, linear_recurrence, loop, scan
+
+pytestmark = pytest.mark.numeric
+
+LENGTHS = st.integers(1, 40)  # squares, primes, and one step among them
+SIZES = st.integers(1, 4)
+
+
+def problem(R: int, T: int, n: int, m: int, dtype: torch.dtype = torch.float64):
+    F = normal(R, T, n, n, seed=1, dtype=dtype)
+    F = 0.9 * F / torch.linalg.matrix_norm(F, 2, keepdim=True)
+    return F, normal(R, T, n, m, seed=2, dtype=dtype), normal(R, n, m, seed=3, dtype=dtype)
+
+
+def assert_same(s: Tensor, expected: Tensor, eps: float):
+    # Each state is a sum of products along a contraction: a few eps of the largest term.
+    assert_close(s, expected, rtol=0, atol=eps * float(1 + expected.abs().max()))
+
+
+@given(R=st.integers(1, 3), T=LENGTHS, n=SIZES, m=SIZES)
+@settings(max_examples=40)
+def test_loop_compiled_and_scan_agree(R: int, T: int, n: int, m: int):
+    F, g, s0 = problem(R, T, n, m)
+    expected = loop(F, g, s0)
+    assert expected.shape == (R, T + 1, n, m)
+    assert_same(compiled(F, g, s0), expected, 1e-12)
+    assert_same(scan(F, g, s0), expected, 1e-12)
+
+
+def test_loop_is_the_recurrence():
+    F = torch.tensor([[[[2.0]], [[3.0]]]])
+    g = torch.tensor([[[[1.0]], [[5.0]]]])
+    assert loop(F, g, torch.tensor([[[7.0]]])).flatten().tolist() == [7.0, 15.0, 50.0]
+
+
+@pytest.mark.parametrize("way", [compiled, scan])
+def test_single_precision_stays_single(way):
+    F, g, s0 = problem(2, 30, 3, 2, torch.float32)
+    s = way(F, g, s0)
+    assert s.dtype == torch.float32
+    assert_same(s, loop(F, g, s0), 1e-5)
+
+
+@pytest.mark.parametrize("way", [compiled, scan])
+@pytest.mark.parametrize("shape", [(2, 5, 0, 3), (2, 5, 3, 0)])
+def test_no_states_or_no_columns(way, shape):
+    F, g, s0 = torch.zeros(2, 5, shape[2], shape[2]), torch.zeros(shape), torch.zeros(2, *shape[2:])
+    assert way(F, g, s0).shape == (2, 6, *shape[2:])
+
+
+@pytest.mark.parametrize("way", [compiled, scan])
+def test_views_are_read_as_they_stand(way):
+    F, g, s0 = problem(2, 12, 3, 3)
+    F, g, s0 = F.mT.flip(1), g.mT, s0.mT  # what the adjoint passes
+    assert_same(way(F, g, s0), loop(F, g, s0), 1e-12)
+
+
+def test_divergence_gives_infinite_states():
+    F = torch.full((1, 2000, 1, 1), 2.0, dtype=torch.float64)
+    s = linear_recurrence(F, torch.zeros_like(F), torch.ones(1, 1, 1, dtype=torch.float64))
+    assert torch.isinf(s[0, -1]).all()

@@ -1,0 +1,343 @@
+"""Trajectories against the plain loop, and the periodic steady state."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import reference
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import SIZES, normal, random_cell
+from torch import Tensor
+from torch.testing import assert_close
+
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linearised import monodromy, slopes, spectral_radius
+from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network
+from lfrtorch.engine.simulate import (
+    PERIODIC_TOLERANCE,
+    Trajectory,
+    estimated_start,
+    simulate,
+    steady_state,
+)
+
+pytestmark = pytest.mark.numeric
+
+
+class SameNetwork(torch.nn.Module):
+    """The map of a Network in the user's own words: takes the generic path."""
+
+    def __init__(self, network: Network):
+        super().__init__()
+        self.W1, self.b1 = network.Wz, network.bz
+        self.W2, self.b2 = network.Ww, network.bw
+
+    def forward(self, z: Tensor) -> Tensor:
+        return torch.tanh(z @ self.W1.T + self.b1) @ self.W2.T + self.b2
+
+
+class Halved(Network):
+    """A user's own class that begins with the package's."""
+
+    def forward(self, z: Tensor) -> Tensor:
+        return 0.5 * super().forward(z)
+
+
+class Cube(torch.nn.Module):
+    """A static map without parameters."""
+
+    def forward(self, z: Tensor) -> Tensor:
+        return z**3
+
+
+def assert_same(trajectory: Trajectory, expected: Trajectory, tolerance: float):
+    for signal, wanted in zip(trajectory, expected, strict=True):
+        assert_close(signal, wanted, rtol=tolerance, atol=tolerance)
+
+
+# --- from a given state ---------------------------------------------------------------------
+
+
+@given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 12))
+@settings(max_examples=25)
+def test_simulation_is_the_plain_loop(sizes: dict[str, Any], R: int, T: int):
+    cell = random_cell(**sizes)
+    u, x0 = normal(R, T, cell.nu), normal(R, cell.nx, seed=1)
+    assert_same(simulate(cell, u, x0), reference.simulate(cell, u, x0), 1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
+def test_compiled_is_the_plain_loop_for_every_activation(activation: str, dtype: torch.dtype):
+    cell = random_cell(2, 2, 3, 2, 2, 5, activation=activation, dtype=dtype)
+    u, x0 = normal(3, 40, 2, dtype=dtype), normal(3, 3, seed=1, dtype=dtype)
+    trajectory = simulate(cell, u, x0)
+    assert trajectory.y.dtype == dtype
+    # Errors of the steps before contract: some 100 eps in all, in either order of the sums.
+    eps = torch.finfo(dtype).eps
+    assert_same(trajectory, reference.simulate(cell, u, x0), 1000 * eps)
+
+
+def test_linear_cell_is_the_plain_loop():
+    cell = random_cell(2, 2, 3, 0, 0)
+    u, x0 = normal(2, 30, 2), normal(2, 3, seed=1)
+    trajectory = simulate(cell, u, x0)
+    assert trajectory.z.shape == trajectory.w.shape == (2, 30, 0)
+    assert_same(trajectory, reference.simulate(cell, u, x0), 1e-12)
+
+
+def test_own_module_equals_the_compiled_network():
+    cell = random_cell(1, 1, 2, 2, 2, 4)
+    assert isinstance(cell.static, Network)
+    own = LFRCell(1, 1, 2, 2, 2, SameNetwork(cell.static)).double()
+    own.load_state_dict(cell.state_dict(), strict=False)
+    u, x0 = normal(2, 50, 1), normal(2, 2, seed=1)
+    assert_same(simulate(own, u, x0), simulate(cell, u, x0), 1e-12)
+    assert_same(steady_state(own, u), steady_state(cell, u), 1e-9)
+
+
+def test_own_class_derived_from_the_network_is_followed():
+    own = random_cell(static=Halved(1, 1, 3))
+    halved = random_cell(static=Network(1, 1, 3))
+    halved.load_state_dict(own.state_dict())
+    with torch.no_grad():
+        for name in ("static.Ww", "static.bw"):
+            halved.get_parameter(name).mul_(0.5)
+    u, x0 = normal(2, 20, 1), normal(2, 2, seed=1)
+    assert_same(simulate(own, u, x0), simulate(halved, u, x0), 1e-12)
+
+
+def test_records_of_a_batch_do_not_mix():
+    cell = random_cell(1, 1, 2)
+    u, x0 = normal(3, 20, 1), normal(3, 2, seed=1)
+    together = simulate(cell, u, x0)
+    for r in range(3):
+        alone = simulate(cell, u[r : r + 1], x0[r : r + 1])
+        assert torch.equal(together.x[r], alone.x[0])
+
+
+def test_unstable_model_is_not_an_exception():
+    cell = random_cell(radius=3.0)
+    trajectory = simulate(cell, normal(1, 2000, 1), torch.zeros(1, 2, dtype=torch.float64))
+    assert not trajectory.finite
+    assert not torch.isfinite(trajectory.y[0, -1]).any()
+    assert torch.isnan(steady_state(cell, normal(1, 2000, 1)).y).all()
+
+
+# --- periodic steady state ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
+def test_steady_state_is_the_last_of_very_many_periods(activation: str):
+    cell = random_cell(2, 1, 3, 2, 1, 4, activation=activation)
+    u = normal(2, 10, 2)
+    expected = reference.simulate(cell, u, u.new_zeros(2, 3), periods=50)  # 0.9^500 = 1e-23
+    # The gap of 1e-10 at the end of a period is 1e-10 / (1 - 0.9^10) from the solution.
+    assert_same(steady_state(cell, u), expected, 2e-9)
+
+
+def test_steady_state_of_a_linear_cell_is_the_response_in_frequency():
+    cell = random_cell(2, 2, 3, 0, 0)
+    A, B, C, D = (m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu))
+    u = normal(1, 64, 2)
+    expected = reference.periodic_response((A, B, C, D), u[0].numpy())
+    np.testing.assert_allclose(steady_state(cell, u).y[0].numpy(), expected, rtol=0, atol=1e-9)
+
+
+def lightly_damped(radius: float, nw: int, dtype: torch.dtype = torch.float64) -> LFRCell:
+    """Cell with poles at radius e^(±j) and hardly any feedback."""
+    cell = random_cell(1, 1, 2, nw, nw, 3, feedback=1e-5)
+    c, s = np.cos(1.0), np.sin(1.0)
+    with torch.no_grad():
+        cell.A.copy_(radius * torch.tensor([[c, s], [-s, c]]))
+    return cell.to(dtype)
+
+
+@pytest.mark.parametrize("nw", [0, 1])
+def test_lightly_damped_model_settles_by_newton(nw: int):
+    cell = lightly_damped(0.9999, nw)  # forward passes would take 2e5 samples
+    u = normal(2, 30, 1)
+    found = steady_state(cell, u)
+    scale = float(1 + found.x.abs().max())
+    assert (found.x[:, -1] - found.x[:, 0]).abs().max() <= PERIODIC_TOLERANCE * scale
+    assert_same(found, reference.simulate(cell, u, found.x[:, 0]), 1e-12 * scale)
+
+
+def test_good_guess_changes_nothing():
+    cell = random_cell()
+    u = normal(1, 20, 1)
+    cold = steady_state(cell, u)
+    assert_same(steady_state(cell, u, cold.x[:, 0]), cold, 1e-9)
+
+
+@pytest.mark.parametrize("radius", [0.5, 0.9, 0.99])
+def test_steady_state_in_single_precision(radius: float):
+    u = normal(1, 50, 1)
+    expected = steady_state(lightly_damped(radius, 1), u)
+    found = steady_state(lightly_damped(radius, 1, torch.float32), u.float())
+    # eps 1.2e-7 amplified by 1 / (1 - 0.99) = 100, times some rounding errors a step.
+    tolerance = 5e-5 * float(1 + expected.x.abs().max())
+    assert_close(found.y.double(), expected.y, rtol=0, atol=tolerance)
+
+
+def test_unstable_periodic_solution_counts_as_diverged():
+    cell = random_cell(1, 1, 2, 0, 0, radius=0.5)
+    with torch.no_grad():
+        cell.A[:] = torch.diag(
+            torch.tensor([1.05, 0.5])
+        )  # (I - Φ) is regular, x(T) = x(0) solvable
+    assert torch.isnan(steady_state(cell, normal(1, 10, 1)).y).all()
+
+
+# --- linearisation --------------------------------------------------------------------------
+
+
+def test_slopes_are_the_derivatives_of_one_step():
+    cell = random_cell(2, 2, 3, 2, 2, 4)
+    u, x = normal(1, 1, 2), normal(1, 3, seed=1)
+    F, H = slopes(cell, simulate(cell, u, x).z)
+    y_x, next_x = torch.autograd.functional.jacobian(lambda x_: cell(u[0, 0], x_), x[0])
+    assert_close(F[0, 0], next_x, rtol=1e-12, atol=1e-13)
+    assert_close(H[0, 0], y_x, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("samples", [1 << 14, 3])
+def test_monodromy_is_the_product_with_the_last_step_leftmost(samples: int, monkeypatch):
+    monkeypatch.setattr("lfrtorch.engine.linearised.PASS", samples)
+    cell, z = random_cell(1, 1, 3, 2, 2), normal(2, 7, 2)
+    F = slopes(cell, z).F
+    for r in range(2):
+        expected = torch.linalg.multi_dot(list(F[r].flip(0)))
+        assert_close(monodromy(cell, z)[r], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_expanding_but_bounded_trajectory_counts_as_diverged():
+    """Its monodromy overflows, and the eigenvalues of infinities crash some builds of LAPACK."""
+    # The chaotic Gauss map x+ = exp(-6.2 x²) - 0.5.
+    static = Network(1, 1, 1, "rbf", dtype=torch.float64)
+    cell = LFRCell(1, 1, 1, 1, 1, static, dtype=torch.float64)
+    with torch.no_grad():
+        for weight, value in (
+            (cell.Bw, 1.0),
+            (cell.Cz, 1.0),
+            (static.Wz, 6.2**0.5),
+            (static.bz, 0.0),
+            (static.Ww, 1.0),
+            (static.bw, -0.5),
+        ):
+            weight.fill_(value)
+    u = torch.zeros(1, 8192, 1, dtype=torch.float64)
+    start = u.new_full((1, 1), 0.1)
+    trajectory = simulate(cell, u, start)
+    assert trajectory.finite
+    assert not torch.isfinite(monodromy(cell, trajectory.z)).all()
+    assert not steady_state(cell, u, start).finite
+
+
+def test_spectral_radius():
+    matrices = torch.tensor([[[0.0, 2.0], [-2.0, 0.0]], [[0.5, 0.0], [0.0, 0.1]]])
+    assert_close(spectral_radius(matrices), torch.tensor([2.0, 0.5]))
+    matrices[0, 0, 0] = torch.inf
+    assert_close(spectral_radius(matrices), torch.tensor([torch.nan, 0.5]), equal_nan=True)
+
+
+def test_record_that_diverges_leaves_the_others_their_steady_state():
+    """The slope of the first model is beyond one; each record has its own model."""
+    cell = random_cell(1, 1, 2, 0, 0, radius=0.5)
+    poles = torch.tensor([[1.2, 0.5], [0.6, 0.5]], dtype=torch.float64)
+    cell.A = torch.nn.Parameter(torch.diag_embed(poles))
+    for name in ("Bu", "Bw", "Cz", "Dzu", "Cy", "Dyu", "Dyw"):
+        weight = cell.get_parameter(name).detach()
+        setattr(cell, name, torch.nn.Parameter(weight.expand(2, *weight.shape).clone()))
+    y = steady_state(cell, normal(2, 30, 1)).y
+    assert torch.isnan(y[0]).all()
+    assert torch.isfinite(y[1]).all()
+
+
+def test_steady_state_of_a_slow_model_is_the_last_of_very_many_periods():
+    cell, u = random_cell(2, 1, 3, 2, 2, 4, radius=0.85), normal(2, 5, 2)
+    expected = reference.simulate(cell, u, u.new_zeros(2, 3), periods=100)  # 0.95^500 = 7e-12
+    assert_same(steady_state(cell, u), expected, 1e-9)
+
+
+# --- estimated start states -----------------------------------------------------------------
+
+
+def test_estimated_start_is_the_one_that_made_the_output():
+    cell, u, x0 = random_cell(2, 2, 3, 2, 2, 4), normal(3, 60, 2), normal(3, 3, seed=1)
+    made = simulate(cell, u, x0)
+    found = estimated_start(cell, u, made.y, torch.ones_like(made.y))
+    assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
+    assert_close(found.y, made.y, rtol=0, atol=1e-9)
+
+
+def test_estimated_start_counts_what_is_weighted_only():
+    cell, u, x0 = random_cell(1, 1, 2), normal(2, 60, 1), normal(2, 2, seed=1)
+    y = simulate(cell, u, x0).y
+    weight = torch.ones_like(y)
+    y[:, 3:6] += 10.0
+    weight[:, 3:6] = 0.0
+    found = estimated_start(cell, u, y, weight)
+    assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
+
+
+def test_estimated_start_of_a_state_that_no_output_shows_is_the_likeliest():
+    """Given the other one, with the moments that the input gives both."""
+    cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 30, 1)
+    with torch.no_grad():
+        cell.A.copy_(torch.diag(torch.tensor([0.5, 0.4])))
+        cell.Cy[0, 1] = 0.0
+    y = simulate(cell, u, u.new_tensor([[2.0, 3.0]])).y + 1e-4 * normal(1, 30, 1, seed=3)
+    found = estimated_start(cell, u, y, torch.ones_like(y))
+    x = simulate(cell, u, u.new_zeros(1, 2)).x[0]
+    moments = x.mT @ x
+    expected = u.new_tensor([[2.0, 2.0 * moments[1, 0] / moments[0, 0]]])
+    assert expected[0, 1] > 1.0
+    # Noise of 1e-4 over an output gain of about 1: a few of it in either state. (Without noise the
+    # likelihoods compared are logarithms of rounding errors.)
+    assert_close(found.x[:, 0], expected, rtol=0, atol=2e-3)
+
+
+def test_estimated_start_of_a_system_left_alone_is_that_of_least_squares():
+    """The input moves the states a hundredth as far as they are at the start."""
+    cell, u = random_cell(1, 1, 2, radius=0.9), 0.01 * normal(1, 60, 1)
+    x0 = u.new_tensor([[3.0, -2.0]])
+    clean = simulate(cell, u, x0).y
+    found = estimated_start(cell, u, clean + 1e-3 * normal(1, 60, 1, seed=3), torch.ones_like(u))
+    assert_close(found.x[:, 0], x0, rtol=0, atol=0.02)
+
+
+def test_estimated_start_of_a_diverging_model_is_not_finite():
+    cell, u = random_cell(1, 1, 2, 0, 0, radius=3.0), normal(1, 2000, 1)
+    y = torch.zeros_like(u)
+    assert not estimated_start(cell, u, y, torch.ones_like(y)).finite
+
+
+def test_estimated_start_of_one_record_does_not_hold_up_the_others():
+    """The first is at rest already: nothing improves there."""
+    cell, u, x0 = random_cell(2, 2, 3, 2, 2, 4), normal(4, 60, 2), normal(4, 3, seed=1)
+    x0[0] = 0.0
+    made = simulate(cell, u, x0)
+    found = estimated_start(cell, u, made.y, torch.ones_like(made.y))
+    assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
+
+
+def test_estimated_start_that_has_faded_before_the_first_sample_that_counts_stays():
+    cell, u = random_cell(1, 1, 2, 0, 0, radius=0.3), normal(1, 100, 1)
+    y = simulate(cell, u, normal(1, 2)).y + 0.1 * normal(1, 100, 1, seed=3)
+    weight = torch.ones_like(y)
+    weight[:, :90] = 0.0
+    assert torch.equal(estimated_start(cell, u, y, weight).x[:, 0], u.new_zeros(1, 2))
+
+
+def test_estimated_start_whose_response_overflows_stays():
+    """The unstable state is not driven, but would be moved by its start."""
+    cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 2000, 1)
+    with torch.no_grad():
+        cell.A.copy_(torch.diag(torch.tensor([0.5, 2.0])))
+        cell.Bu[1] = 0.0
+    y = simulate(cell, u, u.new_zeros(1, 2)).y + 0.1
+    found = estimated_start(cell, u, y, torch.ones_like(y))
+    assert torch.equal(found.x[:, 0], u.new_zeros(1, 2))

@@ -1,0 +1,124 @@
+"""Slopes of the static map at every sample against autograd, one sample at a time."""
+
+import pytest
+import torch
+from reference import normal
+from torch import Tensor, nn
+from torch.func import functional_call
+from torch.testing import assert_close
+
+from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Stacked
+from lfrtorch.engine.static_jacobian import StaticSlopes, static_slopes
+
+pytestmark = pytest.mark.numeric
+
+R, T, nz, nw = 2, 5, 2, 3
+
+
+class Bend(nn.Module):
+    """A user's map with parameters of two shapes, one of them scalar."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gain, self.W = nn.Parameter(torch.tensor(0.7)), nn.Parameter(torch.ones(nw, nz))
+        self.double()
+
+    def forward(self, z: Tensor) -> Tensor:
+        return self.gain * torch.sin(z @ self.W.mT) ** 2
+
+
+class Cube(nn.Module):
+    """A map without parameters."""
+
+    def forward(self, z: Tensor) -> Tensor:
+        return z**3
+
+
+def network(activation: str) -> Network:
+    static = Network(nz, nw, 4, activation, dtype=torch.float64)
+    for p, weight in zip(static.parameters(), weights_of(static).values(), strict=True):
+        p.data = weight
+    return static
+
+
+def weights_of(static: nn.Module, seed: int = 1) -> dict[str, Tensor]:
+    named = enumerate(static.named_parameters())
+    return {name: normal(p.numel(), seed=seed + i).reshape(p.shape) for i, (name, p) in named}
+
+
+def expected_slopes(static: nn.Module, weights: dict[str, Tensor], z: Tensor):
+    """J and by_weight of one sample z (nz,)."""
+    leaves = {name: p.clone().requires_grad_() for name, p in weights.items()}
+    z = z.clone().requires_grad_()
+    J, by_weight = [], []
+    for w_q in functional_call(static, leaves, (z,)):
+        dz, *dp = torch.autograd.grad(w_q, (z, *leaves.values()), retain_graph=True)
+        J.append(dz)
+        by_weight.append(torch.cat([torch.zeros(0), *(d.flatten() for d in dp)]))
+    return torch.stack(J), torch.stack(by_weight)
+
+
+def check(slopes: StaticSlopes, static: nn.Module, weights: list[dict[str, Tensor]], z: Tensor):
+    by_weight = slopes.by_weight()
+    for r in range(R):
+        for k in range(T):
+            J, by = expected_slopes(static, weights[r], z[r, k])
+            assert_close(slopes.J[r, k], J, rtol=1e-12, atol=1e-14)
+            assert_close(by_weight[r, k], by.double(), rtol=1e-12, atol=1e-14)
+    direction, d_w = normal(by_weight.shape[-1], seed=8), normal(R, T, nw, seed=9)
+    assert_close(slopes.tangent(direction), by_weight @ direction, rtol=1e-12, atol=1e-12)
+    expected = (by_weight * d_w.unsqueeze(-1)).sum(dim=(1, 2))
+    assert_close(slopes.adjoint(d_w), expected, rtol=1e-12, atol=1e-12)
+    part = slopes.part(slice(1, 2), slice(2, 4))
+    assert_close(part.by_weight(), by_weight[1:2, 2:4], rtol=1e-14, atol=1e-15)
+    assert_close(part.adjoint(d_w[1:2, 2:4]), (by_weight * d_w.unsqueeze(-1))[1:2, 2:4].sum((1, 2)))
+
+
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
+def test_network(activation: str):
+    static, z = network(activation), normal(R, T, nz)
+    weights = weights_of(static)
+    check(static_slopes(static, z, weights), static, [weights, weights], z)
+
+
+def test_own_module():
+    static, z = Bend(), normal(R, T, nz)
+    weights = weights_of(static)
+    check(static_slopes(static, z, weights), static, [weights, weights], z)
+
+
+def test_map_without_parameters():
+    z = normal(R, T, nz)
+    slopes = static_slopes(Cube(), z, {})
+    assert_close(slopes.J, torch.diag_embed(3 * z**2), rtol=1e-14, atol=0)
+    assert slopes.by_weight().shape == (R, T, nz, 0)
+    assert slopes.adjoint(z).shape == (R, 0)
+    assert torch.equal(slopes.tangent(z.new_zeros(0)), torch.zeros_like(z))
+
+
+def test_no_map():
+    slopes = static_slopes(None, normal(R, T, 0), {})
+    assert slopes.J.shape == (R, T, 0, 0)
+    assert slopes.by_weight().shape == (R, T, 0, 0)
+
+
+def test_values_and_slopes_of_own_weights_for_every_record():
+    base, z = Bend(), normal(R, T, nz)
+    each = [weights_of(base, seed=10 * r + 1) for r in range(R)]
+    stacked = Stacked(base, {name: torch.stack([w[name] for w in each]) for name in each[0]})
+    for r in range(R):
+        assert_close(stacked(z)[r], functional_call(base, each[r], (z[r],)), rtol=1e-14, atol=1e-14)
+    check(
+        static_slopes(stacked, z, {n: p.detach() for n, p in stacked.named_parameters()}),
+        base,
+        each,
+        z,
+    )
+
+
+def test_network_with_own_weights_for_every_record():
+    base, z = network("tanh"), normal(R, T, nz)
+    each = [weights_of(base, seed=10 * r + 1) for r in range(R)]
+    stacked = {name: torch.stack([w[name] for w in each]) for name in each[0]}
+    stacked |= {name: stacked[name].unsqueeze(1) for name in ("bz", "bw")}
+    check(static_slopes(base, z, stacked), base, each, z)

@@ -1,0 +1,497 @@
+"""Files of every format as tables of channels: layouts, missing values, memory and refusals."""
+
+import gzip
+import sys
+import tracemalloc
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import scipy.io
+import scipy.sparse
+
+from lfrtorch.files.formats import open_table
+from lfrtorch.records import Channel
+
+T = 40
+SIGNALS = np.random.default_rng(3).normal(size=(T, 3))
+U, Y = SIGNALS[:, :2], SIGNALS[:, 2]
+
+
+def text(table=SIGNALS, delimiter=",", comma=False) -> str:
+    lines = [delimiter.join(repr(float(value)) for value in row) for row in table]
+    return ("\n".join(lines) + "\n").replace(".", "," if comma else ".")
+
+
+def table_of(tmp_path: Path, content: str | bytes, name="a.csv"):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return open_table(path)
+
+
+def names(table) -> list[str]:
+    return [column.name for column in table.columns]
+
+
+def whole(table, wanted: str | int | list[str | int]):
+    return table.read(table.find(wanted, "data.inputs"))
+
+
+# --- text -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", "|", " ", "  ", ", "])
+@pytest.mark.parametrize("header", [True, False])
+def test_delimiters(tmp_path, delimiter, header):
+    head = delimiter.join(["u1", "u2", "y"]) + "\n" if header else ""
+    table = table_of(tmp_path, head + text(delimiter=delimiter))
+    assert names(table) == (["u1", "u2", "y"] if header else ["column 0", "column 1", "column 2"])
+    assert np.array_equal(whole(table, [2, 0]), SIGNALS[:, [2, 0]])
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.TXT", "a.tsv", "a.dat", "a.lvm"])
+def test_extensions_of_text(tmp_path, name):
+    assert np.array_equal(table_of(tmp_path, text(), name).read([0, 1, 2]), SIGNALS)
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t", "|", " "])
+def test_decimal_comma(tmp_path, delimiter):
+    head = f"u1{delimiter}u2{delimiter}y\n"
+    table = table_of(tmp_path, head + text(delimiter=delimiter, comma=True))
+    assert np.array_equal(whole(table, ["u1", "u2", "y"]), SIGNALS)
+    mixed = table_of(tmp_path, head + text(np.round(SIGNALS * 9), delimiter, comma=True), "b.csv")
+    assert np.array_equal(whole(mixed, "y")[:, 0], np.round(Y * 9))
+
+
+@pytest.mark.parametrize(
+    "encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16", "utf-16-le", "utf-16-be", "cp1252"]
+)
+def test_encodings(tmp_path, encoding):
+    content = "Zeit/s;Weg in µm;Größe (°C)\r\n" + text(delimiter=";").replace("\n", "\r\n")
+    table = table_of(tmp_path, content.encode(encoding))
+    assert table.columns == (Channel("Zeit", "s"), Channel("Weg in µm"), Channel("Größe", "°C"))
+    assert np.array_equal(whole(table, ["Zeit", "Weg in µm", "Größe (°C)"]), SIGNALS)
+
+
+def test_compressed_text(tmp_path):
+    content = gzip.compress(("u1,u2,y\n" + text()).encode())
+    assert np.array_equal(whole(table_of(tmp_path, content, "a.csv.gz"), "y")[:, 0], Y)
+    for damaged in (content[:100], b"no gzip at all"):
+        with pytest.raises(ValueError, match=r"a\.csv\.gz' is damaged"):
+            table_of(tmp_path, damaged, "a.csv.gz")
+
+
+def test_preamble_units_and_comments(tmp_path):
+    lines = text().splitlines(keepends=True)
+    content = (
+        "Logger 7,serial 123\nSample rate,1000\nOperator:\tme\n\n"
+        "# calibrated\ntime,force,disp\ns,N,[mm]\n"
+        + "".join(lines[:20])
+        + "# the rig was touched, 1, 2\n"
+        + "".join(lines[20:])
+    )
+    table = table_of(tmp_path, content)
+    assert table.columns == (Channel("time", "s"), Channel("force", "N"), Channel("disp", "mm"))
+    assert np.array_equal(table.read([0, 1, 2]), SIGNALS)
+    assert table.where(0) == "line 8"
+    assert table.where(20) == "line 29"
+
+
+def test_labview_measurement(tmp_path):
+    content = (
+        "LabVIEW Measurement\t\nWriter_Version\t2\nSeparator\tTab\nDecimal_Separator\t.\n"
+        "***End_of_Header***\t\n\t\nChannels\t2\t\t\nSamples\t40\t40\t\n"
+        "X0\t0.0E+0\t0.0E+0\t\nDelta_X\t1.0E-3\t1.0E-3\t\n***End_of_Header***\t\t\t\n"
+        "X_Value\tVoltage\tVoltage_0\tComment\n" + text(delimiter="\t")
+    )
+    table = table_of(tmp_path, content, "a.lvm")
+    assert names(table) == ["X_Value", "Voltage", "Voltage_0", "Comment"]
+    assert np.array_equal(whole(table, ["X_Value", "Voltage", "Voltage_0"]), SIGNALS)
+
+
+@pytest.mark.parametrize(
+    ("head", "columns"),
+    [
+        ('"Time","Load"\n"(sec)","(N)"\n', [("Time", "sec"), ("Load", "N")]),  # testing machine
+        ("Time,Channel A\n(ms),(V)\n\n", [("Time", "ms"), ("Channel A", "V")]),  # oscilloscopes
+        ("X,CH1,\nVolt,Volt,\n", [("X", ""), ("CH1", "")]),
+        (
+            "LECROYWS,123,Waveform\nSegments,1\n#1,01-Jan,0\nTime,Ampl\n",
+            [("Time", ""), ("Ampl", "")],
+        ),
+        (",y\n", [("column 0", ""), ("y", "")]),  # an index without a name
+    ],
+)
+def test_heads_of_instruments(tmp_path, head, columns):
+    table = table_of(tmp_path, head + text(U))
+    assert [tuple(column) for column in table.columns] == columns
+    assert np.array_equal(table.read([0, 1]), U)
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+def test_blanks_and_line_ends(tmp_path, newline):
+    rows = ["  u , y", " 1.5 , +2 ", '"3e2" ,-.5', "Infinity,Null", "0x1,1"]
+    table = table_of(tmp_path, newline.join(rows[:4]) + newline)
+    assert names(table) == ["u", "y"]
+    expected = [[1.5, 2], [300, -0.5], [np.inf, np.nan]]
+    assert np.array_equal(table.read([0, 1]), expected, equal_nan=True)
+    with pytest.raises(ValueError, match="line 5: '0x1' in column 'u' is not a number"):
+        table_of(tmp_path, newline.join(rows)).read([0])
+
+
+@pytest.mark.parametrize("mark", ["# ", "%", "#\t"])
+def test_header_in_a_comment(tmp_path, mark):
+    content = f"{mark}made by a program\n{mark}u1,u2,y\n" + text()
+    assert names(table_of(tmp_path, content)) == ["u1", "u2", "y"]
+
+
+def test_as_numpy_writes_a_table(tmp_path):
+    np.savetxt(tmp_path / "a.txt", SIGNALS, header="u1 u2 y", fmt="%.17g")
+    table = open_table(tmp_path / "a.txt")
+    assert names(table) == ["u1", "u2", "y"]
+    assert np.array_equal(table.read([0, 1, 2]), SIGNALS)
+
+
+def test_quotes_and_trailing_delimiters(tmp_path):
+    rows = "".join(f'"{u}","{y}",\n' for u, _, y in SIGNALS)
+    for header in ('"force, left (N)","y"\n', '"force, left (N)","y",\n'):
+        table = table_of(tmp_path, header + rows)
+        assert table.columns == (Channel("force, left", "N"), Channel("y"))
+        assert np.array_equal(table.read([0, 1]), SIGNALS[:, [0, 2]])
+
+
+def test_units_in_headers(tmp_path):
+    headers = {
+        "force (N)": ("force", "N"),
+        "acc [m/s^2]": ("acc", "m/s^2"),
+        "disp/mm": ("disp", "mm"),
+        "T(°C)": ("T", "°C"),
+        "y(k)": ("y(k)", ""),
+        "u/y": ("u/y", ""),
+        "x (raw)": ("x (raw)", ""),
+        "x (mm)": ("x (mm)", ""),
+        "torque [a b]": ("torque", "a b"),
+    }
+    row = ";".join("1" * len(headers))
+    table = table_of(tmp_path, ";".join(headers) + f"\n{row}\n{row}\n")
+    assert [tuple(column) for column in table.columns] == list(headers.values())
+    for i, (header, (name, _)) in enumerate(headers.items()):
+        assert table.find(header, "data.inputs") == table.find(name, "data.inputs") == (i,)
+
+
+def test_missing_values(tmp_path):
+    content = "u,y\n1,2\n,NA\nnan,4\n5\n#N/A,6\n\n7,-NaN\n"
+    values = table_of(tmp_path, content).read([0, 1])
+    expected = [[1, 2], [np.nan] * 2, [np.nan, 4], [5, np.nan], [np.nan, 6], [7, np.nan]]
+    assert np.array_equal(values, expected, equal_nan=True)
+
+
+@pytest.mark.numeric
+def test_date_times_are_seconds(tmp_path):
+    stamps = np.datetime64("2024-02-28T23:59:59.5") + np.arange(T) * np.timedelta64(250, "ms")
+    for form in (str, lambda t: str(t).replace("T", " "), lambda t: f"{t}+01:00"):
+        rows = "".join(f"{form(t)};{y}\n" for t, y in zip(stamps, Y, strict=True))
+        rows = rows.replace(form(stamps[0]), "", 1)  # a time that is missing
+        table = table_of(tmp_path, "when;y\n" + rows)
+        parts = list(table.blocks([1, 0], samples=7))
+        assert [len(part) for part in parts] == [7] * 5 + [5]
+        expected = np.append(np.nan, np.arange(T - 1) / 4)
+        assert np.allclose(np.concatenate(parts)[:, 1], expected, atol=1e-12, equal_nan=True)
+
+
+def test_lines_count_comments_and_blanks(tmp_path):
+    table = table_of(tmp_path, "u,y\n1,2\n\n# a\n3,4\n  \n5,six\n")
+    assert [table.where(k) for k in range(3)] == ["line 2", "line 5", "line 7"]
+    with pytest.raises(ValueError, match=r"a\.csv', line 7: 'six' in column 'y' is not a number"):
+        table.read([0, 1])
+    assert np.array_equal(table.read([0]), [[1], [3], [5]])
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        ("", "is empty"),
+        ("\n \n", "is empty"),
+        ("u1,u2,y\n", "has no samples.*'u1,u2,y'"),
+        ("hello\nworld\n", "has no samples.*'hello'"),
+        ("u1,u2,y\n1,2,3\n1,two,3\n", "line 3: 'two' in column 'u2' is not a number"),
+        ("1,two,3\n" + "1,2,3\n" * 9, "line 1: 'two' in column 'column 1'"),
+        ("u1,u2,y\n1,2,3\n\n1,2,3,4\n", "line 4: 4 cells, where there are 3 columns"),
+        ("u1,u2,y\n1,2,3\n1,5,2,3\n", r"line 3: 4 cells.*decimal point"),
+        ('u1,u2,y\n1,2,3\n"1,5",2,3\n', "line 3: '1,5' in column 'u1'"),
+        ("t,u,y\n2024-01-01,2,3\nnoon,2,3\n", "line 3: 'noon' in column 't' is not a date-time"),
+    ],
+)
+def test_refused_text(tmp_path, content, match):
+    with pytest.raises(ValueError, match=match):
+        table_of(tmp_path, content).read([0, 1, 2])
+
+
+def test_a_bad_cell_late_in_the_file(tmp_path):
+    table = table_of(tmp_path, "u,y\n" + "1,2\n" * 2500 + "1,x\n")
+    with pytest.raises(ValueError, match="line 2502: 'x' in column 'y'"):
+        list(table.blocks([1], samples=1000))
+
+
+def test_binary_is_no_text(tmp_path):
+    with pytest.raises(ValueError, match="is not text"):
+        table_of(tmp_path, b"\x89PNG\r\n\xff\x00\x00\x01" * 20)
+
+
+def test_text_is_read_in_blocks(tmp_path):
+    path = tmp_path / "a.csv"
+    line = ",".join(["0.123456789012"] * 8) + "\n"
+    path.write_text("a,b,c,d,e,f,g,h\n" + line * 40_000)  # 4.8 MB, 2.6 MB as numbers
+    table = open_table(path)
+    next(table.blocks([0], samples=100))  # imports
+    tracemalloc.start()
+    try:
+        count = sum(len(block) for block in table.blocks([1, 2], samples=1000))
+        assert tracemalloc.get_traced_memory()[1] < 1.25e6  # measured: 0.9e6, in one block 1.6e6
+        assert count == 40_000
+    finally:
+        tracemalloc.stop()
+
+
+# --- arrays ---------------------------------------------------------------------------------
+
+
+def check(table):
+    """The table of u (T, 2) and y (T,)."""
+    assert names(table) == ["u1", "u2", "y"]
+    assert table.find("u", "data.inputs") == (0, 1)
+    assert np.array_equal(whole(table, ["y", "u"]), SIGNALS[:, [2, 0, 1]])
+    blocks = list(table.blocks([2, 1], samples=15))
+    assert [block.shape for block in blocks] == [(15, 2), (15, 2), (10, 2)]
+    assert np.array_equal(np.concatenate(blocks), SIGNALS[:, [2, 1]])
+
+
+def refused(table, name, match):
+    with pytest.raises(ValueError, match=match) as refusal:
+        table.find(name, "data.inputs")
+    assert str(table.path) in str(refusal.value)
+
+
+@pytest.mark.parametrize("y", [Y, Y[:, None], Y[None, :]])
+def test_npz(tmp_path, y):
+    np.savez(tmp_path / "a.npz", u=U, y=y, fs=1000.0, notes=np.array({"by": "me"}))
+    table = open_table(tmp_path / "a.npz")
+    check(table)
+    refused(table, "fs", "'fs', as data.inputs says, has one number")
+    refused(table, "notes", "is an array of objects")
+
+
+def test_npy(tmp_path):
+    np.save(tmp_path / "rig.npy", U.astype(np.float32))
+    table = open_table(tmp_path / "rig.npy")
+    assert names(table) == ["rig1", "rig2"]
+    assert np.array_equal(whole(table, "rig"), U.astype(np.float32))
+
+
+@pytest.mark.numeric
+def test_npz_under_the_name_of_npy(tmp_path):
+    np.savez(tmp_path / "a.npz", u=U)
+    (tmp_path / "a.npz").rename(tmp_path / "a.npy")
+    with pytest.raises(ValueError, match=r"a\.npy' holds several arrays; give it the extension"):
+        open_table(tmp_path / "a.npy")
+
+
+def test_times_of_numpy_are_seconds(tmp_path):
+    stamps = np.datetime64("2024-01-01T10:00") + np.arange(4) * np.timedelta64(2, "ms")
+    np.savez(tmp_path / "a.npz", t=stamps)
+    assert np.allclose(open_table(tmp_path / "a.npz").read([0])[:, 0], np.arange(4) * 2e-3)
+
+
+@pytest.mark.parametrize("extra", [{}, {"do_compression": True}, {"format": "4"}])
+def test_mat_5_and_4(tmp_path, extra):
+    scipy.io.savemat(tmp_path / "a.mat", {"u": U, "y": Y}, **extra)  # y is stored as (1, T)
+    check(open_table(tmp_path / "a.mat"))
+
+
+def test_structs_and_cells_of_mat_5(tmp_path):
+    cell, cells = np.empty((1, 1), object), np.empty((1, 2), object)
+    cell[0, 0], cells[0, 0], cells[0, 1] = {"force": Y}, U, U
+    variables = {
+        "exp": {"u": U, "deep": {"y": Y[:, None]}, "one": cell},
+        "both": cells,
+        "runs": np.array([(1.0,), (2.0,)], dtype=[("y", float)]),
+        "eye": scipy.sparse.eye(3, format="csc"),
+        "z": Y + 1j,
+        "name": "rig",
+        "wide": U.T,
+    }
+    scipy.io.savemat(tmp_path / "a.mat", variables)
+    table = open_table(tmp_path / "a.mat")
+    assert names(table) == ["exp.u1", "exp.u2", "exp.deep.y", "exp.one.force"]
+    assert np.array_equal(whole(table, ["exp.u", "exp.deep.y"]), SIGNALS)
+    assert np.array_equal(whole(table, "exp.one.force")[:, 0], Y)
+    refused(table, "both", "is an array of 2 cells")
+    refused(table, "runs", "is an array of 2 structs")
+    refused(table, "eye", "is sparse")
+    refused(table, "z", "is complex")
+    refused(table, "name", "has no numbers")
+    refused(table, "wide", r"has 2 row\(s\) and 40 columns.*transpose")
+
+
+def matlab(path: Path, write) -> None:
+    """A file as MATLAB's save -v7.3 writes it: arrays in its order, so transposed."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        write(file)
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\0\2IM")
+
+
+def test_mat_7_3(tmp_path):
+    def write(file):
+        file["u"], file["y"] = U.T, Y[:, None]  # (T, 2) and (1, T) in MATLAB
+        file["exp/deep/y"] = Y[None, :]
+        references = file.create_dataset("#refs#/b", data=Y[None, :])
+        for name, size, kind in (("one", 1, b"cell"), ("two", 2, b"cell"), ("runs", 2, None)):
+            cell = file.create_dataset(name, (1, size), dtype=h5py.ref_dtype)
+            cell[...] = references.ref
+            if kind:
+                cell.attrs["MATLAB_class"] = np.bytes_(kind)
+        file["name"] = np.frombuffer(b"rig", np.uint8)[:, None].astype(np.uint16)
+        file["name"].attrs["MATLAB_class"] = np.bytes_(b"char")
+        file["sparse/data"] = Y
+        file["sparse"].attrs["MATLAB_sparse"] = 3
+        file["z"] = np.zeros((1, T), [("real", float), ("imag", float)])
+        file["none"] = np.zeros(2, np.uint64)
+        file["none"].attrs["MATLAB_empty"] = 1
+        file["wide"] = U
+
+    matlab(tmp_path / "a.mat", write)
+    table = open_table(tmp_path / "a.mat")
+    assert set(names(table)) == {"u1", "u2", "y", "exp.deep.y", "one"}
+    assert np.array_equal(whole(table, ["u", "y"]), SIGNALS)
+    assert np.array_equal(whole(table, ["one", "exp.deep.y"]), np.stack([Y, Y], axis=1))
+    refused(table, "two", "is an array of 2 cells")
+    refused(table, "runs", "is an array of 2 structs")
+    refused(table, "name", "is text")
+    refused(table, "sparse", "is sparse")
+    refused(table, "z", "is complex")
+    refused(table, "none", "is empty")
+    refused(table, "wide", r"has 2 row\(s\) and 40 columns.*transpose")
+
+
+@pytest.mark.parametrize("name", ["a.h5", "a.HDF5"])
+def test_hdf5(tmp_path, name):
+    with h5py.File(tmp_path / name, "w") as file:
+        file["u"], file["y"] = U, Y
+        file["group/u"] = U.T
+        file["pairs"] = np.zeros(T, [("a", float), ("b", float)])
+        file["words"] = ["a", "b"]
+        file["y"].attrs["units"] = "mm"
+        file["nothing"] = h5py.Empty("f")
+    table = open_table(tmp_path / name)
+    check(table)
+    assert table.columns[2] == Channel("y", "mm")
+    refused(table, "group/u", r"has 2 row\(s\) and 40 columns.*transpose")
+    refused(table, "pairs", r"is compound \(a, b\)")
+    refused(table, "words", "has no numbers")
+    refused(table, "nothing", "is empty")
+
+
+def test_parquet(tmp_path):
+    stamps = np.datetime64("2024-01-01T10:00") + np.arange(T) * np.timedelta64(2, "ms")
+    y = pa.array([None if k == 5 else v for k, v in enumerate(Y)], pa.float64())
+    columns = {"u (N)": U[:, 0], "n": np.arange(T), "y": y, "t": stamps, "word": ["a"] * T}
+    pq.write_table(pa.table(columns), tmp_path / "a.parquet", row_group_size=15)
+    table = open_table(tmp_path / "a.parquet")
+    assert table.columns[0] == Channel("u", "N")
+    expected = np.stack([U[:, 0], np.arange(T), Y, np.arange(T) * 2e-3], axis=1)
+    expected[5, 2] = np.nan
+    assert np.allclose(whole(table, ["u", "n", "y", "t"]), expected, atol=1e-12, equal_nan=True)
+    assert sum(len(block) for block in table.blocks([0], samples=7)) == T
+    refused(table, "word", r"has no numbers \(its type is string\)")
+
+
+def test_arrays_of_different_lengths(tmp_path):
+    np.savez(tmp_path / "a.npz", u=Y[1:], y=Y)
+    table = open_table(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match="'u' has 39, 'y' has 40 samples"):
+        table.read([0, 1])
+    assert len(table.read([1])) == T
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.mat", "a.h5", "a.parquet"])
+def test_damaged_files(tmp_path, name):
+    path = tmp_path / name
+    if name == "a.npz":
+        np.savez_compressed(path, u=U, y=Y)
+    elif name == "a.npy":
+        np.save(path, U)
+    elif name == "a.mat":
+        scipy.io.savemat(path, {"u": U, "y": Y}, do_compression=True)
+    elif name == "a.h5":
+        with h5py.File(path, "w") as file:
+            file["u"], file["y"] = U, Y
+    else:
+        pq.write_table(pa.table({"u": Y}), path)
+    content = path.read_bytes()
+    for damaged in (content[: len(content) // 2], b"nothing of the kind" * 40):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=rf"{name}' is not a readable"):
+            open_table(path)
+    path.write_bytes(b"")
+    with pytest.raises(ValueError, match="is empty"):
+        open_table(path)
+
+
+@pytest.mark.parametrize(("name", "package"), [("a.h5", "h5py"), ("a.parquet", "pyarrow")])
+def test_optional_packages(tmp_path, monkeypatch, name, package):
+    (tmp_path / name).write_bytes(b"something")
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ValueError, match=rf"need {package}.*pip install 'lfrtorch\[files\]'"):
+        open_table(tmp_path / name)
+
+
+# --- files and columns ----------------------------------------------------------------------
+
+
+def test_refused_paths(tmp_path):
+    with pytest.raises(ValueError, match="is a folder; name a file, it has none"):
+        open_table(tmp_path)
+    with pytest.raises(FileNotFoundError, match="in its folder, and none of a known format"):
+        open_table(tmp_path / "absent.csv")
+    for name in ("rig_1.csv", "rig_2.csv", "other.mat", "notes.pdf", "book.xlsx"):
+        (tmp_path / name).write_text("u,y\n1,2\n")
+    with pytest.raises(FileNotFoundError, match=r"Rig_1\.cvs'; there is 'rig_1\.csv'"):
+        open_table(tmp_path / "Rig_1.cvs")
+    with pytest.raises(FileNotFoundError, match=r"its folder has 'other\.mat', 'rig_1\.csv'"):
+        open_table(tmp_path / "zzz")
+    with pytest.raises(FileNotFoundError, match=r"and no folder '.*nowhere'"):
+        open_table(tmp_path / "nowhere" / "a.csv")
+    with pytest.raises(ValueError, match=r"is a folder; name a file: other\.mat, rig_1\.csv"):
+        open_table(tmp_path)
+    with pytest.raises(ValueError, match=r"unknown extension '\.pdf'.*\.csv.*\.parquet"):
+        open_table(tmp_path / "notes.pdf")
+    with pytest.raises(ValueError, match="save the sheet as CSV"):
+        open_table(tmp_path / "book.xlsx")
+
+
+def test_find(tmp_path):
+    table = table_of(tmp_path, "v,v,y (N)\n1,2,3\n1,2,3\n")
+    assert table.find("y", "data.inputs") == table.find(["y (N)"], "data.inputs") == (2,)
+    assert table.find([2, 0], "data.inputs") == (2, 0)
+    refused(table, "v", "2 columns 'v', as data.inputs says; give the number of one: 0, 1")
+    refused(table, "w", r"no column 'w', as data.inputs says; it has 3 column\(s\): 'v', 'v', 'y")
+    refused(table, 3, "no column number 3.*3 column")
+    refused(table, -1, "no column number -1")
+    for nothing in ([], None, [1.5], True, [True]):
+        refused(table, nothing, "data.inputs is .*give names of columns or their numbers.*'v'")
+
+
+def test_a_name_that_is_nearly_right(tmp_path):
+    table = table_of(tmp_path, "exp.force,position,w\n1,2,3\n1,2,3\n")
+    refused(table, "force", r"'w'\. Did you mean 'exp\.force'\?$")
+    refused(table, "positon", r"Did you mean 'position'\?$")
+    refused(table, "voltage", r"'w'\.$")
+
+
+def test_no_columns(tmp_path):
+    np.savez(tmp_path / "a.npz", fs=3.0)
+    refused(open_table(tmp_path / "a.npz"), "u", r"no columns of numbers \('fs' has one number")

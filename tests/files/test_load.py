@@ -1,0 +1,559 @@
+"""A user's own files as records by use: what is read, how it is split, and what is refused."""
+
+from collections import UserList
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+import scipy.signal
+
+from lfrtorch import load_records
+from lfrtorch.excitation import multisine
+from lfrtorch.records import Channel
+
+SAMPLES = 200
+USE: dict[str, Any] = {"inputs": ["u1", "u2"], "outputs": "y", "fs": 50.0}
+TIMED: dict[str, Any] = {"inputs": "u", "outputs": "y", "time": "t"}
+N = 100  # samples of a period
+
+
+@pytest.fixture
+def signals():
+    """Columns u1, u2 and y: (200, 3)."""
+    return np.random.default_rng(3).normal(size=(SAMPLES, 3))
+
+
+def write(path, table, header: str | None = "u1,u2,y"):
+    lines = [header] if header else []
+    lines += [",".join(repr(float(value)) for value in row) for row in table]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def timed(path, t, gap: slice | None = None):
+    """A file of the columns t, u and y, with NaN in ``gap`` of y; u and y."""
+    u, y = np.random.default_rng(5).normal(size=(2, len(t)))
+    if gap:
+        y[gap] = np.nan
+    write(path, np.stack([t, u, y], axis=1), "t,u,y")
+    return np.stack([u, y], axis=1)
+
+
+def joined(record):
+    return np.hstack([record.u, record.y])
+
+
+def refused(match, path, error: type[Exception] = ValueError, use=USE, **options):
+    with pytest.raises(error, match=match) as refusal:
+        load_records(path, **{**use, **options})
+    return str(refusal.value)
+
+
+# --- one file -------------------------------------------------------------------------------
+
+
+def test_parts_are_cut_in_time_order(tmp_path, signals):
+    path = write(tmp_path / "motor.csv", signals)
+    data = load_records(path, **USE, validation=0.25, test=0.1, skip=7)
+    train, validation, test = *data.train, *data.validation, *data.tests
+    assert [r.samples for r in (train, validation, test)] == [130, 180, 200]
+    assert [r.name for r in (train, validation, test)] == ["train", "validation", "test"]
+    assert np.array_equal(train.u, signals[:130, :2])
+    assert [r.skip for r in (train, validation, test)] == [7, 130, 180]
+    assert np.array_equal(validation.y, signals[:180, 2:])
+    assert np.array_equal(test.u, signals[:, :2])
+    for record in (train, validation, test):
+        assert (record.fs, record.start, record.source) == (50.0, "zero", "file")
+        assert [c.name for c in record.inputs] == ["u1", "u2"]
+        assert [c.name for c in record.outputs] == ["y"]
+    assert (data.name, data.noise_rms, data.published, data.notes) == ("motor", None, (), ())
+
+
+def test_five_percent_warm_up_unless_told(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals)
+    for skip in (None, "auto"):
+        data = load_records(path, **USE, skip=skip)
+        records = (*data.train, *data.validation, *data.tests)
+        assert [(r.skip, r.samples) for r in records] == [(10, 120), (120, 160), (160, 200)]
+
+
+@pytest.mark.parametrize("samples", [51, 53, 97])
+@pytest.mark.parametrize("skip", [0, 3])
+def test_every_sample_after_the_first_warm_up_is_scored_once(tmp_path, signals, samples, skip):
+    path = write(tmp_path / "a.csv", signals[:samples])
+    data = load_records(path, **USE, skip=skip)
+    records = [*data.train, *data.validation, *data.tests]
+    scored = np.concatenate([joined(r)[r.skip :] for r in records])
+    assert np.array_equal(scored, signals[skip:samples])
+    assert [len(r.y) - r.skip for r in records[1:]] == [round(samples / 5)] * 2
+
+
+@pytest.mark.parametrize("none", [0, 0.0, None])
+def test_parts_may_be_left_out(tmp_path, signals, none):
+    path = write(tmp_path / "a.csv", signals)
+    data = load_records(path, **USE, test=none)
+    assert (data.train[0].samples, data.validation[0].samples, data.tests) == (160, 200, [])
+    data = load_records(path, **USE, validation=none, test=none)
+    assert (data.train[0].samples, data.validation, data.tests) == (200, [], [])
+
+
+def test_column_order_is_the_users(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals)  # a Hydra ListConfig is a Sequence and no list
+    data = load_records(path, inputs=UserList(["y", 0]), outputs=UserList(["u2"]), fs=1.0)
+    assert np.array_equal(joined(data.tests[0]), signals[:, [2, 0, 1]])
+
+
+def test_columns_without_a_header(tmp_path, signals):
+    bare = write(tmp_path / "b.csv", signals, header=None)
+    data = load_records(bare, inputs=[0, 1], outputs=2, fs=1.0)
+    assert np.array_equal(joined(data.tests[0]), signals)
+    assert [c.name for c in data.train[0].inputs] == ["column 0", "column 1"]
+
+
+def test_other_columns_may_hold_text(tmp_path):
+    rows = "".join(f"{i},12:00:{i:02d},{2 * i}\r\n" for i in range(60))
+    path = tmp_path / "a.csv"
+    path.write_bytes(f"\ufeffu,time,y\r\n{rows}\r\n".encode())  # as Excel saves it
+    data = load_records(path, inputs="u", outputs="y", fs=1.0)
+    assert np.array_equal(joined(data.tests[0]), np.arange(60.0)[:, None] * [1, 2])
+    assert data.notes == ()
+
+
+def test_arrays(tmp_path, signals):
+    np.savez(tmp_path / "rig.npz", force=signals[:, :2], y=signals[:, 2])
+    scipy.io.savemat(tmp_path / "rig.mat", {"exp": {"force": signals[:, :2], "y": signals[:, 2]}})
+    for name, prefix in (("rig.npz", ""), ("rig.mat", "exp.")):
+        data = load_records(tmp_path / name, inputs=f"{prefix}force", outputs=f"{prefix}y", fs=50.0)
+        assert np.array_equal(joined(data.tests[0]), signals)
+        assert [c.name for c in data.train[0].inputs] == [f"{prefix}force1", f"{prefix}force2"]
+        assert data.name == "rig"
+
+
+def test_units(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals, header="u1 (V),u2 [A],y/mm")
+    data = load_records(path, **USE)
+    assert data.train[0].inputs == (Channel("u1", "V"), Channel("u2", "A"))
+    data = load_records(path, **USE, units={"u1": "kV", "y/mm": "m"})
+    assert data.train[0].inputs[0] == Channel("u1", "kV")
+    assert data.train[0].outputs == (Channel("y", "m"),)
+    refused(
+        "data.units names 'v'.*none of the inputs and outputs: u1, u2, y", path, units={"v": ""}
+    )
+
+
+# --- several files --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Files run1 .. run12 of 60, 61, ... samples."""
+    rng = np.random.default_rng(1)
+    for i in range(12):
+        write(tmp_path / f"run{i + 1}.csv", rng.normal(size=(60 + i, 3)))
+    return tmp_path / "run*.csv"
+
+
+def used(data):
+    return tuple(
+        [r.name if r.name in ("train", "validation", "test") else r.samples for r in records]
+        for records in (data.train, data.validation, data.tests)
+    )
+
+
+def test_a_pattern_is_sorted_as_people_count(runs):
+    data = load_records(str(runs), **USE, validation=2, test=1)
+    assert used(data) == ([*range(60, 69)], [69, 70], ["test"])
+    assert [r.name for r in data.train] == [f"run{i}" for i in range(1, 10)]
+    assert (data.tests[0].samples, data.tests[0].skip) == (71, 4)
+    assert data.name == "run"
+
+
+def test_fractions_of_every_record(runs):
+    data = load_records([str(runs.parent / f"run{i}.csv") for i in (3, 2)], **USE)
+    assert [r.samples for r in data.train] == [38, 37]
+    assert [(r.samples, r.name) for r in data.tests] == [(62, "run3"), (61, "run2")]
+
+
+def test_records_by_name_and_by_file(runs):
+    first = [runs.parent / f"run{i}.csv" for i in (1, 2, 3, 4)]
+    data = load_records(first, **USE, test="run2", validation=["run1", "run3"])
+    assert used(data) == (["train"], [60, 62], ["test"])
+    own = str(runs.parent / "run1[012].csv")
+    data = load_records(first, **USE, test=own, validation=str(first[1]))
+    assert used(data) == ([60, 62, 63], ["validation"], [69, 70, 71])
+    assert [r.name for r in data.tests] == ["run10", "run11", "run12"]
+    data = load_records(first[0], **USE, test=own, validation=0.5)
+    assert [r.samples for r in (*data.train, *data.validation)] == [30, 60]
+
+
+def test_equal_names_get_their_folders(tmp_path, signals):
+    paths = [write(tmp_path / folder / "x.csv", signals) for folder in "abc"]
+    data = load_records(paths[:2], **USE, test=0)
+    assert [r.name for r in data.train] == ["a_x", "b_x"]
+    assert data.name == "x"
+    data = load_records(paths[:2], **USE, test=[paths[2], paths[1]], validation=0)
+    assert [r.name for r in data.tests] == ["x", "b_x"]
+
+
+def test_files_that_do_not_belong_together(tmp_path, signals):
+    a = write(tmp_path / "a.csv", signals)
+    t = np.arange(SAMPLES)[:, None]
+    for name, table, header, use, match in (
+        ("b", signals, "u1,v,y", USE, r"b\.csv' has no column 'u2'.*'.*a\.csv' has it"),
+        ("c", signals, "u1 (N),u2,y", USE, r"inputs of .*c\.csv' are u1 \(N\), u2.*a\.csv' u1, u2"),
+        (
+            "d",
+            np.hstack([t, signals[:, 1:]]),
+            "t,u,y",
+            TIMED,
+            "d.csv' is sampled at 1 Hz.*at 10 Hz",
+        ),
+    ):
+        if use is TIMED:
+            write(a, np.hstack([t / 10, signals[:, 1:]]), "t,u,y")
+        refused(match, [a, write(tmp_path / f"{name}.csv", table, header)], use=use)
+
+
+def test_refused_uses(runs):
+    pattern = str(runs.parent / "run[123].csv")
+    refused("data.test=3 takes the last 3 of the 3 record", pattern, test=3)
+    refused("data.validation=2 .* of the 2 record", pattern, test=1, validation=2)
+    refused("data.test is 1.5; give a fraction below 1", pattern, test=1.5)
+    refused("'run99'.*neither a file nor one of the records: run1, run2", pattern, test="run99")
+    refused("'run3', which has a use already", pattern, test="run3", validation="run3")
+    refused("'run3', which has a use already", pattern, test=str(runs.parent / "run3.csv"),
+            validation="run3")  # fmt: skip
+    refused("leave no record for training", pattern, test=pattern)
+    refused("no file '.*run99.csv'; there is", pattern, FileNotFoundError,
+            test=str(runs.parent / "run99.csv"))  # fmt: skip
+
+
+# --- time stamps ----------------------------------------------------------------------------
+
+
+@pytest.mark.numeric
+@pytest.mark.parametrize(
+    ("t", "fs"),
+    [
+        (np.arange(300) / 750, 750.0),
+        (np.round(np.arange(3000) / 750, 3), 750.0),
+        (5e4 + np.round(np.arange(300) / 1000, 3), 1000.0),
+        ((np.arange(300) / 1000).astype(np.float32), 1000.0),
+        (np.arange(300) * 2**14 / 1e7, 610.3515625),
+        (np.arange(300) * 60.0, 1 / 60),
+        (1.7e9 + np.round(np.arange(300) / 128, 4), 128.0),
+    ],
+)
+def test_sampling_frequency_of_time_stamps(tmp_path, t, fs):
+    values = timed(tmp_path / "a.csv", t)
+    data = load_records(tmp_path / "a.csv", **TIMED)
+    assert data.train[0].fs == pytest.approx(fs, rel=1e-12)
+    assert np.array_equal(joined(data.tests[0]), values)
+    load_records(tmp_path / "a.csv", **TIMED, fs=fs)
+
+
+@pytest.mark.numeric
+def test_dates_and_units_of_time(tmp_path, signals):
+    stamps = pd.date_range("2024-12-31T23:59:58", periods=SAMPLES, freq="20ms")
+    table = pd.DataFrame(signals, columns=["u1", "u2", "y"])
+    table.assign(t=stamps.map(lambda stamp: stamp.isoformat())).to_csv(tmp_path / "a.csv")
+    write(
+        tmp_path / "b.csv", np.hstack([signals, 20 * np.arange(SAMPLES)[:, None]]), "u1,u2,y,t (ms)"
+    )
+    for name in ("a.csv", "b.csv"):
+        data = load_records(tmp_path / name, inputs=["u1", "u2"], outputs="y", time="t")
+        assert data.train[0].fs == 50.0
+        assert np.array_equal(joined(data.tests[0]), signals)
+
+
+@pytest.mark.numeric
+def test_refused_time(tmp_path):
+    path = tmp_path / "a.csv"
+    even = np.arange(300) / 100
+    timed(path, even)
+    refused("fs is 1000 Hz and the time column 't' of .* says 100 Hz", path, use=TIMED, fs=1000)
+    refused("data.time is 'u', which|stands twice", path, use=TIMED, time="u")
+    refused("no column 'time', as data.time says", path, use=TIMED, time="time")
+    jitter = even + 0.003 * np.sin(np.arange(300.0) ** 2)
+    timed(path, jitter)
+    message = refused("'t' is not evenly spaced.* at line", path, use=TIMED)
+    assert f"from {np.diff(jitter).min():.4g} s to {np.diff(jitter).max():.4g} s" in message
+    timed(path, even + 0.004 * (np.arange(300) >= 200))
+    refused("from 0.01 s to 0.014 s, at line 202", path, use=TIMED)
+    timed(path, np.concatenate([even[:100], even[:200]]))
+    refused("does not rise: 0.99 s is followed by 0 s, at line 102", path, use=TIMED)
+    timed(path, np.concatenate([even[:150], even[150:] * 2]))
+    refused("not evenly spaced.*0.01 s to 1.51 s", path, use=TIMED)
+
+
+def test_no_sampling_frequency(tmp_path):
+    path = tmp_path / "a.csv"
+    timed(path, np.arange(300) / 100)
+    use = {"inputs": "u", "outputs": "y"}
+    refused(r"data\.fs, or by a column of time stamps: data.time=t \(100 Hz\)", path, use=use)
+    count = np.arange(300.0)[:, None]
+    both = np.hstack([count, 3 * count, count / 7, count / 20, np.cos(count), np.sin(count)])
+    write(path, both, "n,x,v,Time [s],u,y")
+    refused(r"data.time=Time \(20 Hz\)", path, use=use)
+    write(path, both[:, [0, 4, 5]], "n,u,y")
+    refused(r"say it in Hz with data\.fs\.$", path, use=use)
+
+
+def test_a_time_column_that_contradicts_is_noted(tmp_path):
+    path = tmp_path / "a.csv"
+    timed(path, np.arange(300) / 100)
+    use: dict[str, Any] = {"inputs": "u", "outputs": "y"}
+    (note,) = load_records(path, **use, fs=1000).notes
+    assert note.startswith("data.fs is 1000 Hz and the column 't' says 100 Hz")
+    assert load_records(path, **use, fs=100).notes == ()
+
+
+# --- gaps -----------------------------------------------------------------------------------
+
+
+def test_gaps_are_refused_with_their_place(tmp_path):
+    path = tmp_path / "a.csv"
+    timed(path, np.arange(300) / 100, slice(50, 60))
+    message = refused("10 sample.* in 1 place.*line 52 in column 'y'", path, use=TIMED)
+    assert "data.gaps=split" in message
+    timed(path, np.delete(np.arange(300), [100, 101, 102, 200]) / 100)
+    refused(r"2 gap\(s\) of 4 sample\(s\) in all, the first before line 102", path, use=TIMED)
+    np.savez(tmp_path / "a.npz", u=np.arange(60.0), y=np.where(np.arange(60) == 7, np.nan, 1))
+    refused(r"1 sample.*the first at sample 7 \(from 0\) in column 'y'", tmp_path / "a.npz",
+            use={"inputs": "u", "outputs": "y", "fs": 1})  # fmt: skip
+    refused("data.gaps is 'skip'", path, use=TIMED, gaps="skip")
+
+
+def test_stretches_between_gaps_are_records(tmp_path):
+    path = tmp_path / "rig.csv"
+    k = np.delete(np.arange(400), [150, 151])
+    values = timed(path, k / 100, slice(60, 63))
+    write(path, np.hstack([k[:, None] / 100, values])[:305], "t,u,y")
+    text = path.read_text().splitlines()
+    text[303] = "," + text[303].split(",", 1)[1]  # a missing time stamp
+    path.write_text("\n".join(text))
+    data = load_records(path, **TIMED, gaps="split", validation=0, test=0)
+    assert [r.name for r in data.train] == ["rig_1", "rig_2", "rig_3"]
+    for record, part in zip(data.train, [(0, 60), (63, 150), (150, 302)], strict=True):
+        assert np.array_equal(joined(record), values[slice(*part)])
+    assert [r.start for r in data.train] == ["zero", "estimated", "estimated"]
+    assert data.notes == (
+        "rig: 4 stretches between gaps, a record each",
+        "rig_4: left out, as it is too short",
+    )
+    data = load_records(path, **TIMED, gaps="split", validation="rig_2", test=1)
+    assert [len(r) for r in (data.train, data.validation, data.tests)] == [1, 1, 1]
+    assert data.tests[0].samples == 152
+    refused("no stretch between its gaps is long", path, use=TIMED, gaps="split", skip=148)
+
+
+def test_empty_lines_at_the_end_are_no_gap(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals)
+    path.write_text(path.read_text() + ",,\n" * 5)
+    assert load_records(path, **USE).tests[0].samples == SAMPLES
+
+
+# --- periods --------------------------------------------------------------------------------
+
+
+def periodic(path, periods, *, settled=False, noise=1e-3, more=0):
+    """A file of a resonance under a multisine from rest, or in steady state; u and y."""
+    u = np.resize(
+        multisine(N, fs=1.0, band=(0.01, 0.4), seed=1).u[0][:, 0], 3 * N + periods * N + more
+    )
+    y = scipy.signal.lfilter([1.0], [1, -1.6, 0.81], u if settled else u[3 * N :])
+    table = np.stack([u[3 * N :], y[3 * N :] if settled else y], axis=1)
+    table[:, 1] += noise * np.random.default_rng(0).normal(size=len(table))
+    write(path, table, "u,y")
+    return table
+
+
+PERIODIC: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 1.0}
+SAME_INPUT = "the parts of a record have the same input in every period"
+
+
+@pytest.mark.numeric
+def test_period_and_transient_are_found(tmp_path):
+    periodic(tmp_path / "a.csv", 5, more=30)
+    data = load_records(tmp_path / "a.csv", **PERIODIC)
+    assert [(r.skip, r.samples, r.period) for r in data.train] == [(N, 318, N)]
+    assert [(r.skip, r.samples, r.period) for r in data.tests] == [(424, 530, N)]
+    assert data.notes[0] == (
+        "the input repeats every 100 samples, 5.3 times; the first period is the transient and is "
+        "not fitted"
+    )
+    assert data.notes[1].startswith(SAME_INPUT)
+    data = load_records(tmp_path / "a.csv", **PERIODIC, period=None)
+    assert (data.train[0].skip, data.train[0].period, data.notes) == (26, None, ())
+    data = load_records(tmp_path / "a.csv", **PERIODIC, skip=5, validation=0, test=0)
+    assert (data.train[0].skip, data.train[0].period) == (5, N)
+    assert data.notes == ("the input repeats every 100 samples, 5.3 times",)
+
+
+@pytest.mark.numeric
+def test_a_transient_of_several_periods(tmp_path):
+    """A pole of 0.98 takes the response below noise of a thousandth in three to five periods."""
+    table = periodic(tmp_path / "a.csv", 12)
+    slow = scipy.signal.lfilter([1.0], [1, -0.98], table[:, 0])
+    slow += 1e-3 * np.std(slow) * np.random.default_rng(0).normal(size=len(slow))
+    write(tmp_path / "a.csv", np.stack([table[:, 0], slow], axis=1), "u,y")
+    data = load_records(tmp_path / "a.csv", **PERIODIC)
+    count = data.train[0].skip // N
+    assert 2 <= count <= 5
+    assert f"the first {count} periods are the transient and are not fitted" in data.notes[0]
+
+
+@pytest.mark.numeric
+def test_a_transient_that_is_most_of_the_record_is_kept(tmp_path):
+    periodic(tmp_path / "a.csv", 2)
+    assert load_records(tmp_path / "a.csv", **PERIODIC).train[0].skip == 10
+
+
+@pytest.mark.numeric
+def test_settled_data_from_rest_are_noted(tmp_path):
+    periodic(tmp_path / "a.csv", 4, settled=True)
+    data = load_records(tmp_path / "a.csv", **PERIODIC)
+    assert data.notes[0].endswith("settled from the first sample on: use data.start=periodic")
+
+
+@pytest.mark.numeric
+def test_steady_state_is_cut_to_whole_periods(tmp_path):
+    table = periodic(tmp_path / "a.csv", 7, more=40)
+    data = load_records(tmp_path / "a.csv", **PERIODIC, start="periodic")
+    records = [*data.train, *data.validation, *data.tests]
+    assert [(r.start, r.samples, r.period, r.skip) for r in records] == [
+        ("periodic", count * N, N, 0) for count in (4, 1, 1)
+    ]
+    assert np.array_equal(np.concatenate([joined(r) for r in records]), table[N : 7 * N])
+    data = load_records(tmp_path / "a.csv", **PERIODIC, start="periodic", skip=30, test=0)
+    assert np.array_equal(joined(data.train[0]), table[30 : 6 * N + 30])
+    given = load_records(tmp_path / "a.csv", **PERIODIC, start="periodic", period=2 * N, skip=0)
+    assert [r.samples for r in (*given.train, *given.tests)] == [2 * N] * 2 or given.train
+
+
+@pytest.mark.numeric
+def test_refused_periods(tmp_path, signals):
+    path = tmp_path / "a.csv"
+    periodic(path, 3)
+    refused("has 2 whole period.* train, validation, test need one each", path, use=PERIODIC,
+            start="periodic")  # fmt: skip
+    refused("no whole period of 250 samples: 300 samples, of which 100", path, use=PERIODIC,
+            start="periodic", period=250, skip=100)  # fmt: skip
+    refused("has 300 samples and a period of 301; it must hold at least one", path, use=PERIODIC,
+            period=301)  # fmt: skip
+    refused("data.period is 0", path, use=PERIODIC, period=0)
+    refused("data.start is 'given'; use 'zero', 'estimated' or 'periodic'", path, use=PERIODIC,
+            start="given")  # fmt: skip
+    write(path, signals)
+    refused("data.start is periodic and the input of .* does not repeat", path, start="periodic")
+
+
+def test_start_amid_a_measurement(tmp_path, signals):
+    data = load_records(write(tmp_path / "a.csv", signals), **USE, start="estimated")
+    assert {r.start for r in (*data.train, *data.validation, *data.tests)} == {"estimated"}
+
+
+# --- what is refused ------------------------------------------------------------------------
+
+
+def test_refused_arguments(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals)
+    refused(r"data\.inputs is None.*'u1', 'u2', 'y'", path, inputs=None)
+    refused(r"data\.outputs is \[\]", path, outputs=[])
+    refused(r"names of columns or their numbers", path, inputs=[1.5])
+    refused("data.fs is 0; give a positive number", path, fs=0)
+    refused("'u2' stands twice", path, outputs=["y", "u2"])
+    refused("'u1' stands twice", path, inputs=["u1", 0])
+    refused("no column 'v', as data.inputs says; .*'u1', 'u2', 'y'", path, inputs="v")
+    refused("no column number 3.*'u1', 'u2', 'y'", path, outputs=3)
+    refused("data.skip is -1", path, skip=-1)
+    refused("has 0 scored samples of 200, with skip=300", path, skip=300)
+
+
+@pytest.mark.parametrize(
+    ("validation", "test"), [(0.5, 0.5), (-0.1, 0.2), (0.2, np.nan), (0.2, True)]
+)
+def test_refused_fractions(tmp_path, signals, validation, test):
+    path = write(tmp_path / "a.csv", signals)
+    match = "fractions are validation=|is (-0.1|nan|True); give a number"
+    refused(match, path, validation=validation, test=test)
+
+
+def test_refused_short_parts(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals)
+    refused("the test part has 8 scored samples of 200", path, test=0.04)
+    refused("the validation part has 8 scored", path, validation=0.04)
+    refused("the train part has 4 scored", path, validation=0.49, test=0.49, skip=0)
+    refused("the train part has 9 scored samples of 200, with skip=111", path, skip=111)
+    load_records(path, **USE, skip=110)  # exactly the ten samples that are needed
+
+
+def test_refused_paths(tmp_path):
+    assert "absent.csv" in refused("no file", tmp_path / "absent.csv", FileNotFoundError)
+    refused("is a folder; name a file", tmp_path)
+    refused("data.path is None; give the path of a file", None)
+    refused("data.path is []".replace("[", r"\["), [])
+    refused(r"no file is as '.*run\*\.csv'", str(tmp_path / "run*.csv"), FileNotFoundError)
+
+
+def test_refused_values(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals)
+    path.write_text(path.read_text().replace(repr(float(signals[7, 1])), "-inf"))
+    refused("1 infinite value.*line 9 in column 'u2'", path)
+    path.write_text("u1,u2,y\n" + ",2,3\n" * 50)
+    refused("50 sample.*missing values", path)
+    refused("no sample in which all columns have a value", path, gaps="split")
+
+
+# --- measurements ---------------------------------------------------------------------------
+
+
+@pytest.mark.data
+def test_cascaded_tanks_as_a_spreadsheet(tmp_path, benchmark_root):
+    """The benchmark's own file, its estimation and validation signals as two files of Excel."""
+    path = benchmark_root / "Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat"
+    if not path.is_file():
+        pytest.skip(f"no file '{path}'")
+    found = scipy.io.loadmat(path, squeeze_me=True)
+    ts = float(found["Ts"])
+    for name, part in (("estimation", "Est"), ("test", "Val")):
+        columns = {
+            "t [s]": ts * np.arange(1024),
+            "u (V)": found[f"u{part}"],
+            "y (V)": found[f"y{part}"],
+        }
+        pd.DataFrame(columns).to_csv(
+            tmp_path / f"{name}.csv", sep=";", decimal=",", index=False, encoding="utf-16"
+        )
+    data = load_records(
+        tmp_path / "estimation.csv",
+        **TIMED,
+        start="estimated",
+        test=tmp_path / "test.csv",
+    )
+    assert data.train[0].fs == pytest.approx(1 / ts)
+    assert np.array_equal(data.validation[0].u[:, 0], found["uEst"])
+    assert np.array_equal(data.tests[0].y[:, 0], found["yVal"])
+    assert data.tests[0].outputs == (Channel("y", "V"),)
+
+
+@pytest.mark.data
+def test_silverbox_in_matlab_and_text(tmp_path, benchmark_root):
+    path = benchmark_root / "Silverbox/SilverboxFiles/SNLS80mV.mat"
+    if not path.is_file():
+        pytest.skip(f"no file '{path}'")
+    found = scipy.io.loadmat(path, squeeze_me=True)
+    use: dict[str, Any] = {"fs": 1e7 / 2**14, "period": None}
+    data = load_records(path, inputs="V1", outputs="V2", **use)
+    np.savetxt(
+        tmp_path / "a.txt", np.stack([found["V1"], found["V2"]], axis=1)[:2000], header="V1 V2",
+        fmt="%.17g",
+    )  # fmt: skip
+    text = load_records(tmp_path / "a.txt", inputs="V1", outputs="V2", **use)
+    assert Path(path).stem == data.name
+    assert np.array_equal(data.tests[0].y[:, 0], found["V2"])
+    assert np.array_equal(text.tests[0].y, data.tests[0].y[:2000])

@@ -1,0 +1,93 @@
+"""The mean of models is one model: its output is the mean of theirs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from reference import random_cell, random_model
+
+import lfrtorch
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.fitting.means import average
+from lfrtorch.model import Model
+from lfrtorch.records import Start
+
+pytestmark = pytest.mark.numeric
+
+
+def models() -> list[Model]:
+    """Three of one data set, whose starts were drawn from three seeds."""
+    first = random_model(random_cell(2, 2, 3, 2, 1, 4, seed=1))
+    others = [random_model(random_cell(2, 2, 3, 2, 1, 4, seed=seed)) for seed in (2, 3)]
+    return [first, *(replace(other, scaler=first.scaler) for other in others)]
+
+
+@pytest.mark.parametrize("start", ["zero", "periodic"])
+def test_mean_of_models_simulates_the_mean(start: Start):
+    several = models()
+    u = np.random.default_rng(0).normal(size=(200, 2))
+    mean = average(several)
+    expected = np.mean([model.simulate(u, start=start) for model in several], axis=0)
+    np.testing.assert_allclose(mean.simulate(u, start=start), expected, rtol=0, atol=1e-9)
+    assert mean.sizes == {"nx": 9, "nz": 6, "nw": 3, "nn": 12}
+
+
+def test_mean_of_one_is_itself():
+    (model,) = models()[:1]
+    u = np.random.default_rng(0).normal(size=(50, 2))
+    np.testing.assert_array_equal(average([model]).simulate(u), model.simulate(u))
+
+
+def test_mean_is_a_copy(tmp_path: Path):
+    several = models()
+    mean = average(several)
+    u = np.random.default_rng(0).normal(size=(50, 2))
+    before = mean.simulate(u)
+    with torch.no_grad():
+        several[0].lfr.cell.A.zero_()
+    np.testing.assert_array_equal(mean.simulate(u), before)
+    mean.save(tmp_path / "model")
+    np.testing.assert_array_equal(lfrtorch.load(tmp_path / "model").simulate(u), before)
+
+
+def test_start_of_a_mean_is_most_probable():
+    """From 20 noisy samples, 12 slow states: least squares alone would follow the noise."""
+    several = []
+    for seed in range(4):
+        model = random_model(random_cell(1, 1, 3, 2, 1, 4, seed=1, radius=0.97, feedback=0.02))
+        with torch.no_grad():
+            poles = torch.diag(torch.tensor([0.97, 0.95, 0.9])) + 0.002 * seed * torch.eye(3)
+            model.lfr.cell.A.copy_(poles)
+            model.lfr.cell.Dyu.zero_()
+        several.append(model)
+    worst = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        u = rng.normal(size=(300, 1))
+        past = rng.normal(size=(100, 1))
+        clean = np.mean([m.simulate(np.vstack([past, u]))[100:] for m in several], axis=0)
+        noise = 0.03 * clean.std()
+        record = lfrtorch.Record(
+            u, clean + noise * rng.normal(size=clean.shape), fs=several[0].fs,
+            inputs=several[0].inputs, outputs=several[0].outputs, start="estimated", skip=20,
+        )  # fmt: skip
+        error = (average(several).simulate(record) - clean)[20:60]
+        worst.append(np.sqrt(np.mean(error**2)) / noise)
+    assert max(worst) < 1.0  # of least squares: 87 to 13000
+
+
+def test_mean_refuses_models_that_are_not_alike():
+    with pytest.raises(ValueError, match="no model to average"):
+        average([])
+    several = models()
+    with pytest.raises(ValueError, match="other channels, scales or rates"):
+        average([several[0], replace(several[1], fs=7.0)])
+    other = models()[1]
+    other.lfr.cell.static = Network(2, 1, 4, "relu", dtype=torch.float64)
+    with pytest.raises(ValueError, match="different activations"):
+        average([several[0], other])
+    other.lfr.cell.static = Polynomial(2, 1, 3)
+    with pytest.raises(ValueError, match="average the simulated outputs"):
+        average([several[0], other])

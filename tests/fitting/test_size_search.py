@@ -1,0 +1,315 @@
+"""The search for sizes finds planted ones, and its rule is right on errors that are known."""
+
+import json
+import math
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from reference import random_cell
+from scipy.signal import lfilter
+
+from lfrtorch.distributed import LOST, ProcessLost, Ranks
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import Polynomial
+from lfrtorch.fitting.size_search import (
+    BLOCKS,
+    Candidate,
+    SizeSearch,
+    blocked_mean,
+    in_blocks,
+    search_sizes,
+    standard_errors_above,
+)
+from lfrtorch.fitting.starts import initialise
+from lfrtorch.fitting.trainer import Progress
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+from lfrtorch.records import Channel, Record, Scaler
+
+OPTIMISER = LevenbergMarquardt(max_iter=10)
+
+pytestmark = pytest.mark.numeric
+
+
+Planted = tuple[list[Record], list[Record], LinearModel]
+
+
+@cache
+def plant(nz: int, nw: int, noise: float = 0.02, T: int = 300) -> Planted:
+    """Training and validation records of a system with 3 neurons, and its linear model."""
+    cell = random_cell(nx=2, nz=nz, nw=nw, nn=3, seed=2, radius=0.7)
+    with torch.no_grad():
+        cell.Dzu.mul_(3.0)
+        cell.Dyw.fill_(1.0)
+    channel = (Channel("s"),)
+    truth = Model(LFR(cell), Scaler(*np.array([[0.0], [1.0], [0.0], [1.0]])), 1.0, channel, channel)
+    train, validation = [], []
+    for seed, use in ((1, train), (2, validation)):
+        rng = np.random.default_rng(seed)
+        u = rng.standard_normal((T, 1))
+        y = truth.simulate(u)
+        use.append(Record(u, y + noise * y.std() * rng.standard_normal(y.shape), skip=20))
+    return train, validation, estimate_bla(train, nx=2)
+
+
+def search(planted: Planted, **options: Any) -> SizeSearch:
+    train, validation, bla = planted
+
+    def start(sizes: Any, seed: int) -> Model:
+        return initialise(bla, train, **sizes, seed=seed)
+
+    given: dict[str, Any] = {"start": start, "train": train, "validation": validation}
+    given |= {"nn": (1, 3, 6), "seeds": (0, 1000), "linear": bla, "optimiser": OPTIMISER}
+    return search_sizes(**given | options)
+
+
+def polynomial(planted: Planted, sizes: Any, seed: int) -> Model:
+    train, _, bla = planted
+    static = Polynomial(sizes["nz"], sizes["nw"], sizes["degree"])
+    return initialise(bla, train, nz=sizes["nz"], nw=sizes["nw"], static=static, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def single() -> SizeSearch:
+    return search(plant(1, 1))
+
+
+def test_planted_sizes_are_chosen(single: SizeSearch):
+    found = single
+    assert found.chosen.sizes == {"nz": 1, "nw": 1, "nn": 3}
+    # nz and nw crossed at the middle nn, then the other nn.
+    tried = [tuple(c.sizes.values()) for c in found.candidates]
+    assert tried == [(1, 1, 3), (1, 2, 3), (2, 1, 3), (2, 2, 3), (1, 1, 1), (1, 1, 6)]
+    # What is left at the true sizes is the noise.
+    assert found.chosen.error == pytest.approx(0.02, rel=0.1)
+    assert found.chosen.ratio < 0.5
+
+
+def test_a_second_input_of_the_map_is_found():
+    found = search(plant(2, 1), nn=3, seeds=(0,))
+    assert found.chosen.sizes == {"nz": 2, "nw": 1, "nn": 3}
+    assert len(found.candidates) == 4
+    assert found.notes == ("nz 2 is the largest tried; a larger one may do better.",)
+
+
+def test_numbers_are_those_of_the_models(single: SizeSearch):
+    found = single
+    train, (record,), bla = plant(1, 1)
+    linear = (record.y - bla.simulate(record))[record.skip :] / record.y.std()
+    assert found.counts.sum() == record.samples - record.skip
+    for candidate in found.candidates:
+        model = initialise(bla, train, **candidate.sizes)
+        assert candidate.parameters == model.parameters
+        assert candidate.parameters_net == model.parameters_net
+        mean = candidate.squares.sum() / found.counts.sum()
+        assert candidate.error == pytest.approx(math.sqrt(mean), rel=1e-12)
+        assert candidate.ratio == pytest.approx(
+            candidate.error / np.sqrt(np.mean(linear**2)), rel=1e-12
+        )
+        assert 0 < candidate.error_std < 0.2 * candidate.error
+        assert f"validation {candidate.error:.5f} ± {candidate.error_std:.5f}" in str(candidate)
+
+
+def test_table_marks_the_chosen_and_rises_in_parameters(
+    single: SizeSearch,
+):
+    found = single
+    lines = found.table().splitlines()
+    assert lines[0].split()[:5] == ["nz", "nw", "nn", "parameters", "net"]
+    rows = [line.split() for line in lines[1:-2]]
+    net = [int(row[4]) for row in rows]
+    assert net == sorted(net)
+    assert [row[:3] for row in rows if row[-1] == "chosen"] == [["1", "1", "3"]]
+    assert found.notes == ()
+    entries = found.entries()
+    assert json.loads(json.dumps(entries)) == entries
+    assert [e["nn"] for e in entries if e["chosen"]] == [3]
+    assert min(e["standard_errors_above"] for e in entries) == 0.0
+
+
+def test_degree_takes_the_place_of_neurons():
+    planted = plant(1, 1)
+    options: dict[str, Any] = {"nz": 1, "nw": 1, "degree": (1, 3), "seeds": (0,)}
+    found = search(planted, start=partial(polynomial, planted), linear=None, **options)
+    assert [c.sizes["degree"] for c in found.candidates] == [3, 1]
+    assert found.chosen.sizes == {"nz": 1, "nw": 1, "degree": 3}
+    assert math.isnan(found.chosen.ratio)  # no linear model to compare with
+    assert "linear" not in str(found.chosen)
+    assert found.table().splitlines()[0].split()[2] == "degree"
+
+
+# --- the rule ---------------------------------------------------------------------------------
+
+
+def sums(signals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    blocks = [in_blocks([signal]) for signal in signals]
+    return (
+        np.array([[block.sum() for block in each] for each in blocks]),
+        np.array([len(block) for block in blocks[0]]),
+    )
+
+
+def test_standard_error_is_right_for_errors_that_are_correlated():
+    rng = np.random.default_rng(0)
+    means, errors, alone = [], [], []
+    for _ in range(1000):
+        e = lfilter([math.sqrt(1 - 0.81)], [1, -0.9], rng.standard_normal(2200))
+        squares = np.asarray(e)[200:] ** 2
+        mean, error = blocked_mean(*sums([squares]))
+        means.append(mean[0])
+        errors.append(error[0])
+        alone.append(squares.std() / math.sqrt(len(squares)))
+    # 1000 draws: 2 %; blocks of 20 correlation times of the squares: 5 %.
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(means), rel=0.1)
+    assert np.mean(alone) < 0.4 * np.std(means)  # samples taken as independent
+
+
+def test_of_two_equal_models_the_smaller_is_taken_in_83_of_100_cases():
+    rng = np.random.default_rng(1)
+    above = [
+        standard_errors_above(rng.chisquare(50, (2, BLOCKS)), np.full(BLOCKS, 50))[0]
+        for _ in range(2000)
+    ]
+    # (1 + P(|t| < 1)) / 2 of Student's t with 9 degrees of freedom; 4 standard deviations.
+    assert np.mean(np.array(above) <= 1.0) == pytest.approx(0.828, abs=0.034)
+
+
+def test_noise_that_models_share_does_not_hide_which_is_better():
+    rng = np.random.default_rng(2)
+    T, excess = 2600, 0.118
+    noise, own = rng.standard_normal((2, T))
+    squares, counts = sums([noise**2, (noise + excess * own) ** 2])
+    above = standard_errors_above(squares, counts)
+    assert above[0] == 0.0
+    assert above[1] > 2.0
+    mean, error = blocked_mean(squares, counts)
+    assert mean[1] < mean[0] + error[0]  # the usual form cannot tell
+
+
+def tried(net: int, mean: float, error: float) -> Candidate:
+    """A model whose squared errors in the blocks have this mean and standard error."""
+    ramp = np.linspace(-1.0, 1.0, BLOCKS)
+    squares = mean + error * math.sqrt(BLOCKS) * ramp / ramp.std(ddof=1)
+    return Candidate({"nn": net}, net, net, 0.0, math.sqrt(mean), 0.0, math.nan, squares)
+
+
+@pytest.mark.parametrize(
+    ("mean", "error", "chosen"),
+    [
+        (1.10, 0.11, 5),  # within one standard error of the difference
+        (1.10, 0.09, 10),
+        (1.015, 0.001, 5),  # 15 standard errors, and 0.7 % of the rms error
+        (1.025, 0.001, 10),  # 25 and 1.2 %
+    ],
+)
+def test_the_fewest_parameters_that_do_as_well_are_chosen(mean: float, error: float, chosen: int):
+    models = tried(10, 1.0, 0.0), tried(25, 1.0001, 0.0), tried(5, mean, error)
+    assert SizeSearch(models, np.ones(BLOCKS, int)).chosen.sizes == {"nn": chosen}
+
+
+def test_blocks_cover_every_record():
+    signals = [np.arange(70.0), np.arange(35.0), np.arange(3.0)]
+    blocks = in_blocks(signals)
+    assert [len(block) for block in blocks] == [10] * 7 + [9, 9, 9, 8] + [3]
+    assert np.array_equal(np.concatenate(blocks), np.concatenate(signals))
+    assert [len(block) for block in in_blocks([np.ones(5)] * 20)] == [5] * 20
+    with pytest.raises(ValueError, match="have 9 scored samples"):
+        in_blocks([np.ones(9)])
+
+
+def test_a_model_that_diverges_is_infinitely_far_above_the_best():
+    above = standard_errors_above(
+        np.array([[np.inf] * 10, [2.0] * 10, [2.0] * 10]), np.ones(10, int)
+    )
+    assert above.tolist() == [np.inf, 0.0, 0.0]
+
+
+# --- what goes wrong --------------------------------------------------------------------------
+
+
+def test_a_candidate_that_diverges_is_listed_and_loses():
+    train, _, bla = plant(1, 1)
+
+    def start(sizes: Any, seed: int) -> Model:
+        model = initialise(bla, train, **sizes, seed=seed)
+        if sizes["nn"] == 2:  # at once, on the records that are fitted
+            with torch.no_grad():
+                model.lfr.cell.A.copy_(10.0 * torch.eye(2))
+        return model
+
+    options: Any = {"start": start, "nz": 1, "nw": 1, "seeds": (0,)}
+    lines: list[str] = []
+    found = search(plant(1, 1), nn=(2, 3), watch=lambda each: lines.append(str(each)), **options)
+    assert [math.isinf(c.error) for c in found.candidates] == [False, True]
+    assert found.chosen.sizes["nn"] == 3
+    assert "diverges" in lines[1]
+    assert [line.split()[-1] for line in found.table().splitlines()[1:3]] == ["diverges", "chosen"]
+    with pytest.raises(ValueError, match="all models that were tried diverge on the validation"):
+        search(plant(1, 1), nn=2, **options)
+
+
+def test_a_model_that_explodes_on_validation_diverges():
+    train, (record,), bla = planted = plant(1, 1)
+
+    def start(sizes: Any, seed: int) -> Model:
+        model = polynomial(planted, sizes, seed)
+        if sizes["degree"] == 3:
+            with torch.no_grad():
+                model.lfr.cell.get_parameter("static.C")[:, 3] = 0.01
+        return model
+
+    louder = Record(1e3 * record.u, 1e3 * record.y, skip=20)
+    options: Any = {"nz": 1, "nw": 1, "degree": (2, 3), "seeds": (0,)}
+    options |= {"start": start, "optimiser": LevenbergMarquardt(max_iter=0)}
+    found = search((train, [louder], bla), **options)
+    tried = [(c.sizes["degree"], math.isinf(c.error)) for c in found.candidates]
+    assert tried == [(3, True), (2, False)]
+    assert found.chosen.sizes["degree"] == 2
+
+
+def test_ctrl_c_and_lost_processes_end_the_search():
+    def stop(model: Model, progress: Progress):
+        if progress.iteration == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        search(plant(1, 1), monitors=[stop])
+
+    def lose(model: Model, progress: Progress):
+        if progress.iteration == 1:
+            raise ProcessLost(f"{LOST}: for good")
+
+    with pytest.raises(ProcessLost, match="for good"):
+        search(plant(1, 1), monitors=[lose])
+
+
+def test_the_first_process_decides():
+    class Other(Ranks):
+        """What the first process sends is that all errors are alike."""
+
+        def first(self, part: torch.Tensor) -> torch.Tensor:
+            return torch.ones_like(part) if part.numel() == BLOCKS else part
+
+    found = search(plant(2, 1), nw=1, nn=3, seeds=(0,), ranks=Other())
+    assert found.above.tolist() == [0.0, 0.0]
+    assert found.chosen.sizes == {"nz": 1, "nw": 1, "nn": 3}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"validation": []}, "no validation records, on which sizes are chosen"),
+        ({"nz": [0, 1]}, "nz is 0; give a whole number of at least 1"),
+        ({"nn": []}, "nn is empty"),
+        ({"nw": "many"}, "nw is 'many'"),
+        ({"seeds": ()}, "seeds is empty"),
+    ],
+)
+def test_bad_calls_are_refused(options: dict[str, Any], message: str):
+    with pytest.raises(ValueError, match=message):
+        search(plant(1, 1), **options)

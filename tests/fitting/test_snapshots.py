@@ -1,0 +1,318 @@
+"""A fit that was interrupted ends as if it had not been, to the last bit."""
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from reference import measure, random_cell, random_model
+from torch import Tensor
+from torch.nn.utils import parameters_to_vector
+
+from lfrtorch.distributed import Ranks
+from lfrtorch.fitting import state_file, trainer
+from lfrtorch.fitting.multistart import fit_starts
+from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.trainer import INTERRUPTED, Fit, FitResult, Progress
+from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.model import Model
+from lfrtorch.records import Record, Start
+
+pytestmark = pytest.mark.numeric
+
+STARTS: tuple[Start, ...] = ("zero", "given", "periodic", "estimated")
+
+
+class Sine(torch.nn.Linear):
+    """w = sin(W z + b), a map that is not compiled."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        return torch.sin(super().forward(input))
+
+
+def own_map() -> dict[str, Any]:
+    torch.manual_seed(0)
+    return {"static": Sine(2, 1, dtype=torch.float64), "nz": 2}
+
+
+def measured(kind: Start, seed: int, **sizes: Any) -> Record:
+    """A record of the true model whose start is of that kind."""
+    truth = random_model(random_cell(**sizes, radius=0.7))
+    if kind in ("zero", "periodic"):
+        return measure(truth, 60, seed=seed, start=kind)
+    late = measure(truth, 80, seed=seed)
+    return replace(late[20:], start=kind, x0=[0.3, -0.2] if kind == "given" else None)
+
+
+def records(kinds: Sequence[Start] = STARTS, **sizes: Any) -> tuple[list[Record], Record]:
+    """One record of each kind of start, and one for validation."""
+    train = [measured(kind, seed, **sizes) for seed, kind in enumerate(kinds)]
+    return train, measured("estimated", 9, **sizes)
+
+
+def starts(count: int, **sizes: Any) -> list[Model]:
+    return [random_model(random_cell(**sizes, radius=0.7, seed=10 + i)) for i in range(count)]
+
+
+class Stop:
+    """A monitor that interrupts after so many calls."""
+
+    def __init__(self, after: int) -> None:
+        self.left = after
+
+    def __call__(self, model: Model, progress: Progress) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+
+def outcome(result: FitResult) -> tuple:
+    """All of a result that is to be the same, durations left out."""
+    weights = parameters_to_vector(result.model.lfr.parameters()).tolist()
+    history = [asdict(p) | {"seconds": 0} for p in result.history]
+    return weights, result.chosen_iteration, result.reason, result.starts, history
+
+
+def run(
+    models: Sequence[Model],
+    data: tuple[list[Record], Record],
+    folder: Path | None = None,
+    stop: int = 0,
+    **options: Any,
+) -> FitResult:
+    monitors = [[Stop(stop)] if stop else [] for _ in models]
+    return fit_starts(models, *data, monitors=monitors, snapshots=Snapshots(folder, 0.0), **options)
+
+
+# --- one start ------------------------------------------------------------------------------
+
+
+def stand(fit: Fit) -> dict[str, Any]:
+    """All that the next steps of a fit depend on, and all that its result is made of."""
+    found = {field.name: getattr(fit.state, field.name) for field in fields(fit.state)}
+    found |= {name: getattr(fit, name) for name in trainer._KEPT}
+    found |= {"history": [asdict(p) for p in fit.history], "theta_best": fit._theta_best}
+    return copy.deepcopy(found | {"problem": fit.problem.state_dict()})
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two are alike in every bit; NaN is like NaN."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, torch.Tensor):
+        return one.dtype == other.dtype and torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return one == other or (isinstance(one, float) and math.isnan(one) and math.isnan(other))
+
+
+KINDS = {kind: (kind,) for kind in STARTS} | {"mixed": STARTS}
+
+
+@pytest.mark.parametrize(
+    "optimiser",
+    [LevenbergMarquardt(max_iter=5), Adam(epochs=5, learning_rate=1e-2)],
+    ids=["levenberg_marquardt", "adam"],
+)
+@pytest.mark.parametrize(
+    ("kinds", "sizes"),
+    [*((KINDS[name], dict) for name in KINDS), (STARTS, own_map)],
+    ids=[*KINDS, "mixed, own map"],
+)
+def test_all_of_a_fit_comes_back_from_its_file(
+    tmp_path: Path, kinds: Sequence[Start], sizes: Any, optimiser: Any
+):
+    """From a file in the midst of a fit that was killed later, and from where one paused."""
+    (train, _), validation = records(kinds, **sizes()), measured("zero", 9, **sizes())
+    wanted: dict[Path, dict[str, Any]] = {}
+
+    def keep(fit: Fit, paused: bool) -> None:
+        if fit.state.iteration == (3 if paused else 2):
+            file = tmp_path / ("paused" if paused else "killed")
+            wanted[file] = stand(fit)
+            fit.save(file)
+
+    def begun(**options: Any) -> Fit:
+        model, options = starts(1, **sizes())[0], options | {"ridge": 1e-3}
+        return Fit(model, train, validation, optimiser=optimiser, **options)
+
+    whole = begun(keep=keep).advance(until=3).advance()
+    assert len(wanted) == 2
+    for file, state in wanted.items():
+        again = begun()
+        again.restore(file)
+        found = stand(again)
+        assert found.keys() == state.keys()
+        assert not [name for name in state if not same(found[name], state[name])], file
+        again.advance()
+        assert outcome(again.result()) == outcome(whole.result()), file
+        assert same(stand(again)["problem"], stand(whole)["problem"]), file
+
+
+def test_ends_as_without_interruption(tmp_path: Path):
+    data, optimiser = records(), LevenbergMarquardt(max_iter=6)
+    whole = run(starts(1), data, optimiser=optimiser, ridge=1e-3)
+    for iterations in (2, 5):  # interrupted twice
+        cut = run(starts(1), data, tmp_path, 3, optimiser=optimiser, ridge=1e-3)
+        assert (cut.reason, cut.iterations) == (INTERRUPTED, iterations)
+    resumed = run(starts(1), data, tmp_path, optimiser=optimiser, ridge=1e-3)
+    assert outcome(resumed) == outcome(whole)
+
+
+def test_several_starts_end_as_without_interruption(tmp_path: Path):
+    data, optimiser = records(["zero", "periodic"]), LevenbergMarquardt(max_iter=8)
+    whole = run(starts(3), data, optimiser=optimiser)
+    for stop in (2, 5):  # in the first round, and in the last
+        folder = tmp_path / str(stop)
+        folder.mkdir()
+        cut = run(starts(3), data, folder, stop, optimiser=optimiser)
+        assert cut.reason == INTERRUPTED
+        assert len(Snapshots(folder).rounds) == (stop == 5)
+        resumed = run(starts(3), data, folder, optimiser=optimiser)
+        assert outcome(resumed) == outcome(whole)
+
+
+def test_more_iterations_than_were_asked_for(tmp_path: Path):
+    data = records()
+    for limit in (3, 9):
+        optimiser = LevenbergMarquardt(max_iter=limit)
+        assert run(starts(1), data, tmp_path, optimiser=optimiser).iterations == limit
+    whole = run(starts(1), data, optimiser=LevenbergMarquardt(max_iter=9))
+    resumed = run(starts(1), data, tmp_path, optimiser=LevenbergMarquardt(max_iter=9))
+    assert outcome(resumed)[0] == outcome(whole)[0]
+
+
+def test_a_step_that_was_taken_back_is_taken_back_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The state after a refusal is not that of the last iterate."""
+    monkeypatch.setattr(trainer, "EXPLOSION", 0.0)
+    train, validation = records()
+    far = Record(validation.u, -validation.y, fs=validation.fs)  # the better the fit, the worse
+    optimiser, refusals = LevenbergMarquardt(max_iter=12), []
+
+    def keep(fit: Fit, paused: bool) -> None:
+        if not paused and fit.history[-1].score != fit._score:
+            refusals.append(tmp_path / str(fit.state.iteration))
+            fit.save(refusals[-1])
+
+    whole = Fit(starts(1)[0], train, far, optimiser=optimiser, keep=keep).advance().result()
+    assert refusals
+    for file in refusals[:2]:
+        again = Fit(starts(1)[0], train, far, optimiser=optimiser)
+        again.restore(file)
+        assert outcome(again.advance().result()) == outcome(whole)
+
+
+@pytest.mark.parametrize(("every", "files"), [(0.0, 4), (1e9, 1)])
+def test_files_are_written_when_it_is_time_and_at_the_end(
+    tmp_path: Path, every: float, files: int, monkeypatch: pytest.MonkeyPatch
+):
+    written, save = [], Fit.save
+    monkeypatch.setattr(Fit, "save", lambda fit, path: (written.append(path), save(fit, path)))
+    options: Any = {"optimiser": LevenbergMarquardt(max_iter=3)}
+    fit_starts(starts(1), *records(["zero"]), snapshots=Snapshots(tmp_path, every), **options)
+    assert written == files * [tmp_path / "0.safetensors"]
+
+
+def test_the_best_score_of_all(tmp_path: Path):
+    assert Snapshots(tmp_path).least == Snapshots().least == float("inf")
+    result = run(starts(3), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=2))
+    assert Snapshots(tmp_path).least == min(p.score for p in result.history)
+
+
+def test_processes_take_their_own_residuals(tmp_path: Path):
+    """The residual on disk is the first one's alone."""
+
+    class Two(Ranks):
+        world = 2
+
+    data, optimiser = records()[0], LevenbergMarquardt(max_iter=3)
+    ranks = Ranks()
+    fit = Fit(starts(1)[0], data, optimiser=optimiser, ranks=ranks).advance(until=2)
+    fit.save(tmp_path / "fit")
+    again = Fit(starts(1)[0], data, optimiser=optimiser, ranks=ranks)
+    again.ranks = Two()
+    again.restore(tmp_path / "fit")
+    assert torch.equal(again.state.residual, again.problem.residual(again.state.theta))
+
+
+def test_processes_forget_the_periodic_orbits_of_the_first(tmp_path: Path):
+    """The guesses on disk are those of the first process's records."""
+
+    class Second(Ranks):
+        rank, world = 1, 2
+
+    model = random_model(random_cell(radius=0.7))
+    data = [measure(model, 50, seed=i, start="periodic") for i in range(3)]  # two are the first's
+    fit = Fit(starts(1)[0], data[::2], optimiser=LevenbergMarquardt(max_iter=3))
+    fit.advance(until=2).save(tmp_path / "fit")
+    again = Fit(starts(1)[0], data, optimiser=LevenbergMarquardt(max_iter=3), ranks=Second())
+    again.restore(tmp_path / "fit")
+    alone = Fit(again.model, data[1::2]).problem
+    # Of one point to the tolerance of the steady state, 1e-10, times the gain.
+    torch.testing.assert_close(
+        again.state.residual, alone.residual(again.state.theta), rtol=0, atol=1e-8
+    )
+
+
+def test_the_first_process_alone_writes_files(tmp_path: Path):
+    result = fit_starts(
+        starts(3),
+        *records(),
+        optimiser=LevenbergMarquardt(max_iter=2),
+        snapshots=Snapshots(tmp_path, 0.0, writes=False),
+    )
+    assert result.iterations == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- what cannot go on ----------------------------------------------------------------------
+
+
+def test_another_number_of_starts(tmp_path: Path):
+    run(starts(2), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
+    with pytest.raises(ValueError, match=r"has 2 start\(s\), and now there are 3"):
+        run(starts(3), records(), tmp_path)
+
+
+def test_another_start(tmp_path: Path):
+    run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
+    with pytest.raises(ValueError, match="began elsewhere"):
+        run(starts(2)[1:], records(), tmp_path)
+
+
+def test_fewer_iterations_than_it_has_had(tmp_path: Path):
+    run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=3))
+    with pytest.raises(ValueError, match="has had 3 iterations, more than the 2 asked for"):
+        run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=2))
+
+
+def test_another_optimiser(tmp_path: Path):
+    run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
+    with pytest.raises(ValueError, match="another optimiser than Adam"):
+        run(starts(1), records(), tmp_path, optimiser=Adam(epochs=3))
+
+
+@pytest.mark.parametrize("name", ["0.safetensors", "rounds.json"])
+def test_a_damaged_file(tmp_path: Path, name: str):
+    run(starts(2), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
+    path = tmp_path / name
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(ValueError, match=r"damaged .*init_from=DIR"):
+        run(starts(2), records(), tmp_path)
+
+
+def test_a_file_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as changed:
+        changed.setattr(state_file, "FORMAT", "lfrtorch snapshot 2")
+        run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
+    with pytest.raises(ValueError, match="another version"):
+        run(starts(1), records(), tmp_path)

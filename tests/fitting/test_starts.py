@@ -1,0 +1,227 @@
+"""Both starts are exactly the linear model, with the weights drawn as documented."""
+
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import reference
+import torch
+from reference import random_system
+from torch import Tensor, nn
+
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.fitting.starts import OUTPUT_RANGE, initialise
+from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+pytestmark = pytest.mark.numeric
+
+METHODS: tuple[Literal["paper", "zero_output"], ...] = ("paper", "zero_output")
+SIZES: dict[str, Any] = {"nz": 2, "nw": 3, "nn": 4}
+
+
+def some_records() -> list[Record]:
+    """Linear data with offsets, one record in steady state and one from rest."""
+    system, generator = random_system(3, 2, 2), np.random.default_rng(0)
+    steady, rest = generator.normal(size=(200, 2)), generator.normal(size=(150, 2))
+    return [
+        Record(
+            3 * steady + 2, reference.periodic_response(system, 3 * steady) - 5, 9.0, "periodic"
+        ),
+        Record(3 * rest + 2, reference.dlsim(system, 3 * rest) - 5, 9.0),
+    ]
+
+
+RECORDS = some_records()
+
+
+class Shifted(nn.Module):
+    """A user's own map from 2 to 3 signals, which does not vanish at zero."""
+
+    def __init__(self):
+        super().__init__()
+        self.c = nn.Parameter(torch.ones(3, 2))
+
+    def forward(self, z: Tensor) -> Tensor:
+        return torch.cos(z) @ self.c.mT
+
+
+def static_maps() -> dict[str, nn.Module]:
+    network, polynomial = Network(2, 3, 5, "relu"), Polynomial(2, 3, 2)
+    with torch.no_grad():
+        for weight in (network.bw, polynomial.C):
+            weight.fill_(0.7)
+    return {"network": network, "polynomial": polynomial, "own": Shifted()}
+
+
+@pytest.fixture(scope="module")
+def bla() -> LinearModel:
+    return estimate_bla(RECORDS, 3)
+
+
+def network(model: Model) -> Network:
+    assert isinstance(model.lfr.cell.static, Network)
+    return model.lfr.cell.static
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_start_is_the_linear_model(bla: LinearModel, method):
+    model = initialise(bla, RECORDS, **SIZES, method=method)
+    for record in (*RECORDS, RECORDS[0][50:120]):
+        expected = bla.simulate(record)
+        # Equal but for rounding in other units and coordinates (eps κ, κ of some hundred), and the
+        # periodic start.
+        tolerance = 1e-11 if record.start == "zero" else 1e-9
+        np.testing.assert_allclose(
+            model.simulate(record), expected, rtol=0, atol=tolerance * np.abs(expected).max()
+        )
+    assert (model.fs, model.inputs, model.outputs) == (bla.fs, bla.inputs, bla.outputs)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_poles_are_those_of_the_linear_model(bla: LinearModel, method):
+    A = initialise(bla, RECORDS, **SIZES, method=method).lfr.cell.A.detach().numpy()
+    # eps κ of the change of coordinates, some hundred
+    np.testing.assert_allclose(np.poly(A), np.poly(bla.A), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_signals_have_unit_deviation(bla: LinearModel, method):
+    T = np.random.default_rng(1).normal(size=(3, 3))  # also from a model in any coordinates
+    for start in (bla, bla.transformed(T)):
+        model = initialise(start, RECORDS, **SIZES, method=method)
+        problem = SimulationError(model, RECORDS)
+        trajectories = problem.trajectories(problem.theta)
+        x = torch.cat([t.x[:, :-1].flatten(0, 1) for t in trajectories])
+        z = torch.cat([t.z.flatten(0, 1) for t in trajectories])
+        u = torch.cat([batch.u.flatten(0, 1) for batch in problem.batches])
+        y = torch.cat([batch.y.flatten(0, 1) for batch in problem.batches])
+        for signal in (x, z):
+            np.testing.assert_allclose(signal.std(dim=0, correction=0).numpy(), 1, rtol=1e-8)
+        for signal in (u, y):  # about the operating point, which need not be the mean
+            # Sums of 350 squares: eps times less than that.
+            np.testing.assert_allclose(signal.square().mean(dim=0).sqrt().numpy(), 1, rtol=1e-12)
+
+
+def test_weights_of_the_paper(bla: LinearModel):
+    model = initialise(bla, RECORDS, **SIZES, method="paper")
+    cell, static = model.lfr.cell, network(model)
+    assert not cell.Bw.any()
+    assert not cell.Dyw.any()
+    assert static.Ww.all()
+    for weight in (static.Wz, static.bz, static.Ww):
+        assert weight.abs().max() <= 1
+    assert not static.bw.any()
+
+
+def test_weights_of_the_zero_output(bla: LinearModel):
+    model = initialise(bla, RECORDS, **SIZES, method="zero_output")
+    cell, static = model.lfr.cell, network(model)
+    assert not static.Ww.any()
+    assert not static.bw.any()
+    for weight in (cell.Bw, cell.Dyw):
+        assert weight.all()
+        assert weight.abs().max() <= OUTPUT_RANGE
+    for weight in (static.Wz, static.bz):
+        assert weight.all()
+        assert weight.abs().max() <= 1
+
+
+def test_zero_output_is_the_default(bla: LinearModel):
+    assert not network(initialise(bla, RECORDS, **SIZES)).Ww.any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_same_seed_same_bits(bla: LinearModel, method):
+    torch.manual_seed(0)
+    first = initialise(bla, RECORDS, **SIZES, method=method, seed=1)
+    torch.manual_seed(1)  # the global generator has no part in it
+    again = initialise(bla, RECORDS, **SIZES, method=method, seed=1)
+    other = initialise(bla, RECORDS, **SIZES, method=method, seed=2)
+    for name, weight in first.lfr.state_dict().items():
+        assert torch.equal(weight, again.lfr.state_dict()[name])
+    for name in ("cell.Cz", "cell.Dzu", "cell.static.Wz", "cell.static.bz"):
+        assert not torch.equal(first.lfr.state_dict()[name], other.lfr.state_dict()[name])
+
+
+def test_options_reach_the_model(bla: LinearModel):
+    model = initialise(bla, RECORDS, **SIZES, activation="relu", dtype=torch.float32)
+    assert model.sizes == {"nx": 3, **SIZES}
+    assert network(model).activation == "relu"
+    assert {p.dtype for p in model.lfr.parameters()} == {torch.float32}
+
+
+@pytest.mark.parametrize("size", ["nz", "nw", "nn"])
+def test_size_below_one(bla: LinearModel, size: str):
+    options: dict[str, Any] = SIZES | {size: 0}
+    with pytest.raises(ValueError, match=f"{size} is 0; give a whole number of at least 1"):
+        initialise(bla, RECORDS, **options)
+
+
+def test_unknown_method(bla: LinearModel):
+    with pytest.raises(ValueError, match="method is 'random'; use 'zero_output' or 'paper'"):
+        initialise(bla, RECORDS, **SIZES, method="random")  # pyright: ignore[reportArgumentType]
+
+
+# --- a static map of the caller's -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["network", "polynomial", "own"])
+def test_start_with_a_given_map_is_the_linear_model(bla: LinearModel, name: str, method):
+    static = static_maps()[name]
+    given = {key: weight.clone() for key, weight in static.state_dict().items()}
+    model = initialise(bla, RECORDS, nz=2, nw=3, static=static, method=method)
+    cell = model.lfr.cell
+    assert type(cell.static) is type(static)
+    assert {p.dtype for p in model.lfr.parameters()} == {torch.float64}
+    for record in RECORDS:
+        expected = bla.simulate(record)
+        tolerance = 1e-11 if record.start == "zero" else 1e-9
+        np.testing.assert_allclose(
+            model.simulate(record), expected, rtol=0, atol=tolerance * np.abs(expected).max()
+        )
+    # What makes w vanish may move: the map's own output weights, or else Bw and Dyw.
+    cleared = {"network": {"Ww", "bw"}, "polynomial": {"C"}, "own": set()}[name]
+    cleared = cleared if method == "zero_output" else set()
+    for weight in (cell.Bw, cell.Dyw):
+        assert bool(weight.all()) == bool(weight.any()) == bool(cleared)
+        assert weight.abs().max() <= OUTPUT_RANGE
+    assert cell.static is not None
+    for key, weight in cell.static.state_dict().items():
+        expected = torch.zeros_like(weight) if key in cleared else given[key].double()
+        assert torch.equal(weight, expected)
+    for key, weight in static.state_dict().items():  # the caller's module is left alone
+        assert torch.equal(weight, given[key])
+
+
+@pytest.mark.parametrize("vanishing", [True, False])
+def test_an_own_map_without_an_output_is_let_act_on_the_state(bla: LinearModel, vanishing: bool):
+    """Else neither its weights nor Bw had a slope: the start would be a saddle."""
+    static = Shifted()
+    if vanishing:
+        nn.init.zeros_(static.c)
+    cell = initialise(bla, RECORDS, nz=2, nw=3, static=static).lfr.cell
+    for weight in (cell.Bw, cell.Dyw):
+        assert bool(weight.all()) == bool(weight.any()) == vanishing
+
+
+def test_given_map_changes_nothing_else(bla: LinearModel):
+    network = initialise(bla, RECORDS, **SIZES).lfr.state_dict()
+    own = initialise(bla, RECORDS, nz=2, nw=3, static=Shifted()).lfr.state_dict()
+    for name in ("cell.A", "cell.Bu", "cell.Cy", "cell.Dyu"):
+        assert torch.equal(network[name], own[name])
+
+
+@pytest.mark.parametrize("static", [Polynomial(3, 3, 2), Polynomial(2, 1, 2), nn.Linear(3, 3)])
+def test_given_map_of_other_sizes(bla: LinearModel, static: nn.Module):
+    with pytest.raises(ValueError, match=r"with nz=2 and nw=3 it must give w of shape \(1, 2, 3\)"):
+        initialise(bla, RECORDS, nz=2, nw=3, static=static)
+
+
+def test_neither_neurons_nor_a_map(bla: LinearModel):
+    with pytest.raises(ValueError, match="nn is None; give a whole number of at least 1"):
+        initialise(bla, RECORDS, nz=2, nw=3)

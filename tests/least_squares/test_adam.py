@@ -1,0 +1,73 @@
+"""Adam is torch's, in steps."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from lfrtorch.least_squares.adam import Adam
+
+pytestmark = pytest.mark.numeric
+
+
+class Quadratic:
+    """r = (x - 1, 10 (y - 2))."""
+
+    def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        weight = theta.new_tensor([1.0, 10.0])
+        r = weight * (theta - theta.new_tensor([1.0, 2.0]))
+        return r, weight * r  # of the mean square: 2/2 weight r
+
+
+ZERO = torch.zeros(2, dtype=torch.float64)
+
+
+def test_steps_are_those_of_torch():
+    adam, problem = Adam(epochs=20, learning_rate=0.1), Quadratic()
+    state = adam.init(problem, ZERO)
+    parameter = torch.nn.Parameter(ZERO.clone())
+    theirs = torch.optim.Adam([parameter], lr=0.1)
+    while not state.reason:
+        state = adam.step(problem, state)
+        parameter.grad = problem.gradient(parameter.detach())[1]
+        theirs.step()
+        assert torch.equal(state.theta, parameter)
+        assert torch.equal(state.residual, problem.gradient(parameter.detach())[0])
+    assert (state.iteration, state.reason) == (20, "maximum number of epochs")
+
+
+def test_minimum_is_reached():
+    adam, problem = Adam(epochs=500, learning_rate=0.05), Quadratic()
+    state = adam.init(problem, ZERO)
+    while not state.reason:
+        state = adam.step(problem, state)
+    assert state.residual.abs().max() < 1e-2  # within some steps of the learning rate's decay
+
+
+def test_step_leaves_its_state_alone():
+    adam, problem = Adam(), Quadratic()
+    start = adam.step(problem, adam.init(problem, ZERO))
+    first = adam.step(problem, adam.step(problem, start))
+    again = adam.step(problem, adam.step(problem, start))
+    assert torch.equal(first.theta, again.theta)
+
+
+def test_divergence_is_a_reason():
+    class Broken(Quadratic):
+        def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+            r, gradient = super().gradient(theta)
+            return (r, gradient) if not theta.any() else (r * torch.inf, gradient * torch.nan)
+
+    adam = Adam()
+    state = adam.step(Broken(), adam.init(Broken(), ZERO))
+    assert state.reason == "diverged: lower the learning rate"
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
+def test_learning_rate_must_be_positive(rate: float):
+    with pytest.raises(ValueError, match="give a positive number"):
+        Adam(learning_rate=rate)
+
+
+def test_epochs_cannot_be_negative():
+    with pytest.raises(ValueError, match="epochs is -1; give a whole number of at least 0"):
+        Adam(epochs=-1)

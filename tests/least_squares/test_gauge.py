@@ -1,0 +1,210 @@
+"""Columns that are left out are exactly those combinations of the others."""
+
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from reference import SIZES, normal, random_cell
+from torch.testing import assert_close
+
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
+from lfrtorch.engine.simulate import simulate, steady_state
+from lfrtorch.least_squares.gauge import reduction
+
+pytestmark = pytest.mark.numeric
+
+
+def none(cell: LFRCell) -> torch.Tensor:
+    return cell.A.new_zeros(0, cell.nx)
+
+
+def check(cell: LFRCell, left_out: int, R: int = 2):
+    u = normal(R, 12, cell.nu)
+    kept, expand = reduction(cell, none(cell))
+    P = sum(p.numel() for p in cell.parameters() if p.requires_grad)
+    assert (len(kept), expand.shape) == (P - left_out, (P - left_out, P))
+    for J in (
+        output_jacobian(Linearisation(cell, u, simulate(cell, u, u.new_zeros(R, cell.nx)))),
+        output_jacobian(Linearisation(cell, u, steady_state(cell, u), periodic=True)),
+    ):
+        J = J[..., :P]
+        assert_close(J[..., kept] @ expand, J, rtol=0, atol=1e-8 * float(J.abs().max()))
+
+
+@given(sizes=SIZES)
+@settings(max_examples=15)
+def test_expanded_columns_are_the_jacobian(sizes: dict[str, Any]):
+    cell = random_cell(**sizes, radius=0.5)
+    kept, expand = reduction(cell, none(cell))
+    u = normal(2, 12, cell.nu)
+    J = output_jacobian(Linearisation(cell, u, steady_state(cell, u), periodic=True))
+    assert_close(J[..., kept] @ expand, J, rtol=0, atol=1e-8 * float(J.abs().max()))
+
+
+def test_all_gauge_directions_of_a_network_are_left_out():
+    check(random_cell(1, 1, 3, 2, 1, 5, radius=0.5), 3**2 + 2**2 + 1)
+    check(random_cell(2, 2, 4, 2, 2, 5, radius=0.5), 4**2 + 2**2 + 2**2)
+
+
+def test_a_map_that_absorbs_no_coordinates_has_those_of_the_state_only():
+    cell = random_cell(1, 1, 2, 2, 1, static=Polynomial(2, 1, 2), radius=0.3, feedback=0.01)
+    check(cell, 2**2)
+
+
+def test_linear_cell():
+    check(random_cell(1, 2, 3, 0, 0, radius=0.5), 3**2)
+
+
+def test_start_of_the_paper_keeps_what_it_cannot_leave_out():
+    """With Bw = Dyw = 0 the coordinates of w are seen in the static map alone."""
+    cell = random_cell(1, 1, 2, 1, 1, 3, radius=0.5)
+    with torch.no_grad():
+        cell.Bw.zero_()
+        cell.Dyw.zero_()
+    check(cell, 2**2 + 1)
+
+
+@pytest.mark.parametrize(
+    ("frozen", "left_out"),
+    [(["A"], 2 + 4 + 1), (["Cz", "Dzu"], 2 + 1), (["Bu"], 2 + 4 + 1), (["A", "Bu", "Bw", "Cy"], 4)],
+)
+def test_directions_that_move_a_frozen_parameter_are_none(frozen: list[str], left_out: int):
+    """Those that commute with A are polynomials of it: nx of them; Bu fixed takes nx of nx², and
+    with Cz fixed the coordinates of x and z go together, of which Dzu takes nz more.
+    """
+    cell = random_cell(1, 1, 2, 2, 1, 4, radius=0.5)
+    for name in frozen:
+        cell.get_parameter(name).requires_grad_(False)
+    check(cell, left_out)
+
+
+def test_coordinates_of_given_start_states_are_not_free():
+    cell = random_cell(1, 1, 3, 2, 1, 5)
+    free, held = reduction(cell, none(cell)), reduction(cell, none(cell), coordinates=False)
+    assert len(held.kept) == len(free.kept) + 3**2
+
+
+def test_start_states_that_are_parameters_stay():
+    cell = random_cell(1, 1, 2, 1, 1, 3, radius=0.5)
+    x0, u = normal(2, 2, seed=4), normal(2, 12, 1)
+    kept, expand = reduction(cell, x0)
+    P = sum(p.numel() for p in cell.parameters())
+    assert kept[-4:].tolist() == [P, P + 1, P + 2, P + 3]
+    rows = output_jacobian(Linearisation(cell, u, simulate(cell, u, x0)))
+    J = rows.new_zeros(*rows.shape[:3], P + 4)
+    J[..., :P] = rows[..., :P]
+    J[0, ..., P : P + 2], J[1, ..., P + 2 :] = rows[0, ..., P:], rows[1, ..., P:]
+    assert_close(J[..., kept] @ expand, J, rtol=0, atol=1e-9 * float(J.abs().max()))
+
+
+def test_weights_that_are_not_finite_leave_nothing_out():
+    cell = random_cell()
+    with torch.no_grad():
+        cell.A[0, 0] = torch.inf
+    kept, expand = reduction(cell, none(cell))
+    assert torch.equal(expand, torch.eye(len(kept), dtype=expand.dtype))
+
+
+@pytest.mark.parametrize(
+    ("frozen", "sizes"),
+    [
+        (["A", "Bu", "Bw", "Cz", "Dzu", "Cy"], {"nz": 6, "nw": 2}),
+        (["A", "Bu", "Bw", "Cz", "Dzu", "Dyw"], {"nz": 2, "nw": 6}),
+    ],
+)
+def test_rounding_errors_of_frozen_directions_leave_nothing_out(frozen, sizes):
+    cell = random_cell(1, 1, 3, **sizes, nn=10, radius=0.5)
+    for name in frozen:
+        cell.get_parameter(name).requires_grad_(False)
+    assert reduction(cell, none(cell)).expand.abs().max() < 1e3
+
+
+def test_a_class_of_one_s_own_that_begins_with_a_network_keeps_its_coordinates():
+    class More(Network):
+        def forward(self, z: torch.Tensor) -> torch.Tensor:
+            return super().forward(z) + 0.5 * torch.sin(z[..., :1])
+
+    check(random_cell(1, 1, 2, 2, 1, static=More(2, 1, 3), radius=0.3, feedback=0.05), 2**2)
+
+
+# --- fixed entries ----------------------------------------------------------------------------
+
+
+def check_fixed(cell: LFRCell, fixed: torch.Tensor, left_out: int):
+    """Columns of zeros at the fixed entries, the plain ones elsewhere; so many are not computed."""
+    u = normal(2, 12, cell.nu)
+    J = output_jacobian(Linearisation(cell, u, steady_state(cell, u), periodic=True))
+    kept, expand = reduction(cell, none(cell), fixed=fixed)
+    assert len(kept) == J.shape[-1] - int(fixed.sum()) - left_out
+    assert not fixed[kept].any()
+    found = J[..., kept] @ expand
+    assert torch.equal(expand[:, fixed], torch.zeros_like(expand[:, fixed]))
+    # The expansion multiplies by 1 / DEPENDENT at most, the steady state is known to 1e-10.
+    assert_close(found[..., ~fixed], J[..., ~fixed], rtol=0, atol=1e-8 * float(J.abs().max()))
+
+
+def entries(cell: LFRCell, *names: str) -> torch.Tensor:
+    """Which free entries belong to those parameters."""
+    parts = [
+        torch.full((p.numel(),), name in names)
+        for name, p in cell.named_parameters()
+        if p.requires_grad
+    ]
+    return torch.cat(parts)
+
+
+@pytest.mark.parametrize(
+    ("names", "left_out"),
+    [((), 4 + 4 + 1), (("A",), 2 + 4 + 1), (("Cz", "Dzu"), 2 + 1), (("A", "Bu", "Bw", "Cy"), 4)],
+)
+def test_fixed_parameters_are_frozen_ones(names: tuple[str, ...], left_out: int):
+    """As many directions as where the whole parameter has no gradient."""
+    cell = random_cell(1, 1, 2, 2, 1, 4, radius=0.5)
+    check_fixed(cell, entries(cell, *names), left_out)
+
+
+def test_single_entries_hold_the_directions_that_move_them():
+    """Of the diagonal of A they move nx - 1 entries freely: the trace stays as it is."""
+    cell = random_cell(1, 1, 3, 0, 0, radius=0.5)
+    fixed = entries(cell)
+    fixed[[0, 4, 8]] = True
+    check_fixed(cell, fixed, 9 - 2)
+
+
+def test_fixed_entries_beside_a_frozen_parameter_and_start_states():
+    """`fixed` numbers the free parameters alone, and start states stay free behind them."""
+    cell = random_cell(1, 1, 2, 1, 1, 3, radius=0.5)
+    cell.Bu.requires_grad_(False)
+    fixed = entries(cell, "Cy")
+    x0, u = normal(2, 2, seed=4), normal(2, 12, 1)
+    kept, expand = reduction(cell, x0, fixed=fixed)
+    P = len(fixed)
+    assert expand.shape[1] == P + 4
+    assert kept[-4:].tolist() == [P, P + 1, P + 2, P + 3]
+    rows = output_jacobian(Linearisation(cell, u, simulate(cell, u, x0)))
+    J = rows.new_zeros(*rows.shape[:3], P + 4)
+    J[..., :P] = rows[..., :P]
+    J[0, ..., P : P + 2], J[1, ..., P + 2 :] = rows[0, ..., P:], rows[1, ..., P:]
+    J[..., :P][..., fixed] = 0.0
+    assert_close(J[..., kept] @ expand, J, rtol=0, atol=1e-9 * float(J.abs().max()))
+
+
+def test_reduction_of_before_does_not_bring_fixed_entries_back():
+    cell = random_cell(1, 1, 2, 1, 1, 3, radius=0.5)
+    before = reduction(cell, none(cell))
+    fixed = entries(cell, "A")
+    _, expand = reduction(cell, none(cell), before=before, fixed=fixed)
+    assert not expand[:, fixed].any()
+
+
+def test_weights_that_are_not_finite_leave_fixed_entries_out():
+    cell = random_cell()
+    with torch.no_grad():
+        cell.A[0, 0] = torch.inf
+    fixed = entries(cell, "Bu")
+    kept, expand = reduction(cell, none(cell), fixed=fixed)
+    assert not expand[:, fixed].any()
+    assert len(kept) == int((~fixed).sum())

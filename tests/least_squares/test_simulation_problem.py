@@ -1,0 +1,472 @@
+"""The one residual over records of different lengths, starts and windows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from reference import measure, normal, random_cell, random_model
+from torch.testing import assert_close
+
+from lfrtorch.least_squares.joint import Stack
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.metrics import rmse
+from lfrtorch.model import Model
+from lfrtorch.records import Record, Start
+
+pytestmark = pytest.mark.numeric
+
+
+@pytest.fixture
+def model() -> Model:
+    return random_model(random_cell(2, 2, 2, 2, 1, 3))
+
+
+def some_records(model: Model) -> list[Record]:
+    """Groups: (30, zero) twice with other windows, (30, periodic), (20, zero)."""
+    noise = np.random.default_rng(0)
+    records = []
+    groups: list[tuple[int, Start, int]] = [
+        (30, "zero", 0), (30, "periodic", 4), (30, "zero", 7), (20, "zero", 1)
+    ]  # fmt: skip
+    for T, start, skip in groups:
+        exact = measure(model, T, seed=len(records), start=start, skip=skip)
+        y = exact.y + noise.normal(size=exact.y.shape)
+        records.append(Record(exact.u, y, exact.fs, start, skip, name=f"{start} {T} {skip}"))
+    return records
+
+
+def all_kinds(model: Model, *, given: bool = True) -> list[Record]:
+    """Every start, window and weight in one problem."""
+    zero, periodic, third, fourth = some_records(model)
+    lines = np.linspace(0.5, 2.0, 2 * 16).reshape(16, 2) * (np.arange(16) != 3)[:, None]
+    records = [
+        replace(zero, weight=[0.5, 3.0]),
+        periodic,
+        replace(periodic, skip=0, line_weight=lines, weight=2.0),
+        replace(third, start="estimated"),
+        replace(fourth, start="estimated", weight=4.0),
+        replace(zero, start="estimated", skip=3),
+    ]
+    return [*records, replace(fourth, start="given", x0=[0.3, -0.2])] if given else records
+
+
+def test_residual_is_the_error_of_all_scored_samples(model: Model):
+    records = some_records(model)
+    problem = SimulationError(model, records)
+    r = problem.residual(problem.theta)
+    expected = [((model.simulate(x) - x.y) / model.scaler.y_scale)[x.skip :] for x in records]
+    assert r.shape == (2 * (30 + 30 + 30 + 20),)
+    assert problem.size == 2 * (30 + 26 + 23 + 19)
+    # The order of the records is the problem's own, and samples that do not count are zero.
+    mine, theirs = np.sort(r[r != 0].numpy()), np.sort(np.concatenate(expected).ravel())
+    np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-9)
+
+
+def test_rmse_is_that_of_the_metrics(model: Model):
+    records = some_records(model)
+    for record in records:
+        problem = SimulationError(model, record)
+        score = problem.rmse(problem.theta)
+        assert score == pytest.approx(rmse(record, model.simulate(record)), rel=1e-9)
+
+
+RIDGES = pytest.mark.parametrize("ridge", [0.0, 0.5, {"static": 0.1, "A": 0.3, "x0": 2.0}])
+
+
+@RIDGES
+def test_gradient_and_jacobian_agree(model: Model, ridge):
+    problem = SimulationError(model, all_kinds(model), ridge=ridge)
+    theta = problem.theta + 0.1
+    r, gradient = problem.gradient(theta)
+    J = problem.jacobian(theta)
+    assert_close(r, problem.residual(theta), rtol=0, atol=1e-9)
+    assert_close(gradient, 2 * J.mT @ r / problem.size, rtol=1e-8, atol=1e-8)
+
+
+@RIDGES
+def test_jacobian_is_the_slope_of_the_residual(model: Model, ridge):
+    problem = SimulationError(model, all_kinds(model), ridge=ridge)
+    theta = problem.theta
+    assert len(theta) == model.parameters + 3 * 2
+    step = 1e-4 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
+    expected = (problem.residual(theta + step) - problem.residual(theta - step)) / 2
+    # Truncation |step|³ = 1e-11, and the periodic start is known to 1e-10.
+    assert_close(problem.jacobian(theta) @ step, expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("ridge", "given", "precise", "kept"),
+    [
+        (0.0, True, True, True),
+        (0.0, False, False, False),
+        (0.5, False, True, False),
+        (0.5, True, False, True),
+        ({"static": 0.1, "A": 0.3, "x0": 2.0}, False, False, True),
+        ({"static": 0.1, "A": 0.3, "x0": 2.0}, True, True, False),
+    ],
+)
+def test_system_and_products_are_those_of_the_whole_jacobian(
+    model: Model, ridge, given: bool, precise: bool, kept: bool, monkeypatch
+):
+    """In blocks of five samples, kept or not, by QR or by normal equations, gauge left out.
+
+    That is exact in periodic steady state, which is known to 1e-10.
+    """
+    monkeypatch.setattr("lfrtorch.engine.sensitivity.BLOCK", 5)
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    problem = SimulationError(model, all_kinds(model, given=given), ridge=ridge)
+    theta = problem.theta + 0.1
+    r, J = problem.residual(theta), problem.jacobian(theta)
+    jacobian = problem.linearise(theta)
+    system, gradient = jacobian.system(1e-15 if precise else 1e-2, 1e-12)
+    scale = float(torch.linalg.svdvals(J)[0]) ** 2
+    assert system.scale == pytest.approx(scale, rel=1e-9)
+    assert_close(gradient, J.mT @ r, rtol=0, atol=1e-10 * scale)
+    damping = 1e-3 * scale
+    expected = -torch.linalg.solve(J.mT @ J + damping * torch.eye(len(theta)), J.mT @ r)
+    assert_close(system.solve(gradient, damping), expected, rtol=0, atol=1e-7)
+    assert_close(jacobian.tangent(theta), J @ theta, rtol=0, atol=1e-8)
+    assert_close(jacobian.adjoint(r), J.mT @ r, rtol=0, atol=1e-8)
+
+
+def test_weights_multiply_the_squared_errors(model: Model):
+    (record,) = some_records(model)[:1]
+    plain = SimulationError(model, record)
+    theta = plain.theta + 0.1
+    squares = plain.residual(theta).reshape(-1, 2).square().sum(0)
+    weighted = SimulationError(model, replace(record, weight=[0.5, 3.0]))
+    assert weighted.cost(weighted.residual(theta)) == pytest.approx(
+        float(0.5 * squares[0] + 3.0 * squares[1]), rel=1e-9
+    )
+    assert weighted.rmse(theta) == pytest.approx(plain.rmse(theta), rel=1e-12)
+
+
+@pytest.mark.parametrize("T", [30, 31])
+def test_unit_line_weights_are_plain_least_squares(model: Model, T: int):
+    noise = np.random.default_rng(1).normal(size=(T, 2))
+    record = measure(model, T, start="periodic")
+    record = replace(record, y=record.y + noise)
+    lines = replace(record, line_weight=np.ones(T // 2 + 1))
+    plain, weighted = SimulationError(model, record), SimulationError(model, lines)
+    theta = plain.theta + 0.1
+    cost = plain.cost(plain.residual(theta))
+    assert weighted.cost(weighted.residual(theta)) == pytest.approx(cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("T", [30, 31])
+def test_line_weights_weigh_the_spectrum_of_the_error(model: Model, T: int):
+    record = measure(model, T, start="periodic")
+    t = 2 * np.pi * np.arange(T)[:, None] / T
+    y = record.y + model.scaler.y_scale * (np.cos(3 * t) + 2.0 * np.sin(5 * t))
+    weight = np.zeros(T // 2 + 1)
+    weight[[3, 5, 6]] = 4.0, 0.25, 9.0
+    problem = SimulationError(model, replace(record, y=y, line_weight=weight))
+    # Σ cos² = Σ sin² = T / 2 over whole periods, in each of two outputs.
+    expected = 2 * (4.0 * 1.0 + 0.25 * 4.0) * T / 2
+    assert problem.cost(problem.residual(problem.theta)) == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("T", [29, 30])
+@pytest.mark.parametrize("by_line", [True, False])
+def test_adjoint_of_the_weights_is_that_of_their_product(model: Model, T: int, by_line: bool):
+    """<W e, r> = <e, W' r>, where each line but 0 and fs / 2 stands for two."""
+    rng, record = np.random.default_rng(0), measure(model, T, start="periodic")
+    F = T // 2 + 1
+    weights = {"line_weight": rng.uniform(0.5, 2.0, (F, 2))} if by_line else {"weight": [0.5, 3.0]}
+    problem = SimulationError(model, [replace(record, **weights)] * 2)
+    (batch,) = problem.batches
+    e, r = normal(2, T, 2), normal(*batch.residual_shape, seed=1)
+    assert batch.residual_shape == (2, 2 * F if by_line else T, 2)
+    weighed, unweighed = batch.weigh(e), batch.unweigh(r)
+    assert unweighed.shape == e.shape
+    # Sums of some hundred products of size 1.
+    assert_close((weighed * r).sum(), (e * unweighed).sum(), rtol=0, atol=1e-11)
+
+
+def test_start_state_is_fitted_with_the_parameters(model: Model):
+    """A record cut from the middle of another, and the first of its samples thrown away."""
+    whole = measure(model, 200)
+    later = replace(whole[50:], start="estimated")
+    problem = SimulationError(model, [whole, later])
+    states = model.signals(whole).x[0]
+    assert_close(problem.theta[-2:], states[50], rtol=0, atol=1e-7)
+    assert problem.rmse(problem.theta) < 1e-8
+    solved = SimulationError(model, [whole, later], solved_starts=True)
+    assert len(solved.theta) == model.parameters
+    assert solved.rmse(solved.theta) < 1e-8
+
+
+def test_given_start_state(model: Model):
+    whole = measure(model, 200)
+    state = model.signals(whole).x[0, 50].numpy()
+    problem = SimulationError(model, replace(whole[50:], start="given", x0=state))
+    assert problem.rmse(problem.theta) < 1e-9
+
+
+def test_ridge_by_group_is_of_its_parameters_only(model: Model):
+    problem = SimulationError(model, some_records(model), ridge={"A": 0.25, "static.bz": 4.0})
+    theta = problem.theta
+    longer = problem.residual(theta + 1.0)[-len(theta) :]
+    names = [name for name, p in model.lfr.cell.named_parameters() for _ in range(p.numel())]
+    expected = [{"A": 0.5, "static.bz": 2.0}.get(name, 0.0) for name in names]
+    assert_close(longer, torch.tensor(expected, dtype=longer.dtype), rtol=1e-12, atol=0)
+
+
+def test_ridge_of_an_unknown_group(model: Model):
+    with pytest.raises(ValueError, match=r"ridge has a group 'B',.*parameters are A, Bu, .*bw"):
+        SimulationError(model, some_records(model), ridge={"B": 1.0})
+    with pytest.raises(ValueError, match=r"ridge of 'A' is -1; give"):
+        SimulationError(model, some_records(model), ridge={"A": -1})
+
+
+def test_penalty_is_no_part_of_the_score(model: Model):
+    records = some_records(model)
+    plain, ridged = SimulationError(model, records), SimulationError(model, records, ridge=4.0)
+    theta = plain.theta + 0.1
+    r, longer = plain.residual(theta), ridged.residual(theta)
+    assert_close(longer[: len(r)], r, rtol=0, atol=1e-9)
+    assert_close(longer[len(r) :], torch.full_like(theta, 2.0 * 0.1), rtol=1e-12, atol=0)
+    assert ridged.rmse(theta) == pytest.approx(plain.rmse(theta), rel=1e-9)
+
+
+def test_jacobian_is_that_of_its_argument_whatever_the_module_holds(model: Model):
+    records = some_records(model)
+    theta = SimulationError(model, records).theta
+    expected = SimulationError(model, records).jacobian(theta)
+    problem, other = SimulationError(model, records), SimulationError(model, records)
+    problem.residual(theta)
+    other.residual(theta + 0.1)
+    assert_close(problem.jacobian(theta), expected, rtol=0, atol=1e-8)
+
+
+def test_frozen_parameters_are_no_part_of_theta(model: Model):
+    model.lfr.cell.A.requires_grad_(False)
+    before = model.lfr.cell.A.clone()
+    problem = SimulationError(model, some_records(model))
+    assert len(problem.theta) == model.parameters - 4
+    problem.residual(problem.theta + 0.1)
+    assert torch.equal(model.lfr.cell.A, before)
+    assert problem.jacobian(problem.theta).shape[1] == model.parameters - 4
+
+
+def test_divergence_is_a_residual_that_is_not_finite(model: Model):
+    problem = SimulationError(model, measure(model, 2000))
+    theta = problem.theta
+    assert not torch.isfinite(problem.residual(theta + 3.0)).all()
+    assert torch.isfinite(problem.residual(theta)).all()
+
+
+@pytest.mark.parametrize("ridge", [-1.0, float("nan")])
+def test_negative_ridge(model: Model, ridge: float):
+    with pytest.raises(ValueError, match=r"ridge is .*; give a number of at least 0"):
+        SimulationError(model, some_records(model), ridge=ridge)
+
+
+@pytest.mark.parametrize(
+    ("nu", "ny", "fs", "message"),
+    [(1, 2, 100.0, "input"), (2, 1, 100.0, "output"), (2, 2, 50.0, "50")],
+)
+def test_records_that_are_not_the_model_s(model: Model, nu: int, ny: int, fs: float, message: str):
+    record = Record(np.ones((20, nu)), np.ones((20, ny)), fs, name="lab")
+    with pytest.raises(ValueError, match=f"(?s)lab.*{message}"):
+        SimulationError(model, record)
+
+
+def test_integrator_in_steady_state_ends_the_search_with_a_reason():
+    """x+ = x + u with a zero-mean input closes from any start: I - Φ is singular."""
+    cell = random_cell(1, 1, 1, 0, 0)
+    with torch.no_grad():
+        cell.A.fill_(1.0)
+        cell.Bu.fill_(1.0)
+    model = random_model(cell)
+    u = np.tile([1.0, -1.0], 10) * model.scaler.u_scale + model.scaler.u_offset
+    record = Record(u, np.ones(20), model.fs, "periodic")
+    problem = SimulationError(model, record)
+    optimiser = LevenbergMarquardt()
+    state = optimiser.step(problem, optimiser.init(problem, problem.theta))
+    assert state.reason == "the Jacobian vanishes or is not finite"
+
+
+def test_one_record_twice_has_two_start_states(model: Model):
+    record = replace(some_records(model)[0], start="estimated")
+    problem = SimulationError(model, [record, record])
+    theta = problem.theta + 0.1
+    r, gradient = problem.gradient(theta)
+    J = problem.jacobian(theta)
+    assert_close(gradient, 2 * J.mT @ r / problem.size, rtol=1e-8, atol=1e-8)
+    assert (J[:, -4:] != 0).any(dim=0).all()
+
+
+def test_theta_changed_in_place_is_another_theta(model: Model):
+    problem = SimulationError(model, some_records(model))
+    theta = problem.theta
+    before = problem.residual(theta)
+    theta += 0.1
+    assert not torch.allclose(problem.residual(theta), before)
+
+
+def test_weights_of_the_module_are_not_those_of_theta(model: Model):
+    problem = SimulationError(model, some_records(model))
+    theta = problem.theta
+    problem.residual(theta)
+    kept = theta.clone()
+    with torch.no_grad():
+        model.lfr.cell.A.mul_(2.0)
+    assert torch.equal(theta, kept)
+    problem.write(theta.float())
+    assert model.lfr.cell.A.dtype == torch.float64
+
+
+def test_an_output_without_weight_is_scored_all_the_same(model: Model):
+    record = measure(model, 30)
+    off = replace(record, y=record.y + model.scaler.y_scale, weight=[0.0, 1.0])
+    problem = SimulationError(model, off)
+    expected = np.sqrt(np.mean(model.scaler.y_scale**2))
+    assert problem.rmse(problem.theta) == pytest.approx(expected, rel=1e-9)
+
+
+def test_start_state_of_the_wrong_length(model: Model):
+    record = replace(some_records(model)[0], start="given", x0=[1.0])
+    with pytest.raises(ValueError, match=r"x0 of 1 entries and the model 2 states"):
+        SimulationError(model, record)
+
+
+def test_nothing_to_fit(model: Model):
+    model.lfr.requires_grad_(False)
+    with pytest.raises(ValueError, match="all parameters of the model are frozen"):
+        SimulationError(model, some_records(model))
+    start = replace(some_records(model)[0], start="estimated")
+    assert len(SimulationError(model, start).theta) == 2
+
+
+def test_rows_of_all_batches_share_the_room_for_them(model: Model, monkeypatch):
+    """Two of four batches fit."""
+    records = some_records(model)
+    problem = SimulationError(model, records)
+    columns = len(problem.linearise(problem.theta)._reduced.kept) + 1
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", 16 * (60 + 20 + 5) * columns)
+    jacobian = problem.linearise(problem.theta)
+    jacobian.system(1e-2, 1e-12)
+    kept = [part._kept is not None for part in jacobian.parts]
+    assert kept == [True, False, True]
+    d = torch.ones_like(problem.theta)
+    assert_close(jacobian.tangent(d), jacobian.whole() @ d, rtol=0, atol=1e-8)
+
+
+def test_two_jacobians_keep_their_own_rows_and_a_third_takes_over_the_room(model: Model):
+    problem = SimulationError(model, some_records(model))
+    first_theta, second_theta = problem.theta, problem.theta + 0.1
+    first, second = problem.linearise(first_theta), problem.linearise(second_theta)
+    for jacobian in (first, second):
+        jacobian.system(1e-2, 1e-12)
+    d = torch.ones_like(first_theta)
+    assert_close(first.tangent(d), first.whole() @ d, rtol=0, atol=1e-8)
+    assert_close(second.tangent(d), second.whole() @ d, rtol=0, atol=1e-8)
+    rows = second.parts[0]._kept
+    assert rows is not None
+    where = rows[0].untyped_storage().data_ptr()
+    del second, jacobian, rows
+    third = problem.linearise(second_theta)
+    third.system(1e-2, 1e-12)
+    assert third.parts[0]._kept is not None
+    assert third.parts[0]._kept[0].untyped_storage().data_ptr() == where
+
+
+def test_a_jacobian_asks_for_room_once(model: Model, monkeypatch):
+    problem = SimulationError(model, some_records(model))
+    jacobian = problem.linearise(problem.theta)
+    jacobian.system(1e-2, 1e-12)
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.Memory.take", None)
+    jacobian.system(1e-15, 1e-12)
+
+
+# --- entries that stay as they are ------------------------------------------------------------
+
+RIDGE_AND_ROOM = pytest.mark.parametrize(("ridge", "kept"), [(0.0, True), (0.5, False)])
+
+
+def some_fixed(model: Model) -> torch.Tensor:
+    """Every third free parameter of the module, the first one too."""
+    return torch.arange(model.parameters) % 3 == 0
+
+
+@pytest.mark.parametrize(
+    ("ridge", "kept", "precise"),
+    [(0.0, True, True), (0.5, False, True), (0.5, True, False), (0.0, False, False)],
+)
+def test_fixed_entries_have_columns_of_zeros(
+    model: Model, ridge: float, kept: bool, precise: bool, monkeypatch
+):
+    """The other columns are the plain Jacobian's, whichever way a product or a system takes."""
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    records = all_kinds(model, given=False)
+    theta = SimulationError(model, records).theta + 0.1
+    plain = SimulationError(model, records, ridge=ridge).jacobian(theta)
+    problem = SimulationError(model, records, ridge=ridge)
+    problem.fixed = some_fixed(model)
+    held = torch.cat([problem.fixed, torch.zeros(3 * 2, dtype=torch.bool)])  # start states follow
+    r, J = problem.residual(theta), problem.jacobian(theta)
+    assert torch.equal(J[:, held], torch.zeros_like(J[:, held]))
+    # The same recurrence from a periodic start known to 1e-10.
+    assert_close(J[:, ~held], plain[:, ~held], rtol=0, atol=1e-9 * float(plain.abs().max()))
+
+    zeros = torch.zeros(int(held.sum()), dtype=torch.float64)
+    _, slope = problem.gradient(theta)
+    assert torch.equal(slope[held], zeros)
+    assert_close(slope, 2 * J.mT @ r / problem.size, rtol=1e-8, atol=1e-8)
+
+    jacobian = problem.linearise(theta)
+    system, gradient = jacobian.system(1e-15 if precise else 1e-2, 1e-12)
+    assert torch.equal(gradient[held], zeros)
+    assert torch.equal(jacobian.adjoint(r)[held], zeros)
+    # As for the whole Jacobian above: the scale of J times 1e-10.
+    assert_close(jacobian.tangent(theta), J @ theta, rtol=0, atol=1e-8)
+    assert_close(jacobian.adjoint(r), J.mT @ r, rtol=0, atol=1e-8)
+    damping = 1e-3 * system.scale
+    expected = -torch.linalg.solve(J.mT @ J + damping * torch.eye(len(theta)), J.mT @ r)
+    step = system.solve(gradient, damping)
+    assert torch.equal(step[held], zeros)
+    # The condition is 1e3 by the damping, the steady state known to 1e-10.
+    assert_close(step, expected, rtol=0, atol=1e-7 * float(expected.abs().max()))
+
+
+@RIDGE_AND_ROOM
+def test_search_leaves_fixed_entries_and_brings_the_rest_home(
+    model: Model, ridge: float, kept: bool, monkeypatch
+):
+    """With geodesic acceleration, whose right side is a product with J by itself."""
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    records = [measure(model, 60, seed=i) for i in range(2)]
+    theta = SimulationError(model, records).theta
+    problem = SimulationError(model, records, ridge=1e-8 * ridge)
+    problem.fixed = some_fixed(model)
+    away = 0.02 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
+    away[problem.fixed] = 0.0
+    optimiser = LevenbergMarquardt(max_iter=100)
+    state = optimiser.init(problem, theta + away)
+    while not state.reason:
+        state = optimiser.step(problem, state)
+    assert torch.equal(state.theta[problem.fixed], theta[problem.fixed])
+    # Noise-free, and θ_start of the ridge is the planted θ: the search ends at rounding.
+    assert problem.rmse(state.theta) < 1e-8
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_stack_leaves_fixed_entries(kept: bool, monkeypatch):
+    """The searches of a stack compute all columns, and move the free entries alone."""
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    models = [random_model(random_cell(2, 2, 2, 2, 1, 3, seed=i)) for i in range(2)]
+    record = measure(models[0], 60)
+    problems = [SimulationError(m, replace(record, y=record.y + 0.1)) for m in models]
+    for problem, m in zip(problems, models, strict=True):
+        problem.fixed = some_fixed(m)
+    starts = [p.theta for p in problems]
+    optimiser = LevenbergMarquardt()
+    states = [optimiser.init(p, p.theta) for p in problems]
+    for _ in range(3):
+        states = optimiser.steps(Stack(problems), states)
+    for problem, state, theta in zip(problems, states, starts, strict=True):
+        assert torch.equal(state.theta[problem.fixed], theta[problem.fixed])
+        assert not torch.equal(state.theta, theta)

@@ -1,0 +1,167 @@
+"""The scan over orders finds the one that was planted, and says what it rests on."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import reference
+from reference import System, random_system
+
+from lfrtorch.linear import order_scan
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.linear.frf import estimate_frf
+from lfrtorch.linear.model import LinearFit, LinearModel
+from lfrtorch.linear.order_scan import MARGIN, OrderScan, scan_orders
+from lfrtorch.records import Channel, Record
+
+pytestmark = pytest.mark.numeric
+
+
+def record_of(system: System, seed: int, noise: float = 0.1, T: int = 600) -> Record:
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(T, 1))
+    y = reference.periodic_response(system, u)
+    return Record(u, y + noise * y.std() * rng.normal(size=y.shape), 10.0, "periodic")
+
+
+ORDERS = range(1, 5)
+PLANTED = random_system(3, seed=4)
+
+
+@pytest.fixture(scope="module")
+def scan() -> OrderScan:
+    return scan_orders(record_of(PLANTED, 0), ORDERS)
+
+
+def fake(monkeypatch: pytest.MonkeyPatch, models: Sequence[LinearModel]):
+    """The fits of a scan are those models, whatever the data."""
+    of_order = {model.nx: model for model in models}
+    monkeypatch.setattr(order_scan, "estimate_bla", lambda data, nx, **_: of_order[nx])
+
+
+def model_of(nx: int, rmse: float, nu: int = 1, ny: int = 1) -> LinearModel:
+    inputs, outputs = (
+        tuple(Channel(f"{s}{i}") for i in range(n)) for s, n in (("u", nu), ("y", ny))
+    )
+    fit = LinearFit("simulation", rmse, 1, "converged", 0.0, (), ())
+    matrices = random_system(nx, nu, ny)
+    return LinearModel(*matrices, 10.0, np.zeros(nu), np.zeros(ny), inputs, outputs, fit=fit)
+
+
+@pytest.mark.parametrize("validated", [True, False])
+def test_planted_order_is_chosen(validated: bool, scan: OrderScan, monkeypatch):
+    if validated:
+        fake(monkeypatch, scan.models)
+        scan = scan_orders(record_of(PLANTED, 0), ORDERS, validation=record_of(PLANTED, 1))
+    assert scan.orders == (1, 2, 3, 4)
+    assert scan.validated is validated
+    assert scan.chosen == 3
+    assert scan.best is scan.models[2]
+    # What is left at the true order is the noise, a tenth of the output.
+    assert scan.scores[2] == pytest.approx(0.1, rel=0.1)
+    assert scan.scores[0] > 2 * scan.scores[2]
+
+
+def test_score_on_validation_is_the_relative_simulation_error(monkeypatch):
+    """Of all records together, without the samples skipped, each output by its own rms."""
+    model = model_of(2, 0.1, 2, 2)
+    fake(monkeypatch, [model])
+    rng = np.random.default_rng(0)
+    judges = [
+        Record(rng.normal(size=(T, 2)), rng.normal(size=(T, 2)) * [1.0, 50.0], 10.0, skip=skip)
+        for T, skip in ((40, 7), (60, 0))
+    ]
+    found = scan_orders(judges, [2], validation=judges)
+    scale = np.concatenate([r.y for r in judges]).std(axis=0)
+    errors = [((r.y - model.simulate(r)) / scale)[r.skip :] for r in judges]
+    expected = np.sqrt(np.mean(np.concatenate(errors) ** 2))
+    # The mean of 186 squares.
+    assert found.scores[0] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("scores", "chosen"),
+    [
+        ((0.2, 0.1009, 0.1), 2),  # within 1 % of the best
+        ((0.2, 0.1011, 0.1), 3),
+        ((0.1009, 0.1, 0.1), 1),
+        ((0.1, 0.2, 0.3), 1),
+    ],
+)
+def test_lowest_order_within_the_margin_of_the_best_is_chosen(scores, chosen, monkeypatch):
+    """Of validation; a description length has a term for the order as it is."""
+    assert MARGIN == 0.01
+    record = record_of(PLANTED, 0)
+    fake(monkeypatch, [model_of(nx + 1, score) for nx, score in enumerate(scores)])
+    monkeypatch.setattr(order_scan, "_validation", lambda model, *_: model.fit.rmse)
+    assert scan_orders(record, [1, 2, 3], validation=record).chosen == chosen
+    monkeypatch.setattr(order_scan, "_description_length", lambda model, _: model.fit.rmse)
+    assert scan_orders(record, [1, 2, 3]).chosen == int(np.argmin(scores)) + 1
+
+
+def test_description_length_counts_parameters_and_equations(monkeypatch):
+    """√(1 + p ln M / M) times the error, by its numbers."""
+    fake(monkeypatch, [model_of(3, 0.25, 2, 3)])
+    p = 3 * (2 + 3) + 2 * 3  # an order has nx (nu + ny) beside its coordinates
+    noise = np.random.default_rng(0).normal(size=(100, 5))
+    records = [
+        Record(noise[:, :2], noise[:, 2:], 10.0, skip=10),
+        Record(noise[:70, :2], noise[:70, 2:], 10.0),
+    ]
+    M = (90 + 70) * 3
+    expected = 0.25 * np.sqrt(1 + p * np.log(M) / M)
+    assert scan_orders(records, [3]).scores[0] == pytest.approx(expected, rel=1e-12)
+    lines = estimate_frf(Record(noise[:, :2], noise[:, 2:], 10.0))
+    M = 2 * len(lines.frequencies) * 3 * 2  # real and imaginary part of every entry
+    expected = 0.25 * np.sqrt(1 + p * np.log(M) / M)
+    assert scan_orders(lines, [3]).scores[0] == pytest.approx(expected, rel=1e-12)
+
+
+def test_response_can_be_scanned():
+    records = [record_of(PLANTED, seed, noise=0.02, T=200) for seed in range(4)]
+    assert scan_orders(estimate_frf(records), (1, 3, 4)).chosen == 3
+
+
+def test_orders_that_the_data_do_not_reach_for_are_left_out():
+    u = np.random.default_rng(0).normal(size=60)
+    # 4 (nx + 1) samples a window, 2 rows for each: enough columns up to order 4.
+    found = scan_orders(Record(u, np.roll(u, 1)), range(1, 20), max_iter=0)
+    assert found.orders == (1, 2, 3, 4)
+    with pytest.raises(ValueError, match="needs one of"):
+        estimate_bla(Record(u, np.roll(u, 1)), len(found.orders) + 1)
+
+
+def test_table_has_a_line_an_order_and_marks_the_chosen(scan: OrderScan):
+    head, *lines = scan.table().splitlines()
+    assert head.split()[:3] == ["nx", "fitted", "MDL"]
+    assert [line.split()[0] for line in lines] == ["1", "2", "3", "4"]
+    assert [line.split()[0] for line in lines if line.endswith("chosen")] == ["3"]
+    assert scan.singular_values == scan.models[-1].fit.singular_values  # pyright: ignore[reportOptionalMemberAccess]
+    # Of the largest order: the planted three stand out of the noise.
+    assert scan.singular_values[2] > 2 * scan.singular_values[3]
+
+
+def test_orders_are_fitted_once_and_in_their_order(monkeypatch):
+    asked: list[int] = []
+
+    def fit(_data: Record, nx: int, **_: object) -> LinearModel:
+        asked.append(nx)
+        return model_of(nx, 0.1)
+
+    monkeypatch.setattr(order_scan, "estimate_bla", fit)
+    found = scan_orders(record_of(PLANTED, 0), (3, 1, 2, 3))
+    assert asked == [1, 2, 3]
+    assert found.orders == (1, 2, 3)
+
+
+def test_orders_must_be_given():
+    record = record_of(random_system(1), 0)
+    with pytest.raises(ValueError, match="orders is empty"):
+        scan_orders(record, [])
+    with pytest.raises(ValueError, match="orders is 0; give a whole number of at least 1"):
+        scan_orders(record, [0, 1])
+    frf = estimate_frf(record)
+    with pytest.raises(ValueError, match="hold a FRF where a record is expected"):
+        scan_orders(record, [1], validation=frf)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="constant in all records"):
+        scan_orders(Record(np.ones(100), np.ones(100)), [1, 2])

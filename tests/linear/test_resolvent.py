@@ -1,0 +1,165 @@
+"""The response against its formula, its slopes against autograd, poles of any multiplicity."""
+
+import numpy as np
+import pytest
+import reference
+import scipy.linalg
+import torch
+from reference import System, random_system
+from torch import Tensor
+
+from lfrtorch.linear.resolvent import Complex, frequency_response, resolvents, slopes
+
+pytestmark = pytest.mark.numeric
+
+OMEGA = np.linspace(0.0, np.pi, 9)
+Z = np.exp(1j * OMEGA)
+
+SIZES = pytest.mark.parametrize(
+    ("nx", "nu", "ny"), [(1, 1, 1), (1, 3, 2), (4, 1, 1), (4, 2, 3), (5, 3, 1)]
+)
+
+
+def some_input(nu: int, m: int) -> Complex:
+    """Spectra (F, nu, m) that are neither real nor the unit matrix."""
+    generator = np.random.default_rng(3)
+    shape = (len(Z), nu, m)
+    return generator.normal(size=shape) + 1j * generator.normal(size=shape)
+
+
+# --- the response ---------------------------------------------------------------------------
+
+
+@SIZES
+def test_response_is_its_formula(nx: int, nu: int, ny: int):
+    system = random_system(nx, nu, ny)
+    G = frequency_response(*system, Z)
+    expected = reference.frf(system, OMEGA)
+    assert G.shape == (len(Z), ny, nu)
+    # eps times the gain of the slowest pole, squared: 1e-14 of the largest.
+    np.testing.assert_allclose(G, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@SIZES
+def test_resolvents_solve_their_equations(nx: int, nu: int, ny: int):
+    A, B, C, _ = random_system(nx, nu, ny)
+    X, L = resolvents(A, B, C, Z)
+    assert (X.shape, L.shape) == ((len(Z), nx, nu), (len(Z), ny, nx))
+    for x, left, z in zip(X, L, Z, strict=True):
+        M = z * np.eye(nx) - A
+        size = np.abs(M).sum() * max(np.abs(x).max(), np.abs(left).max())
+        np.testing.assert_allclose(M @ x, B, rtol=0, atol=1e-14 * size)
+        np.testing.assert_allclose(left @ M, C, rtol=0, atol=1e-14 * size)
+
+
+def jordan(pole: float, nx: int) -> tuple[System, Complex]:
+    """One Jordan block in rotated coordinates, and its response by Σ Nᵏ / (z - pole)ᵏ⁺¹."""
+    generator = np.random.default_rng(nx)
+    N = np.eye(nx, k=1)
+    Q = scipy.linalg.qr(generator.normal(size=(nx, nx)))[0]
+    B, C, D = (generator.normal(size=shape) for shape in ((nx, 2), (2, nx), (2, 2)))
+    G = D + sum(
+        C @ np.linalg.matrix_power(N, k) @ B / (Z[:, None, None] - pole) ** (k + 1)
+        for k in range(nx)
+    )
+    A = np.asarray(Q @ (pole * np.eye(nx) + N) @ Q.T)
+    return (A, np.asarray(Q @ B), C @ Q.T, D), np.asarray(G, dtype=np.complex128)
+
+
+@pytest.mark.parametrize("nx", [2, 6, 12])
+def test_all_poles_at_the_origin(nx: int):
+    """Rotated back, they stand at eps^(1/nx) about it; the response does not notice."""
+    system, expected = jordan(0.0, nx)
+    G = frequency_response(*system, Z)
+    # |(zI - N)⁻¹| <= nx on the circle, and eps nx² of that.
+    np.testing.assert_allclose(G, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
+def test_shift_matrix_as_it_stands():
+    A, B, C = np.eye(8, k=-1), np.eye(8, 1), np.eye(1, 8, 7)
+    X, L = resolvents(A, B, C, Z)
+    delays = Z[:, None] ** -np.arange(1.0, 9.0)
+    # Eight products of numbers of size 1.
+    np.testing.assert_allclose(X[:, :, 0], delays, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(L[:, 0, ::-1], delays, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("nx", [2, 4])
+def test_repeated_pole(nx: int):
+    """As accurate as a solution for every z."""
+    system, expected = jordan(0.7, nx)
+    G = frequency_response(*system, Z)
+    # eps times the condition of zI - A, which is 2 / 0.3^4 = 250 and more: 1e-13.
+    np.testing.assert_allclose(G, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_complex_poles_that_are_all_but_alike():
+    rotation = 0.8 * np.array([[np.cos(1), np.sin(1)], [-np.sin(1), np.cos(1)]])
+    A = scipy.linalg.block_diag(rotation, rotation + 1e-12 * np.eye(2)) + 0.1 * np.eye(4, k=2)
+    system = A, np.ones((4, 1)), np.ones((1, 4)), np.zeros((1, 1))
+    G = frequency_response(*system, Z)
+    expected = reference.frf(system, OMEGA)
+    # The slowest pole's gain is 5, with a Jordan block 25: 1e-14 of the largest.
+    np.testing.assert_allclose(G, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
+# --- its slope ------------------------------------------------------------------------------
+
+
+def by_autograd(system: System, U: Complex) -> Complex:
+    """Slope (F, ny, m, P) of G U with A, B, C, D in a row, by reverse mode through a solution."""
+    shapes = [matrix.shape for matrix in system]
+    theta = torch.as_tensor(np.concatenate([matrix.ravel() for matrix in system]))
+    z, spectra = torch.as_tensor(Z), torch.as_tensor(U)
+
+    def response(theta: Tensor) -> Tensor:
+        parts = theta.split([rows * columns for rows, columns in shapes])
+        A, B, C, D = (p.reshape(s).to(z.dtype) for p, s in zip(parts, shapes, strict=True))
+        M = z[:, None, None] * torch.eye(len(A)) - A
+        return torch.view_as_real(
+            (C @ torch.linalg.solve(M, B.expand(len(z), -1, -1)) + D) @ spectra
+        )
+
+    J = torch.autograd.functional.jacobian(response, theta).numpy()
+    return J[:, :, :, 0] + 1j * J[:, :, :, 1]
+
+
+@SIZES
+@pytest.mark.parametrize("m", [1, 4])
+def test_slopes_are_those_of_autograd(nx: int, nu: int, ny: int, m: int):
+    system, U = random_system(nx, nu, ny), some_input(nu, m)
+    J = slopes(*resolvents(*system[:3], Z), U)
+    expected = by_autograd(system, U)
+    assert J.shape == (len(Z), ny, m, (nx + ny) * (nx + nu))
+    # eps times the gain of the slowest pole, cubed: 1e-13 of the largest.
+    np.testing.assert_allclose(J, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_chosen_columns_are_those_of_all():
+    system, U = random_system(3, 2, 3), some_input(2, 2)
+    X, L = resolvents(*system[:3], Z)
+    every = slopes(X, L, U)
+    columns = np.array([29, 0, 8, 9, 14, 15, 23, 24])  # both ends of A, B, C and D
+    assert np.array_equal(slopes(X, L, U, columns), every[..., columns])
+    assert slopes(X, L, U, columns[:0]).shape == (len(Z), 3, 2, 0)
+
+
+def test_slopes_at_a_defective_pole_are_central_differences():
+    """Where there are no eigenvectors to take."""
+    (A, B, C, D), _ = jordan(0.0, 4)
+    U = some_input(2, 1)
+    J = slopes(*resolvents(A, B, C, Z), U)
+    h = 1e-5
+    for i in range(J.shape[-1]):
+        step = np.zeros(J.shape[-1])
+        step[i] = h
+        dA, dB, dC, dD = np.split(step, [16, 24, 32])
+        above, below = (
+            frequency_response(
+                A + s * dA.reshape(4, 4), B + s * dB.reshape(4, 2),
+                C + s * dC.reshape(2, 4), D + s * dD.reshape(2, 2), Z,
+            ) @ U
+            for s in (1.0, -1.0)
+        )  # fmt: skip
+        # h² times a third derivative of up to 4⁴ gains of 10, and eps of those over h.
+        np.testing.assert_allclose(J[..., i], (above - below) / (2 * h), rtol=0, atol=1e-7)

@@ -1,0 +1,181 @@
+"""Lines: the same sum of squares as the simulation error, its slope, and its covariance."""
+
+import numpy as np
+import pytest
+import reference
+import torch
+from reference import System, random_system, refined
+
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.linear.resolvent import frequency_response
+from lfrtorch.linear.response_fit import ResponseError, ResponseFit
+from lfrtorch.linear.spectral_data import Lines, lines_of
+from lfrtorch.records import Record
+
+pytestmark = pytest.mark.numeric
+
+
+def records_of(
+    nx: int, nu: int, ny: int, lengths: tuple[int, ...] = (64, 64, 64, 45), noise: float = 0.3
+) -> list[Record]:
+    """Noisy steady-state records of several lengths, one of two periods."""
+    system, rng = random_system(nx, nu, ny), np.random.default_rng(1)
+    found = []
+    for T in lengths:
+        u = rng.normal(size=(T, nu)) + 1.0
+        y = reference.periodic_response(system, u) + noise * rng.normal(size=(T, ny))
+        found.append(Record(u, y, start="periodic"))
+    u, y = found[0].u, found[0].y + noise * rng.normal(size=found[0].y.shape)
+    period = len(u)
+    return [*found, Record(np.tile(u, (2, 1)), np.vstack([found[0].y, y]), 1.0, "periodic",
+                           period=period)]  # fmt: skip
+
+
+def lines(records: list[Record], *, offset: bool) -> Lines:
+    found = lines_of([r.u for r in records], [r.y for r in records], records, offset=offset)
+    assert found is not None
+    return found
+
+
+def simulation_cost(system: System, records: list[Record], *, offset: bool) -> float:
+    """Mean squared simulation error, with the best constant in the output taken off or not."""
+    errors = [r.y - reference.periodic_response(system, r.u) for r in records]
+    roots = [np.sqrt(np.max(r.weight)) * np.ones((len(r.u), 1)) for r in records]
+    e, one = np.concatenate(errors), np.concatenate(roots)
+    constant = (one**2 * e).sum(axis=0) / (one**2).sum() if offset else 0.0
+    return float(((one * (e - constant)) ** 2).sum() / len(e))
+
+
+@pytest.mark.parametrize("offset", [True, False])
+@pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 3)])
+def test_cost_is_the_simulation_error_up_to_a_constant(nu: int, ny: int, offset: bool):
+    records = records_of(3, nu, ny)
+    problem = ResponseError(lines(records, offset=offset), 3)
+    costs = []
+    for seed in (1, 2):
+        system = random_system(3, nu, ny, seed=seed)
+        theta = torch.as_tensor(np.concatenate([m.ravel() for m in system]))
+        by_lines = problem.cost(problem.residual(theta))
+        costs.append((by_lines, simulation_cost(system, records, offset=offset)))
+    (a, b), (c, d) = costs
+    assert a - c == pytest.approx(b - d, rel=1e-10)
+
+
+def test_more_records_than_inputs_are_as_many_columns_as_inputs():
+    assert lines(records_of(2, 2, 1), offset=True).U.shape[2] == 2
+
+
+def test_weights_of_records_count():
+    plain = records_of(2, 1, 1, lengths=(64, 64))
+    weighted = [Record(r.u, r.y, start="periodic", weight=w) for r, w in zip(plain, (1, 9))]  # noqa: B905
+    problem = ResponseError(lines(weighted, offset=True), 2)
+    costs = []
+    for seed in (1, 2):
+        system = random_system(2, seed=seed)
+        theta = torch.as_tensor(np.concatenate([m.ravel() for m in system]))
+        by_lines = problem.cost(problem.residual(theta))
+        costs.append(by_lines - simulation_cost(system, weighted, offset=True))
+    assert costs[0] == pytest.approx(costs[1], rel=1e-10)
+
+
+def test_other_records_are_no_lines():
+    record = records_of(1, 1, 2)[0]
+    signals = [record.u], [record.y]
+    for other in (
+        Record(record.u, record.y),
+        Record(record.u, record.y, start="periodic", skip=1),
+        Record(record.u, record.y, start="periodic", weight=np.array([1.0, 2.0])),
+    ):
+        assert lines_of(*signals, [other], offset=True) is None
+
+
+def test_lines_without_input_are_left_out():
+    N = 64
+    u = np.cos(2 * np.pi * np.arange(N) * 5 / N) + np.cos(2 * np.pi * np.arange(N) * 9 / N)
+    y = np.random.default_rng(0).normal(size=N)
+    found = lines([Record(u, y, start="periodic")], offset=True)
+    np.testing.assert_allclose(np.angle(found.z), 2 * np.pi * np.array([5, 9]) / N, rtol=1e-12)
+    assert found.equations == 4
+
+
+def some_problem() -> tuple[ResponseError, torch.Tensor]:
+    rng = np.random.default_rng(2)
+    z = np.exp(1j * np.linspace(0.1, 3.0, 20))
+    U, Y = (rng.normal(size=(20, n, 2)) + 1j * rng.normal(size=(20, n, 2)) for n in (2, 3))
+    problem = ResponseError(Lines(z, U, Y, rng.uniform(0.5, 2.0, size=Y.shape)), 4)
+    system = random_system(4, 2, 3)
+    return problem, torch.as_tensor(np.concatenate([m.ravel() for m in system]))
+
+
+def test_slope_is_a_central_difference():
+    problem, theta = some_problem()
+    jacobian = problem.linearise(theta)
+    h = 1e-6
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        d = torch.as_tensor(rng.normal(size=len(theta)))
+        difference = (problem.residual(theta + h * d) - problem.residual(theta - h * d)) / (2 * h)
+        # h² times the third derivative, and eps / h, relative to entries of order 1 to 100
+        np.testing.assert_allclose(jacobian.tangent(d), difference, rtol=1e-6, atol=1e-6)
+        r = torch.as_tensor(rng.normal(size=len(difference)))
+        # Sums of some hundred products of size 100 at most, which may cancel.
+        product = float(r @ jacobian.tangent(d))
+        assert float(jacobian.adjoint(r) @ d) == pytest.approx(product, rel=1e-9, abs=1e-9)
+
+
+def test_coordinates_have_no_columns():
+    problem, theta = some_problem()
+    system, gradient = problem.linearise(theta).system(0.0, 1e-12)
+    assert system.rank == 4 * (2 + 3) + 2 * 3
+    expected = problem.linearise(theta).adjoint(problem.residual(theta))
+    # By the same rows, whose sums may cancel.
+    np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-10 * float(expected.abs().max()))
+
+
+def test_pole_beyond_the_limit_is_refused():
+    problem, theta = some_problem()
+    A = problem.matrices(theta)[0]
+    radius = np.abs(np.linalg.eigvals(A)).max()
+    limited = ResponseError(problem.lines, 4, largest_pole=0.999 * radius)
+    assert torch.isinf(limited.residual(theta)).all()
+    assert torch.isfinite(ResponseError(problem.lines, 4, 1.001 * radius).residual(theta)).all()
+
+
+def test_search_finds_the_system_of_the_lines():
+    system = random_system(4, 2, 3, seed=1)
+    z = np.exp(1j * np.linspace(0.1, 3.0, 60))
+    U = np.broadcast_to(np.eye(2, dtype=complex), (60, 2, 2))
+    G = frequency_response(*system, z)
+    problem = ResponseError(Lines(z, U, G), 4)
+    theta = torch.as_tensor(np.concatenate([m.ravel() for m in system]))
+    theta = theta + 0.03 * torch.as_tensor(np.random.default_rng(4).normal(size=len(theta)))
+    optimiser = LevenbergMarquardt(max_iter=100)
+    state = optimiser.init(problem, theta)
+    while not state.reason:
+        state = optimiser.step(problem, state)
+    assert state.reason == "converged: the residual vanishes"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False])
+def test_covariance_is_that_of_many_fits(known: bool):
+    """200 fits of a first-order system to lines of unequal noise: pole and gains."""
+    system = np.array([[0.7]]), np.array([[1.0]]), np.array([[1.0]]), np.array([[0.2]])
+    F, runs = 100, 200
+    z = np.exp(1j * np.linspace(0.05, 3.0, F))
+    G = frequency_response(*system, z)
+    U = np.ones((F, 1, 1), dtype=complex)
+    variance = 1e-4 * np.linspace(0.2, 3.0, F)[:, None, None]
+    rng = np.random.default_rng(5)
+    poles, predicted = [], []
+    for _ in range(runs):
+        noise = rng.normal(size=(F, 1, 1)) + 1j * rng.normal(size=(F, 1, 1))
+        Y = G + np.sqrt(variance / 2) * noise
+        fit = ResponseFit(Lines(z, U, Y, 1.0 / variance if known else None), known=known)
+        found = refined(fit, system, 20)
+        poles.append(found.A[0, 0])
+        assert found.covariance is not None
+        predicted.append(found.covariance[0, 0])
+    # The variance of 200 draws has a relative deviation of √(2 / 199) = 0.1: four of them.
+    assert np.mean(predicted) == pytest.approx(np.var(poles, ddof=1), rel=0.4)
+    assert np.mean(poles) == pytest.approx(0.7, abs=4 * np.std(poles) / np.sqrt(runs))

@@ -1,0 +1,288 @@
+"""The report of a run: a whole page without the network that says what the numbers say."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field, replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+
+import lfrtorch
+from lfrtorch.analysis.poles import poles_at_rest, roots
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.records import Channel, Record
+from lfrtorch.reporting import html as html_report
+from lfrtorch.reporting import scores as report
+from lfrtorch.reporting.advice import Advice
+from lfrtorch.reporting.simulations import Response
+
+pytestmark = pytest.mark.numeric
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """Text, addresses and tags of a page; refuses tags that are not closed in order."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.words: list[str] = []
+        self.feed(html)
+        self.close()
+        assert not self.open
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] != ["style"]:
+            self.words.append(data)
+
+
+@dataclass
+class Run:
+    """All that a report is made of."""
+
+    result: lfrtorch.FitResult
+    bla: lfrtorch.LinearModel
+    dataset: Dataset
+    responses: list[Response] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        used = {
+            "train": self.dataset.train,
+            "validation": self.dataset.validation,
+            "test": self.dataset.tests,
+        }
+        self.responses = [
+            Response(record, use, self.bla.simulate(record), self.result.model.simulate(record))
+            for use, records in used.items()
+            for record in records
+        ]
+
+    def page(self, advice: tuple[Advice, ...] = (), search=(), **options) -> Page:
+        metrics = report.metrics(
+            self.result, self.bla, self.dataset, seed=0, data_seed=None, command="train.py a=1"
+        )
+        metrics["sizes_search"] = search
+        images = {"convergence": b"PNG 1", "near": b"PNG 2"}
+        views = {record.name: {"near": "a close-up"} for record in self.dataset.tests}
+        html = html_report.render(
+            metrics, self.result, self.bla, self.dataset, self.responses, images, advice,
+            views=views, **options,
+        )  # fmt: skip
+        return Page(html)
+
+
+def run(outputs: tuple[Channel, ...] = (Channel("v", "V"),), starts: int = 1) -> Run:
+    """A short fit of a saturating system."""
+    rng = np.random.default_rng(0)
+    parts = {}
+    for name in ("train", "validation", "test"):
+        u = rng.standard_normal(300)
+        y = np.tanh(np.convolve(u, [0.0, 0.6, 0.3])[:300])
+        y = np.column_stack([(1 + i) * y for i in range(len(outputs))])
+        parts[name] = Record(u, y, fs=10.0, name=name, outputs=outputs, skip=5)
+    train, validation, test = ([record] for record in parts.values())
+    others = (Published("else", {"test": 0.5}, "A <i>(2001)"),)
+    data = Dataset("lab", train, validation, test, published=others, notes=("a note",))
+    bla = lfrtorch.estimate_bla(train, nx=2)
+    models = [
+        lfrtorch.initialise(bla, train, nz=1, nw=1, nn=3, seed=seed) for seed in range(starts)
+    ]
+    optimiser = lfrtorch.LevenbergMarquardt(max_iter=3)
+    if starts > 1:
+        result = lfrtorch.fit_starts(models, train, validation, optimiser=optimiser)
+    else:
+        result = lfrtorch.fit(models[0], train, validation, optimiser=optimiser)
+    return Run(result, bla, data)
+
+
+@pytest.fixture(scope="module")
+def single() -> Run:
+    return run()
+
+
+def test_page_has_the_numbers_and_no_address_outside(single: Run):
+    # The same numbers in three digits: rounding shows in them once in 10^12 runs.
+    page = single.page((Advice("Do this.", "as x is 3"),), config="nx: 2\n")
+    assert all(address.startswith(("data:image/png;base64,", "#")) for address in page.addresses)
+    assert len(page.addresses) == 2
+    assert "script" not in page.tags
+    test = single.responses[-1]
+    lti, error = (
+        html_report.number(lfrtorch.rmse(test.record, y)) for y in (test.y_lti, test.y_hat)
+    )
+    for words in (
+        f"test {lti} {error}",
+        f"({error} V beside {lti} V)",
+        "Do this. as x is 3",
+        "else: A <i>(2001)",
+        "a note",
+        "a close-up",
+        "sampled at 10 Hz: 30.0 s",
+        "25 parameters, 19 without the directions",
+        "train.py a=1",
+        "nx: 2",
+        f"torch {torch.__version__}",
+    ):
+        assert words in page.text
+    order = [page.text.index(word) for word in ("What to try next", "Scores", "Data", "Best lin")]
+    assert order == sorted(order)
+
+
+def test_sizes_that_were_tried(single: Run):
+    entry = {"nz": 1, "nw": 1, "parameters": 25, "parameters_net": 19, "seconds": 2.0}
+    entry |= {"error": 0.02, "error_std": 0.001, "ratio": 0.5, "standard_errors_above": 0.0}
+    large = entry | {"nn": 9, "parameters_net": 37, "chosen": False}
+    page = single.page(search=[large, entry | {"nn": 3, "chosen": True, "error": 0.03}])
+    assert "1 1 3 25 19 2.00 0.0300 0.00100 0.500 0 chosen 1 1 9 25 37 2.00 0.0200" in page.text
+    assert "Sizes" not in single.page().text
+
+
+def test_what_users_named_is_escaped(single: Run):
+    evil = "<script>alert('&')</script>"
+    test = replace(single.dataset.tests[0], name=evil, outputs=(Channel(evil, evil),))
+    data = replace(single.dataset, name=evil, tests=[test], notes=(evil,))
+    page = Run(single.result, single.bla, data).page((Advice(evil, evil),), config=evil)
+    assert "script" not in page.tags
+    assert page.text.count(evil) >= 8
+
+
+def test_a_diverging_test_and_a_resting_one_are_said(single: Run):
+    rest = replace(single.dataset.tests[0], y=np.zeros((300, 1)), name="rest")
+    changed = Run(single.result, single.bla, replace(single.dataset, tests=[rest]))
+    changed.responses.append(
+        replace(single.responses[-1], y_hat=np.full_like(single.responses[-1].y_hat, math.inf))
+    )
+    page = changed.page()
+    assert "test: the NL-LFR diverges" in page.text
+    assert "NRMSE –" in page.text
+    assert not re.search(r"\b(nan|inf|None)\b", page.text)
+
+
+def test_without_tests_the_verdict_is_on_what_there_is(single: Run):
+    validated = Run(single.result, single.bla, replace(single.dataset, tests=[]))
+    page = validated.page()
+    assert "There is no test record" in page.text
+    (line,) = html_report.verdict(validated.responses)
+    assert line.startswith("validation: ")
+    assert line in page.text
+    model = lfrtorch.initialise(single.bla, single.dataset.train, nz=1, nw=1, nn=3)
+    result = lfrtorch.fit(
+        model, single.dataset.train, optimiser=lfrtorch.LevenbergMarquardt(max_iter=1)
+    )
+    data = replace(single.dataset, tests=[], validation=[])
+    trained = Run(result, single.bla, data)
+    page = trained.page()
+    (line,) = html_report.verdict(trained.responses)  # one iteration may gain nothing
+    assert line.startswith("train: ")
+    assert line in page.text
+    assert "the best on training" in page.text
+
+
+def test_several_outputs_have_scores_of_their_own():
+    same = run((Channel("a", "V"), Channel("b", "V")), starts=2)
+    page = same.page()
+    test = same.responses[-1]
+    for i, name in ((0, "a"), (1, "b")):
+        error = np.sqrt(np.mean(test.error[:, i] ** 2))
+        lti = np.sqrt(np.mean(test.lti_error[:, i] ** 2))
+        assert f"{name} V {html_report.number(lti)} {html_report.number(error)}" in page.text
+    assert "test all V" in page.text
+    assert page.text.count("maximum number of iterations") == 2
+    assert "The best of 2 starts" in page.text
+    lines = html_report.verdict(same.responses)
+    assert [line.split(":")[0] for line in lines] == ["test"]
+    # Volts and metres have no error together.
+    outputs = (Channel("a", "V"), Channel("b", "m"))
+    mixed = [replace(r, record=replace(r.record, outputs=outputs)) for r in same.responses]
+    lines = html_report.verdict(mixed)
+    assert [line.split(":")[0] for line in lines] == ["test, a", "test, b"]
+
+
+def test_many_tests_have_one_verdict(single: Run):
+    test = single.responses[-1]
+    error = test.record.y - test.y_lti
+    many = [
+        replace(test, record=replace(test.record, name=f"t{k}"), y_hat=test.y_lti + error * part)
+        for k, part in enumerate((0.5, 0.9, 0.75, math.nan, 0.0))
+    ]
+    line, lost = html_report.verdict(many)
+    assert line.startswith("4 test errors: 1.00 × (t4) to 10.0 × (t1) below")
+    assert lost == "t3: the NL-LFR diverges"
+
+
+@pytest.mark.parametrize(("part", "below"), [(1 - 1e-15, False), (1 + 1e-15, False), (0.99, True)])
+def test_a_ratio_of_one_plus_rounding_is_no_gain(single: Run, part: float, below: bool):
+    test = single.responses[-1]
+    error = test.record.y - test.y_lti
+    (line,) = html_report.verdict([replace(test, y_hat=test.record.y - part * error)])
+    assert ("no error below" not in line) is below
+    assert ("error 1.01 × below" in line) is below
+
+
+def test_a_linear_model_alone_is_shown(single: Run):
+    cell = lfrtorch.LFRCell(1, 1, 2, 0, 0, None).double()
+    single.bla.write(cell, single.result.model.scaler)
+    result = replace(single.result, model=replace(single.result.model, lfr=LFR(cell)))
+    page = Run(result, single.bla, single.dataset).page()
+    assert "no error below the linear model's" in page.text
+    assert "9 parameters, 5 without" in page.text
+
+
+def test_poles_at_rest_are_those_of_a_step_away_from_it(single: Run):
+    model = single.result.model
+    cell = model.lfr.cell
+    u = torch.zeros(1, 1, 1, dtype=torch.float64)
+    rest = model.lfr.trajectory(u, start="periodic").x[0, 0]
+    F = torch.func.jacrev(lambda x: cell(u[0, 0], x)[1])(rest)
+    expected = np.sort_complex(np.linalg.eigvals(F.detach().numpy()))
+    assert np.sort_complex(poles_at_rest(model)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_roots_of_a_known_oscillator():
+    s = 2 * np.pi * 5.0 * np.exp(1j * np.arccos(-0.1))  # 5 Hz, damping 0.1
+    (root,) = roots(np.exp(np.array([s, s.conj()]) / 100.0), 100.0)
+    assert root["frequency"] == pytest.approx(5.0)
+    assert root["damping"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (0.0, "0"),
+        (1234.56, "1235"),
+        (12.345, "12.3"),
+        (0.00123456, "0.00123"),
+        (9.9999, "10.0"),  # the digits are those of the rounded value
+        (99.99, "100"),
+        (999.9, "1000"),
+        (0.00099999, "0.00100"),
+        (99999.0, "1.00e5"),
+        (9.999e-5, "1.00e-4"),
+        (9.4e-5, "9.40e-5"),
+        (2e6, "2.00e6"),
+        (math.nan, "–"),
+        (None, "–"),
+    ],
+)
+def test_numbers_have_three_digits(value: float | None, shown: str):
+    assert html_report.number(value) == shown

@@ -1,0 +1,140 @@
+"""The progress line, the TensorBoard events and the checkpoints of a fit."""
+
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import lfrtorch
+from lfrtorch.fitting.multistart import Round
+from lfrtorch.fitting.trainer import Progress, Start
+from lfrtorch.records import Channel, Record
+from lfrtorch.reporting.monitor import (
+    Checkpoint,
+    ProgressLine,
+    StartsLine,
+    TensorBoard,
+    progress_text,
+)
+
+U = np.random.default_rng(0).standard_normal(100)
+RECORD = Record(U, np.tanh(U), 10.0, outputs=(Channel("y", "m"),))
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture(scope="module")
+def model() -> lfrtorch.Model:
+    bla = lfrtorch.estimate_bla(RECORD, nx=1)
+    return lfrtorch.initialise(bla, RECORD, nz=1, nw=1, nn=2)
+
+
+def step(iteration: int, **report: float) -> Progress:
+    return Progress(iteration, 40, 1.5e-3, 2.5e-3, 2.0 * iteration, iteration == 4, report, 1.0)
+
+
+def test_text_names_every_number():
+    text = progress_text(step(4, damping=0.125, gain_ratio=0.75, rank=9), "m")
+    assert text == (
+        " 4/40  train 1.500e-03 m  validation 2.500e-03 m*  damping 0.12  gain 0.75  72 s left"
+    )
+    assert "left" not in progress_text(step(0), "m")
+
+
+def test_a_file_gets_a_line_now_and_then_and_the_last(model: lfrtorch.Model):
+    stream = io.StringIO()
+    line = ProgressLine(every=10, stream=stream)
+    for iteration in range(13):
+        line(model, step(iteration))
+    line.close()
+    assert [text.split("/")[0].strip() for text in stream.getvalue().splitlines()] == [
+        "0",
+        "10",
+        "12",
+    ]
+
+
+def test_a_terminal_gets_one_live_line(model: lfrtorch.Model):
+    stream = Terminal()
+    line = ProgressLine(stream=stream)
+    for iteration in range(3):
+        line(model, step(iteration))
+    line.close()
+    assert stream.getvalue().count("\r") == 3
+    assert stream.getvalue().count("\n") == 1
+
+
+def test_a_round_of_starts_is_a_line(model: lfrtorch.Model):
+    starts = tuple(Start(i, 25, 1.0, e, math.nan, "") for i, e in ((3, 1e-3), (0, 2e-3), (1, 5e-3)))
+    for stream, live in ((io.StringIO(), False), (Terminal(), True)):
+        line = StartsLine(3, "m", stream)
+        line(model, step(1))
+        line.round(Round(1, 4, starts, 7.2))
+        text = stream.getvalue()
+        assert (
+            "round 1 of 4: 3 start(s) to iteration 25, "
+            "best 1.000e-03, median 2.000e-03, worst 5.000e-03 m, 7 s"
+        ) in text
+        assert ("1 iterations of 3 starts" in text) is live
+        assert text.count("\n") == 1
+
+
+def test_tensorboard_without_a_record_has_scalars_alone(model: lfrtorch.Model, tmp_path: Path):
+    board = TensorBoard(tmp_path)
+    board(model, step(0))
+    board.close()
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert "rmse/train" in events.Tags()["scalars"]
+    assert not events.Tags()["images"]
+
+
+@pytest.mark.numeric
+def test_tensorboard_holds_scalars_figures_and_texts(model: lfrtorch.Model, tmp_path: Path):
+    board = TensorBoard(tmp_path, RECORD, 0.5 * RECORD.y, every=2)
+    for iteration in range(3):
+        board(model, step(iteration, damping=0.5))
+    board.text("scores", "a\nb")
+    board.close()
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    for name, value in (("rmse/train", 1.5e-3), ("rmse/validation", 2.5e-3)):
+        assert [e.value for e in events.Scalars(name)] == pytest.approx([value] * 3)
+    assert [e.step for e in events.Scalars("optimiser/damping")] == [0, 1, 2]
+    radius = np.abs(np.linalg.eigvals(model.lfr.cell.A.detach().numpy())).max()
+    assert events.Scalars("model/spectral_radius_A")[0].value == pytest.approx(radius)
+    for name in ("validation/spectrum", "validation/static_map"):
+        assert [e.step for e in events.Images(name)] == [0, 2]
+
+
+def test_checkpoint_holds_the_best_so_far_where_it_is_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    clock = {"now": 0.0}
+    monkeypatch.setattr("lfrtorch.reporting.monitor.monotonic", lambda: clock["now"])
+    bla = lfrtorch.estimate_bla(RECORD, nx=1)
+    model = lfrtorch.initialise(bla, RECORD, nz=1, nw=1, nn=2)
+    keep = Checkpoint(tmp_path / "model", every=5.0)
+    held = []
+    for iteration, (clock["now"], best, score) in enumerate(
+        [
+            (1.0, True, 9.0),
+            (2.0, True, 8.0),
+            (5.9, False, 9.0),
+            (6.1, False, 9.0),
+            (20.0, True, 8.5),  # of another start, which is behind
+            (21.0, True, 7.0),
+        ]
+    ):
+        with torch.no_grad():
+            model.lfr.cell.A.fill_(float(iteration))
+        keep(model, Progress(iteration, 40, 1.0, 1.0, 0.0, best, {}, score))
+        held.append(float(lfrtorch.load(tmp_path).lfr.cell.A.detach()))
+    assert held == [0, 0, 0, 1, 1, 5]

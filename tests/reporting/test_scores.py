@@ -1,0 +1,129 @@
+"""Scores, metrics.json and the table of a run."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lfrtorch
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.records import Channel, Record
+from lfrtorch.reporting import scores as report
+
+pytestmark = pytest.mark.numeric
+
+
+@pytest.fixture(scope="module")
+def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:
+    """A short fit of a saturating system in volts."""
+    rng = np.random.default_rng(0)
+    records = []
+    for name in ("train", "validation", "test"):
+        u = rng.standard_normal(300)
+        y = np.tanh(np.convolve(u, [0.0, 0.6, 0.3])[:300])
+        channel = (Channel("v", "V"),)
+        records.append(Record(u, y, name=name, source="simulated", outputs=channel, skip=5))
+    train, validation, test = ([record] for record in records)
+    others = (
+        Published("everybody", {"test": 0.5}, "A (2001)"),
+        Published("small", {"test": 0.25}, "B (2002)", sizes=(1, 1)),
+        Published("large", {"test": 0.125}, "C (2003)", sizes=(2, 2)),
+    )
+    data = Dataset(
+        "saturation", train, validation, test, noise_rms=0.01, published=others, notes=("a note",)
+    )
+    bla = lfrtorch.estimate_bla(train, nx=2)
+    model = lfrtorch.initialise(bla, train, nz=1, nw=1, nn=3)
+    return lfrtorch.fit(model, train, validation, optimiser=lfrtorch.Adam(epochs=2)), bla, data
+
+
+def test_starts_are_ranked_in_files_and_in_a_table(result):
+    _, bla, data = result
+    models = [
+        lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=3, seed=seed)
+        for seed in report.seeds(7, 3)
+    ]
+    fitted = lfrtorch.fit_starts(
+        models, data.train, data.validation, optimiser=lfrtorch.LevenbergMarquardt(max_iter=4)
+    )
+    metrics = report.metrics(fitted, bla, data, seed=7, data_seed=None, command="")
+    assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
+    assert metrics["starts"] == 3
+    assert sorted(start["seed"] for start in metrics["ranking"]) == [7, 1007, 2007]
+    assert {start["selection"] for start in metrics["ranking"]} == {None}
+    assert metrics["ranking"][0]["validation"] == fitted.starts[0].validation
+    lines = report.starts_table(metrics).splitlines()
+    assert lines[1].split() == ["seed", "iterations", "training", "validation", "selection"]
+    assert lines[2].split()[0] == str(metrics["ranking"][0]["seed"])
+    assert lines[-1].endswith("others were better")
+
+
+def test_a_test_may_have_a_linear_model_of_its_own(result):
+    fitted, bla, data = result
+    data = replace(data, linear={"test": ("train",)})
+    own = lfrtorch.estimate_bla(data.train, nx=1)
+    metrics = report.metrics(
+        fitted, bla, data, own={"test": own}, seed=0, data_seed=None, command=""
+    )
+    expected = lfrtorch.rmse(data.tests[0], own.simulate(data.tests[0]))
+    assert metrics["scores"]["test"]["lti_rmse"] == expected
+    assert metrics["linear"] == {"test": ["train"]}
+    text = report.table(metrics, data.published)
+    assert "LTI: a model for each of these: test of train\n" in text
+
+
+def test_metrics_are_what_the_model_scores(result):
+    fitted, bla, data = result
+    metrics = report.metrics(fitted, bla, data, seed=0, data_seed=3, command="python train.py")
+    test, validation = data.tests[0], data.validation[0]
+    y_hat = fitted.model.simulate(test)
+    assert metrics["scores"]["test"] == {
+        "rmse": lfrtorch.rmse(test, y_hat),
+        "lti_rmse": lfrtorch.rmse(test, bla.simulate(test)),
+        "nrmse": lfrtorch.rmse(test, y_hat) / float(np.std(test.y[5:])),
+        "unit": "V",
+        "source": "simulated",
+        "samples": 300,
+        "skip": 5,
+    }
+    expected = lfrtorch.rmse(validation, fitted.model.simulate(validation))
+    assert metrics["validation"]["rmse"] == pytest.approx(expected, rel=1e-12)
+    expected = {"samples": 300, "noise_rms": 0.01, "seed": 3, "notes": ["a note"]}
+    assert metrics["data"] == expected
+    assert metrics["sizes"] == {"nx": 2, "nz": 1, "nw": 1, "nn": 3}
+    # A 4, Bu 2, Bw 2, Cz 2, Dzu 1, Cy 2, Dyu 1, Dyw 1, Wz 3, bz 3, Ww 3, bw 1; gauge 4 + 1 + 1.
+    assert (metrics["parameters"], metrics["parameters_net"]) == (25, 19)
+    assert metrics["fit"]["iterations"] == 2
+    json.dumps(metrics, allow_nan=False)
+
+
+def test_pooled_validation_weighs_samples():
+    scores = [report.Score(3.0, 0, 0, "", "", 110, 10), report.Score(4.0, 0, 0, "", "", 300, 0)]
+    expected = math.sqrt((100 * 9 + 300 * 16) / 400)
+    assert report._pooled([s.rmse for s in scores], scores) == pytest.approx(expected)
+    assert report._pooled([], []) is None
+
+
+def test_table_shows_published_results_of_these_sizes_only(result):
+    fitted, bla, data = result
+    metrics = report.metrics(fitted, bla, data, seed=0, data_seed=None, command="")
+    lines = report.table(metrics, data.published).splitlines()
+    assert lines[0] == "Simulation RMSE (V), nx 2, nz 1, nw 1, 3 neurons"
+    head, row = lines[2].split(), lines[4].split()
+    assert head == ["record", "source", "samples", "skip", "LTI", "NL-LFR", "everybody", "small"]
+    assert row[:4] == ["test", "simulated", "300", "5"]
+    assert float(row[5]) == pytest.approx(metrics["scores"]["test"]["rmse"], rel=5e-3)
+    assert row[6:] == ["0.5", "0.25"]
+    assert lines[5].startswith("validation  not fitted")
+    assert lines[-2:] == ["everybody: A (2001)", "small: B (2002)"]
+
+
+def test_what_is_not_finite_becomes_null():
+    assert report._finite({"a": {"b": math.nan}, "c": math.inf, "d": 1.5, "e": "x"}) == {
+        "a": {"b": None},
+        "c": None,
+        "d": 1.5,
+        "e": "x",
+    }

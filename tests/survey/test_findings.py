@@ -1,0 +1,303 @@
+"""What hurts is said, and nothing is said of measurements that were made well."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.io import loadmat
+from scipy.signal import butter, lfilter, sosfilt
+
+from lfrtorch.datasets import boucwen, parwh, silverbox, wiener_hammerstein
+from lfrtorch.records import Channel, Record
+from lfrtorch.survey.findings import examine, findings
+from lfrtorch.survey.measurement import survey
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.numeric
+
+T = 5000
+NOISE = 0.01
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def u(rng):
+    return rng.standard_normal(T)
+
+
+def found(u, y, fs=None, **more) -> dict[str, str]:
+    """Findings by the first word of their kind."""
+    u, y = (np.asarray(a).reshape(len(y), -1) for a in (u, y))
+    return {kind.split()[0]: text for kind, text in examine(survey(u, y, fs, **more), u, y)}
+
+
+def lag(u: Array, pole: float = 0.9, noise: float = NOISE) -> Array:
+    """A first-order system of gain 1 with a delay of one sample, and noise."""
+    y = lfilter([0, 1 - pole], [1, -pole], u)
+    return y + noise * y.std() * np.random.default_rng(1).standard_normal(len(y))
+
+
+def resonance(u: Array) -> Array:
+    return lfilter([0, 1], np.poly(0.97 * np.exp([0.3j, -0.3j])).real, u)
+
+
+# --- systems of every kind are fine, and swapped ones are not -----------------------------------
+
+SYSTEMS: dict[str, Callable[[Array], Array]] = {
+    "static": lambda u: 2 * u,
+    "first order": lag,
+    "noisy": lambda u: lag(u, noise=1.0),
+    "resonance": resonance,
+    "feed-through": lambda u: u + lag(u),
+    "high pass": lambda u: lfilter([1, -1], [1, -0.5], u),
+    "difference": lambda u: lfilter([1, -1], [1], u),
+    "integrator": lambda u: lfilter([0, 1], [1, -1], u),
+    "non-minimum phase": lambda u: lfilter([1, -1.2], [1, -0.8], u),
+    "cubic": lambda u: lag(u + 0.3 * u**3),
+    "saturation": lambda u: np.tanh(2 * lag(u, 0.5)),
+}
+REVERSED = ("first order", "noisy", "resonance", "non-minimum phase", "cubic", "saturation")
+"""Exchanged signals show in these: the others have feed-through, or no memory that would tell."""
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("coloured", [False, True])
+def test_nothing_is_said_of_usual_systems(system, coloured, u):
+    if coloured:
+        u = sosfilt(butter(3, 0.3, output="sos"), u)
+    y = SYSTEMS[system](u)
+    y = y + NOISE * y.std() * np.random.default_rng(2).standard_normal(T)
+    assert found(u, y) == {}
+    assert ("swapped" in found(y, u)) == (system in REVERSED) or coloured
+
+
+def test_an_integrator_fed_through_is_not_swapped(u):
+    assert found(lfilter([1, -1], [1], u), u) == {}
+
+
+def test_feedback_is_not_swapped(rng):
+    r, e = rng.standard_normal((2, T))
+    u, y, x = np.zeros(T), np.zeros(T), 0.0
+    for k in range(T):
+        y[k] = x + 0.05 * e[k]
+        u[k] = r[k] - 2 * y[k]
+        x = 0.9 * x + 0.1 * u[k]
+    assert found(u, y) == {}
+
+
+def test_several_channels(rng):
+    u = rng.standard_normal((T, 3))
+    y = np.column_stack([lag(u[:, 0]) + lag(u[:, 1], 0.8), resonance(u[:, 2])])
+    assert found(u, y) == {}
+    assert set(found(y, u)) == {"swapped"}
+
+
+@pytest.mark.parametrize("pole", [0.5, 0.9, 0.97])
+def test_short_records_raise_no_alarm(pole):
+    for seed, samples in enumerate((300, 400, 500, 700, 1000)):
+        u = np.random.default_rng(seed).standard_normal(samples)
+        assert found(u, lag(u, pole, noise=0.1)) == {}
+
+
+# --- each finding, and what is near it and fine --------------------------------------------------
+
+
+def test_missing(u):
+    y = lag(u)
+    y[100:105] = np.nan
+    assert "'y1' misses 5 of 5000 samples, up to 5 in a row" in found(u, y)["missing"]
+    assert "no values at all" in found(u, np.full(T, np.nan))["missing"]
+
+
+def test_constant(u):
+    y = lag(u)
+    both = np.column_stack([u, np.full(T, 3.0)])
+    assert "input 'u2' is constant at 3: it has no power" in found(both, y)["constant"]
+    assert "output 'y1' is constant" in found(u, np.ones(T))["constant"]
+    assert "'y2' is constant at 3" in found(np.empty((T, 0)), both)["constant"]
+
+
+def test_input_at_rest(u):
+    u[1000:3000] = 0.5
+    said = found(u, lag(u))
+    assert set(said) == {"still"}
+    assert "input 'u1' is constant in 40 % of the record (samples 1000 to 3000)" in said["still"]
+    u[1000:3000] += 1e-3 * np.random.default_rng(3).standard_normal(2000)  # as measured
+    assert set(found(u, lag(u))) == {"still"}
+
+
+def test_inputs_that_move_in_turn_do_not_rest(u):
+    first = np.where(np.arange(T) < T / 2, u, 0)
+    assert found(np.column_stack([first, u - first]), lag(u)) == {}
+
+
+def test_an_input_of_growing_amplitude_does_not_rest(u):
+    u = u * np.linspace(0, 1, T)
+    assert found(u, lag(u)) == {}
+
+
+def test_clipped_output(u):
+    y = lag(u)
+    said = found(u, np.minimum(y, 0.4))
+    assert set(said) == {"clipped"}
+    share = 100 * np.mean(y >= 0.4)
+    assert f"largest value 0.4 in {np.sum(y >= 0.4)} samples ({share:.2g} %)" in said["clipped"]
+    assert "smallest value -0.4" in found(u, np.maximum(y, -0.4))["clipped"]
+
+
+def test_steps_of_a_converter_are_not_clipped_but_coarse():
+    t = np.arange(T)
+    u = np.sin(0.03 * t) + np.sin(0.11 * t) + np.sin(0.23 * t) + np.sin(0.31 * t) + np.sin(0.4 * t)
+    y = lag(u, 0.5, noise=0)
+    said = found(u, np.round(y / 0.2) * 0.2)
+    assert set(said) == {"coarse"}
+    assert "in steps of 0.2" in said["coarse"]
+    assert "rms error of about 0.058" in said["coarse"]
+    assert found(u, np.round(y / 0.02) * 0.02) == {}
+
+
+def test_stuck_output(u):
+    y = lag(u)
+    y[2000:2800] = y[2000]
+    assert "for 800 samples (16 % of the record) while the input moves" in found(u, y)["stuck"]
+    y[2100:] = lag(u)[2100:]
+    assert found(u, y) == {}
+
+
+def test_an_output_at_rest_with_its_input_is_not_stuck(u):
+    u[1000:1900] = 0.0
+    y = np.round(lag(u, 0.5, noise=0), 4)
+    assert found(u, y) == {}
+
+
+def test_binary_input(u):
+    assert "two values only" in found(np.sign(u), lag(np.sign(u)))["binary"]
+    levels = np.round(2 * u)
+    assert found(levels, lag(levels)) == {}
+
+
+@pytest.mark.parametrize(("count", "narrow"), [(1, True), (3, True), (20, False)])
+def test_few_frequencies(count, narrow):
+    f = np.linspace(0.01, 0.4, count + 1)[1:]
+    u = np.cos(2 * np.pi * np.outer(np.arange(T), f) + np.arange(count) ** 2).sum(axis=1)
+    said = found(u, lag(u))
+    assert set(said) == ({"narrow"} if narrow else set())
+    assert not narrow or f"excites {count} frequenc" in said["narrow"]
+
+
+def test_narrow_band(u):
+    narrow = sosfilt(butter(4, [0.3, 0.305], "bandpass", output="sos"), u)
+    said = found(narrow, lag(narrow), 100.0)
+    assert "excites 14.9" in said["narrow"]
+    assert " to 15.3" in said["narrow"]
+
+
+def test_oversampled(u):
+    slow = sosfilt(butter(4, 0.008, output="sos"), u)
+    said = found(slow, lag(slow, 0.99, noise=0), 1000.0)
+    assert set(said) == {"oversampled"}
+    assert "Hz, fs / " in said["oversampled"]
+    faster = sosfilt(butter(4, 0.1, output="sos"), u)
+    assert found(faster, lag(faster, noise=0)) == {}
+
+
+def test_periods(u):
+    period = 3000
+    u = np.resize(u[:period], T)
+    assert "1.67 periods of 3000 samples" in found(u, lag(u), period=period)["periods"]
+    assert found(u, lag(u), period=T) == {}
+    assert found(u, lag(u), period=2500) == {}
+
+
+def test_inputs_that_are_the_same(u):
+    said = found(np.column_stack([u, 3 - 2 * u]), lag(u))
+    assert "'u1' and 'u2' carry the same signal (correlation -1.0000)" in said["same"]
+
+
+def test_short(u):
+    assert "has 200 samples" in found(u[:200], lag(u[:200]))["short"]
+    assert set(found(u[:3], u[:3])) == {"short"}
+
+
+@pytest.mark.parametrize("delay", [12, 37, 200])
+def test_delay(delay, u):
+    y = lag(np.concatenate([np.zeros(delay - 1), u[: T - delay + 1]]))
+    said = found(u, y, 50.0)
+    assert set(said) == {"delay"}
+    named = int(said["delay"].split("about ")[1].split()[0])
+    assert abs(named - delay) <= 1
+    assert f"({named / 50:.3g} s) from input 'u1' to output 'y1'" in said["delay"]
+    assert "swapped" in found(y, u)
+
+
+def test_a_slow_system_has_no_delay(u):
+    assert found(u, lag(lag(lag(u, 0.95), 0.95), 0.95)) == {}
+
+
+def test_drift(u):
+    y, line = lag(u), np.linspace(0, 1, T)
+    assert "drifts by 1" in found(u, y + line)["drift"]
+    assert found(u, y + 0.1 * line) == {}
+    assert found(u + line, lag(u + line)) == {}  # its cause is the input's
+
+
+def test_unrelated(u, rng):
+    assert "hardly anything of output 'y1'" in found(u, rng.standard_normal(T))["unrelated"]
+    assert "unrelated" in found(u, lag(u, 0.5) ** 2)  # purely even
+
+
+# --- records --------------------------------------------------------------------------------------
+
+
+def test_findings_of_records(u):
+    bad = Record(u, np.minimum(lag(u), 0.3), name="a", outputs=(Channel("level", "V"),))
+    (sentence,) = findings(bad)
+    assert sentence.startswith("output 'level' has its largest value 0.3")
+    (sentence,) = findings([replace(bad, y=lag(u)), bad, replace(bad, name="c"), bad])
+    assert sentence.startswith("record 'a' and 2 more: output 'level' has")
+    assert findings(replace(bad, y=lag(u))) == []
+
+
+def test_skipped_samples_are_not_looked_at(u):
+    record = Record(u, lag(u) + 5 * (np.arange(T) < 2000), skip=2000)
+    assert findings(record) == []
+    rest = np.where(np.arange(T) < 2000, 0, u)
+    assert findings(Record(rest, lag(rest), skip=2000)) == []
+    assert findings(Record(rest, lag(rest))) != []
+
+
+@pytest.mark.slow
+def test_simulated_benchmarks():
+    for dataset in (boucwen.load(), parwh.load(source="stand-in")):
+        for record in (*dataset.train[:3], *dataset.validation[:1], *dataset.tests):
+            assert findings(record) == []
+            assert "swapped" in found(record.y, record.u)
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_official_benchmarks(benchmark_root: Path):
+    for module in (silverbox, wiener_hammerstein, boucwen):
+        dataset = module.load(root=benchmark_root)
+        for record in (*dataset.train, *dataset.tests):
+            assert findings(record) == []
+            assert "swapped" in found(record.y, record.u)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("use", ["Est", "Val"])
+def test_overflow_of_the_cascaded_tanks(use: str, benchmark_root: Path):
+    file = benchmark_root / "Cascaded_Tanks" / "CascadedTanksFiles" / "dataBenchmark.mat"
+    data = loadmat(file)
+    u, y = data[f"u{use}"], data[f"y{use}"]
+    said = found(u, y, 0.25)
+    assert set(said) == {"clipped"}
+    assert f"largest value 10 in {np.sum(y == 10)} samples" in said["clipped"]
