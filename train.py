@@ -58,6 +58,15 @@ WORLD = int(os.environ.get("WORLD_SIZE", "1"))
 CONFIG, SNAPSHOTS = "config.yaml", "resume"
 """In the folder of a run: its settings, and its starts as far as they came."""
 
+LAST_SIZE = {"network": ["nn"], "polynomial": ["degree"]}
+"""The size of a kind of static map beside nz and nw."""
+
+OLD_WORDS = {
+    "init=polynomial": "static=polynomial",
+    "trainer.epochs": "trainer.max_iter",
+}
+"""Words of the command line that have other names now; saved runs may have them."""
+
 PRINTED = 3
 """Most lines of advice that are printed; the report has all."""
 
@@ -84,8 +93,8 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
     models = starts(cfg, bla, dataset)
     print(
         f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples, "
-        f"{models[0].parameters} parameters "
-        f"({models[0].parameters_net} without the gauge directions), {len(models)} start(s)"
+        f"{models[0].parameter_count} parameters "
+        f"({models[0].net_parameter_count} without the gauge directions), {len(models)} start(s)"
     )
 
     best, several, judged = folder / "model", len(models) > 1, None
@@ -96,10 +105,10 @@ def identify(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | No
             shutil.rmtree(folder / SNAPSHOTS, ignore_errors=True)
     kept = folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None
     snapshots = Snapshots(kept, writes=ranks.rank == 0)
-    settings = {"optimiser": instantiate(cfg.trainer), "ridge": cfg.ridge, "ranks": ranks}
+    settings = {"trainer": instantiate(cfg.trainer), "ridge": cfg.ridge, "ranks": ranks}
     settings |= {"snapshots": snapshots, "average": average(cfg, models)}
     records = (dataset.train, dataset.validation, dataset.selection)
-    search = partial(lfrtorch.fit_starts, models, *records, **settings)
+    search = partial(lfrtorch.fit, models, *records, **settings)
     with Termination(ranks) as termination:
         if ranks.rank > 0:
             result = search(monitors=[[termination]] * len(models))
@@ -134,7 +143,7 @@ def starts(cfg: DictConfig, bla: lfrtorch.LinearModel, dataset: Dataset) -> list
     """The models to start from; that of ``init_from`` is the only one."""
     if cfg.init_from is None:
         models = [
-            instantiate(cfg.init, bla, dataset.train, seed=seed)
+            instantiate(cfg.init, bla, dataset.train, seed=seed, **static_map(cfg))
             for seed in report.seeds(cfg.seed, cfg.starts)
         ]
     else:
@@ -142,6 +151,16 @@ def starts(cfg: DictConfig, bla: lfrtorch.LinearModel, dataset: Dataset) -> list
     for model in models:
         model.lfr.to(device=cfg.device, dtype=getattr(torch, cfg.dtype))
     return models
+
+
+def static_map(cfg: DictConfig) -> dict[str, Any]:
+    """The arguments of a start that say which static nonlinearity it has."""
+    if cfg.static.kind == "network":
+        return {"nn": cfg.nn, "activation": cfg.activation}
+    if cfg.static.kind == "polynomial":
+        return {"static": lfrtorch.Polynomial(cfg.nz, cfg.nw, cfg.degree)}
+    own = {name: value for name, value in cfg.static.items() if name != "kind"}
+    return {"static": instantiate(own, nz=cfg.nz, nw=cfg.nw)}
 
 
 def average(cfg: DictConfig, models: Sequence[lfrtorch.Model]) -> int:
@@ -204,9 +223,9 @@ def sizes(
     names = sizes_of(cfg)
     if cfg.init_from is not None or not any(cfg[name] == "auto" for name in names):
         return None
-    options, limit = cfg.sizes_search, "epochs" if "epochs" in cfg.trainer else "max_iter"
+    options = cfg.sizes_search
     seeds = report.seeds(cfg.seed, max(2, min(cfg.starts, options.starts)))
-    iterations = math.ceil(options.iterations * cfg.trainer[limit])
+    iterations = math.ceil(options.iterations * cfg.trainer.max_iter)
 
     def start(tried: dict[str, Any], seed: int) -> lfrtorch.Model:
         own = OmegaConf.merge(cfg, tried, {"seed": seed, "starts": 1})
@@ -222,7 +241,7 @@ def sizes(
                 **{name: options[name] if cfg[name] == "auto" else cfg[name] for name in names},
                 linear=bla,
                 seeds=seeds,
-                optimiser=instantiate(cfg.trainer, **{limit: iterations}),
+                trainer=instantiate(cfg.trainer, max_iter=iterations),
                 ridge=cfg.ridge,
                 monitors=[termination],
                 watch=partial(print, flush=True),
@@ -241,7 +260,7 @@ def sizes(
 
 def sizes_of(cfg: DictConfig) -> list[str]:
     """Of the static nonlinearity: nz, nw, and a polynomial's degree or a network's nn."""
-    return ["nz", "nw", "degree" if "static" in cfg.init else "nn"]
+    return ["nz", "nw", *LAST_SIZE.get(cfg.static.kind, ())]
 
 
 def write(
@@ -295,7 +314,6 @@ def write(
             result,
             simulated,
             noise_rms=dataset.noise_rms,
-            limit="trainer.epochs" if "epochs" in cfg.trainer else "trainer.max_iter",
             continued=cfg.init_from is not None,
             ridge=cfg.ridge != 0.0,
             searched=search is not None,
@@ -355,7 +373,7 @@ def require(cfg: DictConfig) -> None:
     for name in {"nn", "degree"} - {*sizes_of(cfg)}:
         if cfg[name] == "auto":
             used = sizes_of(cfg)[-1]
-            raise ValueError(f"{name} is auto, and this init has none; give {used}=auto.")
+            raise ValueError(f"{name} is auto, and this static map has none; give {used}=auto.")
     integer("sizes_search.starts", cfg.sizes_search.starts, 1)
     number("sizes_search.iterations", cfg.sizes_search.iterations, positive=True)
     integer("nx_max", cfg.nx_max, 1)
@@ -503,9 +521,13 @@ def arguments(given: Sequence[str]) -> list[str]:
                 f"resume is '{folder}', which is not the folder of a run: there is no {overrides}; "
                 "give the folder that train.py named at its end, runs/NAME/DATE."
             )
-        before = [str(o) for o in OmegaConf.load(overrides) if not str(o).startswith("resume=")]
+        before = [now(str(o)) for o in OmegaConf.load(overrides)]
+        before = [word for word in before if not word.startswith("resume=")]
         escaped = folder.replace("\\", "\\\\").replace("'", "\\'")
         return [*before, *given, f"hydra.run.dir='{escaped}'"]
+    for word in given:
+        if now(word) != word:
+            raise ValueError(f"{word} is called {now(word)} now.")
     for name, mark in (("hydra.run.dir", CONFIG), ("hydra.sweep.dir", "multirun.yaml")):
         folder = values.get(name, "").strip("'\"")
         taken = bool(folder) and (Path(folder) / mark).exists()
@@ -517,17 +539,20 @@ def arguments(given: Sequence[str]) -> list[str]:
     return list(given)
 
 
+def now(word: str) -> str:
+    """The word of the command line by its present name."""
+    for old, new in OLD_WORDS.items():
+        if word == old or word.startswith(f"{old}="):
+            return new + word.removeprefix(old)
+    return word
+
+
 def launch() -> None:
     """``main``; of several processes the first alone has Hydra write files."""
     if WORLD > 1 and {"-m", "--multirun"} & set(sys.argv):
         sys.exit("error: torchrun shares one fit; start several runs one after another.")
     with user_errors(os.environ.get("RANK", "0")):
         sys.argv[1:] = arguments(sys.argv[1:])
-    wrong, right = "trainer.epochs", "trainer.max_iter"
-    if "trainer=adam" in sys.argv:
-        wrong, right = right, wrong
-    if any(word.startswith(f"{wrong}=") for word in sys.argv):
-        sys.exit(f"error: this trainer has no {wrong}; its iterations are {right}.")
     if WORLD > 1 and os.environ["RANK"] != "0":
         sys.argv += WITHOUT_FILES
     main()

@@ -157,7 +157,7 @@ def scaling(folder: Path, axis: str, values: list[int]) -> dict:
             steps += search(problem, RESTART, theta)[1]
         cell = model.lfr.cell
         kept = reduction(cell, torch.zeros(0, cell.nx).to(cell.A)).kept
-        shape = {"samples": problem.size, **model.sizes, "P": model.parameters, "K": len(kept)}
+        shape = {"samples": problem.size, **model.sizes, "P": model.parameter_count, "K": len(kept)}
         points.append({**shape, "value": value, "s": one_trial(steps)})
     return {"points": points}
 

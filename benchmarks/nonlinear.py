@@ -64,8 +64,8 @@ def ours(seed: int, data: Dataset) -> None:
         bla, data.train, nz=SIZES["nz"], nw=SIZES["nw"], nn=NEURONS, seed=seed
     )
     for iterations in (50, 150):
-        optimiser = lfrtorch.LevenbergMarquardt(max_iter=iterations)
-        result = lfrtorch.fit(model, data.train, data.validation, optimiser=optimiser)
+        trainer = lfrtorch.LevenbergMarquardt(max_iter=iterations)
+        result = lfrtorch.fit(model, data.train, data.validation, trainer=trainer)
         row(seed, "lfrtorch, NL-LFR", data, model.simulate, result.iterations, begin)
 
 

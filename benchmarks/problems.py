@@ -47,7 +47,7 @@ def prepare(folder: Path, peers: Path | None) -> dict[str, int]:
         rest = {key: size for key, size in sizes.items() if key != "nx"}
         model = lfrtorch.initialise(bla, records(folder, name), **rest)
         model.save(folder / name)
-        parameters[name] = model.parameters
+        parameters[name] = model.parameter_count
     return parameters
 
 

@@ -70,9 +70,9 @@ def fitted(job: dict) -> dict:
         cfg = compose("config", settings)
     data = instantiate(cfg.data)
     bla = instantiate(cfg.bla, data.train)
-    model = instantiate(cfg.init, bla, data.train)
+    model = instantiate(cfg.init, bla, data.train, nn=cfg.nn, activation=cfg.activation)
     result = lfrtorch.fit(
-        model, data.train, data.validation, optimiser=instantiate(cfg.trainer), ridge=cfg.ridge
+        model, data.train, data.validation, trainer=instantiate(cfg.trainer), ridge=cfg.ridge
     )
     errors = [lfrtorch.rmse(r, model.simulate(r)) for r in (*data.validation, *data.tests)]
     validation, tests = errors[: len(data.validation)], errors[len(data.validation) :]

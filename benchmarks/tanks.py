@@ -59,10 +59,8 @@ def left_out(
     judged = replace(whole[:last], start="estimated", skip=first or SKIP)
     bla = lfrtorch.estimate_bla(train, nx=2)
     models = [lfrtorch.initialise(bla, train, **SIZES, nn=nn, seed=seed) for seed in seeds]
-    optimiser = lfrtorch.LevenbergMarquardt(max_iter=ITERATIONS)
-    result = lfrtorch.fit_starts(
-        models, train, optimiser=optimiser, ridge=ridge, average=len(models)
-    )
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=ITERATIONS)
+    result = lfrtorch.fit(models, train, trainer=trainer, ridge=ridge, average=len(models))
 
     def error(model: lfrtorch.Model) -> float:
         return lfrtorch.rmse(judged, model.simulate(judged))

@@ -46,8 +46,8 @@ def main() -> None:
     starts = [
         lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=5, seed=seed) for seed in range(4)
     ]
-    optimiser = lfrtorch.LevenbergMarquardt(max_iter=60)
-    result = lfrtorch.fit_starts(starts, data.train, data.validation, optimiser=optimiser)
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=60)
+    result = lfrtorch.fit(starts, data.train, data.validation, trainer=trainer)
     print(f"{result.iterations} iterations, {result.seconds:.0f} s: {result.reason}")
 
     (test,) = data.tests

@@ -48,8 +48,8 @@ def main() -> None:
     train, validation, test = (measured(n, seed) for seed, n in enumerate((2000, 1000, 1000)))
     bla = lfrtorch.estimate_bla(train, nx=2, offset=False)
     model = lfrtorch.initialise(bla, train, nz=1, nw=1, static=HardeningSpring())
-    optimiser = lfrtorch.LevenbergMarquardt(max_iter=30)
-    result = lfrtorch.fit(model, train, validation, optimiser=optimiser)
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=30)
+    result = lfrtorch.fit(model, train, validation, trainer=trainer)
     print(f"{result.iterations} iterations, {result.seconds:.0f} s: {result.reason}")
     for name, found in (("linear model", bla), ("with the spring", model)):
         error = 1e6 * lfrtorch.rmse(test, found.simulate(test))

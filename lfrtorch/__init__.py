@@ -1,33 +1,45 @@
 """Identification of nonlinear LFR state-space models from input-output data.
 
-records -> estimate_bla -> initialise or inference -> fit -> simulate, save, load
+records -> estimate_bla -> initialise or infer -> fit -> simulate, save, load
 records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 """
 
 from importlib.metadata import version
+from typing import Any
 
 from lfrtorch import datasets, distributed
-from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial
+
+# data
+from lfrtorch.dataset import Dataset, Published
 from lfrtorch.excitation import multisine
 from lfrtorch.files.load import load_records
-from lfrtorch.fitting.inference import inference
-from lfrtorch.fitting.means import average
-from lfrtorch.fitting.multistart import fit_starts
-from lfrtorch.fitting.size_search import SizeSearch, search_sizes
-from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.starts import initialise
-from lfrtorch.fitting.trainer import FitResult, fit
-from lfrtorch.least_squares.adam import Adam
-from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.records import Channel, Record, Scaler
+
+# the linear model
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
-from lfrtorch.metrics import nrmse, rmse
+
+# the nonlinear model
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.model import Model, load, simulate_blocks
-from lfrtorch.records import Channel, Record, Scaler
+
+# fits
+from lfrtorch.fitting.inference import infer
+from lfrtorch.fitting.means import mean_model
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.size_search import SizeSearch, search_sizes
+from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.starts import initialise
+from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+
+# scores
+from lfrtorch.metrics import nrmse, rmse
 
 __version__ = version("lfrtorch")
 
@@ -36,6 +48,7 @@ __all__ = [
     "LFR",
     "Adam",
     "Channel",
+    "Dataset",
     "FitResult",
     "LFRCell",
     "LevenbergMarquardt",
@@ -45,21 +58,21 @@ __all__ = [
     "Network",
     "OrderScan",
     "Polynomial",
+    "Published",
     "Record",
     "Scaler",
     "SizeSearch",
     "Snapshots",
-    "average",
     "datasets",
     "distributed",
     "estimate_bla",
     "estimate_frf",
     "fit",
-    "fit_starts",
-    "inference",
+    "infer",
     "initialise",
     "load",
     "load_records",
+    "mean_model",
     "multisine",
     "nrmse",
     "rmse",
@@ -67,3 +80,11 @@ __all__ = [
     "search_sizes",
     "simulate_blocks",
 ]
+
+_RENAMED = {"average": "mean_model", "fit_starts": "fit", "inference": "infer"}
+
+
+def __getattr__(name: str) -> Any:
+    """An old name ends in an error that says the new one."""
+    now = f"; it is called lfrtorch.{_RENAMED[name]} now" if name in _RENAMED else ""
+    raise AttributeError(f"module 'lfrtorch' has no attribute '{name}'{now}")

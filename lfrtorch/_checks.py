@@ -3,12 +3,40 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def renamed(**new: str) -> Callable[[Function], Function]:
+    """Let the old names of a function's or class's arguments end in a TypeError with the new one.
+
+    Args:
+        new: the present name of each old one.
+    """
+
+    def decorate(function: Function) -> Function:
+        name = function.__name__
+        inner = function.__init__ if isinstance(function, type) else function
+
+        @wraps(inner)
+        def checked(*args: Any, **kwargs: Any) -> Any:
+            for old in new.keys() & kwargs.keys():
+                raise TypeError(f"the argument '{old}' of {name} is called '{new[old]}' now.")
+            return inner(*args, **kwargs)
+
+        if not isinstance(function, type):
+            return cast(Function, checked)
+        function.__init__ = checked
+        return cast(Function, function)
+
+    return decorate
 
 
 def integer(name: str, value: Any, least: int, *, word: str = "") -> None:

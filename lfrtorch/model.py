@@ -49,11 +49,25 @@ class Model:
 
     @property
     def parameters(self) -> int:
+        """Old name of ``parameter_count``.
+
+        Raises:
+            AttributeError: always.
+        """
+        raise AttributeError(
+            "Model.parameters is called parameter_count now, and parameters_net "
+            "net_parameter_count; the tensors are model.lfr.parameters()."
+        )
+
+    parameters_net = parameters
+
+    @property
+    def parameter_count(self) -> int:
         """Number of parameters P."""
         return sum(p.numel() for p in self.lfr.parameters())
 
     @property
-    def parameters_net(self) -> int:
+    def net_parameter_count(self) -> int:
         """P less the gauge directions, which change the parameters and not the output.
 
         nx² for the coordinates of x, nz² and nw² for those of z and w (a network and a polynomial
@@ -66,7 +80,7 @@ class Model:
             gauge += cell.nz**2 + cell.nw**2 + max(0, cell.nw - cell.ny)
         if isinstance(cell.static, Polynomial):
             gauge += cell.nz * cell.nw
-        return self.parameters - gauge
+        return self.parameter_count - gauge
 
     def simulate(
         self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None

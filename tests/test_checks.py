@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+import lfrtorch
 from lfrtorch._checks import integer, number
 
 
@@ -33,3 +34,14 @@ def test_other_than_numbers_are_named(value):
 def test_zero_is_not_positive():
     with pytest.raises(ValueError, match="damping is 0; give a positive number"):
         number("damping", 0, positive=True)
+
+
+def test_old_names_end_in_an_error_that_says_the_new_one():
+    with pytest.raises(TypeError, match="'epochs' of Adam is called 'max_iter' now"):
+        lfrtorch.Adam(epochs=3)  # pyright: ignore[reportCallIssue]
+    with pytest.raises(TypeError, match="'optimiser' of fit is called 'trainer' now"):
+        lfrtorch.fit(optimiser=lfrtorch.Adam())  # pyright: ignore[reportCallIssue]
+    with pytest.raises(AttributeError, match=r"it is called lfrtorch\.fit now"):
+        _ = lfrtorch.fit_starts
+    with pytest.raises(AttributeError, match=r"no attribute 'nothing'$"):
+        _ = lfrtorch.nothing

@@ -28,8 +28,8 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import LOST, ProcessLost, Ranks, connect
-from lfrtorch.fitting.multistart import fit_starts
-from lfrtorch.fitting.trainer import FitResult, fit
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
@@ -142,7 +142,7 @@ FITS: dict[str, tuple[Any, float, float]] = {  # optimiser, ridge, NORMAL of the
     "normal equations, ridge": (LevenbergMarquardt(max_iter=6), 1e-2, 0.0),
     "orthogonal, ridge": (LevenbergMarquardt(max_iter=6), 1e-2, math.inf),
 }
-ADAM = {"adam": (Adam(epochs=20, learning_rate=1e-2), 1e-2, jacobian.NORMAL)}
+ADAM = {"adam": (Adam(max_iter=20, learning_rate=1e-2), 1e-2, jacobian.NORMAL)}
 
 
 def fitted(name: str, ranks: Ranks) -> tuple[Tensor, FitResult]:
@@ -152,7 +152,7 @@ def fitted(name: str, ranks: Ranks) -> tuple[Tensor, FitResult]:
         model, train, validation = case()
         if ranks.rank == 1:  # starts from what the first process has all the same
             vector_to_parameters(2.0 * theta(model), model.lfr.parameters())
-        result = fit(model, train, validation, optimiser=optimiser, ridge=ridge, ranks=ranks)
+        result = fit(model, train, validation, trainer=optimiser, ridge=ridge, ranks=ranks)
         return theta(model), result
     finally:
         jacobian.NORMAL = usual
@@ -174,7 +174,7 @@ def averaged(ranks: Ranks) -> tuple[Tensor, int]:
     """Weights of a mean of starts, without validation, and of how many."""
     models, (_, train, _) = [case()[0], case()[0]], case()
     optimiser = LevenbergMarquardt(max_iter=2)
-    result = fit_starts(models, train, optimiser=optimiser, average=2, ranks=ranks)
+    result = fit(models, train, trainer=optimiser, average=2, ranks=ranks)
     return theta(result.model), result.averaged
 
 
@@ -199,7 +199,7 @@ def losing(ranks: Ranks) -> Any:
     monitors = [Checkpoint("model", every=0.0)] if ranks.rank == 0 else []
     begin = time.monotonic()
     result = fit(
-        model, train, validation, optimiser=Dying(max_iter=50), monitors=monitors, ranks=ranks
+        model, train, validation, trainer=Dying(max_iter=50), monitors=monitors, ranks=ranks
     )
     seconds = time.monotonic() - begin
     try:

@@ -45,7 +45,7 @@ def peak_of_an_iteration(T: int, start: Start, nn: int = 15) -> tuple[int, int]:
     state = optimiser.init(problem, problem.theta)
     with Allocations() as allocations:
         optimiser.step(problem, state)
-    return allocations.peak, model.parameters
+    return allocations.peak, model.parameter_count
 
 
 @pytest.mark.slow

@@ -87,13 +87,13 @@ def test_net_parameters_are_the_rank_of_the_periodic_jacobian(nu, ny, nx, nz, nw
     cell = random_cell(nu, ny, nx, nz, nw, nn)
     model = random_model(cell)
     linear = nx * (nx + nu + nw) + nz * (nx + nu) + ny * (nx + nu + nw)
-    assert model.parameters == linear + nn * (nz + 1 + nw) + nw
+    assert model.parameter_count == linear + nn * (nz + 1 + nw) + nw
     u = normal(1, 200, nu)
     linearisation = Linearisation(cell, u, steady_state(cell, u), periodic=True)
     J = output_jacobian(linearisation).flatten(0, 2)
     s = torch.linalg.svdvals(J / J.norm(dim=0))
     # Directions that are seen have 6e-7 or more, those of the gauge rounding errors of 5e-16.
-    assert model.parameters_net == int((s > 1e-11 * s[0]).sum())
+    assert model.net_parameter_count == int((s > 1e-11 * s[0]).sum())
 
 
 @pytest.mark.parametrize(
@@ -110,13 +110,13 @@ def test_net_parameters_of_a_polynomial_are_the_rank_as_well(nu, ny, nx, nz, nw,
     J = output_jacobian(linearisation).flatten(0, 2)
     s = torch.linalg.svdvals(J / J.norm(dim=0))
     # Directions that are seen have 6e-7 or more, those of the gauge rounding errors of 5e-16.
-    assert model.parameters_net == int((s > 1e-11 * s[0]).sum())
+    assert model.net_parameter_count == int((s > 1e-11 * s[0]).sum())
 
 
 def test_net_parameters_of_a_linear_model():
     model = random_model(random_cell(2, 1, 3, 0, 0))
-    assert model.parameters == 3 * 3 + 3 * 2 + 3 + 2
-    assert model.parameters_net == 3 * 2 + 3 + 2
+    assert model.parameter_count == 3 * 3 + 3 * 2 + 3 + 2
+    assert model.net_parameter_count == 3 * 2 + 3 + 2
     assert model.sizes == {"nx": 3, "nz": 0, "nw": 0, "nn": 0}
 
 
@@ -244,3 +244,9 @@ def test_starts_that_lack_what_they_need(model: Model):
         model.simulate(u, start="given")
     with pytest.raises(ValueError, match=r"start='estimated' needs a record"):
         model.simulate(u, start="estimated")
+
+
+def test_the_old_name_of_the_count_says_the_new_one():
+    for name in ("parameters", "parameters_net"):
+        with pytest.raises(AttributeError, match="parameter_count"):
+            getattr(random_model(random_cell()), name)

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 import lfrtorch
-from lfrtorch.fitting.multistart import fit_starts
+from lfrtorch.fitting.multistart import fit
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -117,8 +117,8 @@ LM = LevenbergMarquardt(max_iter=2)
         (LM, dict, 0.0, 0),  # rows in blocks
         (LM, dict, math.inf, 0),
         (LM, own_map, 0.0, jacobian.KEPT_BYTES),
-        (Adam(epochs=2), dict, 0.0, jacobian.KEPT_BYTES),
-        (Adam(epochs=2), own_map, 0.0, jacobian.KEPT_BYTES),
+        (Adam(max_iter=2), dict, 0.0, jacobian.KEPT_BYTES),
+        (Adam(max_iter=2), own_map, 0.0, jacobian.KEPT_BYTES),
     ],
 )
 def test_single_fit(
@@ -134,7 +134,7 @@ def test_single_fit(
 
     def work() -> lfrtorch.FitResult:
         model = truth(seed=7, **options())
-        return lfrtorch.fit(model, train, validation, optimiser=trainer)
+        return lfrtorch.fit(model, train, validation, trainer=trainer)
 
     same(work)
 
@@ -144,6 +144,6 @@ def test_several_starts():
 
     def work() -> lfrtorch.FitResult:
         models = [truth(seed=seed) for seed in range(3)]
-        return fit_starts(models, train, validation, optimiser=LM)
+        return fit(models, train, validation, trainer=LM)
 
     same(work)

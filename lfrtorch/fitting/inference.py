@@ -314,7 +314,7 @@ def _least_squares(M: Array, b: Array) -> Array:
     return scipy.linalg.cho_solve(factor, right / scale) / scale
 
 
-def inference(
+def infer(
     bla: LinearModel,
     records: Record | Sequence[Record],
     *,

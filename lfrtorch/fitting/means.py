@@ -15,7 +15,7 @@ from lfrtorch.engine.nonlinearity import Network, is_network
 from lfrtorch.model import Model
 
 
-def average(models: Sequence[Model]) -> Model:
+def mean_model(models: Sequence[Model]) -> Model:
     """The model whose output is the mean of the outputs of several models.
 
     Models that fit alike from different random starts differ where the data do not tell, and their

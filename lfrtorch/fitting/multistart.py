@@ -8,7 +8,7 @@ smallest squared validation error: all to the end 3.37 (3026 iterations), half a
 3.37 (1609, 1696), half after 1/5 3.45, after 3/10 3.48, quarter after 1/16 and 1/8 3.43 (926), an
 eighth after 1/8, 1/4 and 1/2 3.59 (933).
 
-Of starts that end alike the mean may be better than each of them: see :func:`lfrtorch.average`.
+Of starts that end alike the mean may be better than each of them: see :func:`lfrtorch.mean_model`.
 
 References:
     Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter
@@ -23,24 +23,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import ceil
 from threading import Event, Lock
+from typing import cast
 
 import torch
 
-from lfrtorch._checks import integer
+from lfrtorch._checks import integer, renamed
 from lfrtorch._threads import each_alone, spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, loudest
 from lfrtorch.distributed import LOST, Ranks
 from lfrtorch.engine.nonlinearity import is_network
-from lfrtorch.fitting.means import average as mean_of
+from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import (
     INTERRUPTED,
     Fit,
     FitResult,
     Monitor,
-    Optimiser,
     Progress,
     Start,
+    Trainer,
 )
 from lfrtorch.least_squares.joint import Stack
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -79,78 +80,97 @@ class Round:
     seconds: float
 
 
+@renamed(optimiser="trainer", model="models")
 @spread_by_hand()
-def fit_starts(
-    models: Sequence[Model],
+def fit(
+    models: Model | Sequence[Model],
     train: Record | Sequence[Record],
     validation: Record | Sequence[Record] = (),
     selection: Record | Sequence[Record] = (),
     *,
-    optimiser: Optimiser | None = None,
+    trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
     average: int = 1,
-    monitors: Sequence[Sequence[Monitor]] = (),
+    monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] = (),
     watch: Callable[[Round], None] = lambda _: None,
     ranks: Ranks | None = None,
     snapshots: Snapshots | None = None,
 ) -> FitResult:
-    """Minimise the simulation error from several starts, and keep the best.
+    """Minimise the simulation error of a model over records; from several starts, keep the best.
+
+    The iterate with the smallest error on the validation records (without them: on the training
+    records) is kept, also if the search is interrupted by Ctrl-C, or one of the processes that
+    share the records is lost: ``reason`` then begins with "a process was lost".
 
     On a CPU each start is fitted on a thread of its own, as many at a time as torch has threads. On
     another device all go in step, their simulations and Jacobians computed together. Processes that
     share the records fit one start after another.
 
     Args:
-        models: the starts; their weights are changed in place.
-        train, validation, optimiser, ridge, ranks: see :func:`lfrtorch.fit`. Starts are judged on
-            validation and selection, and without both on training.
+        models: where to start: a model, or several of which the best is kept. Their weights are
+            changed in place.
+        train: records that are fitted.
+        validation: records that choose among the iterates.
         selection: more records to judge starts on, and not the iterates of one: at amplitudes
             that are not fitted, where those that fit alike differ. (On the Bouc-Wen benchmark the
             sweep's error has a rank correlation of 0.45 with that at the training's level, of 0.7
             and 0.8 with those at a half and a fifth of it. Iterates that are chosen there are among
             the first where the model is too small, and worse at the training's level by up to 6 %.)
+            Starts are judged on validation and selection, and without both on training.
+        trainer: the search. Default: Levenberg-Marquardt.
+        ridge: weight of |θ - θ_start|², see ``SimulationError``.
         average: so many starts go to the end at least, and the model of the result is the mean of
-            so many of the best at most (:func:`lfrtorch.average`): of as many as come within 1 % of
-            the best error on validation and selection, which may be one, and without both of all.
-            Starts that inputs twice as loud as those of training make run away have no part in it.
-        monitors: of each start, called one at a time.
+            so many of the best at most (:func:`lfrtorch.mean_model`): of as many as come within
+            1 % of the best error on validation and selection, which may be one, and without both
+            of all. Starts that diverge when the training input is doubled are left out.
+        monitors: called with the model and its progress after every iteration; of several models a
+            list for each, called one at a time. Each process calls its own: give those that print
+            or write files to the first alone.
         watch: called after each round.
-        snapshots: where the starts are kept as far as they came. Where some are, they go on from
+        ranks: the processes that share the training records, ``distributed.connect()``; each calls
+            this function with the same arguments, starts from the first one's weights and returns
+            the same fit.
+        snapshots: where the starts are kept as far as they came. If some are, they go on from
             there, to the same end as if they had not been interrupted (on the same machine).
 
     Returns:
-        The fit of the best start, its duration that of all; ``starts`` has all, the best first.
-        ``averaged`` says of how many the model is the mean.
+        The fit of the best start, its duration that of all. Of several models ``starts`` has all,
+        the best first, and ``averaged`` says of how many the model is the mean.
 
     Raises:
-        ValueError: no model, another number of lists of monitors, models to average that have no
-            network, or see :func:`lfrtorch.fit`.
+        ValueError: no model, one that diverges on the training records at the start, fewer records
+            than processes, another number of lists of monitors, or models to average that have no
+            network.
+        ProcessLost: before there was an iterate to keep.
     """
-    if not models:
+    alone = isinstance(models, Model)
+    starts = [models] if alone else list(models)
+    watching = cast(Sequence[Sequence[Monitor]], [monitors] if alone else monitors)
+    if not starts:
         raise ValueError("there is no model to start from; give one or more.")
-    if monitors and len(monitors) != len(models):
+    if watching and len(watching) != len(starts):
         raise ValueError(
-            f"there are {len(models)} models and {len(monitors)} lists of monitors; give each "
+            f"there are {len(starts)} models and {len(watching)} lists of monitors; give each "
             "model its own."
         )
     integer("average", average, 1)
-    if average > 1 and not all(is_network(model.lfr.cell.static) for model in models):
+    if average > 1 and not all(is_network(model.lfr.cell.static) for model in starts):
         raise ValueError(
             f"average is {average}, and the mean is of models with a network as their static "
             "nonlinearity; give average=1 for other maps."
         )
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots
-    options = {"optimiser": optimiser, "ridge": ridge, "ranks": ranks}
+    options = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
     fits = [
         Fit(model, train, validation, **options, keep=snapshots.keeper(number))
-        for number, model in enumerate(models)
+        for number, model in enumerate(starts)
     ]
     snapshots.restore(fits)
     unseen = [r for some in (validation, selection) if some for r in as_records(some)]
     judge = _Judge(fits, unseen if selection else [], unseen)
-    together = _Together(fits, monitors or [()] * len(fits))
-    limit, field = fits[0].optimiser.limit, fits
+    together = _Together(fits, watching or [()] * len(fits))
+    limit, field = fits[0].trainer.limit, fits
     rounds = ROUNDS if len(fits) > 1 else ()
     ends = sorted({ceil(part * limit) for part in rounds} | {limit})
     for number, until in enumerate(ends, start=1):
@@ -161,8 +181,7 @@ def fit_starts(
         field = judge.ranked(field)
         if not field:  # interrupted before there was anything to keep
             raise KeyboardInterrupt
-        starts = judge.summaries(field)
-        watch(Round(number, len(ends), starts, time.perf_counter() - clock))
+        watch(Round(number, len(ends), judge.summaries(field), time.perf_counter() - clock))
         cut = next((fit.reason for fit in field if _cut_short(fit)), "")
         if cut:
             for fit in field:
@@ -173,7 +192,9 @@ def fit_starts(
             snapshots.decided([judge.number(fit) for fit in field[:kept]])
             field = _gone_on(field, field[:kept])
     ranked = judge.ranked(fits)
-    result = replace(ranked[0].result(), starts=judge.summaries(ranked))
+    result = ranked[0].result()
+    if not alone:
+        result = replace(result, starts=judge.summaries(ranked))
     if average > 1:
         mean, count = judge.mean(judge.stable(field, as_records(train))[:average])
         if mean is not None:
@@ -238,8 +259,8 @@ class _Judge:
         mean of all.
         """
         if not self._unseen:
-            return (mean_of(best), len(best)) if len(best) > 1 else (None, 1)
-        means = [mean_of(best[:count]) for count in range(2, len(best) + 1)]
+            return (mean_model(best), len(best)) if len(best) > 1 else (None, 1)
+        means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]
         scores = [min(map(self._score, self.fits))]
         for mean in means:
             error = SimulationError(mean, self._unseen, solved_starts=True)
@@ -276,7 +297,7 @@ class _Together:
     def advance(self, fits: Sequence[Fit], until: int) -> None:
         """Go on with some of them to an iteration."""
         first = fits[0]
-        in_step = isinstance(first.optimiser, LevenbergMarquardt) and first.ranks.world == 1
+        in_step = isinstance(first.trainer, LevenbergMarquardt) and first.ranks.world == 1
         try:
             if len(fits) > 1 and in_step and first.problem.theta.device.type != "cpu":
                 advance_in_step(fits, until, [self._monitors[id(fit)] for fit in fits])
@@ -313,15 +334,15 @@ def advance_in_step(
         KeyboardInterrupt: from a monitor, or by Ctrl-C.
     """
     watching = dict(zip(map(id, fits), monitors or [()] * len(fits), strict=True))
-    optimiser = fits[0].optimiser
-    assert isinstance(optimiser, LevenbergMarquardt)
+    trainer = fits[0].trainer
+    assert isinstance(trainer, LevenbergMarquardt)
     for fit in fits:
         if not fit.history:
             fit.begin(watching[id(fit)])
     try:
         while live := [f for f in fits if not f.over and f.state.iteration < until]:
             clock = time.perf_counter()
-            after = optimiser.steps(Stack([f.problem for f in live]), [f.state for f in live])
+            after = trainer.steps(Stack([f.problem for f in live]), [f.state for f in live])
             each = (time.perf_counter() - clock) / len(live)
             for fit, state in zip(live, after, strict=True):
                 fit.take(state, each, watching[id(fit)])

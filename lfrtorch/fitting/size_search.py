@@ -37,10 +37,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lfrtorch._checks import integer
+from lfrtorch._checks import integer, renamed
 from lfrtorch.distributed import LOST, ProcessLost, Ranks
-from lfrtorch.fitting.multistart import fit_starts
-from lfrtorch.fitting.trainer import INTERRUPTED, Monitor, Optimiser, StartDiverges
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.trainer import INTERRUPTED, Monitor, StartDiverges, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.bla import data_scaler
@@ -179,6 +179,7 @@ class SizeSearch:
         return "\n".join(lines)
 
 
+@renamed(optimiser="trainer")
 def search_sizes(
     start: Callable[[Sizes, int], Model],
     train: Record | Sequence[Record],
@@ -190,7 +191,7 @@ def search_sizes(
     degree: int | Sequence[int] | None = None,
     linear: LinearModel | None = None,
     seeds: Sequence[int] = SEEDS,
-    optimiser: Optimiser | None = None,
+    trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
     monitors: Sequence[Monitor] = (),
     watch: Callable[[Candidate], None] = lambda _: None,
@@ -207,7 +208,7 @@ def search_sizes(
         degree: of a polynomial, in the place of nn.
         linear: the model that errors are compared with.
         seeds: of the starts.
-        optimiser: Levenberg-Marquardt with 50 iterations where left out.
+        trainer: Levenberg-Marquardt with 50 iterations where left out.
         ridge, ranks: see :func:`lfrtorch.fit`.
         monitors: of each start.
         watch: called after each model.
@@ -229,7 +230,7 @@ def search_sizes(
         )
     ranks = Ranks() if ranks is None else ranks
     judge = _Judge(as_records(validation), linear, ranks)
-    optimiser = LevenbergMarquardt(max_iter=ITERATIONS) if optimiser is None else optimiser
+    trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer
     found: list[Candidate] = []
 
     def searched(*values: Sequence[int]) -> SizeSearch:
@@ -240,11 +241,11 @@ def search_sizes(
             clock = time.perf_counter()
             models = [start(sizes, seed) for seed in seeds]
             try:
-                result = fit_starts(
+                result = fit(
                     models,
                     train,
                     validation,
-                    optimiser=optimiser,
+                    trainer=trainer,
                     ridge=ridge,
                     monitors=[monitors] * len(models),
                     ranks=ranks,
@@ -342,7 +343,7 @@ class _Judge:
         """What is known of a model with these errors."""
         error, error_std = self._error(squares)
         return Candidate(
-            sizes, model.parameters, model.parameters_net, seconds, error, error_std,
+            sizes, model.parameter_count, model.net_parameter_count, seconds, error, error_std,
             error / self._linear if self._linear else nan, squares,
         )  # fmt: skip
 

@@ -35,8 +35,8 @@ class StartDiverges(ValueError):
     """The model diverges on the training records at the start."""
 
 
-class OptimiserState(Protocol):
-    """What the loop reads of an optimiser's state."""
+class TrainerState(Protocol):
+    """What the loop reads of a trainer's state."""
 
     @property
     def theta(self) -> Tensor:
@@ -64,7 +64,7 @@ class OptimiserState(Protocol):
         ...
 
 
-class Optimiser(Protocol):
+class Trainer(Protocol):
     """A search in steps: Levenberg-Marquardt or Adam."""
 
     @property
@@ -100,7 +100,7 @@ class Progress:
             where there is no validation record or the model diverges on it.
         seconds: since the start of the fit.
         best: whether this iterate is the best so far, on validation where there is one.
-        report: scalars of the optimiser.
+        report: scalars of the trainer.
         score: normalised squared error that chooses: on validation, or on training without it.
     """
 
@@ -185,12 +185,12 @@ class Fit:
     """A fit that goes on for as many iterations as it is asked for, and keeps the best iterate.
 
     Args:
-        model, train, validation, optimiser, ridge, ranks: see :func:`fit`.
+        model, train, validation, trainer, ridge, ranks: see :func:`lfrtorch.fit`.
         keep: called with the fit after every iteration, when it may be saved, and with True where
             it pauses.
 
     Raises:
-        ValueError: see :func:`fit`.
+        ValueError: see :func:`lfrtorch.fit`.
     """
 
     def __init__(
@@ -199,13 +199,13 @@ class Fit:
         train: Record | Sequence[Record],
         validation: Record | Sequence[Record] = (),
         *,
-        optimiser: Optimiser | None = None,
+        trainer: Trainer | None = None,
         ridge: Ridge = 0.0,
         ranks: Ranks | None = None,
         keep: Keep = nothing,
     ) -> None:
         self.model, self.keep = model, keep
-        self.optimiser = LevenbergMarquardt() if optimiser is None else optimiser
+        self.trainer = LevenbergMarquardt() if trainer is None else trainer
         self.ranks = ranks = Ranks() if ranks is None else ranks
         if ranks.world > 1:
             weights = parameters_to_vector(model.lfr.parameters())
@@ -218,7 +218,7 @@ class Fit:
                 "model."
             )
         self.state: Any = None
-        """The optimiser's; None before the first call of ``advance``."""
+        """The trainer's; None before the first call of ``advance``."""
         self.history: list[Progress] = []
         self.reason = "no iterations asked for"
         self.best = math.inf
@@ -238,22 +238,22 @@ class Fit:
         """Whether there is no more to come."""
         if not self.history:
             return False
-        return bool(self.state.reason) or self.state.iteration >= self.optimiser.limit
+        return bool(self.state.reason) or self.state.iteration >= self.trainer.limit
 
     @spread_by_hand()
     def advance(self, until: int | None = None, monitors: Sequence[Monitor] = ()) -> Self:
-        """Go on to an iteration, the optimiser's last where left out; the best is in the model.
+        """Go on to an iteration, the trainer's last where left out; the best is in the model.
 
         Raises:
             ProcessLost: before there was an iterate to keep.
         """
-        until = self.optimiser.limit if until is None else until
+        until = self.trainer.limit if until is None else until
         try:
             if not self.history:
                 self.begin(monitors)
             while not self.over and self.state.iteration < until:
                 clock = time.perf_counter()
-                after = self.optimiser.step(self.problem, self.state)
+                after = self.trainer.step(self.problem, self.state)
                 self.take(after, time.perf_counter() - clock, monitors)
         except KeyboardInterrupt:
             if not self.history:
@@ -287,14 +287,14 @@ class Fit:
         state_file.write(path, numbers, tensors | {"best": self._theta_best})
 
     def restore(self, path: Path) -> None:
-        """Take over where a fit of the same model, records and optimiser stood.
+        """Take over where a fit of the same model, records and trainer stood.
 
         Raises:
             ValueError: a damaged file, or another fit.
         """
         numbers, tensors = state_file.read(path)
         device = self.problem.theta.device
-        like = self.optimiser.init(self.problem, self.problem.theta)
+        like = self.trainer.init(self.problem, self.problem.theta)
         # After init, which may evaluate gradients and leave guesses of periodic orbits behind.
         self.problem.load_state_dict(state_file.within("problem.", tensors, device))
         try:
@@ -302,18 +302,18 @@ class Fit:
             state = state_file.unpacked(like, numbers["state"], state)
         except TypeError:
             raise ValueError(
-                f"'{path}' was left by another optimiser than {type(self.optimiser).__name__}; go "
+                f"'{path}' was left by another trainer than {type(self.trainer).__name__}; go "
                 "on with the one that the run had."
             ) from None
-        if state.iteration > self.optimiser.limit:
+        if state.iteration > self.trainer.limit:
             raise ValueError(
                 f"the fit that is to go on has had {state.iteration} iterations, more than the "
-                f"{self.optimiser.limit} asked for; ask for more."
+                f"{self.trainer.limit} asked for; ask for more."
             )
         if self.ranks.world > 1:  # what was kept is the first one's part
             self.problem.guesses = [None] * len(self.problem.batches)
             state = replace(state, residual=self.problem.residual(state.theta))
-        self.state = self.optimiser.prolonged(state)
+        self.state = self.trainer.prolonged(state)
         self.reason = self.state.reason
         self.history = [Progress(**entry) for entry in numbers["history"]]
         self._theta_best = tensors["best"].to(device)
@@ -324,14 +324,14 @@ class Fit:
     def begin(self, monitors: Sequence[Monitor] = ()) -> None:
         """Judge the start."""
         clock = time.perf_counter()
-        start = self.optimiser.init(self.problem, self.problem.theta)
+        start = self.trainer.init(self.problem, self.problem.theta)
         progress = self._judged(start, time.perf_counter() - clock)
         self._first = progress.score
         self._enter(start, progress)
         self._show(progress, monitors)
 
     def take(self, after: Any, seconds: float, monitors: Sequence[Monitor] = ()) -> None:
-        """Go on from the optimiser's next state, which took so many seconds to find.
+        """Go on from the trainer's next state, which took so many seconds to find.
 
         Not where the model there explodes on validation: the search goes back, and treads softly.
         """
@@ -342,7 +342,7 @@ class Fit:
         self._enter(after, progress)
         self.reason = after.reason
         if math.isfinite(last) and not progress.score <= max(EXPLOSION * last, self._first):
-            self.state, self._score = self.optimiser.refused(before, after), last
+            self.state, self._score = self.trainer.refused(before, after), last
         self._show(progress, monitors)
         self.keep(self, False)
 
@@ -358,7 +358,7 @@ class Fit:
             reason=self.reason,
         )
 
-    def _judged(self, state: OptimiserState, seconds: float) -> Progress:
+    def _judged(self, state: TrainerState, seconds: float) -> Progress:
         """The progress that an iterate is, which took so many seconds to find."""
         clock, problem = time.perf_counter(), self.problem
         train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")
@@ -374,11 +374,11 @@ class Fit:
         seconds += self._seconds + time.perf_counter() - clock
         problem.write(state.theta)
         return Progress(
-            state.iteration, self.optimiser.limit, train_rmse, validation_rmse, seconds, better,
+            state.iteration, self.trainer.limit, train_rmse, validation_rmse, seconds, better,
             state.report, score,
         )  # fmt: skip
 
-    def _enter(self, state: OptimiserState, progress: Progress) -> None:
+    def _enter(self, state: TrainerState, progress: Progress) -> None:
         """Note an iterate, and keep it where it is the best."""
         if progress.best:
             self._theta_best, self.best, self._chosen = (
@@ -393,41 +393,3 @@ class Fit:
         """Call the monitors, with the latest iterate in the model."""
         for monitor in monitors:
             monitor(self.model, progress)
-
-
-@spread_by_hand()
-def fit(
-    model: Model,
-    train: Record | Sequence[Record],
-    validation: Record | Sequence[Record] = (),
-    *,
-    optimiser: Optimiser | None = None,
-    ridge: Ridge = 0.0,
-    monitors: Sequence[Monitor] = (),
-    ranks: Ranks | None = None,
-) -> FitResult:
-    """Minimise the simulation error of a model over records.
-
-    The iterate with the smallest error on the validation records (without them: on the training
-    records) is kept, also when the search is interrupted by Ctrl-C, or one of the processes that
-    share the records is lost: ``reason`` then begins with "a process was lost".
-
-    Args:
-        model: where to start; its weights are changed in place.
-        train: records that are fitted.
-        validation: records that choose among the iterates.
-        optimiser: Levenberg-Marquardt with its defaults where left out.
-        ridge: weight of |θ - θ_start|², see ``SimulationError``.
-        monitors: called with the model and its progress after every iteration. Each process calls
-            its own: give those that print or write files to the first alone.
-        ranks: the processes that share the training records, ``distributed.connect()``; each calls
-            this function with the same arguments, starts from the first one's weights and returns
-            the same fit.
-
-    Raises:
-        ValueError: the model diverges on the training records at the start, or there are fewer
-            records than processes.
-        ProcessLost: before there was an iterate to keep.
-    """
-    begun = Fit(model, train, validation, optimiser=optimiser, ridge=ridge, ranks=ranks)
-    return begun.advance(monitors=monitors).result()

@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from lfrtorch._checks import integer, number
+from lfrtorch._checks import integer, number, renamed
 
 SPENT = "maximum number of epochs"
 
@@ -38,26 +38,27 @@ class AdamState:
         return {"gradient_norm": float(self.gradient.norm())}
 
 
+@renamed(epochs="max_iter")
 @dataclass(frozen=True)
 class Adam:
     """Options of ``torch.optim.Adam``; ``init`` and ``step`` run it.
 
     Args:
-        epochs: steps; each sees all the data.
+        max_iter: most steps; each sees all the data.
         learning_rate: step size, in normalised units.
     """
 
-    epochs: int = 2000
+    max_iter: int = 2000
     learning_rate: float = 1e-3
 
     def __post_init__(self) -> None:
         number("learning_rate", self.learning_rate, positive=True)
-        integer("epochs", self.epochs, 0)
+        integer("max_iter", self.max_iter, 0)
 
     @property
     def limit(self) -> int:
         """Most iterations."""
-        return self.epochs
+        return self.max_iter
 
     def init(self, problem: Differentiable, theta: Tensor) -> AdamState:
         """State at the start θ."""
@@ -74,7 +75,7 @@ class Adam:
         theta = parameter.detach()
         residual, gradient = problem.gradient(theta)
         iteration = state.iteration + 1
-        reason = SPENT if iteration >= self.epochs else ""
+        reason = SPENT if iteration >= self.max_iter else ""
         if not torch.isfinite(gradient).all():
             reason = "diverged: lower the learning rate"
         moments = dict(optimiser.state[parameter])
@@ -82,7 +83,7 @@ class Adam:
 
     def prolonged(self, state: AdamState) -> AdamState:
         """State to go on from where all epochs were spent and there are more now."""
-        spent = state.reason == SPENT and state.iteration < self.epochs
+        spent = state.reason == SPENT and state.iteration < self.max_iter
         return replace(state, reason="") if spent else state
 
     def refused(self, before: AdamState, after: AdamState) -> AdamState:

@@ -71,7 +71,6 @@ class Evidence:
         falling: part by which the error fell over the last tenth of the iterations, 0 where the
             search ended for another reason than its limit.
         iterations: of the fit.
-        limit: setting of the most iterations, ``"trainer.max_iter"``.
         starts: errors of all starts that went to the end, the best first.
         started: number of starts.
         continued: whether the fit went on from a model, so that there are no other starts.
@@ -93,7 +92,6 @@ class Evidence:
     transient: float | None = None
     falling: float = 0.0
     iterations: int = 0
-    limit: str = "trainer.max_iter"
     starts: Sequence[float] = ()
     started: int = 1
     continued: bool = False
@@ -176,7 +174,8 @@ def still_falling(e: Evidence) -> Advice | None:
     if e.falling <= FALLING:
         return None
     return Advice(
-        f"Still falling: {e.limit}={4 * max(e.iterations, 1)}; init_from=RUN goes on from here.",
+        f"Still falling: trainer.max_iter={4 * max(e.iterations, 1)}; "
+        "init_from=RUN goes on from here.",
         f"the error fell by {_percent(e.falling)} over the last tenth of the {e.iterations} "
         "iterations",
     )

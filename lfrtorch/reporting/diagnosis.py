@@ -33,7 +33,6 @@ def evidence(
     responses: Sequence[Response],
     *,
     noise_rms: float | None = None,
-    limit: str = "trainer.max_iter",
     continued: bool = False,
     ridge: bool = False,
     searched: bool = False,
@@ -44,7 +43,6 @@ def evidence(
         result: the fit.
         responses: of the training records and, where there are some, of validation and tests.
         noise_rms: of the training outputs in their unit, where it is known.
-        limit: setting of the most iterations.
         continued: whether the fit went on from a model.
         ridge: whether it had one.
         searched: whether validation chose the sizes.
@@ -73,7 +71,6 @@ def evidence(
         transient=_transient(train, scale),
         falling=falling(result),
         iterations=result.iterations,
-        limit=limit,
         starts=_finished(result),
         started=max(1, len(result.starts)),
         continued=continued,

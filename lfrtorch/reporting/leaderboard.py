@@ -61,7 +61,7 @@ def entry(
         "; ".join(record.name for record in records),
         "; ".join(str(record.skip) for record in records),
         f"NL-LFR state space ({sizes}), from the best linear approximation",
-        model.parameters,
+        model.parameter_count,
         f"{seconds:.0f}",
         command,
     )

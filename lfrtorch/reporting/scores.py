@@ -130,8 +130,8 @@ def evaluation(
     entries = {
         "bench": dataset.name,
         "sizes": model.sizes,
-        "parameters": model.parameters,
-        "parameters_net": model.parameters_net,
+        "parameters": model.parameter_count,
+        "parameters_net": model.net_parameter_count,
         "data": {"noise_rms": dataset.noise_rms, "notes": list(dataset.notes)},
         "validation": {
             "rmse": _pooled([s.rmse for s in validation], validation),

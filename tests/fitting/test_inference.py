@@ -13,7 +13,7 @@ from torch import nn
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.fitting.inference import InferenceError, inference, residual_of
+from lfrtorch.fitting.inference import InferenceError, infer, residual_of
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
@@ -114,7 +114,7 @@ def error(model: Model | LinearModel, data: list[Record]) -> float:
 @pytest.mark.parametrize("seed", range(2))
 def test_start_is_better_than_the_linear_model(planted, seed: int):
     data, bla = planted
-    model = inference(bla, data, **ONE, seed=seed)
+    model = infer(bla, data, **ONE, seed=seed)
     assert error(model, data) < 0.7 * error(bla, data)
     cell, plain = model.lfr.cell, initialise(bla, data, **ONE, seed=seed).lfr.cell
     for name in ("A", "Bu", "Cy", "Dyu"):
@@ -124,7 +124,7 @@ def test_start_is_better_than_the_linear_model(planted, seed: int):
 @pytest.mark.parametrize(("nz", "nw"), [(2, 1), (1, 2)])
 def test_start_of_other_sizes_is_never_worse(planted, nz: int, nw: int):
     data, bla = planted
-    model = inference(bla, data, nz=nz, nw=nw, nn=6)
+    model = infer(bla, data, nz=nz, nw=nw, nn=6)
     assert (model.sizes["nz"], model.sizes["nw"]) == (nz, nw)
     assert error(model, data) < 0.8 * error(bla, data)
 
@@ -135,7 +135,7 @@ def test_start_from_linear_data_is_the_linear_model():
     y = dlsim(system, np.tile(u, (20, 1)))[-400:]
     data = [Record(np.tile(u, (2, 1)), y, 1.0, "periodic", period=200)]
     bla = estimate_bla(data, 2)
-    model = inference(bla, data, nz=2, nw=2, nn=4)
+    model = infer(bla, data, nz=2, nw=2, nn=4)
     # Rounding errors, of 1e-9 or less, are all there is to explain.
     np.testing.assert_allclose(model.simulate(data[0]), bla.simulate(data[0]), atol=1e-7)
 
@@ -143,10 +143,10 @@ def test_start_from_linear_data_is_the_linear_model():
 def test_same_seed_same_bits(spring):
     data, bla = spring
     torch.manual_seed(0)
-    first = inference(bla, data, **ONE, seed=1)
+    first = infer(bla, data, **ONE, seed=1)
     torch.manual_seed(1)  # the global generator has no part in it
-    again = inference(bla, data, **ONE, seed=1)
-    other = inference(bla, data, **ONE, seed=2)
+    again = infer(bla, data, **ONE, seed=1)
+    other = infer(bla, data, **ONE, seed=2)
     for name, weight in first.lfr.state_dict().items():
         assert torch.equal(weight, again.lfr.state_dict()[name])
     assert not torch.equal(first.lfr.cell.Cz, other.lfr.cell.Cz)
@@ -156,7 +156,7 @@ def test_same_seed_same_bits(spring):
 def test_given_map_is_fitted(spring, static: nn.Module):
     data, bla = spring
     given = {name: weight.clone() for name, weight in static.state_dict().items()}
-    model = inference(bla, data, nz=1, nw=1, static=static)
+    model = infer(bla, data, nz=1, nw=1, static=static)
     assert type(model.lfr.cell.static) is type(static)
     assert error(model, data) < 0.4 * error(bla, data)
     for name, weight in static.state_dict().items():  # the caller's module is left alone
@@ -165,7 +165,7 @@ def test_given_map_is_fitted(spring, static: nn.Module):
 
 def test_options_reach_the_model(spring):
     data, bla = spring
-    model = inference(bla, data, **ONE, activation="sigmoid", degree=3, dtype=torch.float32)
+    model = infer(bla, data, **ONE, activation="sigmoid", degree=3, dtype=torch.float32)
     assert isinstance(model.lfr.cell.static, Network)
     assert model.lfr.cell.static.activation == "sigmoid"
     assert {p.dtype for p in model.lfr.parameters()} == {torch.float32}
@@ -211,16 +211,16 @@ def test_gradient(nz: int, nw: int, ny: int, monkeypatch: pytest.MonkeyPatch):
 def test_records_that_are_not_periodic(spring):
     data, bla = spring
     with pytest.raises(ValueError, match=r"start='zero'; inference works .*init=zero_output"):
-        inference(bla, [data[0], data[1][:]], **ONE)
+        infer(bla, [data[0], data[1][:]], **ONE)
 
 
 def test_degree_below_one(spring):
     data, bla = spring
     with pytest.raises(ValueError, match="degree is 0; give a whole number of at least 1"):
-        inference(bla, data, **ONE, degree=0)
+        infer(bla, data, **ONE, degree=0)
 
 
 def test_map_without_weights(spring):
     data, bla = spring
     with pytest.raises(ValueError, match="static has no weights that could be fitted"):
-        inference(bla, data, nz=1, nw=1, static=nn.Tanh())
+        infer(bla, data, nz=1, nw=1, static=nn.Tanh())

@@ -10,7 +10,7 @@ from reference import random_cell, random_model
 
 import lfrtorch
 from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.fitting.means import average
+from lfrtorch.fitting.means import mean_model
 from lfrtorch.model import Model
 from lfrtorch.records import Start
 
@@ -28,7 +28,7 @@ def models() -> list[Model]:
 def test_mean_of_models_simulates_the_mean(start: Start):
     several = models()
     u = np.random.default_rng(0).normal(size=(200, 2))
-    mean = average(several)
+    mean = mean_model(several)
     expected = np.mean([model.simulate(u, start=start) for model in several], axis=0)
     np.testing.assert_allclose(mean.simulate(u, start=start), expected, rtol=0, atol=1e-9)
     assert mean.sizes == {"nx": 9, "nz": 6, "nw": 3, "nn": 12}
@@ -37,12 +37,12 @@ def test_mean_of_models_simulates_the_mean(start: Start):
 def test_mean_of_one_is_itself():
     (model,) = models()[:1]
     u = np.random.default_rng(0).normal(size=(50, 2))
-    np.testing.assert_array_equal(average([model]).simulate(u), model.simulate(u))
+    np.testing.assert_array_equal(mean_model([model]).simulate(u), model.simulate(u))
 
 
 def test_mean_is_a_copy(tmp_path: Path):
     several = models()
-    mean = average(several)
+    mean = mean_model(several)
     u = np.random.default_rng(0).normal(size=(50, 2))
     before = mean.simulate(u)
     with torch.no_grad():
@@ -73,21 +73,21 @@ def test_start_of_a_mean_is_most_probable():
             u, clean + noise * rng.normal(size=clean.shape), fs=several[0].fs,
             inputs=several[0].inputs, outputs=several[0].outputs, start="estimated", skip=20,
         )  # fmt: skip
-        error = (average(several).simulate(record) - clean)[20:60]
+        error = (mean_model(several).simulate(record) - clean)[20:60]
         worst.append(np.sqrt(np.mean(error**2)) / noise)
     assert max(worst) < 1.0  # of least squares: 87 to 13000
 
 
 def test_mean_refuses_models_that_are_not_alike():
     with pytest.raises(ValueError, match="no model to average"):
-        average([])
+        mean_model([])
     several = models()
     with pytest.raises(ValueError, match="other channels, scales or rates"):
-        average([several[0], replace(several[1], fs=7.0)])
+        mean_model([several[0], replace(several[1], fs=7.0)])
     other = models()[1]
     other.lfr.cell.static = Network(2, 1, 4, "relu", dtype=torch.float64)
     with pytest.raises(ValueError, match="different activations"):
-        average([several[0], other])
+        mean_model([several[0], other])
     other.lfr.cell.static = Polynomial(2, 1, 3)
     with pytest.raises(ValueError, match="average the simulated outputs"):
-        average([several[0], other])
+        mean_model([several[0], other])

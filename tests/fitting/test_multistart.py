@@ -13,9 +13,9 @@ from torch.nn.utils import vector_to_parameters
 
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import Polynomial
-from lfrtorch.fitting.means import average
-from lfrtorch.fitting.multistart import LEFT, Round, advance_in_step, fit_starts
-from lfrtorch.fitting.trainer import INTERRUPTED, Fit, Progress, fit
+from lfrtorch.fitting.means import mean_model
+from lfrtorch.fitting.multistart import LEFT, Round, advance_in_step, fit
+from lfrtorch.fitting.trainer import INTERRUPTED, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.metrics import rmse
@@ -40,7 +40,7 @@ def test_the_better_half_goes_on_round_by_round():
     models, train, validation = several()
     rounds: list[Round] = []
     optimiser = LevenbergMarquardt(max_iter=32, tolerance=0)
-    result = fit_starts(models, train, validation, optimiser=optimiser, watch=rounds.append)
+    result = fit(models, train, validation, trainer=optimiser, watch=rounds.append)
     assert [(r.number, r.count) for r in rounds] == [(1, 3), (2, 3), (3, 3)]
     assert [len(r.starts) for r in rounds] == [5, 3, 2]
     for one, following in pairwise(rounds):
@@ -59,11 +59,11 @@ def test_the_better_half_goes_on_round_by_round():
 def test_the_best_start_is_what_it_is_alone():
     models, train, validation = several()
     optimiser = LevenbergMarquardt(max_iter=8)
-    result = fit_starts(models, train, validation, optimiser=optimiser)
+    result = fit(models, train, validation, trainer=optimiser)
     number = result.starts[0].number
     assert result.model is models[number]
     (alone,) = several()[0][number : number + 1]
-    expected = fit(alone, train, validation, optimiser=optimiser)
+    expected = fit(alone, train, validation, trainer=optimiser)
     assert torch.equal(theta(result.model), theta(alone))
     assert [p.train for p in result.history] == [p.train for p in expected.history]
     assert result.chosen_iteration == expected.chosen_iteration
@@ -75,7 +75,7 @@ def test_results_do_not_depend_on_threads():
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
         models, train, validation = several()
-        found.append(fit_starts(models, train, validation, optimiser=LevenbergMarquardt(8)))
+        found.append(fit(models, train, validation, trainer=LevenbergMarquardt(8)))
     expected, *others = (result.starts for result in found)
     for other in others:
         # The last start alone has its work spread over all threads, which sum in another order.
@@ -86,9 +86,9 @@ def test_results_do_not_depend_on_threads():
 
 def test_one_start_is_a_fit():
     models, train, validation = several(1)
-    result = fit_starts(models, train, validation, optimiser=LevenbergMarquardt(max_iter=6))
+    result = fit(models, train, validation, trainer=LevenbergMarquardt(max_iter=6))
     (alone,) = several(1)[0]
-    expected = fit(alone, train, validation, optimiser=LevenbergMarquardt(max_iter=6))
+    expected = fit(alone, train, validation, trainer=LevenbergMarquardt(max_iter=6))
     assert torch.equal(theta(result.model), theta(alone))
     assert result.reason == expected.reason
     assert len(result.starts) == 1
@@ -98,14 +98,14 @@ def test_starts_in_step_are_what_they_are_alone():
     models, train, validation = several(3)
     alone = several(3)[0]
     optimiser = LevenbergMarquardt(max_iter=6)
-    fits = [Fit(m, train, validation, optimiser=optimiser) for m in models]
+    fits = [Fit(m, train, validation, trainer=optimiser) for m in models]
     seen: list[int] = []
     watching: Any = [[lambda _, p, i=i: seen.append(i)] for i in range(3)]
     advance_in_step(fits, 4, watching)
     assert [fit.history[-1].iteration for fit in fits] == [4, 4, 4]
     advance_in_step(fits, 6)
     for stepped, model in zip(fits, alone, strict=True):
-        expected = fit(model, train, validation, optimiser=optimiser)
+        expected = fit(model, train, validation, trainer=optimiser)
         # Sums in another order, and no gauge columns left out.
         assert stepped.result().history[-1].train == pytest.approx(
             expected.history[-1].train, rel=1e-5
@@ -115,7 +115,7 @@ def test_starts_in_step_are_what_they_are_alone():
 
 def test_starts_without_validation_are_judged_on_training():
     models, train, _ = several(3)
-    result = fit_starts(models, train, optimiser=LevenbergMarquardt(max_iter=1))
+    result = fit(models, train, trainer=LevenbergMarquardt(max_iter=1))
     assert all(math.isnan(start.validation) for start in result.starts)
     errors = [start.train for start in result.starts]
     assert errors == sorted(errors)
@@ -127,12 +127,12 @@ def test_selection_chooses_among_starts_and_not_among_iterates():
     vector_to_parameters(theta(models[2]), odd.lfr.parameters())
     # A record of the third start as it is: at the start it is the best there.
     selection = measure(odd, 60, seed=9)
-    options: Any = {"optimiser": LevenbergMarquardt(max_iter=3, tolerance=0)}
-    result = fit_starts(models, train, validation, selection, **options)
+    options: Any = {"trainer": LevenbergMarquardt(max_iter=3, tolerance=0)}
+    result = fit(models, train, validation, selection, **options)
     for start in result.starts:
         (alone,) = several(4)[0][start.number : start.number + 1]
         until = LevenbergMarquardt(max_iter=start.iterations, tolerance=0)
-        expected = fit(alone, train, validation, optimiser=until)
+        expected = fit(alone, train, validation, trainer=until)
         kept = expected.history[expected.chosen_iteration]
         assert start.validation == pytest.approx(kept.validation, rel=1e-9)
         errors = [rmse(record, alone.simulate(record)) for record in (validation, selection)]
@@ -140,11 +140,11 @@ def test_selection_chooses_among_starts_and_not_among_iterates():
         assert start.selection == pytest.approx(pooled, rel=1e-6)
     errors = [start.selection for start in result.starts]
     assert errors == sorted(errors)
-    alone = fit_starts(several(4)[0], train, selection=selection, **options)
+    alone = fit(several(4)[0], train, selection=selection, **options)
     assert alone.starts[0].selection == pytest.approx(
         rmse(selection, alone.model.simulate(selection)), rel=1e-6
     )
-    by_validation = fit_starts(several(4)[0], train, validation, **options)
+    by_validation = fit(several(4)[0], train, validation, **options)
     assert all(math.isnan(start.selection) for start in by_validation.starts)
 
 
@@ -161,8 +161,8 @@ def test_processes_fit_one_start_after_another():
     models, train, validation = several(2)
     threads = set()
     monitors: Any = [[lambda *_: threads.add(threading.get_ident())]] * 2
-    options: Any = {"optimiser": LevenbergMarquardt(max_iter=2), "monitors": monitors}
-    fit_starts(models, train, validation, ranks=Sharing(), **options)
+    options: Any = {"trainer": LevenbergMarquardt(max_iter=2), "monitors": monitors}
+    fit(models, train, validation, ranks=Sharing(), **options)
     assert threads == {threading.get_ident()}
 
 
@@ -179,7 +179,7 @@ def test_monitors_are_called_one_at_a_time():
         assert own.isfinite().all()
 
     optimiser = LevenbergMarquardt(max_iter=4)
-    fit_starts(models, train, validation, optimiser=optimiser, monitors=[[watch, weights]] * 4)
+    fit(models, train, validation, trainer=optimiser, monitors=[[watch, weights]] * 4)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -196,7 +196,7 @@ def test_ctrl_c_keeps_the_best_of_all(threads: int):
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(threads)
-        result = fit_starts(models, train, validation, monitors=[[watch]] * 3)
+        result = fit(models, train, validation, monitors=[[watch]] * 3)
     finally:
         torch.set_num_threads(before)
     assert result.reason == INTERRUPTED
@@ -212,7 +212,7 @@ def test_a_stop_after_some_have_come_to_the_end_of_their_round():
         if model is models[2]:
             raise KeyboardInterrupt
 
-    result = fit_starts(models, train, validation, monitors=[[stop]] * 3)
+    result = fit(models, train, validation, monitors=[[stop]] * 3)
     assert result.reason == INTERRUPTED
     assert {start.reason for start in result.starts} == {INTERRUPTED}
 
@@ -224,15 +224,15 @@ def test_a_failure_ends_all():
         raise RuntimeError("no room on the disk")
 
     with pytest.raises(RuntimeError, match="no room"):
-        fit_starts(models, train, validation, monitors=[[fail]] * 3)
+        fit(models, train, validation, monitors=[[fail]] * 3)
 
 
 def test_bad_calls_are_refused():
     models, train, _ = several(2)
     with pytest.raises(ValueError, match="no model to start from"):
-        fit_starts([], train)
+        fit([], train)
     with pytest.raises(ValueError, match=r"2 models and 1 lists"):
-        fit_starts(models, train, monitors=[[]])
+        fit(models, train, monitors=[[]])
 
 
 @pytest.mark.parametrize("judged_on", ["validation", "selection"])
@@ -242,11 +242,11 @@ def test_mean_of_as_many_starts_as_are_best_is_taken(judged_on: str):
     for model, step in zip(models, (-0.03, -0.12, 0.0), strict=True):
         move(model, step)  # to 0.02, -0.02 and 0.15
     stay = LevenbergMarquardt(max_iter=0)
-    options: Any = {judged_on: validation, "optimiser": stay, "average": 3}
-    result = fit_starts(models, train, **options)
+    options: Any = {judged_on: validation, "trainer": stay, "average": 3}
+    result = fit(models, train, **options)
     assert all(start.reason != LEFT for start in result.starts)
     best = [models[start.number] for start in result.starts]
-    means = [average(best[:count]) for count in (1, 2, 3)]
+    means = [mean_model(best[:count]) for count in (1, 2, 3)]
     errors = [rmse(validation, mean.simulate(validation)) for mean in means]
     assert errors.index(min(errors)) == 1
     assert result.averaged == 2
@@ -259,7 +259,7 @@ def test_mean_of_more_starts_is_taken_where_it_is_as_good():
     for i, model in enumerate(models):
         move(model, 0.1 + 3e-4 * i - 0.05 * (i + 1))  # to 0.1, 0.1003 and 0.1006
     stay = LevenbergMarquardt(max_iter=0)
-    result = fit_starts(models, train, validation, optimiser=stay, average=3)
+    result = fit(models, train, validation, trainer=stay, average=3)
     assert result.averaged == 3
     assert rmse(validation, result.model.simulate(validation)) > min(
         start.validation for start in result.starts
@@ -270,7 +270,7 @@ def test_mean_of_starts_is_not_taken_where_one_is_better():
     models, train, validation = several(2)
     move(models[0], -0.05)  # the one that made the data
     optimiser = LevenbergMarquardt(max_iter=1)
-    result = fit_starts(models, train, validation, optimiser=optimiser, average=2)
+    result = fit(models, train, validation, trainer=optimiser, average=2)
     assert result.averaged == 1
     assert result.model is models[0]
 
@@ -278,7 +278,7 @@ def test_mean_of_starts_is_not_taken_where_one_is_better():
 def test_mean_of_starts_is_taken_where_nothing_tells():
     models, train, _ = several(3)
     optimiser = LevenbergMarquardt(max_iter=2)
-    result = fit_starts(models, train, optimiser=optimiser, average=3)
+    result = fit(models, train, trainer=optimiser, average=3)
     assert result.averaged == 3
     assert result.model.lfr.cell.nx == 3 * models[0].lfr.cell.nx
 
@@ -286,14 +286,14 @@ def test_mean_of_starts_is_taken_where_nothing_tells():
 def test_mean_is_of_the_starts_that_there_are():
     models, train, _ = several(2)
     optimiser = LevenbergMarquardt(max_iter=1)
-    assert fit_starts(models, train, average=8, optimiser=optimiser).averaged == 2
-    assert fit_starts(models[:1], train, average=8, optimiser=optimiser).model is models[0]
+    assert fit(models, train, average=8, trainer=optimiser).averaged == 2
+    assert fit(models[:1], train, average=8, trainer=optimiser).model is models[0]
     with pytest.raises(ValueError, match="average is 0"):
-        fit_starts(models, train, average=0)
+        fit(models, train, average=0)
 
 
 def test_mean_of_other_maps_is_refused_before_the_fit():
     models, train, _ = several(2)
     models[1].lfr.cell.static = Polynomial(1, 1, 3, dtype=torch.float64)
     with pytest.raises(ValueError, match="average is 2, and the mean is of models with a network"):
-        fit_starts(models, train, average=2, optimiser=Adam(epochs=10**9))
+        fit(models, train, average=2, trainer=Adam(max_iter=10**9))

@@ -64,7 +64,7 @@ def search(planted: Planted, **options: Any) -> SizeSearch:
         return initialise(bla, train, **sizes, seed=seed)
 
     given: dict[str, Any] = {"start": start, "train": train, "validation": validation}
-    given |= {"nn": (1, 3, 6), "seeds": (0, 1000), "linear": bla, "optimiser": OPTIMISER}
+    given |= {"nn": (1, 3, 6), "seeds": (0, 1000), "linear": bla, "trainer": OPTIMISER}
     return search_sizes(**given | options)
 
 
@@ -104,8 +104,8 @@ def test_numbers_are_those_of_the_models(single: SizeSearch):
     assert found.counts.sum() == record.samples - record.skip
     for candidate in found.candidates:
         model = initialise(bla, train, **candidate.sizes)
-        assert candidate.parameters == model.parameters
-        assert candidate.parameters_net == model.parameters_net
+        assert candidate.parameters == model.parameter_count
+        assert candidate.parameters_net == model.net_parameter_count
         mean = candidate.squares.sum() / found.counts.sum()
         assert candidate.error == pytest.approx(math.sqrt(mean), rel=1e-12)
         assert candidate.ratio == pytest.approx(
@@ -265,7 +265,7 @@ def test_a_model_that_explodes_on_validation_diverges():
 
     louder = Record(1e3 * record.u, 1e3 * record.y, skip=20)
     options: Any = {"nz": 1, "nw": 1, "degree": (2, 3), "seeds": (0,)}
-    options |= {"start": start, "optimiser": LevenbergMarquardt(max_iter=0)}
+    options |= {"start": start, "trainer": LevenbergMarquardt(max_iter=0)}
     found = search((train, [louder], bla), **options)
     tried = [(c.sizes["degree"], math.isinf(c.error)) for c in found.candidates]
     assert tried == [(3, True), (2, False)]

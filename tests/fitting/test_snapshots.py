@@ -15,7 +15,7 @@ from torch.nn.utils import parameters_to_vector
 
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting import state_file, trainer
-from lfrtorch.fitting.multistart import fit_starts
+from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import INTERRUPTED, Fit, FitResult, Progress
 from lfrtorch.least_squares.adam import Adam
@@ -86,7 +86,7 @@ def run(
     **options: Any,
 ) -> FitResult:
     monitors = [[Stop(stop)] if stop else [] for _ in models]
-    return fit_starts(models, *data, monitors=monitors, snapshots=Snapshots(folder, 0.0), **options)
+    return fit(models, *data, monitors=monitors, snapshots=Snapshots(folder, 0.0), **options)
 
 
 # --- one start ------------------------------------------------------------------------------
@@ -118,7 +118,7 @@ KINDS = {kind: (kind,) for kind in STARTS} | {"mixed": STARTS}
 
 @pytest.mark.parametrize(
     "optimiser",
-    [LevenbergMarquardt(max_iter=5), Adam(epochs=5, learning_rate=1e-2)],
+    [LevenbergMarquardt(max_iter=5), Adam(max_iter=5, learning_rate=1e-2)],
     ids=["levenberg_marquardt", "adam"],
 )
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_all_of_a_fit_comes_back_from_its_file(
 
     def begun(**options: Any) -> Fit:
         model, options = starts(1, **sizes())[0], options | {"ridge": 1e-3}
-        return Fit(model, train, validation, optimiser=optimiser, **options)
+        return Fit(model, train, validation, trainer=optimiser, **options)
 
     whole = begun(keep=keep).advance(until=3).advance()
     assert len(wanted) == 2
@@ -158,24 +158,24 @@ def test_all_of_a_fit_comes_back_from_its_file(
 
 def test_ends_as_without_interruption(tmp_path: Path):
     data, optimiser = records(), LevenbergMarquardt(max_iter=6)
-    whole = run(starts(1), data, optimiser=optimiser, ridge=1e-3)
+    whole = run(starts(1), data, trainer=optimiser, ridge=1e-3)
     for iterations in (2, 5):  # interrupted twice
-        cut = run(starts(1), data, tmp_path, 3, optimiser=optimiser, ridge=1e-3)
+        cut = run(starts(1), data, tmp_path, 3, trainer=optimiser, ridge=1e-3)
         assert (cut.reason, cut.iterations) == (INTERRUPTED, iterations)
-    resumed = run(starts(1), data, tmp_path, optimiser=optimiser, ridge=1e-3)
+    resumed = run(starts(1), data, tmp_path, trainer=optimiser, ridge=1e-3)
     assert outcome(resumed) == outcome(whole)
 
 
 def test_several_starts_end_as_without_interruption(tmp_path: Path):
     data, optimiser = records(["zero", "periodic"]), LevenbergMarquardt(max_iter=8)
-    whole = run(starts(3), data, optimiser=optimiser)
+    whole = run(starts(3), data, trainer=optimiser)
     for stop in (2, 5):  # in the first round, and in the last
         folder = tmp_path / str(stop)
         folder.mkdir()
-        cut = run(starts(3), data, folder, stop, optimiser=optimiser)
+        cut = run(starts(3), data, folder, stop, trainer=optimiser)
         assert cut.reason == INTERRUPTED
         assert len(Snapshots(folder).rounds) == (stop == 5)
-        resumed = run(starts(3), data, folder, optimiser=optimiser)
+        resumed = run(starts(3), data, folder, trainer=optimiser)
         assert outcome(resumed) == outcome(whole)
 
 
@@ -183,9 +183,9 @@ def test_more_iterations_than_were_asked_for(tmp_path: Path):
     data = records()
     for limit in (3, 9):
         optimiser = LevenbergMarquardt(max_iter=limit)
-        assert run(starts(1), data, tmp_path, optimiser=optimiser).iterations == limit
-    whole = run(starts(1), data, optimiser=LevenbergMarquardt(max_iter=9))
-    resumed = run(starts(1), data, tmp_path, optimiser=LevenbergMarquardt(max_iter=9))
+        assert run(starts(1), data, tmp_path, trainer=optimiser).iterations == limit
+    whole = run(starts(1), data, trainer=LevenbergMarquardt(max_iter=9))
+    resumed = run(starts(1), data, tmp_path, trainer=LevenbergMarquardt(max_iter=9))
     assert outcome(resumed)[0] == outcome(whole)[0]
 
 
@@ -203,10 +203,10 @@ def test_a_step_that_was_taken_back_is_taken_back_again(
             refusals.append(tmp_path / str(fit.state.iteration))
             fit.save(refusals[-1])
 
-    whole = Fit(starts(1)[0], train, far, optimiser=optimiser, keep=keep).advance().result()
+    whole = Fit(starts(1)[0], train, far, trainer=optimiser, keep=keep).advance().result()
     assert refusals
     for file in refusals[:2]:
-        again = Fit(starts(1)[0], train, far, optimiser=optimiser)
+        again = Fit(starts(1)[0], train, far, trainer=optimiser)
         again.restore(file)
         assert outcome(again.advance().result()) == outcome(whole)
 
@@ -217,14 +217,14 @@ def test_files_are_written_when_it_is_time_and_at_the_end(
 ):
     written, save = [], Fit.save
     monkeypatch.setattr(Fit, "save", lambda fit, path: (written.append(path), save(fit, path)))
-    options: Any = {"optimiser": LevenbergMarquardt(max_iter=3)}
-    fit_starts(starts(1), *records(["zero"]), snapshots=Snapshots(tmp_path, every), **options)
+    options: Any = {"trainer": LevenbergMarquardt(max_iter=3)}
+    fit(starts(1), *records(["zero"]), snapshots=Snapshots(tmp_path, every), **options)
     assert written == files * [tmp_path / "0.safetensors"]
 
 
 def test_the_best_score_of_all(tmp_path: Path):
     assert Snapshots(tmp_path).least == Snapshots().least == float("inf")
-    result = run(starts(3), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=2))
+    result = run(starts(3), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=2))
     assert Snapshots(tmp_path).least == min(p.score for p in result.history)
 
 
@@ -236,9 +236,9 @@ def test_processes_take_their_own_residuals(tmp_path: Path):
 
     data, optimiser = records()[0], LevenbergMarquardt(max_iter=3)
     ranks = Ranks()
-    fit = Fit(starts(1)[0], data, optimiser=optimiser, ranks=ranks).advance(until=2)
+    fit = Fit(starts(1)[0], data, trainer=optimiser, ranks=ranks).advance(until=2)
     fit.save(tmp_path / "fit")
-    again = Fit(starts(1)[0], data, optimiser=optimiser, ranks=ranks)
+    again = Fit(starts(1)[0], data, trainer=optimiser, ranks=ranks)
     again.ranks = Two()
     again.restore(tmp_path / "fit")
     assert torch.equal(again.state.residual, again.problem.residual(again.state.theta))
@@ -252,9 +252,9 @@ def test_processes_forget_the_periodic_orbits_of_the_first(tmp_path: Path):
 
     model = random_model(random_cell(radius=0.7))
     data = [measure(model, 50, seed=i, start="periodic") for i in range(3)]  # two are the first's
-    fit = Fit(starts(1)[0], data[::2], optimiser=LevenbergMarquardt(max_iter=3))
+    fit = Fit(starts(1)[0], data[::2], trainer=LevenbergMarquardt(max_iter=3))
     fit.advance(until=2).save(tmp_path / "fit")
-    again = Fit(starts(1)[0], data, optimiser=LevenbergMarquardt(max_iter=3), ranks=Second())
+    again = Fit(starts(1)[0], data, trainer=LevenbergMarquardt(max_iter=3), ranks=Second())
     again.restore(tmp_path / "fit")
     alone = Fit(again.model, data[1::2]).problem
     # Of one point to the tolerance of the steady state, 1e-10, times the gain.
@@ -264,10 +264,10 @@ def test_processes_forget_the_periodic_orbits_of_the_first(tmp_path: Path):
 
 
 def test_the_first_process_alone_writes_files(tmp_path: Path):
-    result = fit_starts(
+    result = fit(
         starts(3),
         *records(),
-        optimiser=LevenbergMarquardt(max_iter=2),
+        trainer=LevenbergMarquardt(max_iter=2),
         snapshots=Snapshots(tmp_path, 0.0, writes=False),
     )
     assert result.iterations == 2
@@ -278,32 +278,32 @@ def test_the_first_process_alone_writes_files(tmp_path: Path):
 
 
 def test_another_number_of_starts(tmp_path: Path):
-    run(starts(2), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
+    run(starts(2), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
     with pytest.raises(ValueError, match=r"has 2 start\(s\), and now there are 3"):
         run(starts(3), records(), tmp_path)
 
 
 def test_another_start(tmp_path: Path):
-    run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
+    run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
     with pytest.raises(ValueError, match="began elsewhere"):
         run(starts(2)[1:], records(), tmp_path)
 
 
 def test_fewer_iterations_than_it_has_had(tmp_path: Path):
-    run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=3))
+    run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=3))
     with pytest.raises(ValueError, match="has had 3 iterations, more than the 2 asked for"):
-        run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=2))
+        run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=2))
 
 
 def test_another_optimiser(tmp_path: Path):
-    run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
-    with pytest.raises(ValueError, match="another optimiser than Adam"):
-        run(starts(1), records(), tmp_path, optimiser=Adam(epochs=3))
+    run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
+    with pytest.raises(ValueError, match="another trainer than Adam"):
+        run(starts(1), records(), tmp_path, trainer=Adam(max_iter=3))
 
 
 @pytest.mark.parametrize("name", ["0.safetensors", "rounds.json"])
 def test_a_damaged_file(tmp_path: Path, name: str):
-    run(starts(2), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
+    run(starts(2), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
     path = tmp_path / name
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(ValueError, match=r"damaged .*init_from=DIR"):
@@ -313,6 +313,6 @@ def test_a_damaged_file(tmp_path: Path, name: str):
 def test_a_file_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with monkeypatch.context() as changed:
         changed.setattr(state_file, "FORMAT", "lfrtorch snapshot 2")
-        run(starts(1), records(), tmp_path, optimiser=LevenbergMarquardt(max_iter=1))
+        run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
     with pytest.raises(ValueError, match="another version"):
         run(starts(1), records(), tmp_path)

@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
 from lfrtorch.distributed import LOST, ProcessLost, Ranks
-from lfrtorch.fitting.trainer import EXPLOSION, INTERRUPTED, Fit, Progress, fit
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.trainer import EXPLOSION, INTERRUPTED, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import SimulationError
@@ -107,7 +108,7 @@ class Quadratic:
 def test_planted_model_is_found_again(sizes: dict[str, Any]):
     model, train, test = planted(**sizes)
     before = nrmse(test, model.simulate(test))
-    result = fit(model, train, optimiser=LevenbergMarquardt(max_iter=60))
+    result = fit(model, train, trainer=LevenbergMarquardt(max_iter=60))
     assert before > 1e-2
     # The Gauss-Newton steps converge quadratically; the periodic start is known to 1e-10.
     assert nrmse(test, model.simulate(test)) < 1e-8
@@ -118,7 +119,7 @@ def test_planted_model_is_found_again_with_a_frozen_matrix():
     model, train, test = planted()
     model.lfr.cell.Cz.requires_grad_(False)
     fixed = model.lfr.cell.Cz.clone()
-    fit(model, train, optimiser=LevenbergMarquardt(max_iter=60))
+    fit(model, train, trainer=LevenbergMarquardt(max_iter=60))
     assert torch.equal(model.lfr.cell.Cz, fixed)
     assert nrmse(test, model.simulate(test)) < 1e-8
 
@@ -127,7 +128,7 @@ def test_planted_model_is_found_again_with_an_own_module():
     truth, model = (random_model(random_cell(static=Sine(1, 1))) for _ in range(2))
     train, test = measure(truth, 100), measure(truth, 100, seed=2)
     move(model, 0.05)
-    fit(model, train, optimiser=LevenbergMarquardt(max_iter=60))
+    fit(model, train, trainer=LevenbergMarquardt(max_iter=60))
     assert nrmse(test, model.simulate(test)) < 1e-8
 
 
@@ -135,7 +136,7 @@ def test_single_precision_is_fitted_to_its_rounding():
     _, train, test = planted()
     model = random_model(random_cell(radius=0.7, dtype=torch.float32))
     move(model, 0.05)
-    result = fit(model, train, optimiser=LevenbergMarquardt(max_iter=60))
+    result = fit(model, train, trainer=LevenbergMarquardt(max_iter=60))
     assert model.lfr.cell.A.dtype == torch.float32
     assert result.reason.startswith("converged")
     assert nrmse(test, model.simulate(test)) < 1e-4  # some hundred eps of 1.2e-7
@@ -143,7 +144,7 @@ def test_single_precision_is_fitted_to_its_rounding():
 
 def test_adam_lowers_the_cost_in_the_same_loop():
     model, train, _ = planted(T=100)
-    result = fit(model, train, optimiser=Adam(epochs=150, learning_rate=3e-3))
+    result = fit(model, train, trainer=Adam(max_iter=150, learning_rate=3e-3))
     assert result.history[-1].train < 0.5 * result.history[0].train
     assert result.reason == "maximum number of epochs"
     assert result.iterations == 150
@@ -160,7 +161,7 @@ def test_iterate_that_is_best_on_validation_is_kept():
     vector_to_parameters(start, truth.lfr.parameters())
     truth.lfr.cell.A.data[0, 0] += 2 * STEP  # the validation record is that of the second iterate
     validation = measure(truth, 100, seed=5)
-    result = fit(model, train, validation, optimiser=Walk((STEP, STEP, STEP, STEP)))
+    result = fit(model, train, validation, trainer=Walk((STEP, STEP, STEP, STEP)))
     assert result.chosen_iteration == 2
     assert [p.best for p in result.history] == [True, True, True, False, False]
     assert torch.equal(theta(model), theta(truth))
@@ -173,7 +174,7 @@ def test_iterate_that_is_best_on_training_is_kept_without_validation():
     model, train, _ = planted()
     start = on_a_grid(model)
     train = [measure(model, 100)]
-    result = fit(model, train, optimiser=Walk((STEP, -STEP, 2 * STEP)))
+    result = fit(model, train, trainer=Walk((STEP, -STEP, 2 * STEP)))
     assert result.chosen_iteration == 0  # the same error at iteration 2 is no better
     assert torch.equal(theta(model), start)
     assert math.isnan(result.history[0].validation)
@@ -185,7 +186,7 @@ def test_iterate_that_diverges_on_validation_is_not_kept():
     start = theta(model)
     long = measure(model, 3000, seed=5)
     validation = Record(long.u, long.y + 0.1, long.fs)
-    result = fit(model, train[0][:5], validation, optimiser=Walk((3.0, 0.0)))  # a pole beyond 3
+    result = fit(model, train[0][:5], validation, trainer=Walk((3.0, 0.0)))  # a pole beyond 3
     assert not math.isfinite(result.history[1].validation)
     assert math.isfinite(result.history[1].train)
     assert result.chosen_iteration == 0
@@ -202,7 +203,7 @@ def test_a_step_to_a_model_that_explodes_on_validation_is_taken_back():
         model,
         train[0][:5],
         validation,
-        optimiser=walk,
+        trainer=walk,
         monitors=[lambda m, _: seen.append(theta(m))],
     )
     moved = [float(each[0] - seen[0][0]) for each in seen]
@@ -219,7 +220,7 @@ def test_a_step_that_is_still_better_than_the_start_is_kept():
     # To the true model, to half the start's distance from it, back, to three times that, and on.
     walk = Walk((2 * STEP, STEP, -STEP, 3 * STEP, STEP))
     validation, watch = measure(truth, 100, seed=5), lambda m, _: seen.append(theta(m))
-    result = fit(model, train, validation, optimiser=walk, monitors=[watch])
+    result = fit(model, train, validation, trainer=walk, monitors=[watch])
     assert [float(each[0] - seen[0][0]) / STEP for each in seen] == [0, 2, 3, 2, 5, 3]
     scores = [p.score for p in result.history]
     assert EXPLOSION * scores[1] < scores[2] < scores[0] < scores[4]
@@ -241,7 +242,7 @@ def test_a_search_that_goes_back_treads_softly():
 
 def test_errors_are_in_physical_units():
     model, train, test = planted()
-    result = fit(model, train[0], test, optimiser=LevenbergMarquardt(max_iter=2))
+    result = fit(model, train[0], test, trainer=LevenbergMarquardt(max_iter=2))
     chosen = result.history[result.chosen_iteration]
     assert chosen.train == pytest.approx(rmse(train[0], model.simulate(train[0])), rel=1e-9)
     assert chosen.validation == pytest.approx(rmse(test, model.simulate(test)), rel=1e-9)
@@ -249,7 +250,7 @@ def test_errors_are_in_physical_units():
 
 def test_fitted_model_is_saved_and_loaded(tmp_path):
     model, train, test = planted(T=50)
-    fit(model, train, optimiser=LevenbergMarquardt(max_iter=2))
+    fit(model, train, trainer=LevenbergMarquardt(max_iter=2))
     back = load(model.save(tmp_path / "model"))
     assert np.array_equal(back.simulate(test), model.simulate(test))
 
@@ -260,8 +261,8 @@ def test_fitted_model_is_saved_and_loaded(tmp_path):
 def test_no_iterations():
     model, train, test = planted(T=50)
     start = theta(model)
-    for optimiser in (LevenbergMarquardt(max_iter=0), Adam(epochs=0)):
-        result = fit(model, train, test, optimiser=optimiser)
+    for optimiser in (LevenbergMarquardt(max_iter=0), Adam(max_iter=0)):
+        result = fit(model, train, test, trainer=optimiser)
         assert (result.iterations, result.chosen_iteration, len(result.history)) == (0, 0, 1)
         assert result.reason == "no iterations asked for"
         assert result.seconds_per_iteration == 0
@@ -270,13 +271,13 @@ def test_no_iterations():
 
 def test_limit_is_a_reason():
     model, train, _ = planted(T=50)
-    result = fit(model, train, optimiser=LevenbergMarquardt(max_iter=2))
+    result = fit(model, train, trainer=LevenbergMarquardt(max_iter=2))
     assert (result.reason, result.iterations) == ("maximum number of iterations", 2)
 
 
 def test_reason_of_the_optimiser_ends_the_fit():
     model, train, _ = planted(T=50)
-    assert fit(model, train, optimiser=Walk((0.01,) * 3, "tired")).reason == "tired"
+    assert fit(model, train, trainer=Walk((0.01,) * 3, "tired")).reason == "tired"
 
 
 def test_ctrl_c_keeps_the_best():
@@ -288,7 +289,7 @@ def test_ctrl_c_keeps_the_best():
         if progress.iteration == 3:
             raise KeyboardInterrupt
 
-    result = fit(model, train, optimiser=Walk((0.01, -0.02, 0.05, 0.0)), monitors=[interrupt])
+    result = fit(model, train, trainer=Walk((0.01, -0.02, 0.05, 0.0)), monitors=[interrupt])
     assert result.reason == INTERRUPTED == "interrupted"
     assert result.iterations == 3
     best = min(range(4), key=lambda i: seen[i][1])
@@ -305,7 +306,7 @@ def test_ctrl_c_amid_a_trial_keeps_the_best():
             return super().step(problem, state)
 
     model, train, test = planted()
-    result = fit(model, train, optimiser=Interrupted())
+    result = fit(model, train, trainer=Interrupted())
     assert (result.reason, result.chosen_iteration) == (INTERRUPTED, 2)
     assert rmse(train[0], model.simulate(train[0])) < result.history[0].train
     assert np.isfinite(model.simulate(test)).all()
@@ -350,7 +351,7 @@ def test_start_that_diverges_is_refused():
     start = theta(model)
     for optimiser in (LevenbergMarquardt(), Adam()):
         with pytest.raises(ValueError, match="diverges on the training records at the start"):
-            fit(model, train, optimiser=optimiser)
+            fit(model, train, trainer=optimiser)
         assert torch.equal(theta(model), start)
 
 
@@ -364,7 +365,7 @@ def test_monitors_see_every_iteration_with_its_weights():
     def watch(model: Model, progress: Progress):
         calls.append((progress.iteration, progress.validation, rmse(test, model.simulate(test))))
 
-    result = fit(model, train, test, optimiser=LevenbergMarquardt(4), monitors=[watch, watch])
+    result = fit(model, train, test, trainer=LevenbergMarquardt(4), monitors=[watch, watch])
     assert [call[0] for call in calls] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
     for _, told, seen in calls:
         assert seen == pytest.approx(told, rel=1e-9)
@@ -381,7 +382,7 @@ def test_time_left_is_that_of_the_iterations_so_far():
 
 
 def test_usual_duration_is_the_median_without_the_first():
-    begun = Fit(*planted(T=20)[:2], optimiser=LevenbergMarquardt(max_iter=1)).advance()
+    begun = Fit(*planted(T=20)[:2], trainer=LevenbergMarquardt(max_iter=1)).advance()
     for durations, usual in (([9.0, 1.0, 4.0, 2.0], 2.0), ([9.0], 9.0)):
         begun._durations = durations
         assert begun.result().seconds_per_iteration == usual
@@ -398,15 +399,15 @@ def test_monitors_never_see_a_trial():
         assert rmse(train[0], model.simulate(train[0])) == pytest.approx(progress.train, rel=1e-9)
 
     model, train, _ = planted(T=100)
-    assert fit(model, train[0], optimiser=Wandering(3), monitors=[watch]).iterations == 3
+    assert fit(model, train[0], trainer=Wandering(3), monitors=[watch]).iterations == 3
 
 
-@pytest.mark.parametrize("optimiser", [LevenbergMarquardt(max_iter=5), Adam(epochs=5)])
+@pytest.mark.parametrize("optimiser", [LevenbergMarquardt(max_iter=5), Adam(max_iter=5)])
 def test_same_start_same_bits(optimiser):
     runs = []
     for _ in range(2):
         model, train, test = planted()
-        result = fit(model, train, test, optimiser=optimiser)
+        result = fit(model, train, test, trainer=optimiser)
         runs.append((theta(model), [(p.train, p.validation) for p in result.history]))
     assert torch.equal(runs[0][0], runs[1][0])
     assert runs[0][1] == runs[1][1]
@@ -417,6 +418,6 @@ def test_ridge_keeps_the_parameters_near_their_start():
     for ridge in (0.0, 1.0, 1e4):
         model, train, _ = planted(T=100)
         start = theta(model)
-        fit(model, train, optimiser=LevenbergMarquardt(max_iter=10), ridge=ridge)
+        fit(model, train, trainer=LevenbergMarquardt(max_iter=10), ridge=ridge)
         steps.append(float((theta(model) - start).norm()))
     assert steps[0] > steps[1] > 10 * steps[2] > 0

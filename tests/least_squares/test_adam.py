@@ -22,7 +22,7 @@ ZERO = torch.zeros(2, dtype=torch.float64)
 
 
 def test_steps_are_those_of_torch():
-    adam, problem = Adam(epochs=20, learning_rate=0.1), Quadratic()
+    adam, problem = Adam(max_iter=20, learning_rate=0.1), Quadratic()
     state = adam.init(problem, ZERO)
     parameter = torch.nn.Parameter(ZERO.clone())
     theirs = torch.optim.Adam([parameter], lr=0.1)
@@ -36,7 +36,7 @@ def test_steps_are_those_of_torch():
 
 
 def test_minimum_is_reached():
-    adam, problem = Adam(epochs=500, learning_rate=0.05), Quadratic()
+    adam, problem = Adam(max_iter=500, learning_rate=0.05), Quadratic()
     state = adam.init(problem, ZERO)
     while not state.reason:
         state = adam.step(problem, state)
@@ -68,6 +68,6 @@ def test_learning_rate_must_be_positive(rate: float):
         Adam(learning_rate=rate)
 
 
-def test_epochs_cannot_be_negative():
-    with pytest.raises(ValueError, match="epochs is -1; give a whole number of at least 0"):
-        Adam(epochs=-1)
+def test_iterations_cannot_be_negative():
+    with pytest.raises(ValueError, match="max_iter is -1; give a whole number of at least 0"):
+        Adam(max_iter=-1)

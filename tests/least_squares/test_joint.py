@@ -131,7 +131,7 @@ def test_frozen_parameters_stay_frozen():
     stack.residuals([0, 1, 2], thetas)
     for problem, jacobian in zip(stack.problems, stack.linearise([0, 1, 2], thetas), strict=True):
         gradient = jacobian.system(1e-2, 1e-12)[1]
-        assert len(gradient) == len(problem.theta) == models[0].parameters - 4
+        assert len(gradient) == len(problem.theta) == models[0].parameter_count - 4
 
 
 def test_problems_that_are_no_stack():

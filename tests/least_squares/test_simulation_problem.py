@@ -89,7 +89,7 @@ def test_gradient_and_jacobian_agree(model: Model, ridge):
 def test_jacobian_is_the_slope_of_the_residual(model: Model, ridge):
     problem = SimulationError(model, all_kinds(model), ridge=ridge)
     theta = problem.theta
-    assert len(theta) == model.parameters + 3 * 2
+    assert len(theta) == model.parameter_count + 3 * 2
     step = 1e-4 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
     expected = (problem.residual(theta + step) - problem.residual(theta - step)) / 2
     # Truncation |step|³ = 1e-11, and the periodic start is known to 1e-10.
@@ -194,7 +194,7 @@ def test_start_state_is_fitted_with_the_parameters(model: Model):
     assert_close(problem.theta[-2:], states[50], rtol=0, atol=1e-7)
     assert problem.rmse(problem.theta) < 1e-8
     solved = SimulationError(model, [whole, later], solved_starts=True)
-    assert len(solved.theta) == model.parameters
+    assert len(solved.theta) == model.parameter_count
     assert solved.rmse(solved.theta) < 1e-8
 
 
@@ -245,10 +245,10 @@ def test_frozen_parameters_are_no_part_of_theta(model: Model):
     model.lfr.cell.A.requires_grad_(False)
     before = model.lfr.cell.A.clone()
     problem = SimulationError(model, some_records(model))
-    assert len(problem.theta) == model.parameters - 4
+    assert len(problem.theta) == model.parameter_count - 4
     problem.residual(problem.theta + 0.1)
     assert torch.equal(model.lfr.cell.A, before)
-    assert problem.jacobian(problem.theta).shape[1] == model.parameters - 4
+    assert problem.jacobian(problem.theta).shape[1] == model.parameter_count - 4
 
 
 def test_divergence_is_a_residual_that_is_not_finite(model: Model):
@@ -389,7 +389,7 @@ RIDGE_AND_ROOM = pytest.mark.parametrize(("ridge", "kept"), [(0.0, True), (0.5, 
 
 def some_fixed(model: Model) -> torch.Tensor:
     """Every third free parameter of the module, the first one too."""
-    return torch.arange(model.parameters) % 3 == 0
+    return torch.arange(model.parameter_count) % 3 == 0
 
 
 @pytest.mark.parametrize(

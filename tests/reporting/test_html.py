@@ -109,9 +109,9 @@ def run(outputs: tuple[Channel, ...] = (Channel("v", "V"),), starts: int = 1) ->
     ]
     optimiser = lfrtorch.LevenbergMarquardt(max_iter=3)
     if starts > 1:
-        result = lfrtorch.fit_starts(models, train, validation, optimiser=optimiser)
+        result = lfrtorch.fit(models, train, validation, trainer=optimiser)
     else:
-        result = lfrtorch.fit(models[0], train, validation, optimiser=optimiser)
+        result = lfrtorch.fit(models[0], train, validation, trainer=optimiser)
     return Run(result, bla, data)
 
 
@@ -187,7 +187,7 @@ def test_without_tests_the_verdict_is_on_what_there_is(single: Run):
     assert line in page.text
     model = lfrtorch.initialise(single.bla, single.dataset.train, nz=1, nw=1, nn=3)
     result = lfrtorch.fit(
-        model, single.dataset.train, optimiser=lfrtorch.LevenbergMarquardt(max_iter=1)
+        model, single.dataset.train, trainer=lfrtorch.LevenbergMarquardt(max_iter=1)
     )
     data = replace(single.dataset, tests=[], validation=[])
     trained = Run(result, single.bla, data)

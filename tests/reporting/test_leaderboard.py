@@ -51,7 +51,7 @@ def test_several_records_are_one_list_in_the_unit_of_the_site():
     assert line.rmse_to_submit == f"[{errors[0]:.3g}; {errors[1]:.3g}]"
     assert (line.unit, line.records) == ("mV", "multisine; arrow")
     assert line.samples_for_the_start == "50; 50"
-    assert line.parameters == MODEL.parameters
+    assert line.parameters == MODEL.parameter_count
     assert "nx 3, nz 2, nw 1, nn 4" in line.model_class
 
 

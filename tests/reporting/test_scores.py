@@ -36,7 +36,7 @@ def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:
     )
     bla = lfrtorch.estimate_bla(train, nx=2)
     model = lfrtorch.initialise(bla, train, nz=1, nw=1, nn=3)
-    return lfrtorch.fit(model, train, validation, optimiser=lfrtorch.Adam(epochs=2)), bla, data
+    return lfrtorch.fit(model, train, validation, trainer=lfrtorch.Adam(max_iter=2)), bla, data
 
 
 def test_starts_are_ranked_in_files_and_in_a_table(result):
@@ -45,8 +45,8 @@ def test_starts_are_ranked_in_files_and_in_a_table(result):
         lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=3, seed=seed)
         for seed in report.seeds(7, 3)
     ]
-    fitted = lfrtorch.fit_starts(
-        models, data.train, data.validation, optimiser=lfrtorch.LevenbergMarquardt(max_iter=4)
+    fitted = lfrtorch.fit(
+        models, data.train, data.validation, trainer=lfrtorch.LevenbergMarquardt(max_iter=4)
     )
     metrics = report.metrics(fitted, bla, data, seed=7, data_seed=None, command="")
     assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
