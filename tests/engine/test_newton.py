@@ -123,7 +123,19 @@ def test_linear_cell_is_found_at_the_first_step(way):
     u, x0 = normal(2, 50, 2), normal(2, 3, seed=1)
     expected = reference.simulate(cell, u, x0).x
     assert_close(states(cell, u, x0, way), expected, rtol=1e-12, atol=1e-12)
-    assert iterations(cell, u, x0) <= 3  # the second finds rounding errors at most to take off
+    # The second finds rounding errors at most to take off, which are relative to large states.
+    for unit in (1.0, 1e12):
+        assert iterations(cell, unit * u, unit * x0) <= 2
+
+
+def test_states_that_hardly_move_are_found_at_once():
+    """A change is relative to states of unit size, too, where the signals are far smaller."""
+    cell = random_cell(1, 1, 3, 2, 2, 4, feedback=0.5)
+    with torch.no_grad():  # rest is x = 0
+        cell.get_parameter("static.bz").zero_()
+        cell.get_parameter("static.bw").zero_()
+    u, x0 = 1e-12 * normal(2, 50, 1), 1e-12 * normal(2, 3, seed=1)
+    assert iterations(cell, u, x0) == 1
 
 
 # --- periodic steady state ------------------------------------------------------------------

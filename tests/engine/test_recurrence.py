@@ -8,7 +8,13 @@ from reference import normal
 from torch import Tensor
 from torch.testing import assert_close
 
-from lfrtorch.engine.recurrence import compiled, linear_recurrence, loop, scan
+from lfrtorch.engine.recurrence import (
+    adjoint_recurrence,
+    compiled,
+    linear_recurrence,
+    loop,
+    scan,
+)
 
 pytestmark = pytest.mark.numeric
 
@@ -63,6 +69,22 @@ def test_views_are_read_as_they_stand(way):
     F, g, s0 = problem(2, 12, 3, 3)
     F, g, s0 = F.mT.flip(1), g.mT, s0.mT  # what the adjoint passes
     assert_same(way(F, g, s0), loop(F, g, s0), 1e-12)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_faded_states_are_zero_and_never_denormal(backwards: bool):
+    """Again and again: after the start, and after what drives them once more."""
+    F = torch.full((2, 2600, 1, 1), 0.5, dtype=torch.float64)
+    g, s0 = torch.zeros_like(F), torch.ones(2, 1, 1, dtype=torch.float64)
+    g[:, 1300] = 1.0
+    s = (adjoint_recurrence if backwards else linear_recurrence)(F, g, s0)
+    expected = loop(F, g, s0)
+    if backwards:
+        expected = loop(F.flip(1), g.flip(1), s0).flip(1)
+    assert_close(s, expected, rtol=0, atol=1e-30)
+    size = s.abs()
+    assert not ((size > 0) & (size < torch.finfo(s.dtype).tiny)).any()
+    assert not s[:, 0 if backwards else -1].any()
 
 
 def test_divergence_gives_infinite_states():

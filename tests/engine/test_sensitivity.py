@@ -207,6 +207,27 @@ def test_columns_are_shared_among_any_number_of_threads(threads: int, monkeypatc
         assert_jacobian(mine, other)
 
 
+@pytest.mark.parametrize("way", ["compiled", "generic"])
+def test_faded_sensitivities_are_zero_and_never_denormal(way: str, monkeypatch):
+    """dy(k)/dBu of a unit pulse is a^(k - 1): each power is exact. Driven again, it fades again."""
+    if way == "generic":
+        generic(monkeypatch)
+    cell = LFRCell(1, 1, 1, dtype=torch.float64)
+    with torch.no_grad():
+        for p, value in ((cell.A, 0.5), (cell.Bu, 1.0), (cell.Cy, 1.0), (cell.Dyu, 0.0)):
+            p.fill_(value)
+    u = torch.zeros(2, 2600, 1, dtype=torch.float64)
+    u[:, [0, 1300]] = 1.0
+    k = torch.arange(2600, dtype=torch.float64)
+    since = torch.stack([k - 1, k - 1301])
+    expected = torch.where(since >= 0, 0.5**since, 0.0).sum(0)
+    J = output_jacobian(Linearisation(cell, u, simulate(cell, u, u.new_zeros(2, 1))))
+    by_Bu = J[:, :, 0, 1]  # of A, Bu, Cy, Dyu
+    assert_close(by_Bu, expected.expand(2, -1), rtol=0, atol=1e-30)
+    assert not ((by_Bu > 0) & (by_Bu < torch.finfo(u.dtype).tiny)).any()
+    assert not by_Bu[:, -1].any()
+
+
 def test_single_precision():
     double, single = random_cell(2, 1, 3), random_cell(2, 1, 3, dtype=torch.float32)
     u = normal(2, 50, 2)

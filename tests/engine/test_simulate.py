@@ -98,6 +98,21 @@ def test_own_module_equals_the_compiled_network():
     assert_same(steady_state(own, u), steady_state(cell, u), 1e-9)
 
 
+def test_own_module_is_followed_step_by_step_where_newton_fails(monkeypatch):
+    monkeypatch.setattr("lfrtorch.engine.newton.MAX_NEWTON", 0)
+    cell = random_cell(1, 1, 2, 2, 2, 4)
+    assert isinstance(cell.static, Network)
+    own = LFRCell(1, 1, 2, 2, 2, SameNetwork(cell.static)).double()
+    own.load_state_dict(cell.state_dict(), strict=False)
+    u, x0 = normal(2, 30, 1), normal(2, 2, seed=1)
+    expected = simulate(cell, u, x0)
+    assert_same(simulate(own, u, x0), expected, 1e-12)
+    assert_same(simulate(own, u, x0, guess=expected.x), expected, 1e-12)
+    periodic = steady_state(cell, u)
+    for guess in (None, x0, periodic.x):
+        assert_same(steady_state(own, u, guess), periodic, 1e-9)
+
+
 def test_own_class_derived_from_the_network_is_followed():
     own = random_cell(static=Halved(1, 1, 3))
     halved = random_cell(static=Network(1, 1, 3))
@@ -124,6 +139,17 @@ def test_unstable_model_is_not_an_exception():
     assert not trajectory.finite
     assert not torch.isfinite(trajectory.y[0, -1]).any()
     assert torch.isnan(steady_state(cell, normal(1, 2000, 1)).y).all()
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_finite_is_every_output_and_the_state_behind_them(bad: float):
+    """The end state of a record is the start of what follows."""
+    cell, u = random_cell(1, 1, 2), normal(2, 5, 1)
+    for signal, at, finite in (("y", 0, False), ("y", -1, False), ("x", -1, False), ("z", 0, True)):
+        trajectory = simulate(cell, u, normal(2, 2, seed=1))
+        assert trajectory.finite
+        getattr(trajectory, signal)[1, at, 0] = bad
+        assert trajectory.finite == finite
 
 
 # --- periodic steady state ------------------------------------------------------------------
@@ -169,7 +195,8 @@ def test_good_guess_changes_nothing():
     cell = random_cell()
     u = normal(1, 20, 1)
     cold = steady_state(cell, u)
-    assert_same(steady_state(cell, u, cold.x[:, 0]), cold, 1e-9)
+    for guess in (cold.x[:, 0], cold.x):  # of the start alone, or of all states
+        assert_same(steady_state(cell, u, guess), cold, 1e-9)
 
 
 @pytest.mark.parametrize("radius", [0.5, 0.9, 0.99])
@@ -298,6 +325,22 @@ def test_estimated_start_of_a_state_that_no_output_shows_is_the_likeliest():
     # Noise of 1e-4 over an output gain of about 1: a few of it in either state. (Without noise the
     # likelihoods compared are logarithms of rounding errors.)
     assert_close(found.x[:, 0], expected, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("shown", [1.0, 1e-12])
+def test_estimated_start_that_the_output_hardly_shows_stays(shown: float, unit: float):
+    """Nothing moves the states, so that nothing else is known about them; whatever the weight."""
+    cell, u = random_cell(1, 1, 2, 0, 0), torch.zeros(1, 30, 1, dtype=torch.float64)
+    with torch.no_grad():
+        cell.A.copy_(torch.diag(torch.tensor([0.5, 0.4])))
+        cell.Cy.copy_(torch.tensor([[shown, 1e-12]]))
+    y = shown * simulate(cell, u, u.new_tensor([[2.0, 0.0]])).x[:, :-1, :1]
+    y = y + 1e-4 * normal(1, 30, 1, seed=3)
+    found = estimated_start(cell, u, y, torch.full_like(y, unit)).x[0, 0]
+    # Noise of 1e-4 over an output gain of 1; the other state moves 1e-12 times as far as this one.
+    assert_close(found[0], u.new_tensor(2.0 if shown == 1.0 else 0.0), rtol=0, atol=1e-3)
+    assert abs(float(found[1])) < 1e-9
 
 
 def test_estimated_start_of_a_system_left_alone_is_that_of_least_squares():

@@ -375,6 +375,32 @@ def test_monitors_see_every_iteration_with_its_weights():
     assert 0 < result.seconds_per_iteration < result.seconds
 
 
+def test_seconds_are_those_of_steps_and_their_judgement(monkeypatch):
+    """Not of the monitors: 4 s for the start, 8 s a step, 2 s to judge each, 100 s to show it."""
+    now = [1000.0]
+
+    def passes(seconds: float):
+        now[0] += seconds
+
+    @dataclass(frozen=True)
+    class Slow(Walk):
+        def init(self, problem, theta):
+            passes(4.0)
+            return super().init(problem, theta)
+
+        def step(self, problem, state):
+            passes(8.0)
+            return super().step(problem, state)
+
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    begun = Fit(*planted(T=20)[:2], trainer=Slow((STEP, STEP)))
+    judged = begun.problem.rmse
+    monkeypatch.setattr(begun.problem, "rmse", lambda theta: (passes(2.0), judged(theta))[1])
+    result = begun.advance(monitors=[lambda *_: passes(100.0)]).result()
+    assert [p.seconds for p in result.history] == [6.0, 16.0, 26.0]
+    assert (result.seconds, result.seconds_per_iteration) == (26.0, 8.0)
+
+
 def test_time_left_is_that_of_the_iterations_so_far():
     progress = Progress(2, 6, 1.0, 1.0, 3.0, True, {}, 1.0)
     assert progress.seconds_left == 6.0

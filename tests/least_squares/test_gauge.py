@@ -130,6 +130,37 @@ def test_a_class_of_one_s_own_that_begins_with_a_network_keeps_its_coordinates()
     check(random_cell(1, 1, 2, 2, 1, static=More(2, 1, 3), radius=0.3, feedback=0.05), 2**2)
 
 
+@pytest.mark.parametrize("seed", [1, 5])
+def test_reduction_of_before_is_kept_where_it_still_does(seed: int):
+    """Another choice of columns than that of these weights alone, and as exact."""
+    other, cell = (random_cell(1, 1, 2, 2, 1, 4, radius=0.5, seed=s) for s in (0, seed))
+    before = reduction(other, none(other))
+    assert before.kept.tolist() != reduction(cell, none(cell)).kept.tolist()
+    kept, expand = reduction(cell, none(cell), before=before)
+    assert torch.equal(kept, before.kept)
+    u = normal(2, 12, 1)
+    J = output_jacobian(Linearisation(cell, u, simulate(cell, u, u.new_zeros(2, 2))))
+    J = J[..., : expand.shape[1]]
+    # The expansion multiplies rounding errors by less than 1 / DEPENDENT.
+    assert_close(J[..., kept] @ expand, J, rtol=0, atol=1e-8 * float(J.abs().max()))
+
+
+@pytest.mark.parametrize("faded", [0.0, 1e-6])
+def test_reduction_of_before_is_given_up_where_it_blows_up(faded: float):
+    """y = Cy Bu times what A makes of u: the column left out is that of the larger factor."""
+    cell = random_cell(1, 1, 1, 0, 0)
+    with torch.no_grad():
+        cell.Bu.fill_(1.0)
+        cell.Cy.fill_(0.1)
+    before = reduction(cell, none(cell))
+    assert before.kept.tolist() == [0, 2, 3]  # of A, Bu, Cy, Dyu
+    with torch.no_grad():
+        cell.Bu.fill_(faded)
+    kept, expand = reduction(cell, none(cell), before=before)
+    assert kept.tolist() == [0, 1, 3]
+    assert_close(expand[:, 2], expand.new_tensor([0.0, faded / 0.1, 0.0]), rtol=1e-12, atol=0)
+
+
 # --- fixed entries ----------------------------------------------------------------------------
 
 

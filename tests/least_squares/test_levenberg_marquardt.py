@@ -1,6 +1,6 @@
 """Published problems, gauge directions, undefined regions, and the options."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -244,6 +244,75 @@ def test_search_ends_after_max_iter():
         states = search(Problem(rosenbrock), tensor(-1.2, 1), LevenbergMarquardt(limit))
         assert states[-1].reason == "maximum number of iterations"
         assert states[-1].iteration == LevenbergMarquardt(limit).limit == limit
+
+
+def test_search_that_spent_its_iterations_goes_on_where_there_are_more():
+    problem, start = Problem(rosenbrock), tensor(-1.2, 1)
+    two, three = LevenbergMarquardt(max_iter=2), LevenbergMarquardt(max_iter=3)
+    spent = search(problem, start, two)[-1]
+    assert two.prolonged(spent) == spent
+    assert three.prolonged(spent) == replace(spent, reason="")
+    end = three.step(problem, three.prolonged(spent))
+    assert torch.equal(end.theta, search(problem, start, three)[-1].theta)
+    for reason in ("", "converged: the residual vanishes"):
+        other = replace(spent, reason=reason)
+        assert three.prolonged(other) == other
+
+
+def test_step_that_is_taken_back_is_tried_again_with_more_damping():
+    problem, optimiser = Problem(rosenbrock), LevenbergMarquardt()
+    before = optimiser.init(problem, tensor(-1.2, 1))
+    after = optimiser.step(problem, before)
+    assert after.damping is not None
+    back = optimiser.refused(before, after)
+    assert (back.theta is before.theta, back.residual is before.residual) == (True, True)
+    assert (back.cost, back.iteration, back.scale) == (before.cost, 1, after.scale)
+    assert back.damping == 10 * after.damping
+    # From the start λ is the same part of the same Jacobian, and ten times the latest one now.
+    again = optimiser.step(problem, back)
+    assert (again.theta - before.theta).norm() < (after.theta - before.theta).norm()
+    assert again.iteration == 2
+
+
+class Several(NamedTuple):
+    """Problems that are evaluated one after another."""
+
+    problems: list[Problem]
+
+    def residuals(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[Tensor]:
+        return [self.problems[i].residual(theta) for i, theta in zip(models, thetas, strict=True)]
+
+    def linearise(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[DenseJacobian]:
+        return [self.problems[i].linearise(theta) for i, theta in zip(models, thetas, strict=True)]
+
+
+@BOTH
+def test_searches_in_step_are_each_what_they_are_alone(acceleration: bool):
+    """They need different numbers of trials, and end one after another."""
+    published = [PUBLISHED[0], PUBLISHED[5], PUBLISHED[4]]
+    optimiser = LevenbergMarquardt(max_iter=8, damping=1e-9, acceleration=acceleration)
+    stack = Several([Problem(p.f) for p in published])
+    states = [optimiser.init(Problem(p.f), p.start) for p in published]
+    states[1] = replace(states[1], iteration=4)  # half of its iterations are gone
+    alone = list(states)
+    for _ in range(9):
+        states = optimiser.steps(stack, states)
+        alone = [
+            state if state.reason else optimiser.step(problem, state)
+            for problem, state in zip(stack.problems, alone, strict=True)
+        ]
+        for mine, other in zip(states, alone, strict=True):
+            assert torch.equal(mine.theta, other.theta)
+            assert (mine.iteration, mine.trials) == (other.iteration, other.trials)
+            assert (mine.cost, mine.reason) == (other.cost, other.reason)
+    assert all(state.reason for state in states)
+
+
+def test_patience_begins_anew_with_progress():
+    problem, optimiser = Problem(lambda x: x - 1), LevenbergMarquardt(patience=2)
+    start = replace(optimiser.init(problem, tensor(5, 7)), quiet=1)
+    state = optimiser.step(problem, start)
+    assert (state.quiet, state.reason) == (0, "")
 
 
 def test_patience_counts_steps_without_progress():
