@@ -34,14 +34,18 @@ def experiments(
     noise: Array | None = None,  # (R, all samples, ny + nu), of output and input
     distortion: Array | None = None,  # (R, N, ny), the same in every period
 ) -> list[Record]:
-    """Records of the periods y and u with offsets of 3 and 5, and what is added."""
+    """Records of the periods y and u with offsets of 3 and 5, and what is added.
+
+    Each channel has 1 more than the one before it, and each record than the one before it.
+    """
     counts = [periods] * len(u) if isinstance(periods, int) else periods
     records = []
     for r, (y_r, u_r, P) in enumerate(zip(y, u, counts, strict=True)):
         if distortion is not None:
             y_r = y_r + distortion[r]
         ny = y_r.shape[1]
-        signals = np.tile(np.concatenate([y_r + 3.0, u_r + 5.0], axis=1), (P, 1))
+        offset = np.concatenate([3.0 + np.arange(ny), 5.0 + np.arange(u_r.shape[1])]) + r
+        signals = np.tile(np.concatenate([y_r, u_r], axis=1) + offset, (P, 1))
         if noise is not None:
             signals = signals + noise[r][: len(signals)]
         y, u_m = signals[:, :ny], signals[:, ny:]
@@ -95,8 +99,9 @@ def test_robust_is_exact_on_linear_data(nu: int, ny: int, R: int, orthogonal: bo
     assert np.abs(estimate.G - true(system, estimate)).max() < 1e-10
     assert np.allclose(estimate.frequencies, np.arange(5, 49) * FS / 120)
     assert (estimate.method, estimate.periods, estimate.experiments) == ("robust", 2, R)
-    assert np.allclose(estimate.u_offset, 5.0, atol=1e-12)
-    assert np.allclose(estimate.y_offset, 3.0, atol=1e-12)
+    mean = (R - 1) / 2  # of what the records have more than the first
+    np.testing.assert_allclose(estimate.u_offset, 5.0 + np.arange(nu) + mean, rtol=1e-12)
+    np.testing.assert_allclose(estimate.y_offset, 3.0 + np.arange(ny) + mean, rtol=1e-12)
     assert estimate.var_noise is not None
     assert estimate.var_noise.max() < 1e-20  # the error squared
     assert (estimate.var_total is None) == (nu == R)
@@ -120,6 +125,28 @@ def test_one_input_at_a_time_is_an_orthogonal_design():
     system = random_system(2, 2, 2)
     estimate = estimate_frf(experiments(steady(system, u), u))
     assert np.abs(estimate.G - true(system, estimate)).max() < 1e-12
+
+
+@pytest.mark.parametrize("scale", [1e-13, 1e13])
+@pytest.mark.parametrize("method", ["robust", "local_polynomial"])
+def test_size_of_the_inputs_does_not_matter(scale: float, method: Method):
+    """Neither to what they determine, nor to what they do not."""
+    u = np.random.default_rng(0).normal(size=(2, 60, 2)) * [scale, 1.0]
+    records = [
+        Record(x, x @ [[1 / scale], [2.0]], period=60, name=f"r{r}") for r, x in enumerate(u)
+    ]
+    estimate = estimate_frf(records, method=method)
+    # Conditions of 1e2 by chance at a line, and of 1e3 in a window.
+    np.testing.assert_allclose(estimate.G[:, 0] * [scale, 0.5], 1.0, rtol=0, atol=1e-10)
+    same = [Record(np.repeat(r.u[:, :1], 2, axis=1), r.y, period=60, name=r.name) for r in records]
+    with pytest.raises(ValueError, match=re.escape("depend on each other")):
+        estimate_frf(same, method=method)
+
+
+def test_three_samples_have_one_line():
+    estimate = estimate_frf(Record(u := np.array([1.0, 2.0, -3.0]), 2 * u, 3.0, "periodic"))
+    assert estimate.frequencies.tolist() == [1.0]
+    assert abs(estimate.G[0, 0, 0] - 2) < 1e-14
 
 
 def test_skip_and_the_last_whole_periods_are_used():
@@ -152,11 +179,30 @@ def test_excited_lines_are_found_among_the_noise_of_the_input():
         assert np.array_equal(np.rint(estimate.frequencies * 1000 / FS), design.lines)
 
 
+def test_lines_of_the_input_stand_out_of_their_noise_by_15_db():
+    """30 times the noise of the mean: of 100 and of 8 times it the line of 100 is found.
+
+    With 8 periods the mean over 21 lines, and over 11 at the last line, has a relative deviation
+    of √(1 / 77) = 0.11 at most; a line of 100 or 8 times the noise has 100 ± 4 · 14, 8 ± 4 · 4.
+    """
+    N, P, deviation = 1000, 8, 0.05
+    strong = multisine(N, lines=np.arange(10, 101, 10))
+    one = deviation * np.sqrt(2 / (N * P))  # rms of the noise of the mean at a line
+    for seed in range(5):
+        u = strong.u[0] + multisine(N, lines=[250], rms=np.sqrt(8) * one, seed=seed).u[0]
+        for line in (300, 499):
+            u += multisine(N, lines=[line], rms=10 * one, seed=seed).u[0]
+        noise = deviation * np.random.default_rng(seed).normal(size=(1, P * N, 2)) * [0, 1]
+        estimate = estimate_frf(experiments(u[None], u[None], periods=P, noise=noise))
+        found = np.rint(estimate.frequencies * N / FS)
+        assert found.tolist() == [*strong.lines, 300, 499]
+
+
 @pytest.mark.parametrize(("deviation", "refused"), [(0.08, False), (0.12, True)])
 def test_input_may_deviate_by_a_tenth_from_period_to_period(deviation: float, refused: bool):
     """Per channel and record, relative to the rms of the channel over all records."""
-    u = np.tile(multisine(4000, nu=2).u * [1.0, 100.0], (1, 2, 1))
-    u[1] += np.random.default_rng(0).normal(size=u[1].shape) * [deviation, 0.0]
+    u = np.tile(multisine(4000, nu=2).u * [0.1, 100.0], (1, 2, 1))
+    u[1] += np.random.default_rng(0).normal(size=u[1].shape) * [0.1 * deviation, 0.0]
     records = [Record(x, x, start="periodic", period=4000, name=f"r{r}") for r, x in enumerate(u)]
     if not refused:
         assert len(estimate_frf(records, lines=[1, 2]).frequencies) == 2
@@ -387,15 +433,33 @@ def test_fast_levels_are_mean_squares_of_the_lines():
 
 
 def test_fast_takes_the_linear_response_to_the_input_off():
-    """Input of -50 dB at the lines left out, and a static gain, which is interpolated exactly."""
+    """Input of -50 dB at the lines left out, and a gain that is interpolated exactly."""
     u = multisine(400, grid="random_odd").u[0] + multisine(400, rms=0.003, seed=1).u[0]
-    record = Record(np.tile(u, (2, 1)), np.tile(2 * u, (2, 1)), start="periodic", period=400)
+    gain = 2 + np.arange(201) / 40
+    y = np.fft.irfft(gain[:, None] * np.fft.rfft(u, axis=0), 400, axis=0)
+    record = Record(np.tile(u, (2, 1)), np.tile(y, (2, 1)), 400.0, "periodic", period=400)
     estimate = estimate_frf(record, method="fast")
     assert estimate.distortion is not None
     for level in (estimate.distortion.odd, estimate.distortion.even):
         assert level.frequencies.size > 10
         assert level.power.max() < 1e-24  # rounding squared, and not 4 · 0.003² / 200
-    assert np.abs(estimate.G - 2).max() < 1e-12
+    G = np.interp(estimate.frequencies, np.arange(201), gain)
+    assert np.abs(estimate.G[:, 0, 0] - G).max() < 1e-12
+
+
+def test_fast_interpolates_the_distortion_between_the_odd_lines_left_out():
+    """Straight from line to line, and constant before the first and after the last one."""
+    design = multisine(400, grid="random_odd", lines=np.arange(41, 160))
+    u = np.tile(design.u[0], (2, 1))
+    estimate = estimate_frf(Record(u, u + 0.1 * u**3, 400.0, "periodic", period=400), method="fast")
+    assert estimate.distortion is not None
+    assert estimate.var_total is not None
+    odd = estimate.distortion.odd
+    assert estimate.frequencies[0] < odd.frequencies[0]
+    assert odd.frequencies[-1] < estimate.frequencies[-1]
+    power = 1 / len(design.lines)  # of the input at a line
+    expected = np.interp(estimate.frequencies, odd.frequencies, odd.power[:, 0]) / power
+    np.testing.assert_allclose(estimate.var_total[:, 0, 0], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("nu", "experiment"), [(1, 1), (2, 4)])
@@ -468,7 +532,7 @@ def test_local_polynomial_beats_the_ratio_under_a_transient():
     assert estimate.notes[0].startswith("noise: not told apart from nonlinear distortion")
 
 
-@pytest.mark.parametrize("order", [0, 1, 2, 3])
+@pytest.mark.parametrize("order", [0, 1, 2, 3, 10])
 def test_local_polynomial_is_exact_for_polynomials(order: int):
     """A static gain, and the transient of a system of finite memory less than the order."""
     u = np.random.default_rng(1).normal(size=(300, 2))
@@ -579,6 +643,21 @@ def test_transient_is_removed_between_the_lines(periods: int, method: Method):
 
     # Poles of 0.03 rad, lines of 2 π / 2000 and windows of 15 of them: a fifth of the width at 3.
     assert rms_error(True) < 0.02 * rms_error(False)
+
+
+@pytest.mark.parametrize("periods", [2, 3])
+@pytest.mark.parametrize(("order", "error"), [(2, 1e-4), (4, 1e-6), (8, 1e-10)])
+def test_transient_removal_converges_with_the_order(periods: int, order: int, error: float):
+    """A transient of 10 samples turns by 10 · 2 π / 800 from line to line, 1 in a window.
+
+    It is some 0.1 of the input, and a polynomial of even order in a window about its line leaves
+    the term of order + 2: 0.1 · 0.5⁴ / 4!, 0.1 · 0.7⁶ / 6!, 0.1 / 10!, less by 2^order or so.
+    """
+    u = np.tile(multisine(400).u[0], (periods, 1))
+    y = dlsim((np.eye(10, k=-1), np.eye(10, 1), np.eye(1, 10, 9), np.ones((1, 1))), u)
+    estimate = estimate_frf(Record(u, y, period=400), transient=True, order=order)
+    z = np.exp(2j * np.pi * estimate.frequencies)
+    assert np.abs(estimate.G[:, 0, 0] - (1 + z**-10)).max() < error
 
 
 @pytest.mark.parametrize("periods", [2, 3])
