@@ -7,10 +7,11 @@ import torch
 from reference import System, random_system, refined
 
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.linear.response_fit import ResponseError, ResponseFit
-from lfrtorch.linear.spectral_data import Lines, lines_of
-from lfrtorch.records import Record
+from lfrtorch.linear.spectral_data import Lines, lines_of, lines_of_response
+from lfrtorch.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
 
@@ -96,6 +97,65 @@ def test_lines_without_input_are_left_out():
     found = lines([Record(u, y, start="periodic")], offset=True)
     np.testing.assert_allclose(np.angle(found.z), 2 * np.pi * np.array([5, 9]) / N, rtol=1e-12)
     assert found.equations == 4
+
+
+@pytest.mark.parametrize("N", [8, 9])
+@pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 3)])
+def test_samples_of_a_period_are_equations_of_its_lines(N: int, nu: int, ny: int):
+    """Lines 0 and N / 2 are real; what has no weight, or a constant takes up, is none."""
+    rng = np.random.default_rng(0)
+    records = [
+        Record(rng.normal(size=(N, nu)), rng.normal(size=(N, ny)), start="periodic")
+        for _ in range(nu)
+    ]
+    found = lines(records, offset=False)
+    assert found.equations == N * nu * ny
+    assert lines(records[:1], offset=True).equations == (N - 1) * ny
+    weight = np.ones(found.Y.shape)
+    weight[0] = 0.0
+    weight[1, 0] = 0.0
+    left = Lines(found.z, found.U, found.Y, weight).equations
+    assert left == ((N - 1) * ny - 2) * nu
+
+
+def response_of(variance: np.ndarray, *, experiments: int, scale: float = 1.0) -> FRF:
+    """A static gain of one input and output with a total variance (F,) and offsets of 2 and 3."""
+    F = len(variance)
+    return FRF(
+        frequencies=np.arange(1, F + 1) / (3 * F),
+        G=np.full((F, 1, 1), scale, dtype=complex),
+        fs=1.0,
+        u_offset=np.array([2.0]),
+        y_offset=np.array([3.0]),
+        inputs=(Channel("u"),),
+        outputs=(Channel("y"),),
+        cov_noise=None,
+        cov_total=variance[:, None, None].astype(complex),
+        experiments=experiments,
+        periods=1,
+        method="robust",
+    )
+
+
+@pytest.mark.parametrize(
+    ("F", "experiments", "width"),
+    [(60, 2, 21), (60, 3, 11), (60, 6, 5), (60, 11, 3), (60, 41, 1), (9, 2, 9), (8, 2, 7)],
+)
+def test_weights_are_inverse_variances_of_some_20_degrees_of_freedom(
+    F: int, experiments: int, width: int
+):
+    """From means over so many lines about each one, at most over those there are."""
+    variance = np.random.default_rng(0).uniform(0.5, 2.0, size=F)
+    frf = response_of(variance, experiments=experiments, scale=4.0)
+    found, scaler, known, notes = lines_of_response(frf, None, offset=True)
+    assert known
+    assert not notes
+    assert found.weight is not None
+    np.testing.assert_allclose(found.Y, 1.0, rtol=1e-12)
+    np.testing.assert_allclose([scaler.u_offset[0], scaler.y_offset[0]], [2.0, 3.0])
+    means = np.convolve(variance, np.full(width, 1 / width), "valid")
+    inside = found.weight[width // 2 : F - width // 2, 0, 0]
+    np.testing.assert_allclose(inside, 4.0**2 / means, rtol=1e-12)
 
 
 def some_problem() -> tuple[ResponseError, torch.Tensor]:
