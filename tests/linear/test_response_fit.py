@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import reference
 import torch
-from reference import System, random_system, refined
+from reference import Array, System, random_system, refined
 
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.resolvent import frequency_response
-from lfrtorch.linear.response_fit import ResponseError, ResponseFit
+from lfrtorch.linear.response_fit import Complex, ResponseError, ResponseFit
 from lfrtorch.linear.spectral_data import Lines, lines_of, lines_of_response
 from lfrtorch.records import Channel, Record
 
@@ -118,38 +118,43 @@ def test_samples_of_a_period_are_equations_of_its_lines(N: int, nu: int, ny: int
     assert left == ((N - 1) * ny - 2) * nu
 
 
-def response_of(variance: np.ndarray, *, experiments: int, scale: float = 1.0) -> FRF:
-    """A static gain of one input and output with a total variance (F,) and offsets of 2 and 3."""
+def response_of(variance: np.ndarray, name: str, **settings) -> FRF:
+    """A static gain of 4 of one input and output with a variance (F,) and offsets of 2 and 3."""
     F = len(variance)
+    covs = {"noise": None, "total": None, name: variance[:, None, None].astype(complex)}
     return FRF(
         frequencies=np.arange(1, F + 1) / (3 * F),
-        G=np.full((F, 1, 1), scale, dtype=complex),
+        G=np.full((F, 1, 1), 4.0, dtype=complex),
         fs=1.0,
         u_offset=np.array([2.0]),
         y_offset=np.array([3.0]),
         inputs=(Channel("u"),),
         outputs=(Channel("y"),),
-        cov_noise=None,
-        cov_total=variance[:, None, None].astype(complex),
-        experiments=experiments,
-        periods=1,
-        method="robust",
+        cov_noise=covs["noise"],
+        cov_total=covs["total"],
+        **({"experiments": 1, "periods": 1, "method": "robust"} | settings),
     )
 
 
 @pytest.mark.parametrize(
-    ("F", "experiments", "width"),
-    [(60, 2, 21), (60, 3, 11), (60, 6, 5), (60, 11, 3), (60, 41, 1), (9, 2, 9), (8, 2, 7)],
+    ("F", "name", "settings", "width"),
+    [
+        *((60, "total", {"experiments": R}, w) for R, w in ((2, 21), (3, 11), (11, 3), (41, 1))),
+        (60, "total", {"experiments": 6}, 5),
+        (60, "noise", {"experiments": 2, "periods": 6}, 3),
+        (60, "total", {"experiments": 41, "method": "local_polynomial"}, 21),
+        (9, "total", {"experiments": 2}, 9),
+        (8, "total", {"experiments": 2}, 7),
+    ],
 )
 def test_weights_are_inverse_variances_of_some_20_degrees_of_freedom(
-    F: int, experiments: int, width: int
+    F: int, name: str, settings: dict, width: int
 ):
     """From means over so many lines about each one, at most over those there are."""
-    variance = np.random.default_rng(0).uniform(0.5, 2.0, size=F)
-    frf = response_of(variance, experiments=experiments, scale=4.0)
-    found, scaler, known, notes = lines_of_response(frf, None, offset=True)
+    variance = 1e-20 * np.random.default_rng(0).uniform(0.5, 2.0, size=F)
+    frf = response_of(variance, name, **settings)
+    found, scaler, known, _ = lines_of_response(frf, None, offset=True)
     assert known
-    assert not notes
     assert found.weight is not None
     np.testing.assert_allclose(found.Y, 1.0, rtol=1e-12)
     np.testing.assert_allclose([scaler.u_offset[0], scaler.y_offset[0]], [2.0, 3.0])
@@ -214,6 +219,41 @@ def test_search_finds_the_system_of_the_lines():
     while not state.reason:
         state = optimiser.step(problem, state)
     assert state.reason == "converged: the residual vanishes"
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_covariance_is_that_of_the_errors_or_of_each_line_by_itself(known: bool):
+    """By central differences of the weighted errors, of several columns and outputs a line."""
+    F, m, nx, nu, ny = 14, 3, 2, 2, 2
+    rng = np.random.default_rng(6)
+    system, omega = random_system(nx, nu, ny), np.linspace(0.1, 3.0, F)
+    U, E = (rng.normal(size=(F, 2, m)) + 1j * rng.normal(size=(F, 2, m)) for _ in range(2))
+    Y, weight = reference.frf(system, omega) @ U + 0.3 * E, rng.uniform(0.5, 2.0, size=(F, ny, m))
+    found = refined(ResponseFit(Lines(np.exp(1j * omega), U, Y, weight), known=known), system, 3)
+    assert found.covariance is not None
+    theta = np.concatenate([part.ravel() for part in found.matrices])
+
+    def errors(theta: Array) -> Complex:
+        parts = np.split(theta, np.cumsum([nx * nx, nx * nu, ny * nx]))
+        A, B, C, D = (p.reshape(-1, n) for p, n in zip(parts, (nx, nu, nx, nu), strict=True))
+        return (np.sqrt(weight) * (reference.frf((A, B, C, D), omega) @ U - Y)).ravel()
+
+    h = 1e-6  # rounding leaves 1e-10 and the step 1e-12, times conditions of 1e3 at most
+    J = np.stack(
+        [(errors(theta + h * d) - errors(theta - h * d)) / (2 * h) for d in np.eye(len(theta))],
+        axis=1,
+    )
+    r = errors(theta)
+    assert found.rmse == pytest.approx(np.sqrt(np.mean(np.abs(r) ** 2)), rel=1e-9)
+    inverse = np.linalg.pinv((J.conj().T @ J).real, rcond=1e-9)
+    expected = inverse / 2  # a complex error of variance 1 has real parts of variance 1 / 2
+    if not known:
+        scores = (J.conj() * r[:, None]).real.reshape(F, ny * m, -1).sum(axis=1)
+        equations, unknowns = 2 * len(r), nx * (nu + ny) + nu * ny
+        expected = inverse @ scores.T @ scores @ inverse * equations / (equations - unknowns)
+    # What the coordinates leave alone: the variances of the fitted lines.
+    spread, wanted = (np.diag(J @ c @ J.conj().T).real for c in (found.covariance, expected))
+    np.testing.assert_allclose(spread, wanted, rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -1,12 +1,14 @@
 """Linear fits to signals: exact without noise, efficient and with the right covariance with it."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import reference
 import scipy.linalg
 from reference import Array, System, random_system, refined
 
-from lfrtorch.linear.signal_fit import SignalFit
+from lfrtorch.linear.signal_fit import OBSERVERS, SignalFit
 from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
@@ -103,6 +105,144 @@ def test_prediction_is_more_precise_than_simulation_where_the_noise_is_coloured(
     assert 1.7 * spread[True] < spread[False]
 
 
+def predictor(system: System, K: Array) -> System:
+    """The one-step-ahead predictor of an innovation model, driven by u and y."""
+    A, B, C, D = system
+    return A - K @ C, np.hstack([B - K @ D, K]), C, np.hstack([D, np.zeros((len(C), len(C)))])
+
+
+def test_fit_of_a_predictor_describes_its_own_errors():
+    """The prediction errors of what is found, where the start is forgotten: 0.6^60 = 5e-14."""
+    K = np.array([[0.5, 0.1], [0.0, 0.4]])
+    A, C = np.array([[0.9, 0.2], [0.0, 0.8]]), np.eye(2)
+    system = A, np.ones((2, 1)), C, np.array([[0.5], [0.0]])
+    record, _ = innovations(system, K, 140, seed=2, y0=3.0)
+    record = Record(record.u, record.y, skip=70)
+    found = refined(fit_of([record], offset=True, prediction=True), system, 5)
+    assert found.K is not None
+    assert found.constant is not None
+    assert found.innovation_covariance is not None
+    y = record.y - found.constant
+    e = (y - reference.dlsim(predictor(found.matrices, found.K), np.hstack([record.u, y])))[70:]
+    assert found.rmse == pytest.approx(np.sqrt(np.mean(e**2)), rel=1e-6)
+    # Without their means, over as many as there are: one fewer would be 1.4 % off.
+    e -= e.mean(axis=0)
+    np.testing.assert_allclose(found.innovation_covariance, e.T @ e / 70, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("best", range(len(OBSERVERS)))
+def test_prediction_starts_from_the_best_of_the_observers(best: int):
+    """Steady-state Kalman gains: state noise of a part of the states' variance, output noise 1."""
+    A, C = np.array([[0.95, 0.1], [0.0, 0.8]]), np.array([[1.0, 0.5], [0.0, 1.0]])
+    system = A, np.array([[2.0], [1.0]]), C, np.array([[0.5], [0.0]])
+    record, _ = innovations(system, np.zeros((2, 2)), 400, seed=4)
+    states = reference.dlsim((A, system[1], np.eye(2), np.zeros((2, 1))), record.u)
+    gains = []
+    for part in OBSERVERS:
+        P, K = np.zeros((2, 2)), np.zeros((2, 2))
+        for _ in range(200):  # the Riccati equation, until it stands
+            S = C @ P @ C.T + np.eye(2)
+            K = A @ P @ C.T @ np.linalg.inv(S)
+            P = A @ P @ A.T - K @ S @ K.T + part * np.diag(states.var(axis=0))
+        gains.append(K)
+    record, e = innovations(system, gains[best], 400, seed=4)
+    driven = np.hstack([record.u, record.y])
+    errors = [record.y - reference.dlsim(predictor(system, K), driven) for K in gains]
+    costs = [np.sum(error**2) for error in errors]
+    assert costs[best] == pytest.approx(np.sum(e**2))
+    assert np.argmin(costs) == best
+    fit = fit_of([record], prediction=True)
+    np.testing.assert_allclose(fit.state_deviation(system), states.std(axis=0), rtol=1e-9)
+    assert fit.search(system).state.cost == pytest.approx(costs[best], rel=1e-8)
+    # No observer where none is asked for.
+    simulated = np.sum((record.y - reference.dlsim(system, record.u)) ** 2)
+    assert fit_of([record]).search(system).state.cost == pytest.approx(simulated, rel=1e-8)
+
+
+def markov(theta: Array, nu: int, ny: int) -> Array:
+    """D, C B and C A B of A, B, C, D by rows, of two states: what no coordinates change."""
+    parts = np.split(theta, np.cumsum([4, 2 * nu, 2 * ny, ny * nu])[:-1])
+    A, B, C, D = (p.reshape(-1, n) for p, n in zip(parts, (2, nu, 2, nu), strict=True))
+    return np.concatenate([m.ravel() for m in (D, C @ B, C @ A @ B, C @ A @ A @ B)])
+
+
+def slope(function: Callable[[Array], Array], theta: Array) -> Array:
+    """Central differences: rounding leaves 1e-10 and the step 1e-12, times conditions of 1e3."""
+    h = 1e-6 * np.eye(len(theta))
+    return np.stack([(function(theta + d) - function(theta - d)) / 2e-6 for d in h], axis=1)
+
+
+def test_covariance_of_simulation_errors_is_a_sum_over_their_lines():
+    """JᵀJ's inverse around the sum of g gᵀ, g = Jᵀ (the error's part in a line of a record)."""
+    nu, ny = 2, 2
+    system = random_system(2, nu, ny)
+    records = []
+    for T, size in ((16, 1.0), (16, 2.0), (21, 1.0)):  # with a line at half the sample rate or not
+        rng = np.random.default_rng([T, int(size)])
+        u, e = size * rng.normal(size=(T, nu)), rng.normal(size=(T, ny))
+        records.append(Record(u, reference.dlsim(system, u) + e + 0.5 * np.roll(e, 1)))
+    found = refined(fit_of(records, offset=True), system, 3)
+    assert found.covariance is not None
+    assert found.constant is not None
+
+    def errors(theta: Array) -> Array:
+        parts = np.split(theta, np.cumsum([4, 2 * nu, 2 * ny, ny * nu]))
+        A, B, C, D = (p.reshape(-1, n) for p, n in zip(parts[:4], (2, nu, 2, nu), strict=True))
+        return np.concatenate(
+            [reference.dlsim((A, B, C, D), r.u) + parts[4] - r.y for r in records]
+        ).ravel()
+
+    theta = np.concatenate([*(m.ravel() for m in found.matrices), found.constant])
+    J, r = slope(errors, theta), errors(theta)
+    inverse = np.linalg.pinv(J, rcond=1e-6)
+    meat, first = np.zeros((len(theta), len(theta))), 0
+    for record in records:
+        T = len(record.u)
+        rows = slice(first * ny, (first + T) * ny)
+        for k in range(T // 2 + 1):
+            angle = 2 * np.pi * k / T * np.arange(T)
+            both = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            line = both @ np.linalg.pinv(both, rcond=1e-6)
+            g = J[rows].T @ (line @ r[rows].reshape(T, ny)).ravel()
+            meat += np.outer(g, g)
+        first += T
+    # 53 samples of 2 outputs, less 2 (2 + 2) + 4 of the system and 2 constants.
+    spread = inverse @ inverse.T @ meat @ inverse @ inverse.T * (106 / (106 - 14))
+    of_theta = slope(lambda t: markov(t, nu, ny), theta[:-2])
+    np.testing.assert_allclose(
+        np.diag(of_theta @ found.covariance @ of_theta.T),
+        np.diag(of_theta @ spread[:-2, :-2] @ of_theta.T),
+        rtol=1e-5,
+    )
+
+
+@pytest.mark.parametrize("T", [8, 30])
+def test_covariance_of_prediction_errors_is_that_of_white_ones(T: int):
+    """JᵀJ's inverse times the errors' variance, by differences of the predictor's errors."""
+    system = random_system(2)
+    record, _ = innovations(system, np.full((2, 1), 0.3), T, seed=5)
+    found = refined(fit_of([record], prediction=True), system, 5)
+    assert found.covariance is not None
+    assert found.K is not None
+
+    def errors(theta: Array) -> Array:
+        parts = np.split(theta, np.cumsum([4, 2, 2, 1]))
+        A, B, C, D, K = (p.reshape(-1, n) for p, n in zip(parts, (2, 1, 2, 1, 1), strict=True))
+        driven = np.hstack([record.u, record.y])
+        return (record.y - reference.dlsim(predictor((A, B, C, D), K), driven)).ravel()
+
+    theta = np.concatenate([*(m.ravel() for m in found.matrices), found.K.ravel()])
+    inverse = np.linalg.pinv(slope(errors, theta), rcond=1e-6)
+    # T samples, less 2 · 2 + 1 of the system and 2 of the observer.
+    spread = inverse @ inverse.T * np.sum(errors(theta) ** 2) / (T - 7)
+    of_theta = slope(lambda t: markov(t, 1, 1), theta[:-2])
+    np.testing.assert_allclose(
+        np.diag(of_theta @ found.covariance @ of_theta.T),
+        np.diag(of_theta @ spread[:-2, :-2] @ of_theta.T),
+        rtol=1e-5,
+    )
+
+
 @pytest.mark.parametrize("kind", ["white", "coloured", "prediction"])
 @pytest.mark.slow
 def test_covariance_is_that_of_many_fits(kind: str):
@@ -172,6 +312,25 @@ def test_start_states_that_no_input_leads_to_are_improbable():
         matrices = np.array([[0.999]]), np.array([[gain]]), np.eye(1), np.zeros((1, 1))
         search = problem.search(matrices)
         return problem.improbability(search) / search.state.cost
+
+    # x0ᵀ P⁻¹ x0 times the errors' variance, of two states, by records that both count.
+    B, C = np.array([[1.0], [0.5]]), np.eye(2)
+    matrices = np.diag([0.9, 0.5]), B, C, np.zeros((2, 1))
+    clean = reference.dlsim(matrices, u)
+    noisy = clean + rng.normal(size=clean.shape)
+    records = [Record(u[10:60], noisy[10:60], start="estimated"), Record(u, noisy)]
+    both = fit_of(records)
+    search = both.search(matrices).advance(1)
+    (x0,) = search.problem.start_states(search.state.theta).numpy()
+    search.problem.write(search.state.theta)
+    cell = search.problem.model.lfr.cell
+    A, B = (m.detach().numpy() for m in (cell.A, cell.Bu))
+    # The state after the last sample counts, too.
+    states = [reference.dlsim((A, B, C, 0 * B), np.vstack([r.u, [[0.0]]])) for r in records]
+    P = sum(x.T @ x for x in states) / 452
+    variance = search.state.cost / 900
+    expected = search.state.cost + variance * x0 @ np.linalg.solve(P, x0)
+    assert both.improbability(search) == pytest.approx(expected, rel=1e-9)
 
     assert ratio(1e-6) > 100.0 * ratio(0.05)
     assert ratio(0.05) < 1.1

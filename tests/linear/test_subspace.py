@@ -10,7 +10,14 @@ from reference import Array, System, random_system
 from lfrtorch.linear import subspace
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.linear.response_fit import Lines, ResponseFit
-from lfrtorch.linear.subspace import LARGEST_POLE, MOVED_POLE, from_signals, from_spectra, shortest
+from lfrtorch.linear.subspace import (
+    LARGEST_POLE,
+    MOVED_POLE,
+    from_signals,
+    from_spectra,
+    shortest,
+    suffice,
+)
 
 pytestmark = pytest.mark.numeric
 
@@ -159,8 +166,19 @@ def test_signals_without_noise_from_any_start_states(nx: int, nu: int, ny: int):
 
 
 def test_records_that_are_too_short_give_no_start():
-    u = np.random.default_rng(0).normal(size=(shortest(3, 1, 1) - 2, 1))
-    assert from_signals([u], [reference.dlsim(random_system(3), u)], 3) == []
+    """As many columns as rows do; one fewer do not, of one record or of several."""
+    system = random_system(3)
+    enough = shortest(3, 1, 1) - 1
+    window = (enough + 1) // 3
+    for lengths in ((enough,), (window + 4, enough - 5), (window - 1, enough)):
+        us = [np.random.default_rng(T).normal(size=(T, 1)) for T in lengths]
+        ys = [reference.dlsim(system, u) for u in us]
+        (past, past_u) = from_signals(us, ys, 3)
+        assert min(same_outputs(system, s.A, s.C) for s in (past, past_u)) < 1e-9
+        assert from_signals([*us[:-1], us[-1][1:]], [*ys[:-1], ys[-1][1:]], 3) == []
+        # The promise is the next one up.
+        assert not suffice(lengths, 3, 1, 1)
+        assert suffice((*lengths[:-1], lengths[-1] + 1), 3, 1, 1)
 
 
 @pytest.mark.parametrize("most", [subspace.MOST_OPERATIONS, 1e8, 1.0])
