@@ -6,7 +6,14 @@ import re
 import numpy as np
 import pytest
 
-from lfrtorch.records import Channel, Record, Scaler, as_records, rms_scale
+from lfrtorch.records import (
+    Channel,
+    Record,
+    Scaler,
+    as_records,
+    rms_scale,
+    without_coordinates,
+)
 
 U, Y = np.linspace(-1, 1, 20).reshape(10, 2), np.linspace(3, 4, 10)
 
@@ -118,6 +125,11 @@ def test_one_sample_of_several_channels_is_a_record():
     assert Record(np.ones((1, 3)), np.ones(1)).samples == 1
 
 
+def test_as_many_channels_as_samples_are_a_record():
+    record = Record(np.ones((30, 30)), np.ones((30, 30)))
+    assert (record.inputs[-1].name, record.outputs[0].name) == ("u30", "y1")
+
+
 @pytest.mark.parametrize("shape", [(), (10, 1, 1)])
 def test_number_of_axes(shape: tuple[int, ...]):
     refused(f"record 'lab': input has shape {shape};", u=np.ones(shape))
@@ -136,6 +148,16 @@ def test_empty_slice():
 @pytest.mark.parametrize("dtype", [complex, object, str])
 def test_numbers_that_are_not_real(dtype):
     refused("record 'lab': input has type", u=U.astype(dtype))
+
+
+@pytest.mark.parametrize("window", [3, slice(None, None, 2), slice(None, None, -1), slice(2, 1, 0)])
+def test_a_part_that_is_no_window(window):
+    with pytest.raises(ValueError, match=r"a record is cut by record\[first:last\], not by"):
+        Record(U, Y)[window]
+
+
+def test_start_state_that_is_not_finite():
+    refused("record 'lab': x0 is [ 1. nan]; give finite", start="given", x0=[1.0, np.nan])
 
 
 def test_channel_names_that_do_not_fit():
@@ -170,8 +192,10 @@ def test_records_of_different_channels():
 
 
 def test_records_of_different_rates():
+    first, same = Record(U, Y, name="a"), Record(U, Y, 1.0 + 1e-12)
     with pytest.raises(ValueError, match=r"'a' and 'b' are sampled at 1\.0 and 2\.0 Hz; resample"):
-        as_records([Record(U, Y, name="a"), Record(U, Y, 2.0, name="b")])
+        as_records([first, same, Record(U, Y, 2.0, name="b")])
+    assert as_records([first, same]) == [first, same]
 
 
 # --- scaling --------------------------------------------------------------------------------
@@ -207,6 +231,36 @@ def test_weights_by_output_and_by_line():
     assert float(record.weight) == 2.0
     assert record.line_weight is not None
     assert record.line_weight.shape == (6, 1)
+
+
+@pytest.mark.parametrize(("T", "F"), [(10, 6), (9, 5)])
+def test_every_output_has_its_weights(T: int, F: int):
+    """Lines from 0 to fs / 2: one more than half the samples, rounded down."""
+    lines = np.arange(2 * F).reshape(F, 2)
+    record = lab(u=U[:T], y=U[:T], start="periodic", weight=[0, 2], line_weight=lines)
+    assert np.array_equal(record.weight, [0.0, 2.0])
+    assert record.line_weight is not None
+    assert np.array_equal(record.line_weight, lines)
+    one = lab(u=U[:T], y=U[:T], start="periodic", line_weight=lines[:, :1])
+    assert one.line_weight is not None
+    assert np.array_equal(one.line_weight, lines[:, [0, 0]])
+
+
+def test_errors_count_by_the_root_of_their_weight_where_they_are_scored():
+    """What is skipped tells an estimated start; all of it does where nothing is skipped."""
+    record = lab(u=U[:4], y=U[:4], weight=[4.0, 9.0], skip=1)
+    assert record.factors.tolist() == [[0, 0], [2, 3], [2, 3], [2, 3]]
+    assert record.start_factors.tolist() == [[2, 3], [0, 0], [0, 0], [0, 0]]
+    whole = Record(U[:2], U[:2], weight=4.0)
+    assert whole.factors.tolist() == whole.start_factors.tolist() == [[2, 2], [2, 2]]
+
+
+def test_start_state_in_the_coordinates_of_a_model_is_estimated_for_another():
+    other = without_coordinates(lab(start="given", x0=[1.0], skip=2))
+    assert (other.start, other.x0, other.skip) == ("estimated", None, 2)
+    for start in ("zero", "estimated", "periodic"):
+        record = lab(start=start)
+        assert without_coordinates(record) is record
 
 
 @pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf"), 0.0])
@@ -248,3 +302,4 @@ def test_period_must_fit():
     refused("has 10 samples and a period of 11; it must hold at least one", period=11)
     refused("record 'lab': period is 0; give a whole number of at least 1", period=0)
     assert lab(period=4).period == 4
+    assert lab(period=10).period == lab(start="periodic", period=10).period == 10

@@ -1,5 +1,7 @@
 """Adam is torch's, in steps."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -49,6 +51,33 @@ def test_step_leaves_its_state_alone():
     first = adam.step(problem, adam.step(problem, start))
     again = adam.step(problem, adam.step(problem, start))
     assert torch.equal(first.theta, again.theta)
+
+
+def test_search_that_spent_its_epochs_goes_on_where_there_are_more():
+    problem, two, three = Quadratic(), Adam(max_iter=2), Adam(max_iter=3)
+    state = two.init(problem, ZERO)
+    for reason in ("", "maximum number of epochs"):
+        state = two.step(problem, state)
+        assert state.reason == reason
+    assert two.prolonged(state).reason == state.reason
+    longer = three.prolonged(state)
+    assert longer.reason == ""
+    end = three.step(problem, longer)
+    assert (end.iteration, end.reason) == (3, "maximum number of epochs")
+    diverged = replace(state, reason="diverged: lower the learning rate")
+    assert three.prolonged(diverged).reason == diverged.reason
+
+
+def test_step_that_might_be_taken_back_is_not():
+    adam, problem = Adam(), Quadratic()
+    before = adam.init(problem, ZERO)
+    after = adam.step(problem, before)
+    assert adam.refused(before, after) is after
+
+
+def test_report_is_the_norm_of_the_gradient():
+    state = Adam().init(Quadratic(), ZERO)
+    assert state.report == {"gradient_norm": pytest.approx((1.0 + 200.0**2) ** 0.5)}
 
 
 def test_divergence_is_a_reason():
