@@ -144,6 +144,26 @@ def test_problems_that_are_no_stack():
         Stack([one, SimulationError(models[1], records[:2])])
 
 
+@pytest.mark.parametrize("signal", ["u", "y"])
+def test_problems_of_other_signals_are_no_stack(signal: str):
+    """In the second batch of the last problem."""
+    models = some_models("network")
+    records = some_records(models[0])[1:4:2]
+    other = replace(records[1], **{signal: getattr(records[1], signal) + 1e-3})
+    same = [SimulationError(model, records) for model in models[:2]]
+    Stack(same)
+    with pytest.raises(ValueError, match="differ in records, scaling or free parameters"):
+        Stack([*same, SimulationError(models[2], [records[0], other])])
+
+
+def test_problems_of_other_free_parameters_are_no_stack():
+    models = some_models("network", 2)
+    models[1].lfr.cell.A.requires_grad_(False)
+    records = some_records(models[0])
+    with pytest.raises(ValueError, match="differ in records, scaling or free parameters"):
+        Stack([SimulationError(model, records) for model in models])
+
+
 def test_start_states_that_are_solved_for():
     models = some_models("network", 2)
     records = [record for record in some_records(models[0]) if record.start == "estimated"]
