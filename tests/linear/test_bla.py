@@ -106,6 +106,30 @@ def test_small_and_large_units_change_nothing():
     assert frf_error(estimate_bla(scaled, 3), (A, B, 1e-15 * C, 1e-15 * D)) < EXACT
 
 
+@pytest.mark.parametrize("refine", ["simulation", "prediction"])
+def test_units_of_each_channel_scale_the_noise_model_and_the_deviations(refine):
+    """By powers of two, which leave the rounding alone."""
+    record = record_of(random_system(2, 2, 2), "zero", T=200, offset=True, noise=0.3)
+    by_u, by_y = np.array([0.25, 8.0]), np.array([512.0, 0.5])
+    scaled = replace(record, u=by_u * record.u, y=by_y * record.y)
+    plain, other = (estimate_bla(r, 2, refine=refine, max_iter=2) for r in (record, scaled))
+    frequencies = np.array([0.5, 2.0, 4.5])
+    for size, wanted in ((other.frf, plain.frf), (other.frf_std, plain.frf_std)):
+        expected = wanted(frequencies) * by_y[:, None] / by_u
+        np.testing.assert_allclose(size(frequencies), expected, rtol=1e-9)
+    assert (other.frf_std(frequencies) > 0).all()
+    np.testing.assert_allclose(other.u_offset, by_u * plain.u_offset, rtol=1e-9)
+    np.testing.assert_allclose(other.y_offset, by_y * plain.y_offset, rtol=1e-9)
+    if refine == "prediction":
+        S = plain.innovation_covariance
+        assert plain.K is not None
+        assert other.K is not None
+        assert S is not None
+        assert other.innovation_covariance is not None
+        np.testing.assert_allclose(other.K, plain.K / by_y, rtol=1e-9)
+        np.testing.assert_allclose(other.innovation_covariance, by_y[:, None] * S * by_y, rtol=1e-9)
+
+
 # --- any data -------------------------------------------------------------------------------
 
 T = 120
