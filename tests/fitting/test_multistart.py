@@ -113,6 +113,38 @@ def test_starts_in_step_are_what_they_are_alone():
     assert sorted(seen) == 5 * [0] + 5 * [1] + 5 * [2]
 
 
+class Slow(LevenbergMarquardt):
+    """8 s an iteration, whether of one search or of several in step, by a clock of its own."""
+
+    now = 1000.0
+
+    def step(self, problem, state):
+        Slow.now += 8.0
+        return super().step(problem, state)
+
+    def steps(self, stack, states):
+        Slow.now += 8.0
+        return super().steps(stack, states)
+
+
+def test_starts_in_step_share_the_time_of_an_iteration(monkeypatch):
+    monkeypatch.setattr("time.perf_counter", lambda: Slow.now)
+    models, train, validation = several(2, T=20)
+    fits = [Fit(m, train, validation, trainer=Slow(max_iter=2)) for m in models]
+    advance_in_step(fits, 2)
+    for begun in fits:
+        assert [p.seconds for p in begun.history] == [0.0, 4.0, 8.0]
+
+
+def test_a_fit_takes_as_long_as_its_rounds(monkeypatch):
+    monkeypatch.setattr("time.perf_counter", lambda: Slow.now)
+    models, train, validation = several(1, T=20)
+    rounds: list[Round] = []
+    result = fit(models, train, validation, trainer=Slow(max_iter=3), watch=rounds.append)
+    assert [r.seconds for r in rounds] == [24.0]
+    assert (result.seconds, result.seconds_per_iteration) == (24.0, 8.0)
+
+
 def test_starts_without_validation_are_judged_on_training():
     models, train, _ = several(3)
     result = fit(models, train, trainer=LevenbergMarquardt(max_iter=1))
