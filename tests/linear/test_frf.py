@@ -198,6 +198,16 @@ def test_lines_of_the_input_stand_out_of_their_noise_by_15_db():
         assert found.tolist() == [*strong.lines, 300, 499]
 
 
+def test_lines_of_40_db_below_the_best_of_their_input_are_not_excited():
+    parts = [
+        multisine(100, lines=[line], rms=10 ** (level / 20)).u[0]
+        for line, level in ((10, 0), (20, -39), (30, -41), (40, -20))
+    ]
+    u = 1e3 * np.sum(parts, axis=0)
+    estimate = estimate_frf(Record(u, u, 100.0, "periodic"))
+    assert estimate.frequencies.tolist() == [10, 20, 40]
+
+
 @pytest.mark.parametrize(("deviation", "refused"), [(0.08, False), (0.12, True)])
 def test_input_may_deviate_by_a_tenth_from_period_to_period(deviation: float, refused: bool):
     """Per channel and record, relative to the rms of the channel over all records."""
@@ -553,6 +563,58 @@ def test_windows_are_the_smallest_that_leave_the_freedom(order: int, nu: int, R:
 
     n = half_width(order, 5, nu, R)
     assert left(n) >= 5 > left(n - 1)
+
+
+@pytest.mark.parametrize(("nu", "ny", "R", "order"), [(1, 1, 1, 2), (2, 2, 1, 0), (2, 3, 3, 1)])
+def test_local_polynomials_are_least_squares_in_the_nearest_lines(
+    nu: int, ny: int, R: int, order: int
+):
+    """Of G and the transients at once; windows that would leave the lines are the first or last."""
+    rng, N = np.random.default_rng(0), 101
+    u, y = rng.normal(size=(R, N, nu)), rng.normal(size=(R, N, ny))
+    records = [Record(a, b, name=f"r{r}") for r, (a, b) in enumerate(zip(u, y, strict=True))]
+    estimate = estimate_frf(records, order=order)
+    assert len(estimate.frequencies) == 50
+    assert estimate.cov_total is not None
+    U, Y = (np.fft.rfft(x, axis=1) * np.sqrt(2) / N for x in (u, y))
+    n = half_width(order, ny + 4, nu, R)
+    for i, line in enumerate(range(1, 51)):
+        window = np.clip(line - n, 1, 50 - 2 * n) + np.arange(2 * n + 1)
+        powers = ((window - line) / n)[:, None] ** np.arange(order + 1)
+        gains = (powers[None, :, :, None] * U[:, window, None]).reshape(R * len(window), -1)
+        X = np.hstack([gains, np.kron(np.eye(R), powers)])
+        inverse, wanted = np.linalg.pinv(X), Y[:, window].reshape(len(X), ny)
+        rest = wanted - X @ inverse @ wanted
+        C = rest.T @ rest.conj() / (len(X) - X.shape[1])
+        cov = np.kron(C, inverse[:nu] @ inverse[:nu].conj().T)
+        # Windows have conditions of 1e3.
+        np.testing.assert_allclose(estimate.G[i], (inverse[:nu] @ wanted).T, rtol=0, atol=1e-10)
+        atol = 1e-10 * np.abs(cov).max()
+        np.testing.assert_allclose(estimate.cov_total[i], cov, rtol=0, atol=atol)
+
+
+def test_windows_leave_ny_and_four_degrees_of_freedom():
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=(100, 1)), rng.normal(size=(100, 2))
+
+    def same(ny: int, freedom: int) -> bool:
+        record = Record(u, y[:, :ny])
+        left = estimate_frf(record).G, estimate_frf(record, degrees_of_freedom=freedom).G
+        return np.array_equal(*left)
+
+    # Windows grow by two lines: 4 degrees of freedom take that of 5, and 6 that of 7.
+    assert [same(1, freedom) for freedom in (3, 4, 5, 6)] == [False, True, True, False]
+    assert [same(2, freedom) for freedom in (4, 5, 6, 7, 8)] == [False, False, True, True, False]
+
+
+@pytest.mark.parametrize("beyond", [0, 1])
+def test_input_has_power_within_half_a_window_of_its_lines(beyond: int):
+    record = Record(multisine(400, lines=[100]).u[0], np.ones(400))
+    n = half_width(2, 5, 1, 1)
+    message = "an input has no power about line" if beyond else "determine the response at no line"
+    for line in (100 - n - beyond, 100 + n + beyond):
+        with pytest.raises(ValueError, match=message):
+            estimate_frf(record, lines=[line])
 
 
 @pytest.mark.parametrize(("nu", "R"), [(1, 1), (2, 1), (2, 3)])

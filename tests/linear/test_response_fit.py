@@ -79,6 +79,20 @@ def test_weights_of_records_count():
     assert costs[0] == pytest.approx(costs[1], rel=1e-10)
 
 
+def test_weights_of_lines_are_those_of_the_whole_record():
+    """Of three periods every third line counts; line 0 is taken up by the offset."""
+    rng, N = np.random.default_rng(0), 32
+    u, y = (np.tile(rng.normal(size=(N, 1)), (3, 1)) for _ in range(2))
+    weight = rng.uniform(0.5, 2.0, size=3 * N // 2 + 1)
+    one = lines([Record(u[:N], y[:N], start="periodic")], offset=True)
+    three = Record(u, y, start="periodic", period=N, line_weight=weight)
+    found = lines([three], offset=True)
+    root = np.sqrt(weight[3::3])[:, None, None]
+    np.testing.assert_allclose(found.z, one.z, rtol=1e-12)
+    np.testing.assert_allclose(found.U, root * one.U, rtol=1e-10)
+    np.testing.assert_allclose(found.Y, root * one.Y, rtol=1e-10)
+
+
 def test_other_records_are_no_lines():
     record = records_of(1, 1, 2)[0]
     signals = [record.u], [record.y]
