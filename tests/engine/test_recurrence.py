@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from reference import normal
 from torch import Tensor
 from torch.testing import assert_close
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from lfrtorch.engine.recurrence import (
     adjoint_recurrence,
@@ -47,6 +48,27 @@ def test_loop_is_the_recurrence():
     F = torch.tensor([[[[2.0]], [[3.0]]]])
     g = torch.tensor([[[[1.0]], [[5.0]]]])
     assert loop(F, g, torch.tensor([[[7.0]]])).flatten().tolist() == [7.0, 15.0, 50.0]
+
+
+class Products(TorchDispatchMode):
+    """Counts the products of matrices."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += "mm" in str(func)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("T", [1, 900, 930])
+def test_scan_takes_3_root_of_T_products_at_most(T: int):
+    F, g, s0 = problem(2, T, 3, 2)
+    with Products() as products:
+        s = scan(F, g, s0)
+    assert_same(s, loop(F, g, s0), 1e-12)
+    assert 0 < products.count <= 3 * T**0.5
 
 
 @pytest.mark.parametrize("way", [compiled, scan])
