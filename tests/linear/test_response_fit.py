@@ -93,6 +93,22 @@ def test_weights_of_lines_are_those_of_the_whole_record():
     np.testing.assert_allclose(found.Y, root * one.Y, rtol=1e-10)
 
 
+def test_offset_is_the_mean_by_the_weights_of_line_0():
+    """Of means of 1 and 4 with weights of 1 and 3 it is 3.25, which leaves a mean square of 3.375.
+
+    A half of 1 · 2.25² and 3 · 0.75², at both the input and the output.
+    """
+    records = []
+    for mean, weight in ((1.0, 1.0), (4.0, 3.0)):
+        u = mean + np.cos(2 * np.pi * np.arange(16) / 16)
+        line_weight = np.r_[weight, np.full(8, 2.0)]
+        records.append(Record(u, 2 * u, start="periodic", line_weight=line_weight))
+    found = lines(records, offset=True)
+    np.testing.assert_allclose(found.z[0], 1.0)
+    assert float((np.abs(found.U[0]) ** 2).sum()) == pytest.approx(3.375, rel=1e-10)
+    assert float((np.abs(found.Y[0]) ** 2).sum()) == pytest.approx(4 * 3.375, rel=1e-10)
+
+
 def test_other_records_are_no_lines():
     record = records_of(1, 1, 2)[0]
     signals = [record.u], [record.y]
