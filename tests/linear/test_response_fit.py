@@ -193,6 +193,16 @@ def test_weights_are_inverse_variances_of_some_20_degrees_of_freedom(
     np.testing.assert_allclose(inside, 4.0**2 / means, rtol=1e-12)
 
 
+def test_line_without_variance_has_a_large_and_finite_weight():
+    variance = np.ones(60)
+    variance[30] = 0.0
+    frf = response_of(variance, "total", experiments=41)
+    weight = lines_of_response(frf, "total", offset=True)[0].weight
+    assert weight is not None
+    assert np.isfinite(weight).all()
+    assert weight[30, 0, 0] > 1e6 * np.delete(weight, 30).max()
+
+
 def some_problem() -> tuple[ResponseError, torch.Tensor]:
     rng = np.random.default_rng(2)
     z = np.exp(1j * np.linspace(0.1, 3.0, 20))
