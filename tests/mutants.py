@@ -45,7 +45,7 @@ TESTS: dict[str, str] = {
     "records": "records stream",
     "engine/recurrence": "engine/recurrence engine/newton engine/sensitivity",
     "engine/newton": "engine/newton",
-    "engine/simulate": "engine/simulate model engine/newton",
+    "engine/simulate": "engine/simulate model engine/newton engine/nonlinearity",
     "engine/linearised": "engine/sensitivity engine/simulate",
     "engine/static_jacobian": "engine/static_jacobian engine/sensitivity",
     "engine/jacobian_kernel": "engine/sensitivity least_squares/simulation_problem",
