@@ -22,7 +22,7 @@ from lfrtorch.least_squares.jacobian import Jacobian
 from lfrtorch.least_squares.simulation_problem import SimulationError
 
 
-def stacked(cells: Sequence[LFRCell], repeat: int = 1) -> LFRCell:
+def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
     """One cell with the weights of all along a leading axis, each repeated for so many records.
 
     Args:

@@ -3,6 +3,8 @@
 import itertools
 import re
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import reference
 import scipy.linalg
 from reference import Array, System, random_system
 
+from lfrtorch.linear import bla
 from lfrtorch.linear.bla import data_scaler, estimate_bla
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearModel
@@ -575,3 +578,36 @@ def test_error_and_data_must_go_together():
     refused("weight is that of a response: use refine='frequency'.", record, weight="noise")
     with pytest.raises(ValueError, match="refine is 'simulation', an error of records"):
         estimate_bla(estimate_frf(record), 1, refine="simulation")
+
+
+class Race:
+    """A problem whose starts are known by their costs; which of them are searched?"""
+
+    def __init__(self) -> None:
+        self.searched: list[float] = []
+
+    def contenders(self, nx: int) -> int:
+        return 10
+
+    def search(self, matrices: float) -> SimpleNamespace:
+        self.searched.append(matrices)
+        search = SimpleNamespace(state=SimpleNamespace(cost=matrices))
+        search.advance = lambda _: search
+        return search
+
+    def improbability(self, search: SimpleNamespace) -> float:
+        return -search.state.cost
+
+    def refined(self, search: SimpleNamespace) -> float:
+        return search.state.cost
+
+
+def test_starts_that_are_alike_or_hopeless_are_not_searched(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(bla, "_scaled", lambda problem, matrices, balanced: matrices)
+    race, start = Race(), SimpleNamespace(A=[0])
+    starts: Any = [(cost, start, cost) for cost in (1.0, 1.0005, 2.0, 9.9, 10.1, 50.0)]
+    _, refined = bla._best(race, starts, 100, balanced=True)  # pyright: ignore[reportArgumentType]
+    assert race.searched == [1.0, 2.0, 9.9]
+    assert refined == 9.9  # the most probable one
+    bla._best(race, starts, bla.FIRST_STEPS, balanced=True)  # pyright: ignore[reportArgumentType]
+    assert race.searched[3:] == [1.0]  # without steps to compare them the best one alone
