@@ -99,6 +99,11 @@ def test_every_activation(activation: str):
     check_zero_start(random_cell(2, 2, 2, 2, 2, 3, activation=activation))
 
 
+def test_more_states_than_fit_into_a_tile_of_the_kernel():
+    """Of 4 by 4: a second one in both directions, and a part of a third."""
+    check_zero_start(random_cell(1, 2, 9, 1, 2, 2, radius=0.5))
+
+
 @pytest.mark.parametrize("check", [check_zero_start, check_periodic])
 def test_linear_cell(check):
     check(random_cell(2, 2, 3, 0, 0, radius=0.5))

@@ -583,15 +583,16 @@ def test_error_and_data_must_go_together():
 class Race:
     """A problem whose starts are known by their costs; which of them are searched?"""
 
-    def __init__(self) -> None:
-        self.searched: list[float] = []
+    def __init__(self, minimum: float | None = None) -> None:
+        self.minimum, self.searched = minimum, list[float]()
 
     def contenders(self, nx: int) -> int:
         return 10
 
     def search(self, matrices: float) -> SimpleNamespace:
         self.searched.append(matrices)
-        search = SimpleNamespace(state=SimpleNamespace(cost=matrices))
+        cost = matrices if self.minimum is None else self.minimum
+        search = SimpleNamespace(state=SimpleNamespace(cost=cost))
         search.advance = lambda _: search
         return search
 
@@ -611,3 +612,11 @@ def test_starts_that_are_alike_or_hopeless_are_not_searched(monkeypatch: pytest.
     assert refined == 9.9  # the most probable one
     bla._best(race, starts, bla.FIRST_STEPS, balanced=True)  # pyright: ignore[reportArgumentType]
     assert race.searched[3:] == [1.0]  # without steps to compare them the best one alone
+
+
+def test_starts_that_went_to_one_minimum_end_the_race(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(bla, "_scaled", lambda problem, matrices, balanced: matrices)
+    race, start = Race(minimum=0.5), SimpleNamespace(A=[0])
+    starts: Any = [(cost, start, cost) for cost in (1.0, 2.0, 3.0, 4.0, 5.0)]
+    bla._best(race, starts, 100, balanced=True)  # pyright: ignore[reportArgumentType]
+    assert race.searched == [1.0, 2.0, 3.0]
