@@ -85,16 +85,18 @@ LIBRARIES = ["torch", "numba", "scipy.signal", "scipy.io", "pandas", "matplotlib
 
 
 class Mutant(NamedTuple):
-    """One fault: the occurrence of an operator in a module."""
+    """One fault: the occurrence of an operator in a module, whose source is ``clean``."""
 
     module: str
+    clean: str
     line: int
     operator: Operator
     occurrence: int
 
-    def source(self, clean: str) -> str:
+    @property
+    def source(self) -> str:
         """The module's source with the fault."""
-        mutated = mutate_code(clean, self.operator, self.occurrence)
+        mutated = mutate_code(self.clean, self.operator, self.occurrence)
         assert mutated is not None
         return mutated
 
@@ -186,12 +188,13 @@ def operators() -> list[Operator]:
 
 def mutants(module: str) -> Iterator[Mutant]:
     """All of a module, but for those in annotations, assertions, messages and decorators."""
-    tree = get_ast((ROOT / "lfrtorch" / f"{module}.py").read_text())
+    clean = (ROOT / "lfrtorch" / f"{module}.py").read_text()
+    tree = get_ast(clean)
     for operator in operators():
         positions = (node for node in ast_nodes(tree) for _ in operator.mutation_positions(node))
         for occurrence, node in enumerate(positions):
             if not _is_outside(node):
-                yield Mutant(module, node.start_pos[0], operator, occurrence)
+                yield Mutant(module, clean, node.start_pos[0], operator, occurrence)
 
 
 def _is_outside(node: Any) -> bool:
@@ -235,16 +238,16 @@ def clean_seconds(module: str, folder: Path, processes: Any) -> float:
 def is_noticed(mutant: Mutant, folder: Path, processes: Any, limit: float) -> bool:
     """Whether the tests of the module fail on the mutant, or take longer than so many seconds."""
     module = mutant.module
-    path = folder / "lfrtorch" / f"{module}.py"
-    clean = (ROOT / "lfrtorch" / f"{module}.py").read_text()
-    path.write_text(mutant.source(clean))
+    path, kept = folder / "lfrtorch" / f"{module}.py", folder / "kept.py"
+    shutil.copy2(path, kept)
+    path.write_text(mutant.source)
     process = processes.Process(target=_run, args=(folder, module))
     process.start()
     process.join(limit)
     if late := process.is_alive():
         process.kill()
         process.join()
-    shutil.copy2(ROOT / "lfrtorch" / f"{module}.py", path)
+    shutil.copy2(kept, path)  # as old as it was, so that compiled code is good again
     for file in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
         file.unlink()
     kernels = (ROOT / "lfrtorch" / f"{module}.py").parent / "__pycache__"
@@ -255,9 +258,8 @@ def is_noticed(mutant: Mutant, folder: Path, processes: Any, limit: float) -> bo
 
 def difference(mutant: Mutant) -> str:
     """The lines that the mutant changes."""
-    clean = (ROOT / "lfrtorch" / f"{mutant.module}.py").read_text()
     lines = difflib.unified_diff(
-        clean.splitlines(), mutant.source(clean).splitlines(), n=0, lineterm=""
+        mutant.clean.splitlines(), mutant.source.splitlines(), n=0, lineterm=""
     )
     return "\n".join(line for line in lines if line[:3] not in ("---", "+++"))
 
