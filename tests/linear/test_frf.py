@@ -882,3 +882,12 @@ def twice(u: Array) -> Array:
 def test_door(records, options: dict, message: str):
     with pytest.raises(ValueError, match=re.escape(message)):
         estimate_frf(records, **options)
+
+
+@pytest.mark.parametrize("N", [16, 17])
+def test_lines_end_below_half_the_sampling_frequency(N: int):
+    """An even number of samples has a line there, of power in an input like this one."""
+    u = np.tile(np.eye(N)[0], 2)
+    response = estimate_frf(Record(u, u, 1.0, "periodic", period=N))
+    assert response.frequencies.max() == pytest.approx((N - 1) // 2 / N)
+    assert response.frequencies.max() < 0.5

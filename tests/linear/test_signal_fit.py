@@ -338,3 +338,17 @@ def test_start_states_that_no_input_leads_to_are_improbable():
     at_rest = fit_of([Record(u, drift, fs=1.0)])
     search = at_rest.search((0.9 * np.eye(1), np.eye(1), np.eye(1), np.zeros((1, 1))))
     assert at_rest.improbability(search) == search.state.cost
+
+
+@pytest.mark.parametrize(
+    ("start", "predicted_from"),
+    [("zero", "zero"), ("estimated", "estimated"), ("periodic", "estimated")],
+)
+def test_prediction_estimates_the_start_of_what_repeats_but_for_its_noise(start, predicted_from):
+    u = np.random.default_rng(0).normal(size=(60, 1))
+    record = Record(u, u, 10.0, start)
+    options = {"offset": False, "feedthrough": True}
+    (driven,) = SignalFit([u], [u], [record], prediction=True, **options)._records
+    assert driven.start == predicted_from
+    (driven,) = SignalFit([u], [u], [record], prediction=False, **options)._records
+    assert driven.start == start
