@@ -12,7 +12,9 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 @pytest.mark.slow
 @pytest.mark.numeric
 @pytest.mark.parametrize(
-    ("name", "ratio"), [("own_static_map", 50), ("in_a_larger_model", 20), ("own_data", 3)]
+    ("name", "ratio"),
+    # The larger model ends 21 to 31 times better, by the processor's rounding.
+    [("own_static_map", 50), ("in_a_larger_model", 10), ("own_data", 3)],
 )
 def test_is_many_times_better_than_the_linear_model(
     name: str,
