@@ -5,7 +5,7 @@ records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 """
 
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING
 
 from lfrtorch import datasets, distributed
 
@@ -84,7 +84,9 @@ __all__ = [
 _RENAMED = {"average": "mean_model", "fit_starts": "fit", "inference": "infer"}
 
 
-def __getattr__(name: str) -> Any:
-    """An old name ends in an error that says the new one."""
-    now = f"; it is called lfrtorch.{_RENAMED[name]} now" if name in _RENAMED else ""
-    raise AttributeError(f"module 'lfrtorch' has no attribute '{name}'{now}")
+if not TYPE_CHECKING:  # a checker would take every name for one of these
+
+    def __getattr__(name: str) -> None:
+        """An old name ends in an error that says the new one."""
+        now = f"; it is called lfrtorch.{_RENAMED[name]} now" if name in _RENAMED else ""
+        raise AttributeError(f"module 'lfrtorch' has no attribute '{name}'{now}")

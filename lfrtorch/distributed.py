@@ -40,7 +40,7 @@ class ProcessLost(RuntimeError):
 
 
 class Ranks:
-    """One process that holds all records. ``distributed`` has several."""
+    """One process that holds all records; ``ProcessGroup`` is several."""
 
     rank, world = 0, 1
 

@@ -42,6 +42,6 @@ def test_old_names_end_in_an_error_that_says_the_new_one():
     with pytest.raises(TypeError, match="'optimiser' of fit is called 'trainer' now"):
         lfrtorch.fit(optimiser=lfrtorch.Adam())  # pyright: ignore[reportCallIssue]
     with pytest.raises(AttributeError, match=r"it is called lfrtorch\.fit now"):
-        _ = lfrtorch.fit_starts
+        _ = lfrtorch.fit_starts  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.raises(AttributeError, match=r"no attribute 'nothing'$"):
-        _ = lfrtorch.nothing
+        _ = lfrtorch.nothing  # pyright: ignore[reportAttributeAccessIssue]

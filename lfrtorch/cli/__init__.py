@@ -1,1 +1,1 @@
-"""The command line: Hydra lives here alone."""
+"""What the command line needs beyond the settings: how a run is interrupted."""

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reference import Array, System, dlsim, frf, periodic_response, random_system
 
 from lfrtorch.excitation import Multisine, multisine
 from lfrtorch.linear.frf import FRF, Method, estimate_frf
 from lfrtorch.linear.local_polynomial import half_width
 from lfrtorch.records import Channel, Record
-from tests.reference import Array, System, dlsim, frf, periodic_response, random_system
 
 pytestmark = pytest.mark.numeric
 
