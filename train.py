@@ -362,7 +362,7 @@ def require(cfg: DictConfig) -> None:
     """Say what is missing from the command line before anything is computed."""
     require_data(cfg)
     if cfg.nx is None and cfg.init_from is not None:
-        cfg.nx = lfrtorch.load(cfg.init_from).sizes["nx"]
+        cfg.nx = opened(cfg).sizes["nx"]
     if cfg.nx is None:
         raise ValueError(
             "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
@@ -374,6 +374,8 @@ def require(cfg: DictConfig) -> None:
         if cfg[name] == "auto":
             used = sizes_of(cfg)[-1]
             raise ValueError(f"{name} is auto, and this static map has none; give {used}=auto.")
+    if cfg.static.kind == "own" and "auto" in (cfg.nz, cfg.nw):
+        raise ValueError("nz or nw is auto, and a map of one's own is not searched; give numbers.")
     integer("sizes_search.starts", cfg.sizes_search.starts, 1)
     number("sizes_search.iterations", cfg.sizes_search.iterations, positive=True)
     integer("nx_max", cfg.nx_max, 1)
@@ -405,7 +407,7 @@ def require_data(cfg: DictConfig) -> None:
 
 def continued(cfg: DictConfig, dataset: Dataset) -> lfrtorch.Model:
     """The model of ``init_from``; its sizes replace those of the configuration."""
-    model = lfrtorch.load(cfg.init_from)
+    model = opened(cfg)
     same_channels(model, dataset.train[0], cfg.init_from)
     for name, size in model.sizes.items():
         if cfg[name] != size:
@@ -414,6 +416,12 @@ def continued(cfg: DictConfig, dataset: Dataset) -> lfrtorch.Model:
             )
             cfg[name] = size
     return model
+
+
+def opened(cfg: DictConfig) -> lfrtorch.Model:
+    """The model of ``init_from`` as it was saved."""
+    own = static_map(cfg)["static"] if cfg.static.kind == "own" else None
+    return lfrtorch.load(cfg.init_from, static=own)
 
 
 def same_channels(model: lfrtorch.Model, record: lfrtorch.Record, folder: str) -> None:

@@ -21,6 +21,7 @@ from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.reporting.advice import Advice
+from lfrtorch.reporting.scores import neurons
 from lfrtorch.reporting.simulations import Response, rms
 
 USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
@@ -167,7 +168,7 @@ def _sizes(metrics: Mapping[str, Any]) -> str:
     """In words."""
     sizes = dict(metrics["sizes"])
     static = (
-        f"polynomial of degree {sizes['degree']}" if "degree" in sizes else f"{sizes['nn']} neurons"
+        f"polynomial of degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])
     )
     return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
 

@@ -179,7 +179,7 @@ def table(result: dict, published: Sequence[Published]) -> str:
     scored = {**result["validation"]["records"], **result["scores"]}
     units = {s["unit"] for s in scored.values()} - {""}
     title = f"Simulation RMSE{f' ({next(iter(units))})' if len(units) == 1 else ''}"
-    static = f"degree {sizes['degree']}" if "degree" in sizes else f"{sizes['nn']} neurons"
+    static = f"degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])
     title += f", nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
     if not rows:
         return f"{title}: nothing is scored, as there is no test and no validation record"
@@ -189,6 +189,11 @@ def table(result: dict, published: Sequence[Published]) -> str:
         references.insert(0, f"LTI: a model for each of these: {models}")
     rule = "-" * max(map(len, [first, *lines]))
     return "\n".join([title, rule, first, rule, *lines, rule, *references])
+
+
+def neurons(count: int) -> str:
+    """Of a network, in words; other maps have none."""
+    return f"{count} neurons" if count else "a map of one's own"
 
 
 def starts_table(result: dict) -> str:

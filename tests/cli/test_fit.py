@@ -137,7 +137,7 @@ def test_every_option_of_a_group_is_an_argument_of_its_target(group: str):
         assert set(node) - {"_target_"} <= set(parameters)
 
 
-def test_a_static_map_of_ones_own(csv: Path, tmp_path: Path):
+def test_a_static_map_of_ones_own(csv: Path, tmp_path: Path, capsys):
     words = [*file_overrides(csv), "nx=1", "nz=1", "nw=1", "trainer.max_iter=2", "static=own"]
     cfg = configuration(*words, "static._target_=cli.test_fit.Cubic")
     with open_dict(cfg):
@@ -146,6 +146,12 @@ def test_a_static_map_of_ones_own(csv: Path, tmp_path: Path):
     model = lfrtorch.load(tmp_path, static=Cubic(1, 1, 0.5))
     assert isinstance(model.lfr.cell.static, Cubic)
     assert model.lfr.cell.static.scale == 0.5
+    assert "nx 1, nz 1, nw 1, a map of one's own" in capsys.readouterr().out
+    cfg.init_from, cfg.nx = str(tmp_path), None
+    again = tmp_path / "again"
+    again.mkdir()
+    train.identify(cfg, again)
+    assert lfrtorch.load(again, static=Cubic(1, 1, 0.5)).sizes["nx"] == 1
 
 
 class Cubic(torch.nn.Linear):
@@ -542,6 +548,7 @@ def test_user_errors_are_one_message(
         (["sizes_search.starts=0"], "sizes_search.starts is 0"),
         (["init.method=magic"], "init method is 'magic'"),
         (["static=polynomial", "degree=0"], "degree is 0"),
+        (["static=own", "nz=auto"], "a map of one's own is not searched; give numbers"),
         (["activation=softsign"], "activation is 'softsign'"),
         (["trainer.damping=-1"], "damping is -1"),
         (["bla.coordinates=polar"], "coordinates is 'polar'"),
