@@ -6,7 +6,7 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all test-machines mutants coverage check bench reproduce docs clean
+.PHONY: help setup run test test-all test-machines mutants coverage check bench reproduce docs docs-links clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -45,9 +45,13 @@ bench: $(READY)  ## costs against what is required (PEERS=DIR, ARGS=--quick)
 reproduce: $(READY)  ## the public benchmarks at hand -> RESULTS.md (ARGS="silverbox data.root=DIR")
 	@$(BIN)/python scripts/reproduce.py $(ARGS)
 
-docs: $(READY)  ## API reference from the docstrings, in site/
-	@$(BIN)/pdoc -d google -o site lfrtorch
+docs: $(READY)  ## guide, notebooks and reference, in site/; a broken link in it is an error
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	@$(BIN)/sphinx-build -qW --keep-going docs site
 	@echo "Open site/index.html"
+
+docs-links: docs  ## links to other sites, too; needs the network
+	@$(BIN)/sphinx-build -qW --keep-going -b linkcheck docs site/.links
 
 clean:  ## remove caches and builds; .venv and runs stay
 	@rm -rf build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache

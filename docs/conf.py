@@ -1,0 +1,64 @@
+"""Sphinx: a guide, notebooks that run during the build, and the reference from the docstrings."""
+
+import importlib.metadata
+import re
+from typing import Any
+
+from sphinx.application import Sphinx
+
+project = "lfrtorch"
+author = "lfrtorch contributors"
+release = importlib.metadata.version(project)
+html_title = f"{project} {release}"
+html_theme = "furo"
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["**.ipynb_checkpoints"]
+
+# Markdown: formulas, and links to headings.
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+
+# Notebooks: an exception in one of them fails the build.
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_merge_streams = True
+
+# Reference: members in the order of the source.
+autodoc_default_options = {"members": True}
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+napoleon_numpy_docstring = False
+napoleon_custom_sections = ["Shape", ("Returns", "Shape")]
+python_maximum_signature_line_length = 88
+
+# Every reference must exist. Types of other packages have no page here.
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:.*", r"(collections|matplotlib|numpy|pathlib|scipy|threading|torch|typing)\..*"),
+    ("py:class", r"Tensor|lfrtorch\.distributed\.Shared"),  # the last: a type variable
+]
+
+# To other sites: `make docs-links`.
+linkcheck_timeout = 20
+linkcheck_anchors = False
+
+
+def as_written(_app: Sphinx, what: str, _name: str, _obj: Any, _options: Any, lines: list[str]):
+    """|x| is a norm, and the first words of a property are no type even before a colon."""
+    lines[:] = [re.sub(r"(``.*?``)|\|", lambda m: m[1] or r"\|", line) for line in lines]
+    if what == "property":
+        lines.insert(0, "\\ ")
+
+
+def left_to_the_source(_app: Sphinx, _what: str, name: str, obj: Any, _skip: bool, _options: Any):
+    """Constants, and the fields of named tuples, which the docstring of the class explains."""
+    field = (getattr(obj, "__doc__", None) or "").startswith("Alias for field number")
+    return True if field or name.isupper() else None
+
+
+def setup(app: Sphinx) -> None:
+    """Connect both to autodoc, before napoleon."""
+    app.connect("autodoc-process-docstring", as_written, priority=400)
+    app.connect("autodoc-skip-member", left_to_the_source)
