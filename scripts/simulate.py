@@ -60,7 +60,8 @@ def simulate(cfg: DictConfig) -> None:
         with about(path):
             stream = FileStream(
                 path, model.inputs, model.outputs, model.fs,
-                u=cfg.data.inputs, y=cfg.data.outputs, times=time_column(cfg, model, path),
+                inputs=cfg.data.inputs, outputs=cfg.data.outputs,
+                time=time_column(cfg, model, path),
             )  # fmt: skip
             if not stream.y:
                 missing = ", ".join(stream.missing)

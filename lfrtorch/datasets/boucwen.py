@@ -111,13 +111,13 @@ def load(
         ValueError: an argument out of range, or a test file that cannot be used.
         FileNotFoundError: ``root`` holds no test file, or one of a pair is missing.
     """
-    integer("data.seed", seed, 0)
-    integer("data.validation_seed_offset", validation_seed_offset, -seed)
-    number("data.noise_rms", noise_rms)
-    trained = _levels("data.rms", rms)
+    integer("seed", seed, 0)
+    integer("validation_seed_offset", validation_seed_offset, -seed)
+    number("noise_rms", noise_rms)
+    trained = _levels("rms", rms)
     if not trained:
-        raise ValueError("data.rms is empty; give one level or more, in N, for example [50].")
-    levels = [trained[0], *_levels("data.selection_rms", selection_rms)]
+        raise ValueError("rms is empty; give one level or more, in N, for example [50].")
+    levels = [trained[0], *_levels("selection_rms", selection_rms)]
     offsets = range(validation_seed_offset, validation_seed_offset + len(levels))
     if 0 in offsets or _TEST_OFFSET in offsets:
         raise ValueError(

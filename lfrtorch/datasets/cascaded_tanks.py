@@ -73,15 +73,15 @@ def load(
         FileNotFoundError: no such file below ``root``.
         OSError: the download fails.
     """
-    integer("data.skip", skip, 1)
-    number("data.validation", validation)
+    integer("skip", skip, 1)
+    number("validation", validation)
     held_out = official.held_out(_SAMPLES, validation) if validation else 0
     latest = _SAMPLES - held_out
-    integer("data.first", first, 1)
+    integer("first", first, 1)
     if first > latest:
         raise ValueError(
-            f"data.first is {first}, and {held_out} samples are to validate from there on; there "
-            f"are {_SAMPLES}: give {latest} at most, or a smaller data.validation."
+            f"first is {first}, and {held_out} samples are to validate from there on; there "
+            f"are {_SAMPLES}: give {latest} at most, or a smaller validation."
         )
     path = official.find(root, _FILE, "Cascaded_Tanks", download=download)
     signals = official.read_mat(path, ["uEst", "yEst", "uVal", "yVal"], _SAMPLES)

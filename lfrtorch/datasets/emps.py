@@ -83,12 +83,12 @@ def load(
         FileNotFoundError: no such file below ``root``, or nothing to download it with.
         OSError: the download fails.
     """
-    integer("data.warm_up", warm_up, 1)
+    integer("warm_up", warm_up, 1)
     held_out = official.held_out(_SAMPLES, validation)
     if warm_up >= held_out:
         raise ValueError(
-            f"data.warm_up is {warm_up}, which leaves none of the {held_out} validation samples "
-            "to score; give fewer, or a larger data.validation."
+            f"warm_up is {warm_up}, which leaves none of the {held_out} validation samples "
+            "to score; give fewer, or a larger validation."
         )
     trained = _SAMPLES - held_out
     estimation, test = (_measured(file, root, download) for file in (_ESTIMATION, _TEST))

@@ -139,7 +139,7 @@ def _checked(levels: Sequence[int], validation_level: int) -> list[int]:
         chosen = []
     if len(chosen) < 2 or len(set(chosen)) < len(chosen):
         raise ValueError(
-            f"data.levels is {levels} and data.validation_level is {validation_level}; give one or "
+            f"levels is {levels} and validation_level is {validation_level}; give one or "
             f"more of {', '.join(map(str, _ESTIMATION))} to train, for example [1, 3, 7], and "
             "another one of them to validate on, each once."
         )

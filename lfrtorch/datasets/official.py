@@ -64,7 +64,7 @@ def find(
         OSError: the download fails.
     """
     if not isinstance(download, bool):
-        raise ValueError(f"data.download is {download!r}; give true or false.")
+        raise ValueError(f"download is {download!r}; give True or False.")
     below = folder(root)
     path = _present(below, (file, *others))
     if path is None and download:
@@ -79,8 +79,8 @@ def find(
     if path is None:
         raise FileNotFoundError(
             f"there is no '{file}' in '{below}'. Give the folder that holds "
-            f"'{file.split('/')[0]}' with data.root=DIR, or have it downloaded: pip install "
-            f"'lfrtorch[bench]', then data.download=true (nonlinear_benchmarks.{loader}())."
+            f"'{file.split('/')[0]}' with root=DIR, or have it downloaded: pip install "
+            f"'lfrtorch[bench]', then download=True (nonlinear_benchmarks.{loader}())."
         )
     return path
 
@@ -188,11 +188,11 @@ def held_out(samples: int, validation: float, least: int = 1) -> int:
     Raises:
         ValueError: a fraction that leaves too little to train or nothing to validate on.
     """
-    number("data.validation", validation, positive=True)
+    number("validation", validation, positive=True)
     count = round(samples * min(validation, 1))
     if not 0 < count <= samples - least:
         raise ValueError(
-            f"data.validation is {validation}, which leaves {samples - count} of the {samples} "
+            f"validation is {validation}, which leaves {samples - count} of the {samples} "
             f"estimation samples for training, and {count} to validate on; it needs {least} and 1 "
             "at least: give a fraction like 0.2."
         )
@@ -228,7 +228,7 @@ def _download(below: Path, file: str, loader: str) -> None:
         raise FileNotFoundError(
             f"there is no '{file}' in '{below}', and the package that downloads it cannot be "
             f"imported ({error}): pip install 'lfrtorch[bench]'. Or give the folder that holds "
-            f"'{file.split('/')[0]}' with data.root=DIR."
+            f"'{file.split('/')[0]}' with root=DIR."
         ) from error
     below.mkdir(parents=True, exist_ok=True)
     try:
@@ -237,7 +237,7 @@ def _download(below: Path, file: str, loader: str) -> None:
         raise OSError(
             f"nonlinear_benchmarks.{loader}() failed ({error!r}); remove what it left in "
             f"'{below / file.split('/')[0]}' and try again, or give the folder that holds "
-            f"'{file.split('/')[0]}' with data.root=DIR."
+            f"'{file.split('/')[0]}' with root=DIR."
         ) from error
 
 

@@ -51,7 +51,7 @@ _SHAPES = {  # samples, periods, realisations, levels
 _ADVICE = f"remove '{_FILE}' and '{_ARCHIVE}', and download them again."
 _NOT_FOUND = (
     "the official data are not at hand: all records are the simulated stand-in's "
-    "(data.source=official downloads the data, data.root=DIR says where they are)"
+    "(source='official' downloads the data, root=DIR says where they are)"
 )
 
 _PAPER = "Schoukens and Tóth (2020), table 2, official data"
@@ -125,11 +125,11 @@ def load(
         OSError: the download fails.
     """
     if source not in _SOURCES:
-        raise ValueError(f"data.source is {source!r}; give one of {', '.join(_SOURCES)}.")
-    integer("data.seed", seed, 0)
-    integer("data.realisations", realisations, 1)
-    integer("data.periods", periods, 1)
-    number("data.noise_rms", noise_rms)
+        raise ValueError(f"source is {source!r}; give one of {', '.join(_SOURCES)}.")
+    integer("seed", seed, 0)
+    integer("realisations", realisations, 1)
+    integer("periods", periods, 1)
+    number("noise_rms", noise_rms)
     chosen = _checked(levels)
     path = _found(source, root)
     if path is None:
@@ -207,8 +207,8 @@ class _Official:
         ):
             if asked > most:
                 raise ValueError(
-                    f"data.{name} is {asked}, and the official data have {most} for training; give "
-                    f"1 to {most} (data.source=stand-in simulates as many as are asked for)."
+                    f"{name} is {asked}, and the official data have {most} for training; give "
+                    f"1 to {most} (source='stand-in' simulates as many as are asked for)."
                 )
         self.seed, self.periods = seed, periods
         self.arrays = official.read_arrays(path, _SHAPES, Path(_FILE).name, _ADVICE)
@@ -258,7 +258,7 @@ def _checked(levels: Sequence[int]) -> list[int]:
         chosen = []
     if not chosen or len(set(chosen)) < len(chosen):
         raise ValueError(
-            f"data.levels is {levels}; give one or more of {', '.join(map(str, LEVELS))} (mV rms), "
+            f"levels is {levels}; give one or more of {', '.join(map(str, LEVELS))} (mV rms), "
             "each once, for example [100, 1000]."
         )
     return chosen

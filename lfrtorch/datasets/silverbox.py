@@ -78,7 +78,7 @@ def load(
         FileNotFoundError: no such file below ``root``.
         OSError: the download fails.
     """
-    integer("data.warm_up", warm_up, 0)
+    integer("warm_up", warm_up, 0)
     begin, end = _ESTIMATION
     trained = end - official.held_out(end - begin, validation, least=warm_up + 1)
     path = official.find(root, _FILE, "Silverbox", download=download)

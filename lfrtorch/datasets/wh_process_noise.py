@@ -81,7 +81,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
         FileNotFoundError: no such file below ``root``, or nothing to download it with.
         OSError: the download fails.
     """
-    integer("data.validation", validation, 1)
+    integer("validation", validation, 1)
 
     def columns(file: str) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
         """Path, u and y (samples, records)."""
@@ -110,7 +110,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
     trained = u.shape[1] - validation
     if trained < 1:
         raise ValueError(
-            f"data.validation is {validation}, and '{path}' has {u.shape[1]} record(s), of which "
+            f"validation is {validation}, and '{path}' has {u.shape[1]} record(s), of which "
             f"one at least must train; give 1 to {u.shape[1] - 1}."
         )
     estimation = [

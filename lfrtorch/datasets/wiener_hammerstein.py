@@ -70,7 +70,7 @@ def load(
         FileNotFoundError: no such file below ``root``.
         OSError: the download fails.
     """
-    integer("data.skip", skip, 0)
+    integer("skip", skip, 0)
     held_out = official.held_out(_ESTIMATION, validation, least=_WARM_UP + skip + 1)
     path = official.find(root, _FILE, "WienerHammerBenchMark", download=download)
     u, y = official.read_mat(path, ["uBenchMark", "yBenchMark"], _SAMPLES)

@@ -113,14 +113,14 @@ def load_records(
         period,
         None if skip == "auto" else skip,
     )
-    paths = listed_files(path, "data.path")
+    paths = listed_files(path, "path")
     left = reader.read(paths)
-    tests, left, tested = _taken("data.test", test, left, reader)
-    chosen, left, validated = _taken("data.validation", validation, left, reader)
+    tests, left, tested = _taken("test", test, left, reader)
+    chosen, left, validated = _taken("validation", validation, left, reader)
     if not left:
         raise ValueError(
-            f"data.validation={validation} and data.test={test} leave no record for training; "
-            f"data.path has {len(reader.all)} in all."
+            f"validation={validation} and test={test} leave no record for training; "
+            f"path has {len(reader.all)} in all."
         )
     if validated + tested >= 1:
         raise ValueError(
@@ -159,11 +159,11 @@ class _Reader:
 
     def __init__(self, wanted: Wanted, start: Start, period: Period, skip: int | None) -> None:
         if start not in get_args(Start):
-            raise ValueError(f"data.start is {start!r}; use 'zero', 'estimated' or 'periodic'.")
+            raise ValueError(f"start is {start!r}; use 'zero', 'estimated' or 'periodic'.")
         if period not in (None, "auto"):
-            integer("data.period", period, 1)
+            integer("period", period, 1)
         if skip is not None:
-            integer("data.skip", skip, 0)
+            integer("skip", skip, 0)
         self.wanted, self.period, self.skip = wanted, period, skip
         self.start: Start = start
         self.all: list[_Whole] = []
@@ -251,8 +251,8 @@ class _Reader:
         if start == "periodic":
             if N is None:
                 raise ValueError(
-                    f"data.start is periodic and the input of '{measured.path}' does not repeat; "
-                    "give data.period in samples, or data.start=zero."
+                    f"start is 'periodic' and the input of '{measured.path}' does not repeat; "
+                    "give period in samples, or start='zero'."
                 )
             begin = settling if self.skip is None else self.skip
             if T - begin < N:
@@ -281,7 +281,7 @@ class _Reader:
             elif count:
                 said += f"; the first {count} periods are the transient and are not fitted"
             elif start == "zero" and self.skip is None and not find_transient(y, N):
-                said += "; the output is settled from the first sample on: use data.start=periodic"
+                said += "; the output is settled from the first sample on: use start='periodic'"
             notes.append(said)
         record = Record(
             u[kept],
@@ -314,7 +314,7 @@ def listed_files(given: Paths | None, option: str) -> list[Path]:
             continue
         matches = [Path(p) for p in glob.glob(str(path), recursive=True) if Path(p).is_file()]
         if not matches:
-            raise FileNotFoundError(f"no file is as '{path}', {option}, says{similar(path)}.")
+            raise FileNotFoundError(f"no file matches '{path}'{similar(path)}.")
         found += sorted(matches, key=lambda p: _counting(str(p)))
     return list({path.resolve(): path for path in found}.values())
 
@@ -406,7 +406,7 @@ def _named(
         if used:
             raise ValueError(
                 f"{option} names {', '.join(map(repr, used))}, which has a use already; name every "
-                "record once in data.validation and data.test."
+                "record once in validation and test."
             )
         records += [whole.record for whole in found]
         left = [whole for whole in left if whole not in found]

@@ -35,9 +35,9 @@ class Wanted:
 
     def __post_init__(self) -> None:
         if self.fs is not None:
-            number("data.fs", self.fs, positive=True)
+            number("fs", self.fs, positive=True)
         if self.gaps not in get_args(Gaps):
-            raise ValueError(f"data.gaps is {self.gaps!r}; use 'error' or 'split'.")
+            raise ValueError(f"gaps is {self.gaps!r}; use 'error' or 'split'.")
 
 
 class Stretch(NamedTuple):
@@ -68,28 +68,28 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
             time stamps that are no even grid, or no sampling frequency or two of them.
     """
     table = open_table(path)
-    u = table.find(wanted.inputs, "data.inputs")
-    y = table.find(wanted.outputs, "data.outputs")
-    stamps = () if wanted.time is None else table.find(wanted.time, "data.time")
+    u = table.find(wanted.inputs, "inputs")
+    y = table.find(wanted.outputs, "outputs")
+    stamps = () if wanted.time is None else table.find(wanted.time, "time")
     if len(stamps) > 1:
-        raise ValueError(f"data.time is {wanted.time!r}, which is {len(stamps)} columns; name one.")
+        raise ValueError(f"time is {wanted.time!r}, which is {len(stamps)} columns; name one.")
     columns = (*u, *y, *stamps)
     twice = [table.headers[i] for i in dict.fromkeys(columns) if columns.count(i) > 1]
     if twice:
         raise ValueError(
-            f"'{path}': {', '.join(map(repr, twice))} stands twice in data.inputs, data.outputs "
-            "and data.time; name every column once."
+            f"'{path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs "
+            "and time; name every column once."
         )
     if wanted.fs is None and not stamps:
         raise ValueError(
             f"the sampling frequency of '{path}' is not given; say it in Hz with "
-            f"data.fs{_suggested(table, columns)}."
+            f"fs{_suggested(table, columns)}."
         )
     known = {name for i in (*u, *y) for name in (table.headers[i], table.columns[i].name)}
     strange = [name for name in wanted.units if name not in known]
     if strange:
         raise ValueError(
-            f"data.units names {', '.join(map(repr, strange))}, which is none of the inputs and "
+            f"units names {', '.join(map(repr, strange))}, which is none of the inputs and "
             f"outputs: {', '.join(table.columns[i].name for i in (*u, *y))}."
         )
     notes = []
@@ -172,7 +172,7 @@ def _gap(
             f"all, the first before {table.where(int(grid.gaps[0]))}"
         )
     return ValueError(
-        f"'{table.path}': {', and '.join(said)}; data.gaps=split takes every stretch between for a "
+        f"'{table.path}': {', and '.join(said)}; gaps='split' takes every stretch between for a "
         "record of its own, or fill the gaps."
     )
 
@@ -186,8 +186,8 @@ def _grid(table: Table, t: NDArray[np.float64], column: int) -> Sampling:
     except Uneven as error:
         raise ValueError(
             f"'{table.path}': the time column {table.headers[column]!r} {error}, at "
-            f"{table.where(error.sample)}; resample the signals to an even grid, or give data.fs "
-            "without data.time where the column is wrong."
+            f"{table.where(error.sample)}; resample the signals to an even grid, or give fs "
+            "without time if the column is wrong."
         ) from error
 
 
@@ -195,7 +195,7 @@ def _agree(wanted: Wanted, grid: Sampling, table: Table, column: int) -> None:
     if wanted.fs is not None and abs(wanted.fs / grid.fs - 1) > max(_SAME, grid.uncertainty):
         raise ValueError(
             f"fs is {wanted.fs:g} Hz and the time column {table.headers[column]!r} of "
-            f"'{table.path}' says {grid.fs:g} Hz; leave data.fs or data.time out, whichever is "
+            f"'{table.path}' says {grid.fs:g} Hz; leave fs or time out, whichever is "
             "wrong."
         )
 
@@ -223,16 +223,14 @@ def _suggested(table: Table, columns: Sequence[int]) -> str:
     if not grids:
         return ""
     column, grid = grids[0]
-    return (
-        f", or by a column of time stamps: data.time={table.columns[column].name} ({grid.fs:g} Hz)"
-    )
+    return f", or by a column of time stamps: time={table.columns[column].name!r} ({grid.fs:g} Hz)"
 
 
 def _doubts(table: Table, columns: Sequence[int], fs: float) -> list[str]:
     """A note where a column is named as time is and contradicts ``fs``."""
     return [
-        f"data.fs is {fs:g} Hz and the column {table.headers[column]!r} says {grid.fs:g} Hz; where "
-        f"that is right, give data.time={table.columns[column].name} in place of data.fs"
+        f"fs is {fs:g} Hz and the column {table.headers[column]!r} says {grid.fs:g} Hz; where "
+        f"that is right, give time={table.columns[column].name!r} in place of fs"
         for column, grid in _beside(table, columns)
         if is_time(table.columns[column]) and abs(fs / grid.fs - 1) > max(_SAME, grid.uncertainty)
     ]

@@ -37,8 +37,8 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
     if steady and total - sum(held) < 1:
         raise TooShort(
             f"record '{record.name}' has {total} whole period(s) after the transient, and "
-            f"{', '.join(names)} need one each; give a longer record, set data.validation or "
-            "data.test to 0, or use data.start=zero."
+            f"{', '.join(names)} need one each; give a longer record, set validation or "
+            "test to 0, or use start='zero'."
         )
     ends = [total - sum(held)]
     for count in held:

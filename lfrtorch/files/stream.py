@@ -37,11 +37,11 @@ class FileStream:
 
     Args:
         path: the file, of any format that ``open_table`` reads.
-        inputs, outputs: the model's channels.
+        u, y: the model's input and output channels.
         fs: its sampling frequency in Hz.
-        u, y: columns of the inputs and outputs, names or numbers from 0; where left out, those that
-            are called as the model's channels, no output unless all of them are there.
-        times: column of time stamps, which must run evenly at ``fs``.
+        inputs, outputs: their columns, names or numbers from 0. Default: the columns with the names
+            of the channels, and no outputs unless all of them are there.
+        time: column of time stamps, which must run evenly at ``fs``.
 
     Raises:
         ValueError: a file that cannot be read, or columns that are not there, too many, too few or
@@ -52,24 +52,24 @@ class FileStream:
     def __init__(
         self,
         path: str | Path,
-        inputs: Sequence[Channel],
-        outputs: Sequence[Channel],
+        u: Sequence[Channel],
+        y: Sequence[Channel],
         fs: float,
         *,
-        u: Columns | None = None,
-        y: Columns | None = None,
-        times: str | int | None = None,
+        inputs: Columns | None = None,
+        outputs: Columns | None = None,
+        time: str | int | None = None,
     ) -> None:
         self.table, self.fs = open_table(path), fs
-        self.u = self._found(u, inputs, "data.inputs")
+        self.u = self._found(inputs, u, "inputs")
         there = {column.name for column in self.table.columns}
-        self.missing = [channel.name for channel in outputs if channel.name not in there]
+        self.missing = [channel.name for channel in y if channel.name not in there]
         """The model's outputs that are not in the file, by their own names."""
-        unmeasured = y is None and self.missing
-        self.y = () if unmeasured else self._found(y, outputs, "data.outputs")
-        self.times = () if times is None else self.table.find(times, "data.time")
+        unmeasured = outputs is None and self.missing
+        self.y = () if unmeasured else self._found(outputs, y, "outputs")
+        self.times = () if time is None else self.table.find(time, "time")
         if len(self.times) > 1:
-            raise ValueError(f"data.time is {times!r}, {len(self.times)} columns; name one.")
+            raise ValueError(f"time is {time!r}, {len(self.times)} columns; name one.")
         self.clock = self.table.columns[self.times[0]] if self.times else Channel("sample")
         """Of the time stamps, or of sample numbers where there are none."""
 
@@ -114,7 +114,7 @@ class FileStream:
             if wanted is not None:
                 raise
             raise ValueError(
-                f"{str(error).replace(f', as {option} says', '')} The model has {listed}; "
+                f"{str(error).replace(f', named in {option}', '')} The model has {listed}; "
                 f"say which columns these are with {option}=[...]."
             ) from error
         if len(found) != len(channels):
@@ -140,7 +140,7 @@ class FileStream:
         except Uneven as error:
             raise ValueError(
                 f"{self._at(first + error.sample)}: the time column {self.clock} {error}; resample "
-                "the signals to an even grid, or leave out data.time where the column is wrong."
+                "the signals to an even grid, or leave out time if the column is wrong."
             ) from error
         if abs(grid.fs / self.fs - 1) > max(SAME, grid.uncertainty):
             raise ValueError(

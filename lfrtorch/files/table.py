@@ -87,7 +87,7 @@ class Table(ABC):
 
         Args:
             wanted: one or several.
-            option: what messages call it, ``data.inputs`` for example.
+            option: what messages call it, ``inputs`` for example.
 
         Raises:
             ValueError: no such column, more than one of the name, or something else than names.
@@ -108,7 +108,7 @@ class Table(ABC):
         if isinstance(wanted, int):
             if not 0 <= wanted < len(self.columns):
                 raise NoColumn(
-                    f"'{self.path}' has no column number {wanted}, as {option} says; "
+                    f"'{self.path}' has no column number {wanted}, named in {option}; "
                     f"it has {self.listed}, numbered from 0."
                 )
             return (wanted,)
@@ -121,19 +121,19 @@ class Table(ABC):
             if found:
                 numbers = ", ".join(map(str, found))
                 raise ValueError(
-                    f"'{self.path}' has {len(found)} columns {wanted!r}, as {option} says; "
+                    f"'{self.path}' has {len(found)} columns {wanted!r}, named in {option}; "
                     f"give the number of one: {numbers}."
                 )
         if wanted in self.refused:
             raise ValueError(
-                f"'{self.path}': {wanted!r}, as {option} says, {self.refused[wanted]}."
+                f"'{self.path}': {wanted!r}, named in {option}, {self.refused[wanted]}."
             )
         close = difflib.get_close_matches(wanted, self.headers, n=1, cutoff=CLOSE) or [
             header for header in self.headers if re.split(r"\W+", header)[-1] == wanted
         ]
         meant = f" Did you mean {close[0]!r}?" if len(close) == 1 else ""
         raise NoColumn(
-            f"'{self.path}' has no column {wanted!r}, as {option} says; it has {self.listed}."
+            f"'{self.path}' has no column {wanted!r}, named in {option}; it has {self.listed}."
             f"{meant}"
         )
 

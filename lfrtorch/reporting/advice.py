@@ -151,8 +151,8 @@ def starts_in_a_transient(e: Evidence) -> Advice | None:
     if e.transient is None or e.transient <= TRANSIENT:
         return None
     return Advice(
-        "The records do not begin at rest: skip more samples (data.skip=N), or estimate "
-        "their starts (data.start=estimated).",
+        "The records do not begin at rest: skip more samples (skip=N), or estimate "
+        "their starts (start='estimated').",
         f"in their first twentieth the training error is {e.transient:.2g} times that of the rest",
     )
 
@@ -174,8 +174,7 @@ def still_falling(e: Evidence) -> Advice | None:
     if e.falling <= FALLING:
         return None
     return Advice(
-        f"Still falling: trainer.max_iter={4 * max(e.iterations, 1)}; "
-        "init_from=RUN goes on from here.",
+        f"Still falling: max_iter={4 * max(e.iterations, 1)}; init_from=RUN goes on from here.",
         f"the error fell by {_percent(e.falling)} over the last tenth of the {e.iterations} "
         "iterations",
     )

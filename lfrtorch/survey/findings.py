@@ -128,7 +128,7 @@ def _levels(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
             yield Finding(
                 f"missing {name}",
                 f"'{name}' misses {one.missing} of {T} samples, up to {one.gap} in a row; "
-                "fill short gaps by interpolation; data.gaps=split cuts the record at them.",
+                "fill short gaps by interpolation; gaps='split' cuts the record at them.",
             )
         if one.values == 1:
             told = f"'{name}' is constant at {one.mean:.6g}"

@@ -205,7 +205,7 @@ def test_only_the_beginning_of_a_long_file_is_read(file: Path, run, monkeypatch)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--inputs", "mass"], "has no column 'mass', as --inputs says"),
+        (["--inputs", "mass"], "has no column 'mass', named in --inputs"),
         (["--inputs", "force", "--outputs", "force"], "'force (N)' stands for several"),
         (["--out", "x.csv"], "--out is 'x.csv'; give a name that ends with .png"),
         (["--fs", "-3"], "--fs is -3.0; give a positive number"),

@@ -290,7 +290,7 @@ def test_blocks_give_the_numbers_of_one_simulation(
             ["data.path=input.csv", "out=x.csv"],
             "there is no file 'input.csv'; there is 'inputs.csv'",
         ),
-        (["data.path='*.txt'", "out=x"], "no file is as '*.txt', data.path, says"),
+        (["data.path='*.txt'", "out=x"], "no file matches '*.txt'"),
         (["data.path='*.csv'", "out=x.csv"], "2 files cannot be written to one, 'x.csv'"),
         (["data.path=[both.csv,model/../both.txt]", "out=x"], "several files are called 'both'"),
         (["data.path=both.csv", "out=x.xlsx"], "out is 'x.xlsx'; give a file of .csv"),

@@ -112,7 +112,7 @@ def test_decimation_filter(factor):
 def test_official_multisine(official):
     test = official(boucwen.load, samples=150, selection_rms=[]).tests[0]
     if test.source != "official":
-        pytest.skip("no uval_multisine.mat below data.root")
+        pytest.skip("no uval_multisine.mat below root")
     assert (test.name, test.source, test.samples) == ("multisine", "official", PERIOD)
     u = np.tile(resample(test.u[:, 0], PERIOD * RATIO), 3)
     y = boucwen.simulate(u)[PERIOD : 2 * PERIOD]
@@ -123,7 +123,7 @@ def test_official_multisine(official):
 def test_official_sweep(official, displacement):
     test = official(boucwen.load, samples=150, selection_rms=[]).tests[1]
     if test.source != "official":
-        pytest.skip("no uval_sinesweep.mat below data.root")
+        pytest.skip("no uval_sinesweep.mat below root")
     assert (test.name, test.source, test.samples) == ("sweep", "official", SWEEP)
     assert difference(boucwen.sweep()[::RATIO], test.u) < 1e-9  # measured: 3e-12
     assert difference(boucwen._decimate(displacement, RATIO), test.y) < 1e-9  # measured: 1e-12
@@ -388,25 +388,25 @@ def test_refused_damaged_files(brief, tmp_path, damage):
         ({"samples": 149}, "period of 149 samples .* at least 150"),
         ({"samples": 0}, "period of 0 samples"),
         ({"samples": 1024.0}, "whole number"),
-        ({"rms": 0.0}, "data.rms is 0.0; give a positive"),
-        ({"rms": -50.0}, "data.rms is -50.0; give"),
-        ({"rms": np.nan}, "data.rms is nan"),
+        ({"rms": 0.0}, "rms is 0.0; give a positive"),
+        ({"rms": -50.0}, "rms is -50.0; give"),
+        ({"rms": np.nan}, "rms is nan"),
         ({"rms": 1e9}, "integration fails under a force of up to .* smaller"),
-        ({"noise_rms": -1e-6}, "data.noise_rms is -1e-06; give"),
+        ({"noise_rms": -1e-6}, "noise_rms is -1e-06; give"),
         ({"noise_rms": np.inf}, "noise_rms is inf; give a number of at least 0"),
-        ({"seed": -1}, "data.seed is -1"),
+        ({"seed": -1}, "seed is -1"),
         (
             {"seed": 3, "validation_seed_offset": -4},
-            "data.validation_seed_offset is -4; give a whole number of at least -3",
+            "validation_seed_offset is -4; give a whole number of at least -3",
         ),
         ({"validation_seed_offset": 0}, "none may be the training or simulated test realisation"),
         (
             {"validation_seed_offset": 1999},
             "none may be the training or simulated test realisation",
         ),
-        ({"rms": []}, "data.rms is empty; give"),
-        ({"rms": [50, -1]}, "data.rms is -1; give a positive"),
-        ({"selection_rms": [50, 0]}, "data.selection_rms is 0; give"),
+        ({"rms": []}, "rms is empty; give"),
+        ({"rms": [50, -1]}, "rms is -1; give a positive"),
+        ({"selection_rms": [50, 0]}, "selection_rms is 0; give"),
     ],
 )
 def test_refused_arguments(arguments, match):

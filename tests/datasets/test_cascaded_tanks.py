@@ -74,11 +74,11 @@ def test_validation_amid_the_record(numbered):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"validation": -0.1}, "data.validation is -0.1"),
+        ({"validation": -0.1}, "validation is -0.1"),
         ({"validation": 1.0}, "leaves 0 of the 1024"),
-        ({"skip": 0}, "data.skip is 0"),
-        ({"first": 0}, "data.first is 0"),
-        ({"validation": 0.25, "first": 769}, "data.first is 769.*give 768 at most"),
+        ({"skip": 0}, "skip is 0"),
+        ({"first": 0}, "first is 0"),
+        ({"validation": 0.25, "first": 769}, "first is 769.*give 768 at most"),
     ],
 )
 def test_refused_arguments(arguments, match):
@@ -87,7 +87,7 @@ def test_refused_arguments(arguments, match):
 
 
 def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no 'Cascaded_Tanks/Cascaded.*data.root=DIR"):
+    with pytest.raises(FileNotFoundError, match=r"no 'Cascaded_Tanks/Cascaded.*root=DIR"):
         cascaded_tanks.load(root=tmp_path)
 
 

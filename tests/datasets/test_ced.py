@@ -91,9 +91,9 @@ def test_the_archive_does_as_well(tmp_path, archive):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"validation": 0}, "data.validation is 0"),
+        ({"validation": 0}, "validation is 0"),
         ({"validation": 1.0}, "leaves 0 of the 400"),
-        ({"download": "no"}, "data.download is 'no'; give true or false"),
+        ({"download": "no"}, "download is 'no'; give True or False"),
     ],
 )
 def test_refused_arguments(arguments, match):
@@ -102,7 +102,7 @@ def test_refused_arguments(arguments, match):
 
 
 def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no 'CED/DATAUNIF.MAT'.*data.root=DIR"):
+    with pytest.raises(FileNotFoundError, match=r"no 'CED/DATAUNIF.MAT'.*root=DIR"):
         ced.load(root=tmp_path)
 
 

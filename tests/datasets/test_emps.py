@@ -87,11 +87,11 @@ def test_the_archive_does_as_well(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"validation": 0}, "data.validation is 0"),
+        ({"validation": 0}, "validation is 0"),
         ({"validation": 1.0}, "leaves 0 of the 24841"),
-        ({"warm_up": 0}, "data.warm_up is 0"),
-        ({"warm_up": 4968}, "data.warm_up is 4968, which leaves none of the 4968"),
-        ({"download": "no"}, "data.download is 'no'; give true or false"),
+        ({"warm_up": 0}, "warm_up is 0"),
+        ({"warm_up": 4968}, "warm_up is 4968, which leaves none of the 4968"),
+        ({"download": "no"}, "download is 'no'; give True or False"),
     ],
 )
 def test_refused_arguments(arguments, match):
@@ -102,7 +102,7 @@ def test_refused_arguments(arguments, match):
 def test_a_missing_file_is_one_message(numbered):
     for file in reversed(FILES):
         (numbered / file).unlink()
-        with pytest.raises(FileNotFoundError, match=rf"no '{file}'.*data.root=DIR"):
+        with pytest.raises(FileNotFoundError, match=rf"no '{file}'.*root=DIR"):
             emps.load(root=numbered)
 
 

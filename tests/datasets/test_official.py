@@ -48,7 +48,7 @@ def test_a_missing_file_is_named_with_advice(tmp_path, monkeypatch):
         for part in (
             f"'{folder}'",
             "holds 'Bench'",
-            "data.root=DIR",
+            "root=DIR",
             "nonlinear_benchmarks.Loader",
         ):
             assert part in message
@@ -127,7 +127,7 @@ def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match=r"no 'Bench/x\.mat' in") as refusal:
         official.find(tmp_path / "new", "Bench/x.mat", "Bench", download=True)
     assert "pip install 'lfrtorch[bench]'" in str(refusal.value)
-    assert "data.root=DIR" in str(refusal.value)
+    assert "root=DIR" in str(refusal.value)
     assert not (tmp_path / "new").exists()
 
 
@@ -250,7 +250,7 @@ def test_held_out():
     assert official.held_out(65_062, 0.2) == 13_012
     refused: list[Any] = [0, 1, 1.5, 1e-9, -0.1, float("nan"), float("inf"), None, "0.2"]
     for validation in refused:
-        with pytest.raises(ValueError, match=r"data\.validation is"):
+        with pytest.raises(ValueError, match=r"validation is"):
             official.held_out(1000, validation)
     assert official.held_out(1000, 0.9, least=100) == 900
     with pytest.raises(ValueError, match=r"leaves 100 of the 1000 .* it needs 101"):

@@ -258,18 +258,18 @@ def test_published(data):
     ("arguments", "match"),
     [
         ({"source": "simulated"}, "'simulated'; give one of auto, official, stand-in"),
-        ({"seed": -1}, "data.seed is -1"),
-        ({"realisations": 0}, "data.realisations is 0; give a whole number of at least 1"),
-        ({"realisations": 1.5}, "data.realisations is 1.5"),
-        ({"periods": 0}, "data.periods is 0"),
-        ({"noise_rms": -1e-3}, "data.noise_rms is -0.001"),
-        ({"noise_rms": np.inf}, "data.noise_rms is inf"),
-        ({"levels": ()}, r"data.levels is \(\); give one or more of 100, 325"),
-        ({"levels": 100}, "data.levels is 100; give one or more"),
-        ({"levels": "100"}, "data.levels is 100; give one or more"),
-        ({"levels": [200]}, r"data.levels is \[200\]"),
+        ({"seed": -1}, "seed is -1"),
+        ({"realisations": 0}, "realisations is 0; give a whole number of at least 1"),
+        ({"realisations": 1.5}, "realisations is 1.5"),
+        ({"periods": 0}, "periods is 0"),
+        ({"noise_rms": -1e-3}, "noise_rms is -0.001"),
+        ({"noise_rms": np.inf}, "noise_rms is inf"),
+        ({"levels": ()}, r"levels is \(\); give one or more of 100, 325"),
+        ({"levels": 100}, "levels is 100; give one or more"),
+        ({"levels": "100"}, "levels is 100; give one or more"),
+        ({"levels": [200]}, r"levels is \[200\]"),
         ({"levels": [100, 100]}, "each once"),
-        ({"levels": None}, "data.levels is None"),
+        ({"levels": None}, "levels is None"),
     ],
 )
 def test_refused_arguments(arguments, match):
@@ -433,7 +433,7 @@ def test_source_of_the_default_folder(numbered, tmp_path, monkeypatch):
     found, (note,) = source()
     assert found == "stand-in"
     assert "simulated stand-in" in note
-    assert "data.source=official" in note
+    assert "source='official'" in note
     (tmp_path / ARCHIVE).parent.mkdir()
     (tmp_path / ARCHIVE).touch()  # a placeholder
     assert source()[0] == "stand-in"
@@ -462,16 +462,16 @@ def test_a_root_without_the_file(tmp_path, monkeypatch, source):
     with pytest.raises(FileNotFoundError, match=r"no 'ParWH/ParWHFiles/ParWHData.mat' in") as told:
         parwh.load(source=source, root=tmp_path)
     assert "pip install 'lfrtorch[bench]'" in str(told.value)
-    assert "data.root=DIR" in str(told.value)
+    assert "root=DIR" in str(told.value)
 
 
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"realisations": 20}, "data.realisations is 20, .* give 1 to 19"),
-        ({"periods": 3}, "data.periods is 3, .* give 1 to 2 .*stand-in"),
-        ({"seed": -1}, "data.seed is -1"),
-        ({"levels": [200]}, r"data.levels is \[200\]"),
+        ({"realisations": 20}, "realisations is 20, .* give 1 to 19"),
+        ({"periods": 3}, "periods is 3, .* give 1 to 2 .*stand-in"),
+        ({"seed": -1}, "seed is -1"),
+        ({"levels": [200]}, r"levels is \[200\]"),
     ],
 )
 def test_refused_arguments_of_official_data(numbered, arguments, match):

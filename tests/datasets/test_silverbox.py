@@ -69,10 +69,10 @@ def test_the_rules_of_the_cuts(numbered):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"validation": 0}, "data.validation is 0"),
+        ({"validation": 0}, "validation is 0"),
         ({"validation": 1.0}, "leaves 0 of the 65062"),
         ({"validation": 0.999}, "leaves 65 of the 65062 .* needs 501"),
-        ({"warm_up": -1}, "data.warm_up is -1"),
+        ({"warm_up": -1}, "warm_up is -1"),
         ({"warm_up": 60_000}, "needs 60001"),
     ],
 )
@@ -94,7 +94,7 @@ def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered
 
 
 def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no 'Silverbox/Silver.*data.root=DIR"):
+    with pytest.raises(FileNotFoundError, match=r"no 'Silverbox/Silver.*root=DIR"):
         silverbox.load(root=tmp_path)
 
 

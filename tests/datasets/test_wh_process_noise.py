@@ -61,7 +61,7 @@ def test_split(numbered, validation):
 
 @pytest.mark.parametrize("validation", [0, -1, 1.5, "2", None, True])
 def test_refused_arguments(validation):
-    with pytest.raises(ValueError, match=f"data.validation is {validation!r}; give a whole number"):
+    with pytest.raises(ValueError, match=f"validation is {validation!r}; give a whole number"):
         wh_process_noise.load(validation=validation)
 
 
@@ -69,13 +69,13 @@ def test_refused_arguments(validation):
 def test_one_record_trains_at_least(numbered, validation):
     with pytest.raises(ValueError, match=r"has 10 record\(s\), .* give 1 to 9") as told:
         wh_process_noise.load(root=numbered, validation=validation)
-    assert f"data.validation is {validation}" in str(told.value)
+    assert f"validation is {validation}" in str(told.value)
 
 
 @pytest.mark.parametrize("file", [ESTIMATION, TEST])
 def test_a_missing_file_is_one_message(numbered, file):
     (numbered / FOLDER / file).unlink()
-    with pytest.raises(FileNotFoundError, match=r"holds 'WienHammer' with data\.root=DIR") as told:
+    with pytest.raises(FileNotFoundError, match=r"holds 'WienHammer' with root=DIR") as told:
         wh_process_noise.load(root=numbered)
     assert f"no '{FOLDER}/{file}'" in str(told.value)
     assert "nonlinear_benchmarks.not_splitted_benchmarks.WienerHammerstein_Process_Noise()" in str(

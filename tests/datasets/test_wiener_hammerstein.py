@@ -54,11 +54,11 @@ def test_the_rule_of_the_validation_part(numbered):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"validation": 0}, "data.validation is 0"),
+        ({"validation": 0}, "validation is 0"),
         ({"validation": 1.0}, "leaves 0 of the 100000"),
         ({"validation": 0.95}, "leaves 5000 of the 100000 .* needs 6001"),
-        ({"skip": -1}, "data.skip is -1"),
-        ({"skip": 80_000}, "data.validation is 0.2, which leaves 80000"),
+        ({"skip": -1}, "skip is -1"),
+        ({"skip": 80_000}, "validation is 0.2, which leaves 80000"),
     ],
 )
 def test_refused_arguments(arguments, match):
@@ -79,7 +79,7 @@ def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered
 
 
 def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no 'WienerHammerBenchMark/Wiener.*data.root=DIR"):
+    with pytest.raises(FileNotFoundError, match=r"no 'WienerHammerBenchMark/Wiener.*root=DIR"):
         wiener_hammerstein.load(root=tmp_path)
 
 

@@ -37,7 +37,7 @@ def names(table) -> list[str]:
 
 
 def whole(table, wanted: str | int | list[str | int]):
-    return table.read(table.find(wanted, "data.inputs"))
+    return table.read(table.find(wanted, "inputs"))
 
 
 # --- text -----------------------------------------------------------------------------------
@@ -179,7 +179,7 @@ def test_units_in_headers(tmp_path):
     table = table_of(tmp_path, ";".join(headers) + f"\n{row}\n{row}\n")
     assert [tuple(column) for column in table.columns] == list(headers.values())
     for i, (header, (name, _)) in enumerate(headers.items()):
-        assert table.find(header, "data.inputs") == table.find(name, "data.inputs") == (i,)
+        assert table.find(header, "inputs") == table.find(name, "inputs") == (i,)
 
 
 def test_missing_values(tmp_path):
@@ -262,7 +262,7 @@ def test_text_is_read_in_blocks(tmp_path):
 def check(table):
     """The table of u (T, 2) and y (T,)."""
     assert names(table) == ["u1", "u2", "y"]
-    assert table.find("u", "data.inputs") == (0, 1)
+    assert table.find("u", "inputs") == (0, 1)
     assert np.array_equal(whole(table, ["y", "u"]), SIGNALS[:, [2, 0, 1]])
     blocks = list(table.blocks([2, 1], samples=15))
     assert [block.shape for block in blocks] == [(15, 2), (15, 2), (10, 2)]
@@ -271,7 +271,7 @@ def check(table):
 
 def refused(table, name, match):
     with pytest.raises(ValueError, match=match) as refusal:
-        table.find(name, "data.inputs")
+        table.find(name, "inputs")
     assert str(table.path) in str(refusal.value)
 
 
@@ -280,7 +280,7 @@ def test_npz(tmp_path, y):
     np.savez(tmp_path / "a.npz", u=U, y=y, fs=1000.0, notes=np.array({"by": "me"}))
     table = open_table(tmp_path / "a.npz")
     check(table)
-    refused(table, "fs", "'fs', as data.inputs says, has one number")
+    refused(table, "fs", "'fs', named in inputs, has one number")
     refused(table, "notes", "is an array of objects")
 
 
@@ -475,14 +475,14 @@ def test_refused_paths(tmp_path):
 
 def test_find(tmp_path):
     table = table_of(tmp_path, "v,v,y (N)\n1,2,3\n1,2,3\n")
-    assert table.find("y", "data.inputs") == table.find(["y (N)"], "data.inputs") == (2,)
-    assert table.find([2, 0], "data.inputs") == (2, 0)
-    refused(table, "v", "2 columns 'v', as data.inputs says; give the number of one: 0, 1")
-    refused(table, "w", r"no column 'w', as data.inputs says; it has 3 column\(s\): 'v', 'v', 'y")
+    assert table.find("y", "inputs") == table.find(["y (N)"], "inputs") == (2,)
+    assert table.find([2, 0], "inputs") == (2, 0)
+    refused(table, "v", "2 columns 'v', named in inputs; give the number of one: 0, 1")
+    refused(table, "w", r"no column 'w', named in inputs; it has 3 column\(s\): 'v', 'v', 'y")
     refused(table, 3, "no column number 3.*3 column")
     refused(table, -1, "no column number -1")
     for nothing in ([], None, [1.5], True, [True]):
-        refused(table, nothing, "data.inputs is .*give names of columns or their numbers.*'v'")
+        refused(table, nothing, "inputs is .*give names of columns or their numbers.*'v'")
 
 
 def test_a_name_that_is_nearly_right(tmp_path):

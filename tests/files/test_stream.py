@@ -53,7 +53,7 @@ def test_channels_are_found_by_the_names_of_the_model(file: Path):
 
 
 def test_channels_are_found_where_they_are_said_to_be(file: Path):
-    block = read(file, T, u=["u1 (N)", 2], y=1, times="t")[0]
+    block = read(file, T, inputs=["u1 (N)", 2], outputs=1, time="t")[0]
     assert np.array_equal(block.u, U)
     assert np.array_equal(block.y[:, 0], Y)
     assert np.array_equal(block.times[:, 0], TIMES)
@@ -64,7 +64,7 @@ def test_outputs_may_be_missing(tmp_path: Path):
     stream = opened(path)
     assert (stream.y, stream.missing) == ((), ["y"])
     assert next(stream.blocks()).y.shape == (T, 0)
-    refused("no column 'y', as data.outputs says", path, y="y")
+    refused("no column 'y', named in outputs", path, outputs="y")
 
 
 def test_samples_of_an_output_may_be_missing(tmp_path: Path):
@@ -76,12 +76,12 @@ def test_samples_of_an_output_may_be_missing(tmp_path: Path):
 def test_columns_that_cannot_be(file: Path, tmp_path: Path):
     listed = "has no column 'u1'; it has 2 column(s): 'force', 'u2'. The model has u1 (N), u2;"
     refused(listed, csv(tmp_path / "a.csv", force=Y, u2=Y))
-    refused("data.inputs is 1 column(s)", file, u=["u2"])
-    refused("'force', as data.inputs says", file, u=["force", "u2"])
+    refused("inputs is 1 column(s)", file, inputs=["u2"])
+    refused("'force', named in inputs", file, inputs=["force", "u2"])
     other = csv(tmp_path / "b.csv", **{"u1 (kN)": Y, "u2": Y})
     refused("column u1 (kN) of", other)
     refused("is in another unit than the model's u1 (N); convert it", other)
-    refused("the time column y (mm) does not rise", file, times="y")
+    refused("the time column y (mm) does not rise", file, time="y")
 
 
 @pytest.mark.parametrize("samples", [7, 300, T])
@@ -117,7 +117,7 @@ def test_times_that_run_at_the_rate(name: str, times: np.ndarray, tmp_path: Path
     path = timed(tmp_path, times, name)
     scale = {"t": 1.0, "t [ms]": 1e-3, "t (us)": 1e-6}[name]
     for samples in (300, T - 1, T):  # blocks of one sample, too
-        found = np.concatenate([block.times for block in read(path, samples, times="t")])[:, 0]
+        found = np.concatenate([block.times for block in read(path, samples, time="t")])[:, 0]
         assert np.array_equal(found, scale * times)
 
 
@@ -125,16 +125,16 @@ def test_times_that_run_at_the_rate(name: str, times: np.ndarray, tmp_path: Path
 @pytest.mark.parametrize(("rate", "samples"), [(375.0, 7), (700.0, 300), (1500.0, T)])
 def test_times_at_another_rate(rate: float, samples: int, tmp_path: Path):
     message = f"says {rate:g} Hz and the model runs at 750 Hz; resample"
-    refused(message, timed(tmp_path, np.arange(T) / rate), samples=samples, times="t")
+    refused(message, timed(tmp_path, np.arange(T) / rate), samples=samples, time="t")
 
 
 def test_times_are_one_column(tmp_path: Path):
     np.savez(tmp_path / "x.npz", t=np.stack([TIMES, TIMES], axis=1), u1=U[:, 0], u2=U[:, 1])
-    refused("data.time is 't', 2 columns; name one", tmp_path / "x.npz", times="t")
+    refused("time is 't', 2 columns; name one", tmp_path / "x.npz", time="t")
 
 
 def test_times_that_do_not_rise(tmp_path: Path):
-    refused("line 3: the time column t does not rise", timed(tmp_path, -TIMES), times="t")
+    refused("line 3: the time column t does not rise", timed(tmp_path, -TIMES), time="t")
 
 
 @pytest.mark.numeric
@@ -143,19 +143,19 @@ def test_times_that_do_not_rise(tmp_path: Path):
 def test_samples_that_are_lost(lost: int, samples: int, tmp_path: Path):
     times = (np.arange(T) + lost * (np.arange(T) >= 300)) / FS
     message = f"x.csv', line 302: {lost} sample(s) are missing before it, as the time column t says"
-    refused(message, timed(tmp_path, times), samples=samples, times="t")
+    refused(message, timed(tmp_path, times), samples=samples, time="t")
 
 
 @pytest.mark.numeric
 @pytest.mark.parametrize("samples", [300, 301, T])
 def test_a_sample_that_is_repeated(samples: int, tmp_path: Path):
     times = (np.arange(T) - (np.arange(T) >= 300)) / FS
-    refused("the time column t is not evenly", timed(tmp_path, times), samples=samples, times="t")
+    refused("the time column t is not evenly", timed(tmp_path, times), samples=samples, time="t")
 
 
 def test_a_time_that_is_missing(tmp_path: Path):
     times = np.where(np.arange(T) == 20, np.nan, TIMES)
-    refused("line 22: column 't' has no finite number", timed(tmp_path, times), times="t")
+    refused("line 22: column 't' has no finite number", timed(tmp_path, times), time="t")
 
 
 def test_a_parquet_file_is_not_read_ahead(tmp_path: Path):

@@ -43,8 +43,8 @@ GOOD = Evidence(
     [
         (advice.diverges, {"diverged": ["sweep"]}, "ridge=1e-3"),
         (advice.diverges, {"diverged": ["sweep"], "ridge": True}, "larger ridge"),
-        (advice.starts_in_a_transient, {"transient": 4.0}, "data.skip=N"),
-        (advice.still_falling, {"falling": 0.05}, "trainer.max_iter=400"),
+        (advice.starts_in_a_transient, {"transient": 4.0}, "skip=N"),
+        (advice.still_falling, {"falling": 0.05}, "max_iter=400"),
         (advice.overfits, {"validation": 0.05}, "nn=5, ridge=1e-3, or more data"),
         (advice.linear_part_incomplete, {"linear": 0.5}, "nx=4, nx=5 or nx=auto"),
         (advice.hardly_better, {"validation": 0.19}, "nn=20, nz=2 or nw=2"),
