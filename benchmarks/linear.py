@@ -20,14 +20,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 import lfrtorch
 from lfrtorch import Record
+from lfrtorch._types import Array
 from lfrtorch.datasets import boucwen, parwh, silverbox, wiener_hammerstein
 from lfrtorch.linear.resolvent import frequency_response
 
-Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
 
 

@@ -11,14 +11,12 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import signal
 
 import lfrtorch
 from lfrtorch import LinearModel, Model, Record
+from lfrtorch._types import Array
 from lfrtorch.least_squares.simulation_problem import SimulationError
-
-Array = NDArray[np.float64]
 
 SIZES = {
     "boucwen": {"nx": 3, "nz": 2, "nw": 1, "nn": 15},

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lfrtorch import _checks
 from lfrtorch._checks import integer, number
 from lfrtorch._checks import lines as checked_lines
+from lfrtorch._types import Array, Integers
 
 Grid = Literal["full", "odd", "random_odd"]
 
@@ -28,26 +29,26 @@ class Multisine:
         u: (realisations * nu, N, nu), lines: (F,).
     """
 
-    u: NDArray[np.float64]
-    lines: NDArray[np.int64]
+    u: Array
+    lines: Integers
     fs: float
 
     @property
-    def frequencies(self) -> NDArray[np.float64]:
+    def frequencies(self) -> Array:
         """Frequencies (F,) of the excited lines, Hz."""
         return self.lines * self.fs / self.u.shape[1]
 
     @property
-    def odd_detection(self) -> NDArray[np.int64]:
+    def odd_detection(self) -> Integers:
         """Odd lines left out between the first and the last excited one."""
         return self._left_out(1)
 
     @property
-    def even_detection(self) -> NDArray[np.int64]:
+    def even_detection(self) -> Integers:
         """Even lines left out between the first and the last excited one."""
         return self._left_out(0)
 
-    def _left_out(self, parity: int) -> NDArray[np.int64]:
+    def _left_out(self, parity: int) -> Integers:
         between = np.setdiff1d(np.arange(self.lines[0], self.lines[-1]), self.lines)
         return between[between % 2 == parity]
 
@@ -130,7 +131,7 @@ def multisine(
 
 def _candidates(
     samples: int, fs: float, band: tuple[float, float] | None, lines: ArrayLike | None
-) -> NDArray[np.int64]:
+) -> Integers:
     """The lines that the grid chooses from, rising; fs / 2 itself has no free phase."""
     last = (samples - 1) // 2
     if lines is not None:
@@ -154,9 +155,7 @@ def _candidates(
     return found
 
 
-def _on_grid(
-    lines: NDArray[np.int64], grid: Any, group: int, generator: np.random.Generator
-) -> NDArray[np.int64]:
+def _on_grid(lines: Integers, grid: Any, group: int, generator: np.random.Generator) -> Integers:
     if grid not in get_args(Grid):
         raise ValueError(f"grid is {grid!r}; use 'full', 'odd' or 'random_odd'.")
     if grid == "full":
@@ -175,9 +174,7 @@ def _on_grid(
     return np.delete(odd, dropped)
 
 
-def _amplitudes(
-    amplitude: ArrayLike | None, samples: int, nu: int, excited: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _amplitudes(amplitude: ArrayLike | None, samples: int, nu: int, excited: Integers) -> Array:
     """Relative amplitudes (F, nu) of the excited lines."""
     if amplitude is None:
         return np.ones((excited.size, nu))
@@ -196,7 +193,7 @@ def _amplitudes(
     return np.broadcast_to(A, (excited.size, nu)).copy()
 
 
-def _rms(rms: ArrayLike, nu: int) -> NDArray[np.float64]:
+def _rms(rms: ArrayLike, nu: int) -> Array:
     given = np.asarray(rms, dtype=np.float64)
     if given.shape not in ((), (nu,)) or not (np.isfinite(given).all() and (given > 0).all()):
         raise ValueError(f"rms is {rms}; give a positive number, or one for each of {nu} input(s).")

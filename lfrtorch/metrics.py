@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.records import Record
 
 
-def rmse(record: Record, y_hat: NDArray[np.float64]) -> float:
+def rmse(record: Record, y_hat: Array) -> float:
     """Root mean squared simulation error over scored samples and outputs, in the output's unit.
 
     Raises:
@@ -23,7 +23,7 @@ def rmse(record: Record, y_hat: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def nrmse(record: Record, y_hat: NDArray[np.float64]) -> float:
+def nrmse(record: Record, y_hat: Array) -> float:
     """RMSE over the standard deviation of the measured output, both over the scored samples.
 
     NaN for an output that is constant there.
@@ -51,7 +51,7 @@ class BlockScores:
         self._skip = skip
         self._mean, self._spread, self._errors = np.zeros((3, ny))
 
-    def add(self, y: NDArray[np.float64], y_hat: NDArray[np.float64]) -> None:
+    def add(self, y: Array, y_hat: Array) -> None:
         """Take in the next samples (n, ny), measured and simulated."""
         left_out = min(self._skip, len(y))
         self._skip -= left_out
@@ -70,15 +70,15 @@ class BlockScores:
         self.samples += added
 
     @property
-    def rmse(self) -> NDArray[np.float64]:
+    def rmse(self) -> Array:
         """Root mean squared errors, NaN where no sample counts."""
         return np.sqrt(self._mean_of(self._errors))
 
     @property
-    def nrmse(self) -> NDArray[np.float64]:
+    def nrmse(self) -> Array:
         """RMSE over the standard deviation of the measured output, NaN for a constant one."""
         deviation = np.sqrt(self._mean_of(self._spread))
         return self.rmse / np.where(deviation > 0, deviation, np.nan)
 
-    def _mean_of(self, total: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _mean_of(self, total: Array) -> Array:
         return np.where(self.samples > 0, total / np.maximum(self.samples, 1), np.nan)

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch.nn import Module
 
 from lfrtorch import _checkpoint
+from lfrtorch._types import Array
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network
@@ -84,7 +85,7 @@ class Model:
 
     def simulate(
         self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """Simulated output in physical units.
 
         Args:
@@ -182,7 +183,7 @@ class Model:
 
 def simulate_blocks(
     model: Model, blocks: Iterable[ArrayLike], *, x0: ArrayLike | None = None
-) -> Iterator[NDArray[np.float64]]:
+) -> Iterator[Array]:
     """Simulated output of an input that comes in blocks, as if it were simulated in one go.
 
     The state at the end of a block is that at the start of the next: the numbers are the same to

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
+
+from lfrtorch._types import Array
 
 _ALIKE = 0.02
 """Mean square of a repetition's difference, over that of two unrelated signals, that is noise yet.
@@ -27,7 +28,7 @@ _SMALL = 1e-5  # rms difference over that of the output which is no transient, n
 _TAIL = 4  # of two periods' difference, its last 1 / 4 is taken for noise
 
 
-def find_period(u: NDArray[np.float64]) -> int | None:
+def find_period(u: Array) -> int | None:
     """The shortest period, in samples, that explains the signals; None where they do not repeat.
 
     For every shift p up to half the record,
@@ -61,7 +62,7 @@ def find_period(u: NDArray[np.float64]) -> int | None:
     return int(min((i for i in periods if i < 2 * shortest - 1), key=lambda i: D[i::i].mean()))
 
 
-def _differences(u: NDArray[np.float64]) -> NDArray[np.float64]:
+def _differences(u: Array) -> Array:
     """D(p) of the signal that repeats worst, p = 0, 1, ... to three quarters of the record."""
     T = len(u)
     last = max(int(_FASTER * T), T // 2)
@@ -77,7 +78,7 @@ def _differences(u: NDArray[np.float64]) -> NDArray[np.float64]:
     return worst
 
 
-def find_transient(y: NDArray[np.float64], period: int) -> int:
+def find_transient(y: Array, period: int) -> int:
     """Samples of the whole first periods in which the outputs have not settled.
 
     These are the periods, from the first on, that differ from the last one by more than the last

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._checks import integer
+from lfrtorch._types import Array
 
 Start = Literal["zero", "given", "estimated", "periodic"]
 
@@ -81,8 +82,8 @@ class Record:
             ``skip`` that leaves no sample, or a period that does not fit.
     """
 
-    u: NDArray[np.float64]
-    y: NDArray[np.float64]
+    u: Array
+    y: Array
     fs: float = 1.0
     start: Start = "zero"
     skip: int = 0
@@ -91,9 +92,9 @@ class Record:
     inputs: tuple[Channel, ...] = ()
     outputs: tuple[Channel, ...] = ()
     period: int | None = None
-    x0: NDArray[np.float64] | None = None
-    weight: float | NDArray[np.float64] = 1.0
-    line_weight: NDArray[np.float64] | None = None
+    x0: Array | None = None
+    weight: float | Array = 1.0
+    line_weight: Array | None = None
 
     def __post_init__(self) -> None:
         inputs = _channels(self.inputs, self.u, "u")
@@ -179,13 +180,13 @@ class Record:
             object.__setattr__(self, name, values)
 
     @property
-    def factors(self) -> NDArray[np.float64]:
+    def factors(self) -> Array:
         """What the errors (T, ny) are multiplied by in a fit: √weight, 0 in the skipped samples."""
         counts = np.arange(len(self.y))[:, None] >= self.skip
         return np.broadcast_to(np.sqrt(self.weight) * counts, self.y.shape)
 
     @property
-    def start_factors(self) -> NDArray[np.float64]:
+    def start_factors(self) -> Array:
         """The same for an estimated start of a given model: √weight, 0 in the scored samples."""
         if not self.skip:
             return self.factors
@@ -266,20 +267,20 @@ class Scaler:
         u_offset, u_scale: (nu,), y_offset, y_scale: (ny,); physical units.
     """
 
-    u_offset: NDArray[np.float64]
-    u_scale: NDArray[np.float64]
-    y_offset: NDArray[np.float64]
-    y_scale: NDArray[np.float64]
+    u_offset: Array
+    u_scale: Array
+    y_offset: Array
+    y_scale: Array
 
-    def normalise_u(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+    def normalise_u(self, u: Array) -> Array:
         """Input (T, nu) from physical to normalised units."""
         return (u - self.u_offset) / self.u_scale
 
-    def normalise_y(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def normalise_y(self, y: Array) -> Array:
         """Output (T, ny) from physical to normalised units."""
         return (y - self.y_offset) / self.y_scale
 
-    def restore_y(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def restore_y(self, y: Array) -> Array:
         """Output (T, ny) from normalised to physical units."""
         return y * self.y_scale + self.y_offset
 
@@ -292,7 +293,7 @@ def check_start(start: str, what: str) -> None:
         )
 
 
-def rms_scale(signals: Sequence[NDArray[np.float64]], offset: NDArray[np.float64]) -> NDArray:
+def rms_scale(signals: Sequence[Array], offset: Array) -> NDArray:
     """Root mean square (n,) of signals (T, n) about ``offset``; 1 where a channel is constant."""
     scale = np.sqrt(np.mean((np.concatenate(signals) - offset) ** 2, axis=0))
     return np.where(scale > 0, scale, 1.0)
@@ -311,9 +312,7 @@ def _channels(given: tuple[Channel, ...], signal: ArrayLike, letter: str) -> tup
     return tuple(Channel(*c) for c in given)
 
 
-def as_signal(
-    x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: int = 0
-) -> NDArray[np.float64]:
+def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: int = 0) -> Array:
     """A signal (T, channels) of finite real numbers from (T, channels) or (T,), not writeable.
 
     Args:

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from lfrtorch._types import Array
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
@@ -44,9 +45,6 @@ RATE = 0.01
 THOUSANDS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 FIGURES = (".png", ".pdf", ".svg")
-
-
-Array = NDArray[np.float64]
 
 
 class Roles(NamedTuple):

@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import hydra
 import numpy as np
-from numpy.typing import NDArray
 from omegaconf import DictConfig, ListConfig
+
+from lfrtorch._types import Array
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
@@ -32,8 +33,6 @@ from lfrtorch.files.writer import FORMATS, table_writer  # noqa: E402
 from lfrtorch.metrics import BlockScores  # noqa: E402
 from scripts.bla import columns, finite, percent  # noqa: E402
 from train import CONF, user_errors  # noqa: E402
-
-Array = NDArray[np.float64]
 
 BEGINNING = 100
 """Samples in which the transient of a wrong start state would be seen."""

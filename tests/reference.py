@@ -9,11 +9,11 @@ import numpy as np
 import scipy.signal
 import torch
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.func import functional_call, jacfwd
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from lfrtorch._types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network
@@ -24,7 +24,6 @@ from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler, Start
 
-Array = NDArray[np.float64]
 Weights = dict[str, Tensor]
 
 SIGMA = {
@@ -195,7 +194,7 @@ def dlsim(system: System, u: Array) -> Array:
     return scipy.signal.dlsim((*system, 1.0), u)[1]
 
 
-def frf(system: System, omega: Array) -> NDArray[np.complex128]:
+def frf(system: System, omega: Array) -> Complex:
     """C (zI - A)⁻¹ B + D at the angles omega (F,) -> (F, ny, nu)."""
     A, B, C, D = system
     return np.stack([C @ np.linalg.inv(np.exp(1j * w) * np.eye(len(A)) - A) @ B + D for w in omega])

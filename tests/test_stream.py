@@ -11,16 +11,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from reference import random_cell, random_model
 
 import lfrtorch
 from lfrtorch import simulate_blocks
+from lfrtorch._types import Array
 from lfrtorch.metrics import BlockScores, nrmse, rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.numeric
 

@@ -6,12 +6,10 @@ import math
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lfrtorch._types import Complex
 from lfrtorch.engine.linearised import slopes
 from lfrtorch.model import Model
-
-Complex = NDArray[np.complex128]
 
 
 def roots(values: Complex, fs: float) -> list[dict[str, float | None]]:

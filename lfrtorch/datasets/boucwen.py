@@ -23,10 +23,11 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.signal import firwin, resample
 
 from lfrtorch._checks import integer, number
+from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
@@ -154,7 +155,7 @@ def load(
 
 def multisine(
     *, samples: int = _PERIOD, rms: float = 50.0, seed: int | np.random.Generator = 0
-) -> NDArray[np.float64]:
+) -> Array:
     """One period of the official random-phase multisine at 15 kHz: full grid, 5 Hz to 150 Hz.
 
     Lines floor(5 / f0) to ceil(150 / f0), f0 = 750 / samples Hz, of equal magnitude and uniform
@@ -188,7 +189,7 @@ def multisine(
     return rms * u / np.std(u, ddof=1)  # ddof: the official files have it
 
 
-def sweep() -> NDArray[np.float64]:
+def sweep() -> Array:
     """Input of the official sweep test at 15 kHz, from its formula: 18 Hz to 52 Hz in 204 s.
 
     u(t) = 40 sin(2 pi (18 t + t^2 / 12)): 10 Hz a minute. (The description says 20 Hz to 50 Hz
@@ -207,7 +208,7 @@ def simulate(
     factors: tuple[int, ...] = (2, 2, 5),
     noise_rms: float = 0.0,
     seed: int | np.random.Generator = 0,
-) -> NDArray[np.float64]:
+) -> Array:
     """Displacement at 750 Hz under a force at 15 kHz, from rest.
 
     Args:
@@ -258,7 +259,7 @@ def simulate(
 
 
 @njit(cache=True)
-def _newmark(u: NDArray[np.float64]) -> NDArray[np.float64]:
+def _newmark(u: Array) -> Array:
     """Displacement (T,) under a force (T,), both at 15 kHz; NaN from where Newton fails.
 
     Newmark (1/2, 1/4), with the trapezoidal rule for z. The balance of forces is linear in the
@@ -294,7 +295,7 @@ def _newmark(u: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def _decimate(x: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
+def _decimate(x: Array, factor: int) -> Array:
     """Every ``factor``-th sample (T / factor,) of x (T,), low-passed without delay.
 
     Hamming-window FIR with its cut-off at the new Nyquist frequency; the ends are continued by
@@ -344,7 +345,7 @@ def _sweep_test(folder: Path) -> Record:
     return _record(*signals, name="sweep", start="zero", skip=_SWEEP_SKIP, source=source)
 
 
-def _record(u: NDArray[np.float64], y: NDArray[np.float64], **kwargs: Any) -> Record:
+def _record(u: Array, y: Array, **kwargs: Any) -> Record:
     channels: dict[str, Any] = {"inputs": (Channel("u", "N"),), "outputs": (Channel("y", "m"),)}
     return Record(u, y, fs=_FS, **channels, **kwargs)
 
@@ -370,9 +371,7 @@ def _pair(folder: Path, test: str) -> list[Path]:
     return [folder / f"{letter}val_{test}.mat" for letter in "uy"]
 
 
-def _read_official(
-    folder: Path, test: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def _read_official(folder: Path, test: str) -> tuple[Array, Array] | None:
     """Input (N) and output (m) of a test, (samples,) each; ``None`` if neither file is there."""
     paths = _pair(folder, test)
     missing = [path for path in paths if not path.is_file()]

@@ -35,8 +35,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
@@ -126,7 +126,7 @@ def load(
     )
 
 
-def _mean(signal: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mean(signal: Array) -> Array:
     """Of the periods but the first: (8192, channels)."""
     return signal.reshape(_PERIODS, _PERIOD, -1)[1:].mean(axis=0)
 

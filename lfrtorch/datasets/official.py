@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from lfrtorch._checks import number
+from lfrtorch._types import Array
 from lfrtorch.records import Record, Start
 
 _AGAIN = "download the file again."
@@ -104,9 +105,7 @@ def archive_note(archive: Path, md5: str, file: str) -> str:
     )
 
 
-def read_mat(
-    path: Path, names: Sequence[str], samples: int, advice: str = _AGAIN
-) -> list[NDArray[np.float64]]:
+def read_mat(path: Path, names: Sequence[str], samples: int, advice: str = _AGAIN) -> list[Array]:
     """Signals (samples,) that a .mat file holds as rows or columns, in the order of their names.
 
     Args:
@@ -124,7 +123,7 @@ def read_mat(
 
 def read_arrays(
     path: Path, shapes: Mapping[str, tuple[int, ...]], member: str, advice: str = _AGAIN
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Array]:
     """Arrays of a .mat file by name.
 
     Args:
@@ -142,9 +141,7 @@ def read_arrays(
     }
 
 
-def read_struct(
-    path: Path, name: str, fields: Sequence[str], advice: str = _AGAIN
-) -> list[NDArray[np.float64]]:
+def read_struct(path: Path, name: str, fields: Sequence[str], advice: str = _AGAIN) -> list[Array]:
     """Matrices of one shape, (samples, records), in a struct of a .mat file, in the order named.
 
     Args:
@@ -257,7 +254,7 @@ def _variable(
     name: str,
     shapes: Sequence[tuple[int, ...]],
     advice: str,
-) -> NDArray[np.float64]:
+) -> Array:
     """A variable of a .mat file with one of the shapes."""
     try:
         found = np.asarray(loadmat(content, variable_names=[name])[name])
@@ -272,7 +269,7 @@ def _numbers(
     found: NDArray[Any],
     shapes: Sequence[tuple[int, ...]],
     advice: str,
-) -> NDArray[np.float64]:
+) -> Array:
     """What was found of a name, where it has one of the shapes and is real and finite."""
     if found.dtype.kind not in "iuf" or found.shape not in shapes or not np.isfinite(found).all():
         raise ValueError(

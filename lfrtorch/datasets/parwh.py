@@ -21,9 +21,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfrtorch._checks import integer, number
+from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.datasets.parwh_simulator import FS, PERIOD, Signals, StandIn, multisine, simulate
@@ -140,9 +140,7 @@ def load(
         archive = official.folder(root) / _ARCHIVE
         notes = (official.archive_note(archive, _MD5, Path(_FILE).name),)
 
-    def record(
-        name: str, u: NDArray[np.float64], y: NDArray[np.float64], *, skip: int = 0
-    ) -> Record:
+    def record(name: str, u: Array, y: Array, *, skip: int = 0) -> Record:
         return Record(
             u,
             y,

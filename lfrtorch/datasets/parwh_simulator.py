@@ -18,10 +18,11 @@ that linear models leave about the errors that are published for it (0.83, 9.46,
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.signal import butter, cheby1, cheby2, ellip, freqz
 
 from lfrtorch._checks import number
+from lfrtorch._types import Array
 
 FS = 78125.0
 """Sampling frequency of the records, Hz."""
@@ -39,7 +40,7 @@ _H4 = ellip(3, 0.5, 30, 12e3, fs=FS)
 
 _USES = ("train", "validation", "level", "arrow")  # first number of a record's seed
 
-Signals = tuple[NDArray[np.float64], NDArray[np.float64]]
+Signals = tuple[Array, Array]
 """Input and output, (samples,) each, V."""
 
 
@@ -85,7 +86,7 @@ class StandIn:
 
 def multisine(
     *, rms: float = 1.0, seed: int | np.random.SeedSequence | np.random.Generator = 0
-) -> NDArray[np.float64]:
+) -> Array:
     """One period of a random-phase multisine: lines 1 to 4095 of 4.77 Hz, of equal magnitude.
 
     Args:
@@ -106,7 +107,7 @@ def multisine(
     return rms * u / np.sqrt(np.mean(u**2))
 
 
-def simulate(u: ArrayLike) -> NDArray[np.float64]:
+def simulate(u: ArrayLike) -> Array:
     """Output in the steady state that the input, repeated for ever, leads to; noise free.
 
     Exact: a filter in steady state multiplies each spectral line by its frequency response, and the
@@ -127,7 +128,7 @@ def simulate(u: ArrayLike) -> NDArray[np.float64]:
             f"the input has shape {u.shape}; give one dimension of finite numbers, in V."
         )
 
-    def line_by_line(H: tuple, signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    def line_by_line(H: tuple, signal: Array) -> Array:
         w = 2 * np.pi * np.fft.rfftfreq(u.size)
         return np.fft.irfft(freqz(*H, worN=w)[1] * np.fft.rfft(signal), u.size)
 
@@ -137,12 +138,12 @@ def simulate(u: ArrayLike) -> NDArray[np.float64]:
     return 0.84 * (line_by_line(_H2, w1) + 0.7 * line_by_line(_H4, w2))
 
 
-def _s(v: NDArray[np.float64]) -> NDArray[np.float64]:
+def _s(v: Array) -> Array:
     """A smooth max(v, 0)."""
     return 0.05 * np.logaddexp(0.0, v / 0.05)
 
 
-def _arrow(rng: np.random.Generator) -> NDArray[np.float64]:
+def _arrow(rng: np.random.Generator) -> Array:
     """Gaussian noise (16384,) in the multisines' band, growing to 1 V rms in its last tenth."""
     white = np.fft.rfft(rng.standard_normal(PERIOD))
     spectrum = np.zeros_like(white)

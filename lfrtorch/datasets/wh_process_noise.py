@@ -39,10 +39,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lfrtorch._checks import integer
+from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
@@ -83,7 +81,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
     """
     integer("validation", validation, 1)
 
-    def columns(file: str) -> tuple[Path, NDArray[np.float64], NDArray[np.float64]]:
+    def columns(file: str) -> tuple[Path, Array, Array]:
         """Path, u and y (samples, records)."""
         path = official.find(root, f"{_FILES}/{file}", _LOADER, download=download)
         u, y = official.read_struct(path, "dataMeas", ("u", "y"))
@@ -94,7 +92,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
             )
         return path, u, y
 
-    def record(name: str, u: NDArray[np.float64], y: NDArray[np.float64]) -> Record:
+    def record(name: str, u: Array, y: Array) -> Record:
         return Record(
             u,
             y,

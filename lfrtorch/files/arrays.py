@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.files.table import BLOCK, Clock, Table
 
 _REAL, _TIMES = "biuf", "M"
@@ -100,7 +101,7 @@ class ArrayTable(Table):
             self._found[name] = signal
         super().__init__(path, headers, units=units, arrays=arrays, refused=refused)
 
-    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[NDArray[np.float64]]:
+    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`."""
         chosen = [self._signals[column] for column in columns]
         lengths = {name: self._found[name].size[0] for name, _ in chosen}

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfrtorch._checks import number
+from lfrtorch._types import Array, Integers
 from lfrtorch.files.formats import Table, open_table
 from lfrtorch.files.time_stamps import Sampling, Uneven, in_seconds, is_time, sampling
 from lfrtorch.records import Channel
@@ -43,8 +44,8 @@ class Wanted:
 class Stretch(NamedTuple):
     """Consecutive samples: u (T, nu), y (T, ny), and which sample of the file is the first."""
 
-    u: NDArray[np.float64]
-    y: NDArray[np.float64]
+    u: Array
+    y: Array
     first: int
 
 
@@ -133,7 +134,7 @@ def _channels(
     )
 
 
-def _stretches(missing: NDArray[np.bool_], gaps: NDArray[np.int64]) -> list[tuple[int, int]]:
+def _stretches(missing: NDArray[np.bool_], gaps: Integers) -> list[tuple[int, int]]:
     """First and last sample + 1 of the stretches without a missing value or a gap between."""
     edges = np.flatnonzero(np.diff(np.concatenate([[True], missing, [True]]).astype(np.int8)))
     edges = np.union1d(edges, gaps)
@@ -177,7 +178,7 @@ def _gap(
     )
 
 
-def _grid(table: Table, t: NDArray[np.float64], column: int) -> Sampling:
+def _grid(table: Table, t: Array, column: int) -> Sampling:
     """The grid of time stamps, those that are missing filled in."""
     known = np.isfinite(t)
     k = np.arange(len(t))

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.files.arrays import optional
 from lfrtorch.files.table import BLOCK, Clock, Table
 
@@ -37,7 +37,7 @@ class ParquetTable(Table):
         }
         super().__init__(path, headers, refused=refused)
 
-    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[NDArray[np.float64]]:
+    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`."""
         pa, pq = optional("pyarrow"), optional("pyarrow.parquet")
         names = [self.headers[column] for column in columns]

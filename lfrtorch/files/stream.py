@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.files.formats import BLOCK, open_table
 from lfrtorch.files.table import NoColumn
 from lfrtorch.files.time_stamps import Uneven, in_seconds, sampling
 from lfrtorch.records import Channel
 
-Array = NDArray[np.float64]
 Columns = str | int | Sequence[str | int]
 
 SAME = 1e-3

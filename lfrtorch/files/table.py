@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.records import Channel
 
 BLOCK = 65536
@@ -60,7 +61,7 @@ class Table(ABC):
         self.refused = dict(refused or {})
 
     @abstractmethod
-    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[NDArray[np.float64]]:
+    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """At most ``samples`` samples at a time, (n, len(columns)).
 
         Date-times are in seconds since the first of the file.
@@ -73,7 +74,7 @@ class Table(ABC):
         """What a user finds the sample by."""
         return f"sample {sample} (from 0)"
 
-    def read(self, columns: Sequence[int]) -> NDArray[np.float64]:
+    def read(self, columns: Sequence[int]) -> Array:
         """All samples of some columns, (T, len(columns))."""
         grown = bytearray()  # grows in place, where a list of blocks is twice in memory at its end
         for block in self.blocks(columns):
@@ -192,7 +193,7 @@ class Clock:
     def __init__(self) -> None:
         self._first: np.datetime64 | None = None
 
-    def __call__(self, times: NDArray[np.datetime64]) -> NDArray[np.float64]:
+    def __call__(self, times: NDArray[np.datetime64]) -> Array:
         """Seconds of a block."""
         times = times.astype("M8[ns]")
         known = ~np.isnat(times)

@@ -18,6 +18,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.files.table import BLOCK, Clock, Table, bracketed, is_unit
 
 _HEAD = 1 << 18  # characters that tell the layout
@@ -64,7 +65,7 @@ class TextTable(Table):
         self.layout = _layout(path)
         super().__init__(path, self.layout.headers, units=self.layout.units)
 
-    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[NDArray[np.float64]]:
+    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`; a line's missing cells are missing values."""
         import pandas as pd  # slow to import
 

@@ -6,8 +6,8 @@ import re
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array, Integers
 from lfrtorch.records import Channel
 
 _JITTER = 0.1  # of a step: how far a stamp may be from its place in an even grid
@@ -33,8 +33,8 @@ class Sampling(NamedTuple):
 
     fs: float
     uncertainty: float
-    gaps: NDArray[np.int64]
-    missing: NDArray[np.int64]
+    gaps: Integers
+    missing: Integers
 
 
 class Uneven(ValueError):
@@ -50,12 +50,12 @@ def is_time(channel: Channel) -> bool:
     return _NAMES.fullmatch(channel.name) is not None
 
 
-def in_seconds(t: NDArray[np.float64], channel: Channel) -> NDArray[np.float64]:
+def in_seconds(t: Array, channel: Channel) -> Array:
     """Time stamps by the unit of their column; seconds where it has none."""
     return t * _SECONDS.get(channel.unit, 1.0)
 
 
-def sampling(t: NDArray[np.float64]) -> Sampling:
+def sampling(t: Array) -> Sampling:
     """The even grid that the time stamps are on, up to the rounding of their digits.
 
     Args:
@@ -80,7 +80,7 @@ def sampling(t: NDArray[np.float64]) -> Sampling:
     return _grid(t, digit, np.flatnonzero(steps > _GAP * usual + digit) + 1)
 
 
-def _rounded(t: NDArray[np.float64], digit: float) -> bool:
+def _rounded(t: Array, digit: float) -> bool:
     """Whether all stamps are on one grid but for their last digit, which shows now and then."""
     steps = np.diff(t)
     away = t - np.linspace(t[0], t[-1], len(t))
@@ -88,7 +88,7 @@ def _rounded(t: NDArray[np.float64], digit: float) -> bool:
     return bool(shows >= _SHOWS and np.ptp(away) <= 1.1 * digit)
 
 
-def _grid(t: NDArray[np.float64], digit: float, gaps: NDArray[np.int64]) -> Sampling:
+def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
     """The grid of stamps between gaps, each within ``digit`` and the jitter of its place."""
     steps = np.diff(t)
     within = np.delete(steps, gaps - 1)
@@ -117,7 +117,7 @@ def _grid(t: NDArray[np.float64], digit: float, gaps: NDArray[np.int64]) -> Samp
     return Sampling(_roundest(1 / mean, uncertainty), uncertainty, gaps, missing)
 
 
-def _last_digit(t: NDArray[np.float64]) -> float:
+def _last_digit(t: Array) -> float:
     """What the last digit counts of stamps that were printed, or kept in single precision."""
     largest = float(np.abs(t).max())
     if np.array_equal(t, t.astype(np.float32)) and not np.array_equal(t, np.rint(t)):

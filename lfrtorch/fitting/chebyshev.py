@@ -7,9 +7,8 @@ from itertools import product
 from operator import mul
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lfrtorch._types import Array
 
 REACH = 3.0
 """z that is mapped to 1, in standard deviations: the polynomials grow beyond it."""

@@ -37,11 +37,11 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import Module
 
 from lfrtorch._checks import integer
+from lfrtorch._types import Array, Complex, Integers
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.chebyshev import chebyshev, chebyshev_slope
 from lfrtorch.fitting.starts import OUTPUT_WEIGHTS, initialise
@@ -52,9 +52,6 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.resolvent import resolvent
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 LINES, SAMPLES = 1024, 32768
 """Most lines of a record whose errors count, and about as many samples of all records as are looked
@@ -113,7 +110,7 @@ class Residual:
     E: Complex
     R: Complex
     L: Complex
-    chosen: NDArray[np.intp]
+    chosen: Integers
     weight: Array
 
 

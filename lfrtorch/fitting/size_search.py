@@ -35,9 +35,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from lfrtorch._checks import integer, renamed
+from lfrtorch._types import Array, Integers
 from lfrtorch.distributed import LOST, ProcessLost, Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import INTERRUPTED, Monitor, StartDiverges, Trainer
@@ -49,7 +49,6 @@ from lfrtorch.linear.order_scan import MARGIN
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
-Array = NDArray[np.float64]
 Sizes = dict[str, Any]
 
 NZ, NW, NN = (1, 2), (1, 2), (5, 10, 15, 25)
@@ -108,7 +107,7 @@ class SizeSearch:
     """
 
     candidates: tuple[Candidate, ...]
-    counts: NDArray[np.int64] = field(repr=False)
+    counts: Integers = field(repr=False)
 
     @property
     def above(self) -> Array:
@@ -274,7 +273,7 @@ def search_sizes(
     return search
 
 
-def standard_errors_above(squares: Sequence[Array] | Array, counts: NDArray[np.int64]) -> Array:
+def standard_errors_above(squares: Sequence[Array] | Array, counts: Integers) -> Array:
     """How far the mean squares of several models are above the least of them.
 
     Args:
@@ -293,7 +292,7 @@ def standard_errors_above(squares: Sequence[Array] | Array, counts: NDArray[np.i
     return np.where(np.isfinite(above), above, inf)
 
 
-def blocked_mean(sums: Array, counts: NDArray[np.int64]) -> tuple[Array, Array]:
+def blocked_mean(sums: Array, counts: Integers) -> tuple[Array, Array]:
     """The mean of a signal that has these sums over blocks of time, and its standard error.
 
     Shape:

@@ -8,10 +8,10 @@ from dataclasses import replace
 from typing import Literal, Protocol, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfrtorch._checks import integer
 from lfrtorch._threads import spread_by_hand
+from lfrtorch._types import Array
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel, balancing
 from lfrtorch.linear.refinement import Matrices, Refined, Search
@@ -22,7 +22,6 @@ from lfrtorch.linear.spectral_data import Weight, lines_of, lines_of_response
 from lfrtorch.linear.subspace import Start
 from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
 
-Array = NDArray[np.float64]
 Criterion = Literal["simulation", "prediction", "frequency"]
 
 FIRST_STEPS, FINALISTS = 8, 6

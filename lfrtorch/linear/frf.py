@@ -13,11 +13,10 @@ from lfrtorch import _checks
 from lfrtorch._checks import integer
 from lfrtorch._checks import lines as checked_lines
 from lfrtorch._threads import spread_by_hand
+from lfrtorch._types import Array, Complex, Integers
 from lfrtorch.linear.local_polynomial import half_width, local_polynomial
-from lfrtorch.linear.regression import Complex, Regression, covariance, outer, regress
+from lfrtorch.linear.regression import Regression, covariance, outer, regress
 from lfrtorch.linear.spectra import (
-    Array,
-    Lines,
     Removal,
     Spectra,
     excited_lines,
@@ -271,7 +270,7 @@ def estimate_frf(
     )
 
 
-def _robust(spectra: Spectra, data: list[Record], lines: Lines) -> FRF:
+def _robust(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
     """Distortion from the scatter over experiments, noise from that over periods."""
     fitted = _response(spectra, lines)
     R, nu = spectra.U.shape[1:]
@@ -305,7 +304,7 @@ def _robust(spectra: Spectra, data: list[Record], lines: Lines) -> FRF:
     )
 
 
-def _fast(spectra: Spectra, data: list[Record], lines: Lines) -> FRF:
+def _fast(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
     """Distortion from the lines left out, noise from the scatter over periods."""
     if spectra.P.min() < 2:
         record = data[int(np.argmin(spectra.P))]
@@ -325,7 +324,7 @@ def _fast(spectra: Spectra, data: list[Record], lines: Lines) -> FRF:
         raise ValueError(f"no odd line is left out between the excited ones; {advice}")
     fitted = _response(spectra, lines)
 
-    def level(at: Lines, G: Complex) -> tuple[Level, Complex]:
+    def level(at: Integers, G: Complex) -> tuple[Level, Complex]:
         """Power of Y - G U at the lines, and its matrix (F, ny, ny)."""
         C = outer(spectra.Y[at] - spectra.U[at] @ G.swapaxes(1, 2)) / len(data)
         noise = _residual_noise(spectra.C[at], G) * np.mean(1 / spectra.P)
@@ -411,7 +410,7 @@ def _about(spectra: Spectra, data: list[Record]) -> dict[str, Any]:
     }
 
 
-def _response(spectra: Spectra, lines: Lines) -> Regression:
+def _response(spectra: Spectra, lines: Integers) -> Regression:
     """G at the lines by least squares over the experiments; the rows are experiments."""
     R, nu = spectra.U.shape[1:]
     if nu > R:
@@ -431,7 +430,7 @@ def _response(spectra: Spectra, lines: Lines) -> Regression:
     return fitted
 
 
-def _noise(spectra: Spectra, lines: Lines, fitted: Regression) -> Complex:
+def _noise(spectra: Spectra, lines: Integers, fitted: Regression) -> Complex:
     """Covariance of vec(G) due to the noise: P periods have 1 / P of that of one."""
     C = _residual_noise(spectra.C[lines], fitted.G)
     return covariance(C, fitted.weights / np.sqrt(spectra.P))
@@ -444,7 +443,7 @@ def _residual_noise(C: Complex, G: Complex) -> Complex:
     return H @ C @ H.conj().swapaxes(1, 2)
 
 
-def _block_covariance(spectra: Spectra, lines: Lines) -> Complex | None:
+def _block_covariance(spectra: Spectra, lines: Integers) -> Complex | None:
     """Covariance of the mean over blocks of orthogonal experiments, ``None`` for other designs."""
     R, nu = spectra.U.shape[1:]
     M = R // nu
@@ -461,7 +460,7 @@ def _block_covariance(spectra: Spectra, lines: Lines) -> Complex | None:
     return outer(d) / (M * (M - 1))
 
 
-def _interpolated(at: Lines, lines: Lines, matrices: Complex) -> Complex:
+def _interpolated(at: Integers, lines: Integers, matrices: Complex) -> Complex:
     """Matrices (F, n, m) at other lines, piecewise linear and constant beyond the ends."""
     if len(lines) == 1:
         return np.repeat(matrices, len(at), axis=0)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch.linear.regression import DEPENDENT, Complex, covariance, outer, regress
+from lfrtorch._types import Complex, Integers
+from lfrtorch.linear.regression import DEPENDENT, covariance, outer, regress
 
 CHUNK = 2**21
 """Complex numbers of the windows that are in memory at a time: 32 MiB, and as much in copies."""
@@ -21,7 +22,7 @@ def half_width(order: int, degrees_of_freedom: int, nu: int, records: int) -> in
 
 
 def local_polynomial(
-    U: Complex, Y: Complex, centres: NDArray[np.int64], *, order: int, n: int
+    U: Complex, Y: Complex, centres: Integers, *, order: int, n: int
 ) -> tuple[Complex, Complex, NDArray[np.bool_]]:
     """Frequency response at lines of spectra that hold transients, and its covariance.
 

@@ -10,16 +10,15 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lfrtorch import _checkpoint
+from lfrtorch._types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.linear.resolvent import frequency_response, resolvents, slopes
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler, without_coordinates
-
-Array = NDArray[np.float64]
 
 SINGULAR = 1e-12
 """Singular value, relative to the size of the system, that counts as zero where zeros at infinity
@@ -93,11 +92,11 @@ class LinearModel:
         return len(self.A)
 
     @property
-    def poles(self) -> NDArray[np.complex128]:
+    def poles(self) -> Complex:
         """Poles (nx,), in the z plane."""
         return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
 
-    def zeros(self, output: int | None = None, input: int | None = None) -> NDArray[np.complex128]:
+    def zeros(self, output: int | None = None, input: int | None = None) -> Complex:
         """Finite zeros in the z plane: those of one channel, or the transmission zeros of all.
 
         Args:
@@ -119,7 +118,7 @@ class LinearModel:
             )
         return _zeros(self.A, B, C, D)
 
-    def frf(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
+    def frf(self, frequencies: ArrayLike) -> Complex:
         """Frequency response C (zI - A)⁻¹ B + D.
 
         Shape:
@@ -303,7 +302,7 @@ class LinearModel:
                 f"'{folder}' is damaged: its description and weights do not fit ({error})."
             ) from None
 
-    def _z(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
+    def _z(self, frequencies: ArrayLike) -> Complex:
         f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
         if f.ndim != 1:
             raise ValueError(f"the frequencies have shape {f.shape}; give one dimension, in Hz.")
@@ -323,7 +322,7 @@ def linear_cell(A: Array, B: Array, C: Array, D: Array) -> LFRCell:
     return cell
 
 
-def _zeros(A: Array, B: Array, C: Array, D: Array) -> NDArray[np.complex128]:
+def _zeros(A: Array, B: Array, C: Array, D: Array) -> Complex:
     """Finite invariant zeros, after those at infinity are taken out one by one.
 
     The eigenvalues of the pencil [A - zI, B; C, D] will not do: rounding moves one at infinity of

@@ -13,13 +13,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array, Complex
 from lfrtorch.linear.model import LinearModel, balancing
 from lfrtorch.records import Channel, Record, as_records, without_coordinates
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 DEFECTIVE = 1e8
 """Condition of the eigenvectors above which modes cannot be told apart."""

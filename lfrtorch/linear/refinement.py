@@ -6,13 +6,11 @@ import sys
 from dataclasses import dataclass
 from typing import Any, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from lfrtorch._types import Array
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 
-Array = NDArray[np.float64]
 Matrices = tuple[Array, Array, Array, Array]
 """A, B, C, D."""
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Complex = NDArray[np.complex128]
+from lfrtorch._types import Complex
 
 DEPENDENT = 1e-10
 """A column whose part across the columns before it is relatively below this depends on them."""

@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.intp]
+from lfrtorch._types import Array, Complex, Integers
 
 
 def resolvent(A: Array, B: Array, z: Complex) -> Complex:
@@ -48,7 +45,7 @@ def frequency_response(A: Array, B: Array, C: Array, D: Array, z: Complex) -> Co
     return np.asarray(C @ resolvent(A, B, z) + D, dtype=np.complex128)
 
 
-def slopes(X: Complex, L: Complex, U: Complex, columns: Indices | None = None) -> Complex:
+def slopes(X: Complex, L: Complex, U: Complex, columns: Integers | None = None) -> Complex:
     """Slope of G U with the entries of A, B, C, D, each by rows, one after another.
 
     Args:
@@ -69,7 +66,7 @@ def slopes(X: Complex, L: Complex, U: Complex, columns: Indices | None = None) -
     return left[:, :, None, rows] * right[:, None, :, others]
 
 
-def _places(nx: int, nu: int, ny: int) -> tuple[Indices, Indices]:
+def _places(nx: int, nu: int, ny: int) -> tuple[Integers, Integers]:
     """Row and column of every entry of A, B, C, D in [A B; C D]."""
     x, u, y = np.arange(nx), nx + np.arange(nu), nx + np.arange(ny)
     blocks = [np.meshgrid(r, c, indexing="ij") for r, c in ((x, x), (x, u), (y, x), (y, u))]

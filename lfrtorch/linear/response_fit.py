@@ -7,9 +7,9 @@ import math
 import numpy as np
 import scipy.linalg
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from lfrtorch._types import Array, Complex
 from lfrtorch.least_squares.gauge import Reduction, reduction
 from lfrtorch.least_squares.linear_systems import Orthogonal
 from lfrtorch.linear.model import linear_cell
@@ -17,10 +17,6 @@ from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.resolvent import resolvent, resolvents, slopes
 from lfrtorch.linear.spectral_data import Lines
 from lfrtorch.linear.subspace import LARGEST_POLE, Start, from_spectra
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-
 
 MOST_STARTS, LARGE = 12, 250_000
 """Starts that are refined, up to so many errors times unknowns."""

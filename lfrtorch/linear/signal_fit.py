@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 import scipy.linalg
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from lfrtorch._types import Array
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.least_squares.linear_systems import Orthogonal
@@ -26,8 +26,6 @@ from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.subspace import LARGEST_POLE, Start, from_signals
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler
-
-Array = NDArray[np.float64]
 
 MOST_STARTS, SHORT = 8, 200_000
 """Starts that are refined, up to so many samples times squared states."""

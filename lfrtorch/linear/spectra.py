@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lfrtorch._checks import lines as checked_lines
-from lfrtorch.linear.regression import Complex, outer
+from lfrtorch._types import Array, Complex, Integers
+from lfrtorch.linear.regression import outer
 from lfrtorch.records import Record
-
-Array = NDArray[np.float64]
-Lines = NDArray[np.int64]
 
 RELATIVE_POWER = 1e-4
 """A line is excited where each input has more than this (-40 dB) of its power at its best line."""
@@ -54,11 +52,11 @@ class Spectra(NamedTuple):
     Y: Complex
     C: Complex
     freedom: int
-    P: Lines
+    P: Integers
     N: int
     resolution: float
 
-    def frequencies(self, lines: Lines) -> Array:
+    def frequencies(self, lines: Integers) -> Array:
         """Frequencies (F,) of the lines, Hz."""
         return np.asarray(lines * self.resolution, dtype=np.float64)
 
@@ -211,7 +209,7 @@ def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
         )
 
 
-def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | None) -> Lines:
+def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | None) -> Integers:
     """The lines between 0 and fs / 2 where all inputs are excited, or the given ones.
 
     Raises:
@@ -244,7 +242,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     return lines
 
 
-def powered_lines(spectra: Spectra, n: int) -> Lines:
+def powered_lines(spectra: Spectra, n: int) -> Integers:
     """The lines between 0 and fs / 2 within n lines of which every input has power.
 
     What is left out would be estimated from rounding errors.
@@ -261,7 +259,7 @@ def _smooth(power: Array, width: int) -> Array:
     return np.stack([np.convolve(channel, window, "same") / count for channel in power.T], axis=1)
 
 
-def in_band(lines: Lines, resolution: float, band: tuple[float, float] | None) -> Lines:
+def in_band(lines: Integers, resolution: float, band: tuple[float, float] | None) -> Integers:
     """The lines in a band of frequencies in Hz, or all of them.
 
     Raises:

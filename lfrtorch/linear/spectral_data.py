@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array, Complex
 from lfrtorch.linear.frf import FRF
 from lfrtorch.records import Record, Scaler, rms_scale
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 Weight = Literal["total", "noise", "none"]
 
 DEGREES_OF_FREEDOM = 20

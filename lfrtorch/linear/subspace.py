@@ -19,10 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from lfrtorch._types import Array, Complex
 
 LARGEST_POLE = 1.0 - 1e-6
 """Radius that no pole reaches: the margin keeps a model stable when its coordinates change."""

@@ -7,16 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.signal
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.fitting.multistart import LEFT
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.spectra import spectra_of_periods
 from lfrtorch.records import Record
 from lfrtorch.reporting.advice import Evidence
 from lfrtorch.reporting.simulations import Response, rms
-
-Array = NDArray[np.float64]
 
 AVERAGES = 8
 """Segments for each regressor that a coherence is estimated from, at least."""

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.poles import poles_at_rest, roots
 from lfrtorch.dataset import Dataset
@@ -262,7 +262,7 @@ def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
     }
 
 
-def _moments(x: NDArray[np.float64]) -> list[float]:
+def _moments(x: Array) -> list[float]:
     """Mean, rms about it, smallest and largest sample; a mean that is rounding errors is 0."""
     mean, deviation = float(np.mean(x)), float(np.std(x))
     mean = 0.0 if abs(mean) < 1e-12 * deviation else mean

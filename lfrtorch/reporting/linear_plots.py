@@ -10,13 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import ArrayLike, NDArray
 
+from lfrtorch._types import Array, Complex
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.records import Channel
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 MEASURED, MODEL, DIFFERENCE = "tab:blue", "black", "tab:green"
 TOTAL, NOISE, ODD, EVEN = "tab:red", "0.5", "tab:red", "tab:green"

@@ -9,12 +9,10 @@ import numpy as np
 import scipy.signal
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.records import Record
-
-Array = NDArray[np.float64]
 
 OUTPUT, LTI, NL_LFR = "tab:blue", "tab:red", "tab:green"
 """Colours of the measured output, the linear model's error and the NL-LFR's, as in the paper."""

@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Record
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,13 +6,11 @@ import numpy as np
 import scipy.signal
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.reporting.plots import envelope
 from lfrtorch.survey.measurement import Survey
 from lfrtorch.survey.signal import LEAST, SignalSurvey, longest_run
-
-Array = NDArray[np.float64]
 
 INPUT, OUTPUT, BAND, CLIPPED = "tab:blue", "tab:green", "0.9", "tab:red"
 

@@ -12,10 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.signal
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from lfrtorch._types import Array, Complex
 
 SEGMENTS = (4, 8)
 """Of a record: the response has lags up to T / 8 or T / 16. The one is taken in which more of the

@@ -7,14 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.signal
-from numpy.typing import NDArray
 
+from lfrtorch._types import Array
 from lfrtorch.records import Record, as_records
 from lfrtorch.survey.causality import Lags, lags
 from lfrtorch.survey.measurement import Survey, survey
 from lfrtorch.survey.signal import SignalSurvey, longest_run
-
-Array = NDArray[np.float64]
 
 SHORT = 300
 """Samples below which a record is short: a small NL-LFR model has 50 to 100 parameters."""

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lfrtorch._types import Array
 from lfrtorch.periods import find_period
 from lfrtorch.records import Channel
 from lfrtorch.survey.signal import SignalSurvey, longest_run, survey_signal
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,9 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
+from lfrtorch._types import Array, Integers
 from lfrtorch.periods import find_transient
 from lfrtorch.records import Channel
-
-Array = NDArray[np.float64]
 
 IN_BAND = 0.99
 """Share of the power about the mean that lies in the band; the rest is half below, half above."""
@@ -147,7 +146,7 @@ def band(signal: Array, fs: float = 1.0) -> tuple[float, float] | None:
     return float(f[1 + low]), float(f[1 + high])
 
 
-def _extreme(signal: Array, values: Array, counts: NDArray[np.intp]) -> Extreme:
+def _extreme(signal: Array, values: Array, counts: Integers) -> Extreme:
     """The first of the values, and whether the signal is clipped at it."""
     if not len(values):
         return Extreme(np.nan, 0, 0, False)

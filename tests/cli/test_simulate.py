@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
-from numpy.typing import NDArray
 from omegaconf import DictConfig
 from reference import random_cell, random_model
 
 import lfrtorch
+from lfrtorch._types import Array
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.stream import Block, FileStream
 from scripts import simulate
@@ -29,7 +29,7 @@ NOISE = 0.1 * np.random.default_rng(1).normal(size=(T, 2))
 Y = MODEL.simulate(U) + NOISE
 
 
-def csv(path: Path, **columns: NDArray[np.float64]) -> Path:
+def csv(path: Path, **columns: Array) -> Path:
     rows = np.stack([*columns.values()], axis=1)
     lines = [",".join("" if np.isnan(v) else repr(float(v)) for v in row) for row in rows]
     path.write_text("\n".join([",".join(columns), *lines]) + "\n")
@@ -79,7 +79,7 @@ def refused(monkeypatch, capsys, folder: Path, *words: str) -> str:
     return printed.err
 
 
-def columns(path: Path) -> dict[str, NDArray[np.float64]]:
+def columns(path: Path) -> dict[str, Array]:
     table = open_table(path)
     names = [column.name for column in table.columns]
     return dict(zip(names, table.read(range(len(names))).T, strict=True))

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import reference
 import scipy.linalg
-from reference import Array, System, random_system
+from reference import System, random_system
 
+from lfrtorch._types import Array
 from lfrtorch.linear import bla
 from lfrtorch.linear.bla import data_scaler, estimate_bla
 from lfrtorch.linear.frf import estimate_frf

@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from reference import Array, System, dlsim, frf, periodic_response, random_system
+from reference import System, dlsim, frf, periodic_response, random_system
 
+from lfrtorch._types import Array
 from lfrtorch.excitation import Multisine, multisine
 from lfrtorch.linear.frf import FRF, Method, estimate_frf
 from lfrtorch.linear.local_polynomial import half_width

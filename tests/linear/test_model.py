@@ -12,9 +12,10 @@ import reference
 import scipy.linalg
 import scipy.signal
 import torch
-from reference import Array, System, normal, random_cell, random_model, random_system
+from reference import System, normal, random_cell, random_model, random_system
 
 import lfrtorch
+from lfrtorch._types import Array
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.linear.model import LinearFit, LinearModel, balancing
 from lfrtorch.linear.resolvent import frequency_response

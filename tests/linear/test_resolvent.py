@@ -8,7 +8,8 @@ import torch
 from reference import System, random_system
 from torch import Tensor
 
-from lfrtorch.linear.resolvent import Complex, frequency_response, resolvents, slopes
+from lfrtorch._types import Complex
+from lfrtorch.linear.resolvent import frequency_response, resolvents, slopes
 
 pytestmark = pytest.mark.numeric
 

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import reference
 import torch
-from reference import Array, System, random_system, refined
+from reference import System, random_system, refined
 
+from lfrtorch._types import Array, Complex
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.resolvent import frequency_response
-from lfrtorch.linear.response_fit import Complex, ResponseError, ResponseFit
+from lfrtorch.linear.response_fit import ResponseError, ResponseFit
 from lfrtorch.linear.spectral_data import Lines, lines_of, lines_of_response
 from lfrtorch.records import Channel, Record
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import reference
 import scipy.linalg
-from reference import Array, System, random_system, refined
+from reference import System, random_system, refined
 
+from lfrtorch._types import Array
 from lfrtorch.linear.signal_fit import OBSERVERS, SignalFit
 from lfrtorch.records import Record
 

@@ -5,8 +5,9 @@ import itertools
 import numpy as np
 import pytest
 import reference
-from reference import Array, System, random_system
+from reference import System, random_system
 
+from lfrtorch._types import Array
 from lfrtorch.linear import subspace
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.linear.response_fit import Lines, ResponseFit

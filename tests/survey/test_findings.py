@@ -6,16 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.signal import butter, lfilter, sosfilt
 
+from lfrtorch._types import Array
 from lfrtorch.datasets import boucwen, parwh, silverbox, wiener_hammerstein
 from lfrtorch.records import Channel, Record
 from lfrtorch.survey.findings import examine, findings
 from lfrtorch.survey.measurement import survey
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.numeric
 
