@@ -32,15 +32,14 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))  # of train.py, which is no part of the package
+import lfrtorch
+from lfrtorch._atomic import whole_file
+from lfrtorch.cli.config import CONF
+from lfrtorch.dataset import Dataset
+from lfrtorch.reporting import leaderboard
+from lfrtorch.reporting.html import number
 
-import lfrtorch  # noqa: E402
-from lfrtorch._atomic import whole_file  # noqa: E402
-from lfrtorch.dataset import Dataset  # noqa: E402
-from lfrtorch.reporting import leaderboard  # noqa: E402
-from lfrtorch.reporting.html import number  # noqa: E402
-from train import CONF  # noqa: E402
+ROOT = Path(__file__).resolve().parents[1]
 
 STAND_IN = "stand-in"
 """Source of simulated records in the place of official ones: their scores do not compare."""

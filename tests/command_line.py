@@ -11,7 +11,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-import train
+from lfrtorch.cli import fit
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
@@ -53,7 +53,7 @@ def configuration(*overrides: str) -> DictConfig:
 def launched(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     """The command line in this process."""
     monkeypatch.setattr(sys, "argv", ["train.py", *words])
-    train.launch()
+    fit.launch()
 
 
 def file_overrides(csv: Path) -> list[str]:

@@ -2,7 +2,9 @@ import os
 import re
 import subprocess
 import sys
+import sysconfig
 import tomllib
+import venv
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 import lfrtorch
+from lfrtorch.cli.command import COMMANDS
 from lfrtorch.datasets import boucwen, official
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -22,14 +25,12 @@ print(lfrtorch.__file__)
 """
 
 
-def python(*args: object, cwd: Path = ROOT, path: Path | None = None) -> str:
-    """Run this interpreter and return what it prints."""
-    env = os.environ | ({"PYTHONPATH": str(path)} if path else {})
+def python(*args: object) -> None:
+    """Run this interpreter at the top of the sources."""
     run = subprocess.run(
-        [sys.executable, *map(str, args)], cwd=cwd, env=env, capture_output=True, text=True
+        [sys.executable, *map(str, args)], cwd=ROOT, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stdout + run.stderr
-    return run.stdout.strip()
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +46,72 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     names = {name for name in ZipFile(wheel).namelist() if ".dist-info/" not in name}
     sources = {str(path.relative_to(ROOT)) for path in (ROOT / "lfrtorch").rglob("*.py")}
-    assert names == sources | {"lfrtorch/py.typed", "lfrtorch/reporting/templates/report.html"}
+    settings = {f"lfrtorch/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
+    others = {"lfrtorch/py.typed", "lfrtorch/reporting/templates/report.html"}
+    assert names == sources | settings | others
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bin folder of an environment that has the wheel and its dependencies, not the sources."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=False)
+    executables = folder / ("Scripts" if os.name == "nt" else "bin")
+    (place,) = folder.rglob("site-packages")
+    # A .pth file within is not read: the sources, which one names, stay out.
+    (place / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    pip = "-m", "pip", "--python", executables / "python"
+    python(*pip, "install", "-qq", "--no-deps", "--no-index", "--ignore-installed", wheel)
+    return executables
+
+
+def command(installed: Path, folder: Path, *words: object) -> str:
+    """What the installed ``lfrtorch`` prints in ``folder``."""
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    run = subprocess.run(
+        [installed / "lfrtorch", *map(str, words)],
+        cwd=folder, env=env, capture_output=True, text=True,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stdout + run.stderr
+    return run.stdout
+
+
+def test_installed_wheel_has_the_commands_and_their_settings(installed: Path, tmp_path: Path):
+    settings = command(installed, tmp_path, "fit", "+bench=boucwen", "--cfg", "job")
+    assert "_target_: lfrtorch.datasets.boucwen.load" in settings
+    named = command(installed, tmp_path)
+    assert [line.split()[1] for line in named.splitlines()[1:]] == list(COMMANDS)
 
 
 @pytest.mark.slow
-def test_unpacked_wheel_imports_outside_the_source_tree(wheel: Path, tmp_path: Path):
-    target = tmp_path / "target"
-    ZipFile(wheel).extractall(target)  # all that installing does with a wheel of Python files
-    file = python("-c", IMPORT_ALL, cwd=tmp_path, path=target)
-    assert Path(file).is_relative_to(target)
+def test_installed_wheel_runs_from_file_to_new_outputs(installed: Path, tmp_path: Path):
+    t = np.arange(400)
+    u = np.sin(0.3 * t) + 0.5 * np.sin(0.7 * t + 1.0)
+    y = np.zeros_like(u)
+    for k in t[1:]:
+        y[k] = 0.7 * y[k - 1] + 0.3 * np.tanh(2.0 * u[k - 1])
+    np.savetxt(tmp_path / "x.csv", np.c_[u, y], delimiter=",", header="u,y", comments="")
+    data = "data=file", "data.path=x.csv", "data.inputs=[u]", "data.outputs=[y]", "data.fs=10"
+    preview = command(installed, tmp_path, "preview", "x.csv", "--inputs", "u", "--outputs", "y")
+    assert "signal" in preview
+    assert "Linear model of order 1" in command(installed, tmp_path, "linear", *data, "nx=1")
+    run = "nx=1", "nz=1", "nn=3", "trainer.max_iter=5", "hydra.run.dir=run"
+    command(installed, tmp_path, "fit", *data, *run)
+    assert (tmp_path / "run" / "report.html").is_file()
+    assert "NL-LFR" in command(installed, tmp_path, "evaluate", *data, "checkpoint=run")
+    files = "checkpoint=run", "data.path=x.csv", "out=y.csv"
+    assert "y.csv: 400 samples" in command(installed, tmp_path, "simulate", *files)
+
+
+@pytest.mark.slow
+def test_every_module_of_an_installed_wheel_imports(installed: Path, tmp_path: Path):
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    found = subprocess.run(
+        [installed / "python", "-c", IMPORT_ALL],
+        cwd=tmp_path, env=env, capture_output=True, text=True,
+    )  # fmt: skip
+    assert found.returncode == 0, found.stderr
+    assert Path(found.stdout.strip()).is_relative_to(installed.parent)
 
 
 def test_version_is_the_same_everywhere():

@@ -1,1 +1,1 @@
-"""What the command line needs beyond the settings: how a run is interrupted."""
+"""The command line: its configuration by Hydra, the folder of a run, a module for each command."""

@@ -13,9 +13,8 @@ from command_line import configuration, file_overrides
 from reference import measure, random_cell, random_model
 
 import lfrtorch
-import train
+from lfrtorch.cli import evaluate, fit
 from lfrtorch.dataset import Dataset, Published
-from scripts import evaluate
 
 MODEL = random_model(random_cell(), fs=50.0)
 LINEAR = lfrtorch.LinearModel(
@@ -106,7 +105,7 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
     folder = tmp_path / "run"
     folder.mkdir()
     words = [*file_overrides(csv), "nx=1", "nn=2", "trainer.max_iter=1"]
-    train.identify(configuration(*words), folder)
+    fit.identify(configuration(*words), folder)
     run(monkeypatch, f"checkpoint={folder}", *words, f"out={tmp_path / 'scores.json'}")
     found = json.loads((tmp_path / "scores.json").read_text())
     metrics = json.loads((folder / "metrics.json").read_text())

@@ -34,8 +34,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 import lfrtorch
-import train
-from lfrtorch.cli import interrupts
+from lfrtorch.cli import config, errors, fit, interrupts, run_folder, steps
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
 
@@ -70,7 +69,7 @@ ROUNDING = 1e-12
 def test_every_bench_composes(bench: str):
     cfg = configuration(f"+bench={bench}")
     assert cfg.name == bench
-    train.require(cfg)
+    config.require(cfg)
     dataset = bench.removesuffix("_record")
     assert cfg.data["_target_"] == f"lfrtorch.datasets.{dataset}.load"
     assert (cfg.bla.nx, cfg.init.nz, cfg.init.nw) == (cfg.nx, cfg.nz, cfg.nw)
@@ -105,7 +104,7 @@ def test_every_bench_runs_two_iterations(
         cfg.data.root = str(request.getfixturevalue("benchmark_root"))
     cfg.figures = (bench, choice) == ("boucwen", "trainer.max_iter=2")  # of whole periods, once
     try:
-        train.identify(cfg, tmp_path)
+        fit.identify(cfg, tmp_path)
     except InstantiationException as failed:
         if bench not in SIMULATED and isinstance(failed.__cause__, FileNotFoundError):
             pytest.skip(str(failed.__cause__))
@@ -123,7 +122,7 @@ def test_notes_on_the_data_are_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(official, "cache", lambda: tmp_path)  # without files
-    data = train.loaded(configuration("+bench=parwh", "data.levels=[100]"))
+    data = steps.loaded(configuration("+bench=parwh", "data.levels=[100]"))
     assert data.tests[0].source == "stand-in"
     assert capsys.readouterr().out == f"note: {data.notes[0]}\n"
 
@@ -142,7 +141,7 @@ def test_a_static_map_of_ones_own(csv: Path, tmp_path: Path, capsys):
     cfg = configuration(*words, "static._target_=cli.test_fit.Cubic")
     with open_dict(cfg):
         cfg.static.scale = 0.5
-    train.identify(cfg, tmp_path)
+    fit.identify(cfg, tmp_path)
     model = lfrtorch.load(tmp_path, static=Cubic(1, 1, 0.5))
     assert isinstance(model.lfr.cell.static, Cubic)
     assert model.lfr.cell.static.scale == 0.5
@@ -150,7 +149,7 @@ def test_a_static_map_of_ones_own(csv: Path, tmp_path: Path, capsys):
     cfg.init_from, cfg.nx = str(tmp_path), None
     again = tmp_path / "again"
     again.mkdir()
-    train.identify(cfg, again)
+    fit.identify(cfg, again)
     assert lfrtorch.load(again, static=Cubic(1, 1, 0.5)).sizes["nx"] == 1
 
 
@@ -169,7 +168,7 @@ def test_the_words_of_a_run_are_read_by_their_new_names(tmp_path: Path):
     (tmp_path / ".hydra").mkdir()
     saved = ["init=polynomial", "trainer=adam", "trainer.epochs=30", "resume=x", "init=paper"]
     OmegaConf.save(OmegaConf.create(saved), tmp_path / ".hydra" / "overrides.yaml")
-    words = train.arguments([f"resume={tmp_path}"])
+    words = run_folder.arguments([f"resume={tmp_path}"])
     assert words[:4] == ["static=polynomial", "trainer=adam", "trainer.max_iter=30", "init=paper"]
 
 
@@ -211,8 +210,8 @@ def test_init_from_continues_where_the_run_ended(csv: Path, tmp_path: Path):
     for folder in (first, second):
         folder.mkdir()
     arguments = [*file_overrides(csv), "nx=1"]
-    train.identify(configuration(*arguments, "trainer.max_iter=5"), first)
-    validation = train.identify(
+    fit.identify(configuration(*arguments, "trainer.max_iter=5"), first)
+    validation = fit.identify(
         configuration(*arguments, f"init_from={first}", "trainer.max_iter=0"), second
     )
     before = json.loads((first / "metrics.json").read_text())["validation"]["rmse"]
@@ -226,9 +225,9 @@ def test_polynomial_is_chosen_and_continued(
     for folder in (first, second):
         folder.mkdir()
     arguments = [*file_overrides(csv), "nx=1", "nz=1", "trainer.max_iter=2"]
-    train.identify(configuration(*arguments, "static=polynomial", "degree=2"), first)
+    fit.identify(configuration(*arguments, "static=polynomial", "degree=2"), first)
     cfg = configuration(*arguments, f"init_from={first}")
-    train.identify(cfg, second)
+    fit.identify(cfg, second)
     assert cfg.degree == 2
     sizes = json.loads((second / "metrics.json").read_text())["sizes"]
     assert sizes == {"nx": 1, "nz": 1, "nw": 1, "degree": 2}
@@ -243,13 +242,13 @@ def test_init_from_says_which_sizes_it_takes(
     for folder in (first, second):
         folder.mkdir()
     arguments = [*file_overrides(csv), "nx=1", "trainer.max_iter=1"]
-    train.identify(configuration(*arguments, "nz=1", "nn=4"), first)
+    fit.identify(configuration(*arguments, "nz=1", "nn=4"), first)
     cfg = configuration(*arguments, "nn=auto", f"init_from={first}")
-    train.identify(cfg, second)
+    fit.identify(cfg, second)
     assert (cfg.nz, cfg.nn) == (1, 4)
     assert "nz is 1, that of the model in" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"has the inputs u and the data u \(N\)"):
-        train.identify(configuration("+bench=boucwen", f"init_from={first}"), second)
+        fit.identify(configuration("+bench=boucwen", f"init_from={first}"), second)
 
 
 @pytest.mark.numeric
@@ -261,7 +260,7 @@ def test_a_resting_test_part_gives_a_score_that_is_null(tmp_path: Path):
     np.savez(tmp_path / "rest.npz", u=u, y=y)
     overrides = ["data=file", f"data.path={tmp_path / 'rest.npz'}", "data.inputs=[u]"]
     overrides += ["data.outputs=[y]", "data.fs=1", "data.test=0.1", "nx=1", "trainer.max_iter=1"]
-    train.identify(configuration(*overrides), tmp_path)
+    fit.identify(configuration(*overrides), tmp_path)
     score = json.loads((tmp_path / "metrics.json").read_text())["scores"]["test"]
     assert score["nrmse"] is None
     assert score["rmse"] >= 0
@@ -275,7 +274,7 @@ def test_a_run_without_test_and_validation_records(tmp_path: Path, capsys):
     overrides = ["data=file", f"data.path={tmp_path / 'all.npz'}", "data.inputs=[u]"]
     overrides += ["data.outputs=[y]", "data.fs=1", "nx=1", "trainer.max_iter=1"]
     overrides += ["data.test=0", "data.validation=0", "figures=true"]
-    train.identify(configuration(*overrides), tmp_path)
+    fit.identify(configuration(*overrides), tmp_path)
     assert "nothing is scored" in capsys.readouterr().out
     assert json.loads((tmp_path / "metrics.json").read_text())["scores"] == {}
     assert (tmp_path / "figures" / "convergence.png").is_file()
@@ -339,7 +338,7 @@ def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, t
     usual = signal.getsignal(signal.SIGTERM)
     cfg = configuration(*file_overrides(csv), "nx=1", "trainer._target_=cli.test_fit.Terminated")
     with pytest.raises(interrupts.Terminated, match="the best model so far is in"):
-        train.identify(cfg, tmp_path)
+        fit.identify(cfg, tmp_path)
     assert signal.getsignal(signal.SIGTERM) == usual
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["fit"]["reason"] == "interrupted"
@@ -353,11 +352,11 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
     cut, whole = tmp_path / "cut", tmp_path / "whole"
     for folder in (cut, whole):
         folder.mkdir()
-    train.identify(configuration(*settings), whole)
+    fit.identify(configuration(*settings), whole)
     with pytest.raises(interrupts.Terminated, match=f"python train.py resume={cut}"):
-        train.identify(configuration(*settings, "trainer._target_=cli.test_fit.Terminated"), cut)
+        fit.identify(configuration(*settings, "trainer._target_=cli.test_fit.Terminated"), cut)
     assert json.loads((cut / "metrics.json").read_text())["fit"]["reason"] == "interrupted"
-    train.identify(configuration(*settings, f"resume={cut}"), cut)
+    fit.identify(configuration(*settings, f"resume={cut}"), cut)
     ends = [json.loads((folder / "metrics.json").read_text()) for folder in (cut, whole)]
     assert ends[0]["scores"] == ends[1]["scores"]
     assert ends[0]["ranking"] == ends[1]["ranking"]
@@ -369,7 +368,7 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
 @pytest.mark.usefixtures("undrawn")
 def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "starts=3", "average=3", "trainer.max_iter=3"]
-    judged = train.identify(configuration(*settings, "data.validation=0", "figures=true"), tmp_path)
+    judged = fit.identify(configuration(*settings, "data.validation=0", "figures=true"), tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert (metrics["averaged"], metrics["sizes"]["nx"]) == (3, 3)
     assert judged == metrics["ranking"][0]["train"]
@@ -380,7 +379,7 @@ def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
 
 def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     settings = [*file_overrides(csv), "nx=1", "starts=2", "average=2", "trainer.max_iter=1"]
-    train.identify(configuration(*settings, "static=polynomial", "figures=false"), tmp_path)
+    fit.identify(configuration(*settings, "static=polynomial", "figures=false"), tmp_path)
     assert "note: average is for networks" in capsys.readouterr().out
     assert json.loads((tmp_path / "metrics.json").read_text())["averaged"] == 1
 
@@ -388,27 +387,27 @@ def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.Captu
 def test_a_new_run_forgets_the_one_that_it_replaces(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=2", "threads=3"]
     for seed in (0, 1):
-        train.identify(configuration(*settings, f"seed={seed}"), tmp_path)
+        fit.identify(configuration(*settings, f"seed={seed}"), tmp_path)
     assert torch.get_num_threads() == 3
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["fit"]["iterations"] == 2
 
 
 def test_resume_takes_the_settings_of_the_run(tmp_path: Path):
-    run_folder = tmp_path / "it's a run"
-    (run_folder / ".hydra").mkdir(parents=True)
+    saved = tmp_path / "it's a run"
+    (saved / ".hydra").mkdir(parents=True)
     text = "- +bench=boucwen\n- trainer.max_iter=60\n- resume=before\n"
-    (run_folder / ".hydra" / "overrides.yaml").write_text(text)
-    given = [f"resume={run_folder}", "trainer.max_iter=90"]
-    found = train.arguments(given)
+    (saved / ".hydra" / "overrides.yaml").write_text(text)
+    given = [f"resume={saved}", "trainer.max_iter=90"]
+    found = run_folder.arguments(given)
     assert found[:-1] == ["+bench=boucwen", "trainer.max_iter=60", *given]
     parser = OverridesParser.create()
-    assert parser.parse_override(found[-1]).value() == str(run_folder)
+    assert parser.parse_override(found[-1]).value() == str(saved)
 
 
 def test_resume_needs_a_run(tmp_path: Path):
     with pytest.raises(ValueError, match="not the folder of a run"):
-        train.arguments([f"resume={tmp_path}"])
+        run_folder.arguments([f"resume={tmp_path}"])
 
 
 @pytest.mark.parametrize(
@@ -416,18 +415,18 @@ def test_resume_needs_a_run(tmp_path: Path):
 )
 def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path, option: str, mark: str):
     given = [f"{option}='{tmp_path}'"]
-    assert train.arguments(given) == given
+    assert run_folder.arguments(given) == given
     (tmp_path / mark).touch()
     with pytest.raises(ValueError, match="overwrite=true"):
-        train.arguments(given)
-    assert train.arguments([*given, "overwrite=true"]) == [*given, "overwrite=true"]
+        run_folder.arguments(given)
+    assert run_folder.arguments([*given, "overwrite=true"]) == [*given, "overwrite=true"]
 
 
 @pytest.mark.numeric
 def test_sizes_are_searched_for(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     arguments = ["nx=auto", "nx_max=2", "nz=auto", "nw=1", "nn=auto", "trainer.max_iter=20"]
     cfg = configuration(*file_overrides(csv), *arguments, "sizes_search.nn=[1,3]")
-    train.identify(cfg, tmp_path)
+    fit.identify(cfg, tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     tried = metrics["sizes_search"]
     assert [(t["nz"], t["nw"], t["nn"]) for t in tried][:2] == [(1, 1, 3), (2, 1, 3)]
@@ -448,7 +447,7 @@ def test_degree_is_searched_for_with_adam(csv: Path, tmp_path: Path):
     arguments = [*file_overrides(csv), "nx=1", "nz=1", "static=polynomial", "degree=auto"]
     arguments += ["sizes_search.degree=[1,2]", "trainer=adam", "trainer.max_iter=4"]
     cfg = configuration(*arguments)
-    train.identify(cfg, tmp_path)
+    fit.identify(cfg, tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert [t["degree"] for t in metrics["sizes_search"]] == [2, 1]
     assert metrics["sizes"]["degree"] == cfg.degree
@@ -582,8 +581,8 @@ def test_settings_that_cannot_be_are_one_message(
     """Of the short file, where no other data are given."""
     given = any(word.startswith(("+bench=", "data=")) for word in overrides)
     cfg = configuration(*([] if given else [*file_overrides(csv), "nx=1"]), *overrides)
-    with pytest.raises(SystemExit) as stop, train.user_errors():
-        train.identify(cfg, tmp_path)
+    with pytest.raises(SystemExit) as stop, errors.user_errors():
+        fit.identify(cfg, tmp_path)
     assert stop.value.code == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "metrics.json").exists()

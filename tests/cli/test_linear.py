@@ -18,10 +18,9 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
-import train
+from lfrtorch.cli import errors, fit, linear
 from lfrtorch.dataset import Dataset
 from lfrtorch.records import Record
-from scripts import bla
 
 ROOT = Path(__file__).resolve().parents[2]
 T, FS, SKIP = 1200, 50.0, 100
@@ -62,7 +61,7 @@ def overrides(csv: Path, inputs: str, outputs: str, *more: str) -> list[str]:
 def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> dict:
     """linear.json of a run."""
     monkeypatch.setattr(sys, "argv", ["bla.py", f"hydra.run.dir='{folder}'", *words])
-    bla.main()
+    linear.main()
     return json.loads((folder / "linear.json").read_text())
 
 
@@ -226,8 +225,8 @@ def test_settings_that_cannot_be_are_one_message(
     cfg = copy.deepcopy(composed())
     OmegaConf.set_struct(cfg, False)  # as + does on the command line
     cfg.merge_with_dotlist(overrides(csv, inputs, "x", *more)[1:])
-    with pytest.raises(SystemExit) as stop, train.user_errors():
-        bla.identify(cfg, tmp_path)
+    with pytest.raises(SystemExit) as stop, errors.user_errors():
+        linear.identify(cfg, tmp_path)
     assert stop.value.code == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "linear.json").exists()
@@ -257,7 +256,7 @@ def test_it_is_a_script_that_runs_anywhere(tmp_path: Path):
 def test_train_takes_the_order_of_a_scan(csv: Path, tmp_path: Path, capsys):
     words = overrides(csv, "a,b", "x", "nx=auto", "nx_max=3", "nn=2", "trainer.max_iter=1")
     cfg = configuration(*words)
-    train.identify(cfg, tmp_path)
+    fit.identify(cfg, tmp_path)
     assert cfg.nx == 2
     assert json.loads((tmp_path / "metrics.json").read_text())["sizes"]["nx"] == 2
     assert "nx: 2\n" in (tmp_path / "config.yaml").read_text()
@@ -278,7 +277,7 @@ def test_train_takes_the_order_of_a_scan(csv: Path, tmp_path: Path, capsys):
     ],
 )
 def test_frequency_and_damping(z: complex, frequency: float | None, damping: float | None):
-    (root,) = bla.roots(np.array([z], dtype=complex), 1.0)
+    (root,) = linear.roots(np.array([z], dtype=complex), 1.0)
     assert root["frequency"] == (None if frequency is None else pytest.approx(frequency))
     assert root["damping"] == (None if damping is None else pytest.approx(damping))
     assert root["radius"] == pytest.approx(abs(z))

@@ -14,11 +14,10 @@ from matplotlib.image import imread
 from scipy.io import savemat
 from scipy.signal import lfilter
 
-import train
+from lfrtorch.cli import preview, steps
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.findings import examine
 from lfrtorch.survey.measurement import survey
-from scripts import preview
 
 ROOT = Path(__file__).resolve().parents[2]
 T, FS = 2000, 50.0
@@ -50,7 +49,7 @@ def file(tmp_path: Path, signals, monkeypatch) -> Path:
 @pytest.fixture
 def run(capsys):
     def run(*words: str | Path) -> str:
-        preview.main([str(word) for word in words])
+        preview.launch([str(word) for word in words])
         printed = capsys.readouterr()
         assert printed.err == ""
         return printed.out
@@ -66,7 +65,7 @@ def undrawn(monkeypatch):
 
 def refused(capsys, *words: str | Path) -> str:
     with pytest.raises(SystemExit) as stop:
-        preview.main([str(word) for word in words])
+        preview.launch([str(word) for word in words])
     assert stop.value.code == 1
     return capsys.readouterr().err
 
@@ -240,9 +239,9 @@ def test_train_says_the_findings_of_a_file(file: Path, signals, capsys):
         file.parent / "clipped.csv", signals | {"level": np.nan_to_num(signals["level"])}
     )
     words = ["data=file", "data.inputs=[force]", "data.outputs=[level]", "data.fs=50"]
-    train.loaded(configuration(*words, f"data.path={clipped}"))
+    steps.loaded(configuration(*words, f"data.path={clipped}"))
     assert "note: output 'level' has its largest value 0.3" in capsys.readouterr().out
-    train.loaded(configuration(*words, f"data.path={clean}"))
+    steps.loaded(configuration(*words, f"data.path={clean}"))
     assert "note: output" not in capsys.readouterr().out
 
 

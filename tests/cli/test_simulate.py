@@ -18,9 +18,9 @@ from reference import random_cell, random_model
 
 import lfrtorch
 from lfrtorch._types import Array
+from lfrtorch.cli import simulate
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.stream import Block, FileStream
-from scripts import simulate
 
 MODEL = random_model(random_cell(2, 2, 3, 2, 1, 4), fs=50.0)
 T = 300

@@ -14,7 +14,7 @@ from hydra import compose, initialize_config_dir
 from scipy.io import savemat
 
 import lfrtorch
-import train
+from lfrtorch.cli import fit
 from lfrtorch.datasets import emps
 
 ESTIMATION, TEST = FILES = ("EMPS/DATA_EMPS.mat", "EMPS/DATA_EMPS_PULSES.mat")
@@ -163,7 +163,7 @@ def scores(root: Path, *words: str) -> dict[str, dict[str, float]]:
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         given = ["+bench=emps", f"data.root='{root}'", "figures=false", "starts=1"]
         cfg = compose("config", [*given, *words])
-    train.identify(cfg, root)
+    fit.identify(cfg, root)
     metrics = json.loads((root / "metrics.json").read_text())
     return metrics["scores"] | {"validation": metrics["validation"]}
 

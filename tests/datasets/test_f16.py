@@ -13,8 +13,8 @@ from hydra import compose, initialize_config_dir
 from scipy.io import savemat
 from scipy.signal import lfilter
 
-import train
 from lfrtorch import metrics, multisine
+from lfrtorch.cli import fit
 from lfrtorch.datasets import f16
 
 FOLDER = "F16/F16GVT_Files/BenchmarkData"
@@ -222,7 +222,7 @@ def test_run(shaken, tmp_path, capsys):
     overrides = ["+bench=f16", f"data.root='{shaken}'", *sizes.split(), *shorter.split()]
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         cfg = compose("config", overrides)
-    train.identify(cfg, tmp_path)
+    fit.identify(cfg, tmp_path)
     result = json.loads((tmp_path / "metrics.json").read_text())
     assert list(result["scores"]) == ["level_2", "level_4", "level_6"]
     for score in result["scores"].values():

@@ -1,0 +1,74 @@
+"""A trained model on a dataset: checkpoint and records -> table of scores.
+
+lfrtorch evaluate checkpoint=runs/boucwen/DATE +bench=boucwen
+lfrtorch evaluate checkpoint=DIR data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750
+"""  # noqa: E501
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+import lfrtorch
+from lfrtorch._atomic import refuse_existing, whole_file
+from lfrtorch.cli.config import CONF, require_data
+from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.run_folder import program
+from lfrtorch.cli.steps import loaded, same_channels
+from lfrtorch.reporting import scores as report
+
+
+def evaluate(cfg: DictConfig, command: str = "") -> None:
+    """Print the scores of the checkpoint's model, and write them where that is asked for."""
+    if cfg.checkpoint is None:
+        raise ValueError(
+            "no model chosen: add checkpoint=DIR, the folder of a run or of a saved model."
+        )
+    require_data(cfg)
+    if cfg.out is not None:
+        if Path(cfg.out).suffix.lower() != ".json":
+            raise ValueError(f"out is '{cfg.out}'; the scores are JSON: name it FILE.json.")
+        if not cfg.overwrite:
+            refuse_existing(cfg.out, "overwrite=true")
+    folder = str(cfg.checkpoint)
+    model, bla = lfrtorch.load(folder), linear_beside(folder)
+    dataset = loaded(cfg)
+    for record in (*dataset.tests, *dataset.validation, *dataset.selection):
+        same_channels(model, record, folder)
+    if bla is None:
+        print(f"note: '{folder}' has no folder linear/, so no linear model is scored")
+    elif dataset.linear:
+        print("note: the linear model is that of all training records; a run has one a test")
+    scores = report.evaluation(model, bla, dataset, command=command)
+    print(f"\n{report.table(scores, dataset.published)}")
+    if cfg.out is not None:
+        found = {"checkpoint": folder, **scores}
+        with whole_file(cfg.out) as file:
+            file.write_text(json.dumps(found, indent=2, allow_nan=False) + "\n")
+        print(f"\nScores in {cfg.out}")
+
+
+def linear_beside(checkpoint: str) -> lfrtorch.LinearModel | None:
+    """The linear model of a run, whose folder or ``model/`` folder is given, where it has one."""
+    folder = Path(checkpoint)
+    places = [folder / "linear", *([folder.parent / "linear"] if folder.name == "model" else [])]
+    found = next((place for place in places if place.is_dir()), None)
+    return None if found is None else lfrtorch.LinearModel.load(found)
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="evaluate")
+def main(cfg: DictConfig) -> None:
+    """The command line."""
+    command = shlex.join([*program("scripts/evaluate.py"), *HydraConfig.get().overrides.task])
+    with user_errors():
+        evaluate(cfg, command)
+
+
+def launch() -> None:
+    """The command."""
+    main()

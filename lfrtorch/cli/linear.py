@@ -1,0 +1,269 @@
+"""The linear model alone: records -> frequency response -> BLA -> table, figures, checkpoint.
+
+lfrtorch linear +bench=boucwen
+lfrtorch linear data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750 nx=auto
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+import lfrtorch
+from lfrtorch._atomic import whole_file
+from lfrtorch.analysis.poles import roots
+from lfrtorch.cli.config import CONF, require
+from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
+from lfrtorch.cli.steps import linear_model, loaded
+from lfrtorch.dataset import Dataset
+from lfrtorch.distributed import Ranks
+from lfrtorch.reporting import linear_plots, plots
+
+
+def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
+    """One run, its files written into ``folder``."""
+    require(cfg)
+    if cfg.threads is not None:
+        torch.set_num_threads(cfg.threads)
+    dataset = loaded(cfg)
+    print(f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples")
+    frf, notes = response(cfg, dataset.train)
+    # A fit to the response takes the one that the figures show.
+    data = frf if frf and cfg.bla.refine == "frequency" else dataset.train
+    model, scan = linear_model(cfg, data, dataset.validation, Ranks())
+    assert model.fit is not None
+    for note in notes:
+        if note not in model.fit.notes:
+            print(f"note: {note}")
+
+    found = numbers(model, dataset, frf, scan)
+    found |= {
+        "notes": list(dict.fromkeys([*dataset.notes, *notes, *model.fit.notes])),
+        "command": command,
+    }
+    print(f"\n{table(found)}")
+    model.save(folder / "linear")
+    text = json.dumps(found, indent=2, allow_nan=False)
+    with whole_file(folder / "linear.json") as fresh:
+        fresh.write_text(text + "\n")
+    with whole_file(folder / CONFIG) as fresh:
+        OmegaConf.save(cfg, fresh, resolve=True)
+    for name, figure in figures(model, dataset, frf, scan).items():
+        figure.savefig(made(folder / "figures") / f"{name}.png", dpi=150)
+    print(f"\nRun in {folder}")
+
+
+def response(
+    cfg: DictConfig, records: Sequence[lfrtorch.Record]
+) -> tuple[lfrtorch.FRF | None, list[str]]:
+    """The measured frequency response, where the records give one, and notes."""
+    asked_for = cfg.frf.method != "auto" or cfg.bla.refine == "frequency"
+    try:
+        frf: lfrtorch.FRF = instantiate(cfg.frf, records)
+    except InstantiationException as failed:
+        if asked_for or not isinstance(failed.__cause__, ValueError):
+            raise
+        return None, [f"no measured frequency response: {failed.__cause__}"]
+    return frf, list(frf.notes)
+
+
+def figures(
+    model: lfrtorch.LinearModel,
+    dataset: Dataset,
+    frf: lfrtorch.FRF | None,
+    scan: lfrtorch.OrderScan | None,
+) -> dict:
+    """All figures of a run by file name."""
+    drawn = {record.name: plots.errors(record, model.simulate(record)) for record in dataset.tests}
+    drawn["frequency_response"] = linear_plots.frequency_response(model, frf)
+    drawn["poles_and_zeros"] = linear_plots.poles_and_zeros(model)
+    if scan is not None:
+        drawn["order_scan"] = linear_plots.order_scan(scan)
+    if frf is not None and frf.distortion is not None:
+        drawn["distortion"] = linear_plots.distortion(frf)
+    return drawn
+
+
+def numbers(
+    model: lfrtorch.LinearModel,
+    dataset: Dataset,
+    frf: lfrtorch.FRF | None,
+    scan: lfrtorch.OrderScan | None,
+) -> dict[str, Any]:
+    """What linear.json holds; None where a number is not finite or not known."""
+    fit = model.fit
+    assert fit is not None
+    used = {"train": dataset.train, "validation": dataset.validation, "test": dataset.tests}
+    found: dict[str, Any] = {
+        "bench": dataset.name,
+        "nx": model.nx,
+        "fit": {
+            "criterion": fit.criterion,
+            "rmse": fit.rmse,
+            "iterations": fit.iterations,
+            "reason": fit.reason,
+            "seconds": fit.seconds,
+        },
+        "scores": [score(model, r, use) for use, records in used.items() for r in records],
+        "poles": roots(model.poles, model.fs),
+        "zeros": {name: roots(z, model.fs) for name, z in linear_plots.zeros(model).items()},
+        "offsets": [
+            {"channel": channel.name, "offset": float(offset), "unit": channel.unit}
+            for channel, offset in zip(
+                (*model.inputs, *model.outputs), (*model.u_offset, *model.y_offset), strict=True
+            )
+        ],
+        "response_std": [] if model.covariance is None else uncertainty(model, frf),
+        "frf": None,
+        "scan": None,
+    }
+    if frf is not None:
+        names = "method", "experiments", "periods"
+        found["frf"] = {"lines": len(frf.frequencies)} | {n: getattr(frf, n) for n in names}
+    if scan is not None:
+        found["scan"] = {
+            "orders": scan.orders,
+            "fitted": [None if m.fit is None else finite(m.fit.rmse) for m in scan.models],
+            "scores": [finite(s) for s in scan.scores],
+            "validated": scan.validated,
+            "chosen": scan.chosen,
+        }
+    return found
+
+
+def score(model: lfrtorch.LinearModel, record: lfrtorch.Record, use: str) -> dict[str, Any]:
+    """Simulation errors of each output after the skip window."""
+    y = record.y[record.skip :]
+    rmse = np.sqrt(np.mean((y - model.simulate(record)[record.skip :]) ** 2, axis=0))
+    deviation = np.std(y, axis=0)
+    return {
+        "use": use,
+        "record": record.name,
+        "source": record.source,
+        "samples": record.samples,
+        "skip": record.skip,
+        "outputs": [
+            {
+                "output": channel.name,
+                "unit": channel.unit,
+                "rmse": finite(rmse[i]),
+                "nrmse": finite(rmse[i] / deviation[i]) if deviation[i] > 0 else None,
+            }
+            for i, channel in enumerate(record.outputs)
+        ],
+    }
+
+
+def uncertainty(model: lfrtorch.LinearModel, frf: lfrtorch.FRF | None) -> list[dict[str, Any]]:
+    """The largest standard deviation of each channel's response, in the band of the data."""
+    f = linear_plots.frequencies(model, frf)
+    std, size = model.frf_std(f), np.abs(model.frf(f))
+    listed = []
+    for i, output in enumerate(model.outputs):
+        for j, source in enumerate(model.inputs):
+            k = int(np.argmax(std[:, i, j]))
+            largest, there = float(std[k, i, j]), float(size[k, i, j])
+            listed.append(
+                {
+                    "channel": f"{output.name}/{source.name}",
+                    "std": finite(largest),
+                    "frequency": float(f[k]),
+                    "relative": finite(largest / there) if there > 0 else None,
+                }
+            )
+    return listed
+
+
+def table(found: dict[str, Any]) -> str:
+    """The numbers of a run for people."""
+    fit = found["fit"]
+    parts = [f"Linear model of order {found['nx']}, {fit['criterion']} error"]
+    about = "use", "record", "source", "samples", "skip"
+    scores = [
+        [*(s[key] for key in about), o["output"], o["rmse"], o["unit"], percent(o["nrmse"])]
+        for s in found["scores"]
+        for o in s["outputs"]
+    ]
+    head = ["use", "record", "source", "samples", "skip", "output", "RMSE", "unit", "% of std"]
+    parts.append(columns(head, scores))
+    listed = [["pole", p] for p in found["poles"]]
+    listed += [[f"zero {n}".strip(), z] for n, zeros in found["zeros"].items() for z in zeros]
+    rows = [
+        [what, r["frequency"], r["damping"], r["radius"], "pair" if r["imag"] else ""]
+        for what, r in listed
+    ]
+    parts.append(columns(["", "frequency (Hz)", "damping", "radius", ""], rows))
+    rows = [[o["channel"], o["offset"], o["unit"]] for o in found["offsets"]]
+    parts.append(columns(["operating point", "offset", "unit"], rows))
+    if found["response_std"]:
+        rows = [
+            [r["channel"], r["std"], percent(r["relative"]), r["frequency"]]
+            for r in found["response_std"]
+        ]
+        head = ["response", "largest std", "% of response there", "at (Hz)"]
+        parts.append(columns(head, rows))
+    return "\n\n".join(parts)
+
+
+def percent(ratio: float | None) -> float | None:
+    """100 times the ratio, where there is one."""
+    return None if ratio is None else 100 * ratio
+
+
+def columns(head: list[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Columns under a head: words to the left, numbers to the right."""
+    rows = list(rows)
+    words = [all(isinstance(row[i], str) for row in rows) for i in range(len(head))]
+    cells = [head, *([cell(value) for value in row] for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    lines = [
+        "  ".join(
+            c.ljust(w) if word else c.rjust(w)
+            for c, w, word in zip(row, widths, words, strict=True)
+        ).rstrip()
+        for row in cells
+    ]
+    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
+
+
+def cell(value: str | float | None) -> str:
+    """A value of the table, numbers with four digits."""
+    if value is None:
+        return "-"
+    return str(value) if isinstance(value, str | int) else f"{value:.4g}"
+
+
+def finite(value: float) -> float | None:
+    """The number, None where JSON cannot hold it."""
+    return float(value) if math.isfinite(value) else None
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="linear")
+def main(cfg: DictConfig) -> None:
+    """The command line."""
+    run = HydraConfig.get()
+    command = shlex.join([*program("scripts/bla.py"), *run.overrides.task])
+    folder = Path(run.runtime.output_dir)
+    with user_errors(), no_empty_folder(folder):
+        identify(cfg, folder, command)
+
+
+def launch() -> None:
+    """The command, with the settings of the run in ``resume=DIR`` before its words."""
+    with user_errors():
+        sys.argv[1:] = arguments(sys.argv[1:])
+    main()

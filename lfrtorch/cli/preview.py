@@ -1,0 +1,289 @@
+"""Look at measurements before any fit: a table, what will hurt a model, and a figure.
+
+    lfrtorch preview x.csv --inputs force --outputs displacement --fs 750
+    lfrtorch preview 'runs/*.mat' --inputs u --outputs y
+
+A file is any that data.path takes. Without --inputs and --outputs all columns of numbers are shown,
+and nothing is said of what lies between them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import glob
+import sys
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lfrtorch._atomic import whole_file
+from lfrtorch._checks import number
+from lfrtorch._types import Array
+from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.linear import cell, columns
+from lfrtorch.files.formats import BLOCK, Table, open_table
+from lfrtorch.files.time_stamps import Uneven, in_seconds, is_time, sampling
+from lfrtorch.records import Channel
+from lfrtorch.reporting.survey_plots import survey_figure
+from lfrtorch.survey.findings import examine
+from lfrtorch.survey.measurement import Survey, survey
+from lfrtorch.survey.signal import SignalSurvey
+
+LARGEST = 2**22
+"""Values that are read of a file, of all channels together: what comes after is not looked at."""
+
+RATE = 0.01
+"""Relative difference of two sampling frequencies that are the same."""
+
+THOUSANDS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+
+FIGURES = (".png", ".pdf", ".svg")
+
+
+class Roles(NamedTuple):
+    """Columns of a table by their use; without roles all signals are among the outputs."""
+
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+    time: int | None
+
+
+def launch(words: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog=sys.argv[0], description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("paths", nargs="+", metavar="PATH", help="file, or pattern in quotes")
+    parser.add_argument("--inputs", nargs="+", default=[], metavar="NAME", type=column)
+    parser.add_argument("--outputs", nargs="+", default=[], metavar="NAME", type=column)
+    parser.add_argument("--fs", type=float, metavar="HZ", help="sampling frequency")
+    parser.add_argument(
+        "--time", type=column, metavar="COLUMN", help="of times; looked for where left out"
+    )
+    parser.add_argument("--out", type=Path, metavar="FIGURE.png", help="default: FILE_preview.png")
+    options = parser.parse_args(words)
+    with user_errors():
+        if options.fs is not None:
+            number("--fs", options.fs, positive=True)
+        paths = matching(options.paths)
+        for path in paths:
+            show(path, options, figure_path(options.out, path, len(paths)))
+
+
+def column(word: str) -> str | int:
+    """A column's name or number."""
+    return int(word) if word.isdecimal() else word
+
+
+def matching(patterns: Sequence[str]) -> list[Path]:
+    """The files that are named or match a pattern, each once.
+
+    Raises:
+        ValueError: a pattern that no file matches.
+    """
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        path = Path(pattern).expanduser()
+        paths = [path] if path.exists() else sorted(map(Path, glob.glob(str(path))))
+        if not paths and glob.has_magic(pattern):
+            raise ValueError(f"no file matches '{pattern}'.")
+        found |= dict.fromkeys(paths or [path])
+    return list(found)
+
+
+def figure_path(out: Path | None, path: Path, files: int) -> Path:
+    """Where the figure of a file goes: ``out`` for one, beside it by the file's name for several.
+
+    Raises:
+        ValueError: an extension that is none of a figure.
+    """
+    if out is None:
+        return Path(f"{path.stem}_preview.png")
+    if out.suffix.lower() not in FIGURES:
+        raise ValueError(f"--out is '{out}'; give a name that ends with {', '.join(FIGURES)}.")
+    return out if files == 1 else out.with_stem(f"{out.stem}_{path.stem}")
+
+
+def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
+    """Print what a file holds, and draw it."""
+    table = open_table(path)
+    roles, remarks = chosen(table, options)
+    wanted = [*roles.inputs, *roles.outputs]
+    signals, more = read(table, wanted if roles.time is None else [*wanted, roles.time])
+    fs, sentences = options.fs, []
+    if roles.time is not None:
+        fs, remark, sentences = clock(signals[:, -1], table.columns[roles.time], fs)
+        remarks.append(remark)
+        signals = signals[:, :-1]
+    if more:
+        remarks.append(f"the first {len(signals)} samples are read, and no more")
+    count = len(roles.inputs)
+    u, y = signals[:, :count], signals[:, count:]
+    found = survey(
+        u,
+        y,
+        fs,
+        inputs=[table.columns[i] for i in roles.inputs],
+        outputs=[table.columns[i] for i in roles.outputs],
+    )
+    sentences += [finding.text for finding in examine(found, u, y)]
+    if found.fs is None:
+        remarks.append("no sampling frequency: give --fs; frequencies are in cycles/sample")
+    if not roles.inputs:
+        remarks.append("no --inputs and --outputs: what lies between them is not looked at")
+    print(f"{path}: {len(signals)} samples{'' if found.fs is None else f' at {found.fs:.6g} Hz'}")
+    for remark in remarks:
+        print(f"  {remark}")
+    print(f"\n{numbers(found)}\n")
+    for sentence in sentences:
+        print(textwrap.fill(sentence, 100, initial_indent="- ", subsequent_indent="  "))
+    if not sentences:
+        print("Nothing found that would hurt a model.")
+    with whole_file(figure) as fresh:
+        survey_figure(found, signals, path.name).savefig(fresh, dpi=110)
+    print(f"\nFigure in {figure}\n")
+
+
+def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]:
+    """Which columns are what, and remarks on what was taken.
+
+    Raises:
+        ValueError: a column that is not there or has two uses, or none of numbers.
+    """
+    inputs = table.find(options.inputs, "--inputs") if options.inputs else ()
+    outputs = table.find(options.outputs, "--outputs") if options.outputs else ()
+    time = table.find(options.time, "--time") if options.time is not None else ()
+    named = [*inputs, *outputs, *time]
+    twice = [table.headers[i] for i in dict.fromkeys(named) if named.count(i) > 1]
+    if twice or len(time) > 1:
+        raise ValueError(
+            f"'{table.path}': {', '.join(map(repr, twice)) or '--time'} stands for several; "
+            "give every column one use, and one column of times."
+        )
+    heads, remarks = {}, []
+    for i in set(range(len(table.columns))) - set(named):
+        try:
+            heads[i] = next(table.blocks([i], BLOCK))[:, 0]
+        except ValueError as error:
+            remarks.append(f"left out: {error}")
+    if not time:
+        time = clocks(table, heads)[:1]
+    others = tuple(i for i in heads if i not in time)
+    if not inputs and not outputs:
+        outputs = others
+    elif not inputs or not outputs:
+        side = "outputs" if inputs else "inputs"
+        names = ", ".join(table.columns[i].name for i in others)
+        remarks.append(f"{side}: {names}, all other columns")
+        inputs, outputs = inputs or others, outputs or others
+    if not outputs or (options.inputs and not inputs):
+        raise ValueError(f"'{table.path}' has no columns left to show; it has {table.listed}.")
+    return Roles(inputs, outputs, time[0] if time else None), remarks
+
+
+def clocks(table: Table, heads: Mapping[int, Array]) -> tuple[int, ...]:
+    """Columns that look like times, the likeliest first: by name, even ones, sample numbers."""
+    ranked = []
+    for i, head in heads.items():
+        named = is_time(table.columns[i])
+        try:
+            grid = sampling(in_seconds(filled(head), table.columns[i]))
+        except Uneven:
+            even, counter = False, False
+        else:
+            even, counter = not grid.gaps.size, not named and grid.fs == 1
+        if named or even:
+            ranked.append((counter, not named, i))
+    return tuple(i for *_, i in sorted(ranked))
+
+
+def clock(times: Array, channel: Channel, fs: float | None) -> tuple[float | None, str, list[str]]:
+    """The sampling frequency, what a column of times was taken for, and what is wrong with it."""
+    name = f"'{channel.name}'"
+    try:
+        grid = sampling(in_seconds(filled(times), channel))
+    except Uneven as error:
+        said = f"the time column {name} {error}; resample the signals to an even grid."
+        return fs, f"{name} is taken for the time", [said]
+    if grid.fs == 1 and not is_time(channel):
+        return fs, f"{name} is taken for sample numbers", []
+    sentences = []
+    if grid.gaps.size:
+        sentences.append(
+            f"the times in {name} have {grid.gaps.size} gap(s) of {grid.missing.sum()} sample(s) "
+            f"in all, the first after sample {grid.gaps[0] - 1}: data.gaps=split cuts the record "
+            "there."
+        )
+    remark = f"{name} is taken for the time, {grid.fs:.6g} Hz"
+    if fs is None or abs(fs / grid.fs - 1) < max(RATE, grid.uncertainty):
+        return fs or grid.fs, remark, sentences
+    unit = next((u for f, u in THOUSANDS.items() if abs(fs / grid.fs / f - 1) < RATE), None)
+    sentences.append(
+        f"fs looks like {grid.fs:.6g} Hz, not {fs:g}, by the times in {name}"
+        + (f", unless they are in {unit}." if unit else "; correct one of them.")
+    )
+    return fs, remark, sentences
+
+
+def filled(times: Array) -> Array:
+    """Times with those that are missing on the line between their neighbours."""
+    known, k = np.isfinite(times), np.arange(len(times))
+    return np.interp(k, k[known], times[known]) if known.any() else np.zeros(len(times))
+
+
+def read(table: Table, wanted: Sequence[int]) -> tuple[Array, bool]:
+    """The first samples (T, wanted), and whether there are more."""
+    most = LARGEST // len(wanted)
+    blocks, T = [], 0
+    for block in table.blocks(wanted):
+        blocks.append(block[: most - T])
+        T += len(block)
+        if most < T:
+            break
+    signals = np.concatenate(blocks)
+    present = np.flatnonzero(~np.isnan(signals).all(axis=1))
+    if not present.size:
+        raise ValueError(f"'{table.path}' has no values in the columns to show.")
+    return signals[: present[-1] + 1], most < T  # spreadsheets end in empty lines
+
+
+def numbers(found: Survey) -> str:
+    """The table: a row a signal."""
+    unit = "1/sample" if found.fs is None else "Hz"
+    head = ["signal", "use", "samples", "missing", "mean", "rms", "min", "max", "% at min"]
+    head += ["% at max", "run", f"from {unit}", f"to {unit}", "period", "periods"]
+    table = columns([*head, "noise"], [row(one, found) for one in found.signals])
+    methods = {one.method for one in found.signals}
+    legend = [
+        "rms: about the mean; run: longest at an extreme; from, to: the band of 99 % of the power."
+    ]
+    if "periods" in methods:
+        legend.append("Noise: the scatter from period to period.")
+    if "spectrum" in methods:
+        legend.append("Noise ~: a guess from the quietest part of the spectrum.")
+    return f"{table}\n{' '.join(legend)}"
+
+
+def row(one: SignalSurvey, found: Survey) -> list[str | float | None]:
+    """What the table says of a signal."""
+    use = "" if not found.inputs else "input" if one in found.inputs else "output"
+    ends = one.minimum, one.maximum
+    noise = None if one.noise is None else cell(one.noise)
+    return [
+        str(one.channel),
+        use,
+        one.samples,
+        one.missing,
+        one.mean,
+        one.rms,
+        *(end.value for end in ends),
+        *(round(100 * end.samples / one.samples, 2) for end in ends),
+        max(end.run for end in ends),
+        *(one.band or (None, None)),
+        one.period,
+        None if one.period is None else one.samples / one.period,
+        f"~ {noise}" if one.method == "spectrum" else noise,
+    ]

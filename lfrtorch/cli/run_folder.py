@@ -1,0 +1,119 @@
+"""The folder of a run: its words, its settings, and how to go on with it."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from lfrtorch.distributed import Ranks
+
+WORLD = int(os.environ.get("WORLD_SIZE", "1"))
+"""Processes of one fit that torchrun started."""
+
+CONFIG, SNAPSHOTS = "config.yaml", "resume"
+"""In the folder of a run: its settings, and its starts as far as they came."""
+
+OLD_WORDS = {
+    "init=polynomial": "static=polynomial",
+    "trainer.epochs": "trainer.max_iter",
+}
+"""Words of the command line that have other names now; saved runs may have them."""
+
+
+def arguments(given: Sequence[str]) -> list[str]:
+    """The command line with the settings of the run in ``resume=DIR``, if there is one, before it.
+
+    Raises:
+        ValueError: no run there, or a folder given for a new run that holds another one.
+    """
+    values = dict(argument.split("=", 1) for argument in given if "=" in argument)
+    folder = values.get("resume", "null")
+    if folder != "null":
+        overrides = Path(folder) / ".hydra" / "overrides.yaml"
+        if not overrides.is_file():
+            raise ValueError(
+                f"resume is '{folder}', which is not the folder of a run: there is no {overrides}; "
+                "give the folder that the run named at its end, runs/NAME/DATE."
+            )
+        before = [now(str(o)) for o in OmegaConf.load(overrides)]
+        before = [word for word in before if not word.startswith("resume=")]
+        escaped = folder.replace("\\", "\\\\").replace("'", "\\'")
+        return [*before, *given, f"hydra.run.dir='{escaped}'"]
+    for word in given:
+        if now(word) != word:
+            raise ValueError(f"{word} is called {now(word)} now.")
+    for name, mark in (("hydra.run.dir", CONFIG), ("hydra.sweep.dir", "multirun.yaml")):
+        folder = values.get(name, "").strip("'\"")
+        taken = bool(folder) and (Path(folder) / mark).exists()
+        if taken and values.get("overwrite", "").lower() != "true":
+            raise ValueError(
+                f"{name} is '{folder}', which holds a run; give another folder, resume={folder} "
+                "to go on with that run, or overwrite=true to replace it."
+            )
+    return list(given)
+
+
+def now(word: str) -> str:
+    """The word of the command line by its present name."""
+    for old, new in OLD_WORDS.items():
+        if word == old or word.startswith(f"{old}="):
+            return new + word.removeprefix(old)
+    return word
+
+
+def chosen_before(cfg: DictConfig, folder: Path) -> None:
+    """Take the sizes that the run to go on with chose from the data."""
+    if cfg.resume is None or not (folder / CONFIG).is_file():
+        return
+    before = OmegaConf.load(folder / CONFIG)
+    for name in ("nx", "nz", "nw", "nn", "degree"):
+        if cfg[name] == "auto":
+            cfg[name] = OmegaConf.select(before, name)
+
+
+def program(script: str) -> list[str]:
+    """The words that started this command: ``lfrtorch NAME``, or Python and the script."""
+    installed = sys.argv[0].startswith("lfrtorch ")
+    if WORLD > 1:
+        several = ["torchrun", "--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", str(WORLD))]
+        named = ["-m", "lfrtorch.cli", *sys.argv[0].split()[1:]] if installed else [script]
+        return [*several, *named]
+    return sys.argv[0].split() if installed else ["python", script]
+
+
+def go_on(folder: Path) -> str:
+    """How to go on with a run that ended early."""
+    return f"to go on: {shlex.join(program('train.py'))} resume={folder}"
+
+
+def common(folder: Path, ranks: Ranks) -> Path:
+    """The first process's folder."""
+    name = torch.tensor(list(str(folder).encode()), dtype=torch.uint8)
+    return Path(bytes(ranks.first(name).tolist()).decode())
+
+
+def made(folder: Path) -> Path:
+    """The folder, made where it is missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+@contextmanager
+def no_empty_folder(folder: Path) -> Iterator[None]:
+    """A run that fails before it has a model leaves no folder, where nothing else is in it."""
+    try:
+        yield
+    except BaseException:
+        passing = {".hydra", CONFIG, SNAPSHOTS, "starts"}
+        names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        if names and all(name in passing or name.startswith("events.out") for name in names):
+            shutil.rmtree(folder)
+        raise

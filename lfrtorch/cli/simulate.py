@@ -1,0 +1,309 @@
+"""A trained model on new inputs: checkpoint and files -> simulated outputs, scores.
+
+lfrtorch simulate checkpoint=runs/run/DATE data.path=new.csv out=predicted.csv
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import hydra
+import numpy as np
+from omegaconf import DictConfig, ListConfig
+
+import lfrtorch
+from lfrtorch import _checkpoint
+from lfrtorch._atomic import refuse_existing, whole_file
+from lfrtorch._checks import integer, number
+from lfrtorch._types import Array
+from lfrtorch.cli.config import CONF
+from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.linear import columns, finite, percent
+from lfrtorch.files.formats import open_table
+from lfrtorch.files.load import listed_files
+from lfrtorch.files.stream import Block, FileStream
+from lfrtorch.files.time_stamps import is_time
+from lfrtorch.files.writer import FORMATS, table_writer
+from lfrtorch.metrics import BlockScores
+
+BEGINNING = 100
+"""Samples in which the transient of a wrong start state would be seen."""
+
+TRANSIENT = 3.0
+"""Error there over that of the rest above which it is."""
+
+FAR = 6.0
+"""Standard deviations of the training input that Gaussian noise and most signals stay within."""
+
+
+def simulate(cfg: DictConfig) -> None:
+    """Simulate every file, write what comes out, and print the scores."""
+    require(cfg)
+    pairs = targets(cfg)
+    model = opened(str(cfg.checkpoint))
+    sizes = ", ".join(f"{name} {size}" for name, size in model.sizes.items() if size)
+    u, y = (", ".join(map(str, channels)) for channels in (model.inputs, model.outputs))
+    print(f"{cfg.checkpoint}: {u} -> {y} at {model.fs:g} Hz, {sizes}")
+    check_rate(cfg, model)
+    rows = []
+    for path, out in pairs:
+        clock = time.perf_counter()
+        with about(path):
+            stream = FileStream(
+                path, model.inputs, model.outputs, model.fs,
+                inputs=cfg.data.inputs, outputs=cfg.data.outputs,
+                time=time_column(cfg, model, path),
+            )  # fmt: skip
+            if not stream.y:
+                missing = ", ".join(stream.missing)
+                print(f"note: '{path}' has no column {missing}, so nothing is scored")
+            x0 = start_state(cfg, model, stream)
+            result = written(model, stream, x0, out, cfg.skip)
+        print(f"{out}: {result.samples} samples, {time.perf_counter() - clock:.1f} s")
+        for note in noted(result, model, cfg):
+            print(f"note: {note}")
+        rows += scored(path, model, result.scores, cfg.skip) if stream.y else []
+    if rows:
+        head = ["file", "output", "unit", "samples", "skip", "RMSE", "NRMSE (%)"]
+        print(f"\n{columns(head, rows)}")
+
+
+class Written(NamedTuple):
+    """What is known of a file that was simulated.
+
+    Args:
+        samples: written.
+        scores: of measured outputs after the skipped samples.
+        settled: the same without the first ``BEGINNING`` of those, either.
+        peaks: largest inputs about the operating point, in standard deviations of the model's
+            training inputs, (nu,).
+    """
+
+    samples: int
+    scores: BlockScores
+    settled: BlockScores
+    peaks: Array
+
+
+def written(
+    model: lfrtorch.Model, stream: FileStream, x0: Array | None, out: Path, skip: int
+) -> Written:
+    """Simulate a file block by block into another."""
+    names = [channel.name for channel in model.outputs]
+    scores, settled = (BlockScores(len(names), skip + more) for more in (0, BEGINNING))
+    first, peaks = 0, np.zeros(len(model.inputs))
+    read: list[Block] = []
+
+    def inputs() -> Iterator[Array]:
+        for block in stream.blocks():
+            read[:] = [block]
+            yield block.u
+
+    with whole_file(out) as fresh, table_writer(fresh) as write:
+        for y_hat in lfrtorch.simulate_blocks(model, inputs(), x0=x0):
+            (block,) = read
+            numbers = np.arange(first, first + len(y_hat))
+            found = {stream.clock.name: block.times[:, 0] if stream.times else numbers}
+            for i, name in enumerate(names):
+                found[f"{name}_hat"] = y_hat[:, i]
+                if stream.y:
+                    found[name] = block.y[:, i]
+                    found[f"{name}_error"] = block.y[:, i] - y_hat[:, i]
+            if stream.y:
+                scores.add(block.y, y_hat)
+                settled.add(block.y, y_hat)
+            peaks = np.maximum(peaks, np.abs(model.scaler.normalise_u(block.u)).max(axis=0))
+            write(found)
+            first += len(y_hat)
+        if not first:
+            raise ValueError("there are no samples; give a file with data.")
+    return Written(first, scores, settled, peaks)
+
+
+def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
+    """What a user should know before the outputs are used."""
+    notes = [
+        f"the input {channel.name} goes {peak:.3g} standard deviations of the training input away "
+        "from its mean: the model extrapolates there"
+        for channel, peak in zip(model.inputs, result.peaks, strict=True)
+        if peak > FAR
+    ]
+    scores, settled = result.scores, result.settled
+    with np.errstate(invalid="ignore"):
+        before = scores.samples * scores.rmse**2 - settled.samples * settled.rmse**2
+        beginning = np.sqrt(before / (scores.samples - settled.samples))
+        transient = (settled.samples >= BEGINNING) & (beginning > TRANSIENT * settled.rmse)
+    if cfg.start != "estimated" and transient.any():
+        ratio = (beginning / settled.rmse)[transient].max()
+        notes.append(
+            f"the error over the first {BEGINNING} scored samples is {ratio:.3g} times that of the "
+            "rest: start=estimated finds the state that the file starts from, skip=N leaves out "
+            "the transient"
+        )
+    return notes
+
+
+def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
+    """Refuse another sampling frequency than the model's."""
+    if cfg.data.fs is not None and not np.isclose(cfg.data.fs, model.fs):
+        raise ValueError(
+            f"data.fs is {cfg.data.fs} Hz and the model's sampling frequency {model.fs:g} Hz; "
+            "resample the file."
+        )
+
+
+def time_column(cfg: DictConfig, model: lfrtorch.Model, path: Path) -> str | int | None:
+    """The column of the time: where nothing says how the file is sampled, the one named like it."""
+    if cfg.data.time is not None or cfg.data.fs is not None:
+        return cfg.data.time
+    named = [column.name for column in open_table(path).columns if is_time(column)]
+    if len(named) == 1:
+        print(
+            f"note: the column {named[0]!r} of '{path}' is taken for the time; "
+            f"data.fs={model.fs:g} instead leaves it unread"
+        )
+        return named[0]
+    print(
+        f"note: neither data.time nor data.fs says how '{path}' is sampled; the model's "
+        f"{model.fs:g} Hz is taken"
+    )
+    return None
+
+
+def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> Array | None:
+    """The state to start from; None for zero. How one was estimated is printed."""
+    if cfg.start == "given":
+        return np.array(cfg.x0, dtype=np.float64)
+    if cfg.start == "zero":
+        return None
+    if not stream.y:
+        raise ValueError(
+            "start=estimated needs measured outputs; name their columns with data.outputs=[...], "
+            "or use start=zero."
+        )
+    parts, count = [], 0
+    for block in stream.blocks(cfg.estimate):
+        parts.append(block)
+        count += len(block.u)
+        if count >= cfg.estimate:
+            break
+    if not parts:
+        return None
+    u, y = (np.concatenate(part)[: cfg.estimate] for part in list(zip(*parts, strict=True))[1:])
+    record = lfrtorch.Record(u, y, fs=model.fs, start="estimated", name=stream.table.path.name)
+    trajectory = model.signals(record)
+    fitted = lfrtorch.rmse(record, model.scaler.restore_y(trajectory.y[0].double().numpy()))
+    print(
+        f"start: the state is estimated from the first {len(u)} samples of '{record.name}'; RMSE "
+        f"there {fitted:.3g}, from zero state {lfrtorch.rmse(record, model.simulate(u)):.3g}"
+        + (f" (skip={len(u)} leaves them out of the scores)" if cfg.skip < len(u) else "")
+    )
+    return trajectory.x[0, 0].numpy()
+
+
+def scored(path: Path, model: lfrtorch.Model, scores: BlockScores, skip: int) -> list[list]:
+    """Rows of the table of scores, one an output."""
+    return [
+        [
+            path.name,
+            channel.name,
+            channel.unit,
+            int(scores.samples[i]),
+            skip,
+            finite(scores.rmse[i]),
+            percent(finite(scores.nrmse[i])),
+        ]
+        for i, channel in enumerate(model.outputs)
+    ]
+
+
+def opened(folder: str) -> lfrtorch.Model:
+    """The model of a checkpoint, a linear one as an NL-LFR without static nonlinearity."""
+    description, _ = _checkpoint.read(folder)
+    if "linear" in description:
+        return lfrtorch.LinearModel.load(folder).to_model()
+    return lfrtorch.load(folder)
+
+
+def require(cfg: DictConfig) -> None:
+    """Say what is missing or wrong on the command line before anything is read."""
+    for option, value, example in (
+        ("checkpoint", cfg.checkpoint, "DIR, the folder of a run or of a saved model"),
+        ("data.path", cfg.data.path, "FILE, the file of inputs"),
+        ("out", cfg.out, "FILE.csv, which is written, or for several files a FOLDER"),
+    ):
+        if value is None:
+            raise ValueError(f"{option} is not set: add {option}={example}.")
+    if cfg.start not in ("zero", "given", "estimated"):
+        raise ValueError(f"start is {cfg.start!r}; give zero, given (with x0=[...]) or estimated.")
+    if (cfg.start == "given") != (cfg.x0 is not None):
+        raise ValueError(
+            f"start is {cfg.start!r} and x0 is {cfg.x0}; "
+            "a start state goes with start=given, and only with it."
+        )
+    x0 = cfg.x0 if isinstance(cfg.x0, ListConfig | None) else [None]
+    if not all(isinstance(x, int | float) and np.isfinite(x) for x in x0 or []):
+        raise ValueError(f"x0 is {cfg.x0}; give a list of finite numbers, one a state.")
+    integer("estimate", cfg.estimate, 1)
+    integer("skip", cfg.skip, 0)
+    if cfg.data.fs is not None:
+        number("data.fs", cfg.data.fs, positive=True)
+    if f".{cfg.format}" not in FORMATS:
+        raise ValueError(f"format is {cfg.format!r}; give csv, npz or parquet.")
+
+
+def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
+    """Each file that is read with that which is written."""
+    paths = listed_files(cfg.data.path, "data.path")
+    out = Path(cfg.out).expanduser()
+    if out.is_dir() or not out.suffix:
+        # Of a compressed file the name within.
+        stems = [Path(path.name.removesuffix(".gz")).stem for path in paths]
+        twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+        if twice is not None:
+            raise ValueError(
+                f"several files are called '{twice}', and would be written to one in '{out}'; "
+                "simulate them one by one."
+            )
+        pairs = [
+            (path, out / f"{stem}.{cfg.format}") for path, stem in zip(paths, stems, strict=True)
+        ]
+    elif out.suffix.lower() not in FORMATS:
+        raise ValueError(f"out is '{out}'; give a file of {', '.join(FORMATS)}, or a folder.")
+    elif len(paths) > 1:
+        raise ValueError(f"{len(paths)} files cannot be written to one, '{out}'; give a folder.")
+    else:
+        pairs = [(paths[0], out)]
+    for path, file in pairs:
+        if file.resolve() == path.resolve():
+            raise ValueError(f"'{file}' is the file that is read; give another name to out.")
+        if not cfg.overwrite:
+            refuse_existing(file, "overwrite=true")
+    return pairs
+
+
+@contextmanager
+def about(path: Path) -> Iterator[None]:
+    """Name the file in a message that does not."""
+    try:
+        yield
+    except ValueError as error:
+        if f"'{path}'" in str(error):
+            raise
+        raise ValueError(f"'{path}': {error}") from error
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="simulate")
+def main(cfg: DictConfig) -> None:
+    """The command line."""
+    with user_errors():
+        simulate(cfg)
+
+
+def launch() -> None:
+    """The command."""
+    main()
