@@ -27,7 +27,7 @@ References:
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from math import ceil, inf, isfinite, nan, sqrt
@@ -36,7 +36,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from lfrtorch import _tables
 from lfrtorch._checks import integer, renamed
+from lfrtorch._tables import number
 from lfrtorch._types import Array, Integers
 from lfrtorch.distributed import LOST, ProcessLost, Ranks
 from lfrtorch.fitting.multistart import fit
@@ -62,6 +64,10 @@ ITERATIONS = 50
 
 BLOCKS = 10
 """Least number of blocks of time, over all records."""
+
+LEGEND = """\
+validation: rms error over that of the output. above best: in standard errors of the difference.
+chosen: the fewest net parameters with 1 at most, or an error up to 1 % above the best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +97,10 @@ class Candidate:
         sizes = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
         text = f"{sizes}: {self.parameters} parameters ({self.parameters_net} net), "
         if not isfinite(self.error):
-            return text + f"diverges, {self.seconds:.1f} s"
-        text += f"validation {self.error:.5f} ± {self.error_std:.5f}"
-        text += "" if np.isnan(self.ratio) else f", {self.ratio:.3g} of the linear model's"
-        return f"{text}, {self.seconds:.1f} s"
+            return text + f"diverges, {number(self.seconds)} s"
+        text += f"validation {number(self.error)} ± {number(self.error_std)}"
+        text += "" if np.isnan(self.ratio) else f", {number(self.ratio)} of the linear model's"
+        return f"{text}, {number(self.seconds)} s"
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,28 +160,25 @@ class SizeSearch:
 
     def table(self) -> str:
         """One line a model, by rising net parameters."""
-        names = list(self.candidates[0].sizes)
-        head = "".join(f"{name:>{max(4, len(name) + 2)}}" for name in names)
-        lines = [
-            f"{head}  {'parameters':>10}  {'net':>5}  {'seconds':>7}  {'validation':>10}  "
-            f"{'±':>8}  {'/ LTI':>8}  {'above best':>10}"
-        ]
-        for e in sorted(self.entries(), key=lambda e: e["parameters_net"]):
-            sizes = "".join(f"{e[name]:{max(4, len(name) + 2)}}" for name in names)
-            text = f"{sizes}  {e['parameters']:10}  {e['parameters_net']:5}  {e['seconds']:7.1f}  "
-            if isfinite(e["error"]):
-                ratio = "-" if np.isnan(e["ratio"]) else f"{e['ratio']:.4f}"
-                text += f"{e['error']:10.5f}  {e['error_std']:8.5f}  {ratio:>8}  "
-                text += f"{e['standard_errors_above']:10.1f}{'  chosen' if e['chosen'] else ''}"
-            else:
-                text += f"{'diverges':>10}"
-            lines.append(text)
-        lines.append(
-            "validation: rms error over that of the output. above best: in standard errors of the "
-            "difference.\nchosen: the fewest net parameters with 1 at most, or an error up to 1 % "
-            "above the best."
-        )
-        return "\n".join(lines)
+        return f"{_tables.table(*size_table(self.entries()))}\n{LEGEND}"
+
+
+def size_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
+    """Head and rows of a table of the models tried, by rising number of net parameters."""
+    sizes = [name for name in ("nz", "nw", "nn", "degree") if entries and name in entries[0]]
+    numbers = ["parameters", "parameters_net", "seconds", "error", "error_std", "ratio"]
+    numbers.append("standard_errors_above")
+    rows = [
+        [e[name] for name in (*sizes, *numbers)]
+        + ["chosen" if e["chosen"] else "" if _known(e["error"]) else "diverges"]
+        for e in sorted(entries, key=lambda e: e["parameters_net"])
+    ]
+    head = ["parameters", "net", "seconds", "validation", "±", "/ LTI", "above best", ""]
+    return [*sizes, *head], rows
+
+
+def _known(error: float | None) -> bool:
+    return error is not None and isfinite(error)
 
 
 @renamed(optimiser="trainer")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lfrtorch import _tables
 from lfrtorch._checks import integer
 from lfrtorch.linear.bla import data_scaler, estimate_bla
 from lfrtorch.linear.frf import FRF
@@ -58,16 +59,16 @@ class OrderScan:
     def table(self) -> str:
         """One line an order."""
         how = "validation" if self.validated else "MDL"
-        lines = [f"{'nx':>4}  {'fitted':>10}  {how:>10}  {'singular value':>14}  {'pole':>7}"]
+        rows = []
         for model, score in zip(self.models, self.scores, strict=True):
             s = self.singular_values
-            value = f"{s[model.nx - 1]:.1e}" if model.nx <= len(s) else "-"
+            value = s[model.nx - 1] if model.nx <= len(s) else None
             assert model.fit is not None
-            lines.append(
-                f"{model.nx:4}  {model.fit.rmse:10.5f}  {score:10.5f}  {value:>14}  "
-                f"{np.abs(model.poles).max():7.4f}{'  chosen' if model.nx == self.chosen else ''}"
-            )
-        return "\n".join(lines)
+            radius = float(np.abs(model.poles).max())
+            chosen = "chosen" if model.nx == self.chosen else ""
+            rows.append([model.nx, model.fit.rmse, score, value, radius, chosen])
+        head = ["nx", "fitted", how, "singular value", "largest pole", ""]
+        return _tables.table(head, rows, digits=4)
 
 
 def scan_orders(

@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from lfrtorch._tables import number, percent
+
 NOISE_LIMITED = 1.1
 """Training error over the noise up to which the model's own share, √(1.1² - 1), is below half of
 the noise."""
@@ -153,7 +155,8 @@ def starts_in_a_transient(e: Evidence) -> Advice | None:
     return Advice(
         "The records do not begin at rest: skip more samples (skip=N), or estimate "
         "their starts (start='estimated').",
-        f"in their first twentieth the training error is {e.transient:.2g} times that of the rest",
+        f"in their first twentieth the training error is {number(e.transient)} times that of "
+        "the rest",
     )
 
 
@@ -164,7 +167,7 @@ def at_the_noise(e: Evidence) -> Advice | None:
     return Advice(
         "Noise-limited: nothing to gain from more neurons, states or starts; more data or less "
         "noise make the model better.",
-        f"training error {_percent(e.train)}, noise {_percent(e.noise)} of the output's "
+        f"training error {percent(e.train)}, noise {percent(e.noise)} of the output's "
         "standard deviation",
     )
 
@@ -175,7 +178,7 @@ def still_falling(e: Evidence) -> Advice | None:
         return None
     return Advice(
         f"Still falling: max_iter={4 * max(e.iterations, 1)}; init_from=RUN goes on from here.",
-        f"the error fell by {_percent(e.falling)} over the last tenth of the {e.iterations} "
+        f"the error fell by {percent(e.falling)} over the last tenth of the {e.iterations} "
         "iterations",
     )
 
@@ -192,8 +195,8 @@ def overfits(e: Evidence) -> Advice | None:
         smaller = "smaller sizes"
     return Advice(
         f"Overfit: {smaller}, {'a larger ridge' if e.ridge else 'ridge=1e-3'}, or more data.",
-        f"validation error {_percent(e.validation)}, training error {_percent(e.train)}: "
-        f"{e.overfit:.2g} times the growth of the linear model's",
+        f"validation error {percent(e.validation)}, training error {percent(e.train)}: "
+        f"{number(e.overfit)} times the growth of the linear model's",
     )
 
 
@@ -205,7 +208,7 @@ def linear_part_incomplete(e: Evidence) -> Advice | None:
     order = f"nx={nx + 1}, nx={nx + 2} or nx=auto" if nx else "a higher nx"
     return Advice(
         f"The linear part is incomplete: {order}.",
-        f"a linear filter of the inputs explains {_percent(e.linear)} of the error's power",
+        f"a linear filter of the inputs explains {percent(e.linear)} of the error's power",
     )
 
 
@@ -216,7 +219,7 @@ def hardly_better(e: Evidence) -> Advice | None:
         return None
     if error is None or not lti or error <= USELESS * lti:
         return None
-    gain = f"{which} error {_percent(error)}, of the linear model {_percent(lti)}"
+    gain = f"{which} error {percent(error)}, of the linear model {percent(lti)}"
     if e.lti_train and e.noise and e.lti_train <= NOISE_LIMITED * e.noise:
         return Advice("The system is linear at this level: the linear model is enough.", gain)
     if e.searched:
@@ -238,7 +241,7 @@ def outputs_left_out(e: Evidence) -> Advice | None:
     behind = {name: ratio for name, ratio in e.outputs.items() if ratio > USELESS}
     if not behind or error is None or not lti or error > USELESS * lti:
         return None
-    ratios = ", ".join(f"{ratio:.2g} times on '{name}'" for name, ratio in behind.items())
+    ratios = ", ".join(f"{number(ratio)} times on '{name}'" for name, ratio in behind.items())
     return Advice(
         f"Some outputs gain nothing, or are linear: nw={e.sizes.get('nw', 0) + 1}, "
         f"nz={e.sizes.get('nz', 0) + 1}.",
@@ -256,15 +259,14 @@ def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
     if e.noise and e.train is not None:
         if e.train <= BEYOND_NOISE * e.noise:
             return None
-        evidence = f"training error {e.train / e.noise:.2g} times the noise"
+        evidence = f"training error {number(e.train / e.noise)} times the noise"
         if e.linear is not None:
-            evidence += f", and only {_percent(e.linear)} of its power linear in the inputs"
+            evidence += f", and only {percent(e.linear)} of its power linear in the inputs"
         return Advice(f"Nonlinear behaviour is left: {_larger(e)}.", evidence)
     if e.nonlinear is not None and e.nonlinear > NONLINEAR:
         return Advice(
             f"Nonlinear behaviour is left: {_larger(e)}.",
-            f"squares and cubes of the outputs explain {_percent(e.nonlinear)} of the error's "
-            "power",
+            f"squares and cubes of the outputs explain {percent(e.nonlinear)} of the error's power",
         )
     return None
 
@@ -276,8 +278,8 @@ def best_start_alone(e: Evidence) -> Advice | None:
         return None
     return Advice(
         f"The minimum may be a poor one: starts={2 * max(e.started, 4)}.",
-        f"the second best start's error is {found[1] / found[0]:.2g} times that of the best, of "
-        f"{e.started}",
+        f"the second best start's error is {number(found[1] / found[0])} times that of the best, "
+        f"of {e.started}",
     )
 
 
@@ -295,7 +297,7 @@ def tests_are_louder(e: Evidence) -> Advice | None:
     far = {name: ratio for name, ratio in e.louder.items() if ratio > LOUDER}
     if not far:
         return None
-    ratios = ", ".join(f"'{name}' up to {ratio:.3g} times" for name, ratio in far.items())
+    ratios = ", ".join(f"'{name}' up to {number(ratio)} times" for name, ratio in far.items())
     return Advice(
         "Some tests extrapolate: train on inputs as loud as those the model is for.",
         f"the largest input, over that in training: {ratios}",
@@ -312,7 +314,7 @@ def noise_unknown(e: Evidence) -> Advice | None:
     return Advice(
         "Whether this is the noise is not known: give two periods of a periodic input for training"
         f"{'' if e.searched else choose}.",
-        f"training error {_percent(e.train)} of the output's standard deviation, no repeated "
+        f"training error {percent(e.train)} of the output's standard deviation, no repeated "
         "periods in the training records",
     )
 
@@ -343,10 +345,6 @@ def _larger(e: Evidence) -> str:
 
 def _more_starts(e: Evidence) -> str:
     return "" if e.continued or e.started >= 8 else "starts=8, "
-
-
-def _percent(part: float | None) -> str:
-    return "-" if part is None else f"{100 * part:.3g} %"
 
 
 def _listed(names: Sequence[str]) -> str:

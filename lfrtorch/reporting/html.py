@@ -14,10 +14,12 @@ import jinja2
 import numpy as np
 import torch
 
+from lfrtorch._tables import UNKNOWN, Cell, cell, number, percent, quantity
 from lfrtorch._types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.poles import poles_at_rest, roots
 from lfrtorch.dataset import Dataset
+from lfrtorch.fitting.size_search import LEGEND, size_table
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.reporting.advice import Advice
@@ -33,7 +35,7 @@ FEW = 3
 ALL = "all"
 """Name of several outputs together."""
 
-Rows = list[list[str]]
+Rows = list[Sequence[Cell]]
 
 
 class Errors(NamedTuple):
@@ -79,6 +81,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["cell"] = cell
     return environment.get_template("report.html").render(
         name=dataset.name,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
@@ -136,32 +139,11 @@ def verdict(responses: Sequence[Response]) -> list[str]:
 def _line(name: str, unit: str, errors: Errors) -> str:
     if not math.isfinite(errors.error):
         return f"{name}: the NL-LFR diverges"
-    lower = _to_three_digits(errors.ratio) > 1  # a ratio of 1 + rounding errors is none
+    lower = errors.ratio >= 1.005  # in three digits more than 1.00
     below = f"error {number(errors.ratio)} × below" if lower else "no error below"
-    error, lti = (f"{number(value)} {unit}".strip() for value in (errors.error, errors.lti))
+    error, lti = quantity(errors.error, unit), quantity(errors.lti, unit)
     relative = percent(errors.relative)
     return f"{name}: {below} the linear model's ({error} beside {lti}), NRMSE {relative}"
-
-
-def number(value: float | None) -> str:
-    """Three digits; a dash where it is not known or not finite."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    mantissa, exponent = f"{value:.2e}".split("e")  # the exponent is that of the rounded value
-    if value == 0 or 1e-3 <= abs(_to_three_digits(value)) < 1e5:
-        digits = max(0, 2 - int(exponent)) if value else 0
-        return f"{value:.{digits}f}"
-    return f"{mantissa}e{int(exponent)}"
-
-
-def _to_three_digits(value: float) -> float:
-    return float(f"{value:.2e}")
-
-
-def percent(ratio: float | None) -> str:
-    """100 times the ratio, with its sign."""
-    known = ratio is not None and math.isfinite(ratio)
-    return f"{number(100 * ratio)} %" if known and ratio is not None else "–"
 
 
 def _sizes(metrics: Mapping[str, Any]) -> str:
@@ -188,7 +170,7 @@ def _scores(
         for row, (channel, unit, of) in enumerate(_channels(response)):
             cells = [*[channel, unit][: len(what)], *_cells(_errors(response, of))]
             if use == "test":
-                known = [number(p.scores.get(name)) if row == 0 else "" for p in published]
+                known = [p.scores.get(name) if row == 0 else "" for p in published]
                 tests.append([name if row == 0 else "", *cells, *known])
             else:
                 others.append([*([name, USES[use]] if row == 0 else ["", ""]), *cells])
@@ -228,10 +210,10 @@ def _errors(response: Response, of: slice) -> Errors:
     return Errors(lti, error, ratio, lti / deviation, error / deviation)
 
 
-def _cells(errors: Errors) -> list[str]:
-    shown = number(errors.error) if math.isfinite(errors.error) else "diverges"
+def _cells(errors: Errors) -> list[Cell]:
+    shown = errors.error if math.isfinite(errors.error) else "diverges"
     relative = percent(errors.lti_relative), percent(errors.relative)
-    return [number(errors.lti), shown, number(errors.ratio), *relative]
+    return [errors.lti, shown, errors.ratio, *relative]
 
 
 def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
@@ -240,20 +222,19 @@ def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
     summary = f"{_count(len(train), 'training record')}, {samples} samples"
     summary += f", sampled at {fs:g} Hz: {number(samples / fs)} s." if fs != 1.0 else "."
     if dataset.noise_rms is not None:
-        noise = f"{number(dataset.noise_rms)} {train[0].outputs[0].unit}".strip()
+        noise = quantity(dataset.noise_rms, train[0].outputs[0].unit)
         summary += f" Noise of {noise} rms was added."
     channels = []
     for side, named in (("input", train[0].inputs), ("output", train[0].outputs)):
         signals = [r.u if side == "input" else r.y for r in train]
         signal = np.concatenate([s[r.skip :] for s, r in zip(signals, train, strict=True)])
         channels += [
-            [channel.name, side, channel.unit] + [number(value) for value in _moments(x)]
+            [channel.name, side, channel.unit, *_moments(x)]
             for channel, x in zip(named, signal.T, strict=True)
         ]
     records = []
     for use, r in ((response.use, response.record) for response in responses):
-        counts = str(r.samples), str(r.skip), str(r.period or "–")
-        records.append([r.name, USES.get(use, use), r.source, r.start, *counts])
+        records.append([r.name, USES.get(use, use), r.source, r.start, r.samples, r.skip, r.period])
     return {
         "summary": summary,
         "notes": dataset.notes,
@@ -285,7 +266,7 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
         poles += [
             [
                 model,
-                *(number(p[key]) for key in ("frequency", "damping", "radius")),
+                *(number(p[key], 4) for key in ("frequency", "damping", "radius")),
                 "pair" if p["imag"] else "",
             ]
             for p in roots(values, bla.fs)
@@ -296,8 +277,7 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
 def _fit(metrics: Mapping[str, Any], validated: bool) -> dict[str, Any]:
     fit, ranking = metrics["fit"], metrics["ranking"]
     starts = [
-        [str(s["seed"]), s["reason"], str(s["iterations"])]
-        + [number(s[error]) for error in ("train", "validation", "selection")]
+        [s[k] for k in ("seed", "reason", "iterations", "train", "validation", "selection")]
         for s in ranking
     ]
     judge = "validation" if validated else "training"
@@ -313,17 +293,9 @@ def _fit(metrics: Mapping[str, Any], validated: bool) -> dict[str, Any]:
 
 
 def _search(tried: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The sizes that were tried, by rising number of net parameters."""
-    rising = sorted(tried, key=lambda entry: entry["parameters_net"])
-    sizes = [name for name in ("nz", "nw", "nn", "degree") if tried and name in tried[0]]
-    rows = [
-        [str(entry[name]) for name in (*sizes, "parameters", "parameters_net")]
-        + [number(entry[name]) for name in ("seconds", "error", "error_std", "ratio")]
-        + [number(entry["standard_errors_above"]), "chosen" if entry["chosen"] else ""]
-        for entry in rising
-    ]
-    head = [*sizes, "parameters", "net", "seconds", "validation error", "±", "/ LTI", "above", ""]
-    return {"head": head, "rows": rows}
+    """The sizes that were tried."""
+    head, rows = size_table(tried)
+    return {"head": head, "rows": rows, "legend": LEGEND.splitlines()}
 
 
 def _parameters(metrics: Mapping[str, Any], result: FitResult) -> dict[str, Any]:
@@ -331,7 +303,7 @@ def _parameters(metrics: Mapping[str, Any], result: FitResult) -> dict[str, Any]
         "summary": f"{metrics['parameters']} parameters, {metrics['parameters_net']} without the "
         "directions that change the parameters and not the output.",
         "groups": [
-            [name, " × ".join(map(str, weight.shape)), str(weight.numel())]
+            [name, " × ".join(map(str, weight.shape)), weight.numel()]
             for name, weight in result.model.lfr.cell.named_parameters()
             if weight.numel()
         ],
@@ -370,7 +342,7 @@ def _run(
         ["platform", platform.platform()],
         *([name, number_] for name, number_ in metrics["versions"].items()),
     ]  # fmt: skip
-    return {"command": metrics["command"] or "–", "facts": facts, "config": config}
+    return {"command": metrics["command"] or UNKNOWN, "facts": facts, "config": config}
 
 
 def _count(n: int, what: str) -> str:

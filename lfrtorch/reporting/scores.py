@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
+from lfrtorch import _tables
 from lfrtorch.analysis.amplitude_margin import loudest
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.fitting.size_search import SizeSearch
@@ -166,16 +167,15 @@ def table(result: dict, published: Sequence[Published]) -> str:
     others = [p for p in published if p.sizes in (None, mine)]
     head = ["record", "source", "samples", "skip", "LTI", "NL-LFR", *(p.label for p in others)]
     rows = [
-        [name, s["source"], str(s["samples"]), str(s["skip"])]
-        + [_number(s["lti_rmse"]), _number(s["rmse"])]
-        + [_number(p.scores.get(name)) for p in others]
+        [name, s["source"], s["samples"], s["skip"], s["lti_rmse"], s["rmse"]]
+        + [p.scores.get(name) for p in others]
         for name, s in result["scores"].items()
     ]
-    for name, s in result["validation"]["records"].items():
-        chosen = [name, "not fitted", str(s["samples"]), str(s["skip"])]
-        chosen += [_number(s["lti_rmse"]), _number(s["rmse"])]
-        rows.append(chosen + [_number(None)] * len(others))
-    first, *lines = _aligned([head, *rows], left=(0, 1))
+    rows += [
+        [name, "not fitted", s["samples"], s["skip"], s["lti_rmse"], s["rmse"]]
+        + [None] * len(others)
+        for name, s in result["validation"]["records"].items()
+    ]
     scored = {**result["validation"]["records"], **result["scores"]}
     units = {s["unit"] for s in scored.values()} - {""}
     title = f"Simulation RMSE{f' ({next(iter(units))})' if len(units) == 1 else ''}"
@@ -187,8 +187,7 @@ def table(result: dict, published: Sequence[Published]) -> str:
     if result["linear"]:
         models = ", ".join(f"{n} of {'+'.join(r)}" for n, r in result["linear"].items())
         references.insert(0, f"LTI: a model for each of these: {models}")
-    rule = "-" * max(map(len, [first, *lines]))
-    return "\n".join([title, rule, first, rule, *lines, rule, *references])
+    return "\n".join([title, "", _tables.table(head, rows), *[""] * bool(references), *references])
 
 
 def neurons(count: int) -> str:
@@ -200,29 +199,10 @@ def starts_table(result: dict) -> str:
     """All starts of a fit, the best first."""
     head = ["seed", "iterations", "training", "validation", "selection", ""]
     rows = [
-        [
-            str(s["seed"]),
-            str(s["iterations"]),
-            _number(s["train"]),
-            _number(s["validation"]),
-            _number(s["selection"]),
-            s["reason"],
-        ]
+        [s[k] for k in ("seed", "iterations", "train", "validation", "selection", "reason")]
         for s in result["ranking"]
     ]
-    return "\n".join(["Starts, the best iterate of each", *_aligned([head, *rows], left=(5,))])
-
-
-def _aligned(rows: Sequence[Sequence[str]], left: Sequence[int]) -> list[str]:
-    """Lines of a table with columns of one width, some of them flush left."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return [
-        "  ".join(
-            cell.ljust(w) if i in left else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    return f"Starts, the best iterate of each\n\n{_tables.table(head, rows)}"
 
 
 def _pooled(values: list[float | None], scores: list[Score]) -> float | None:
@@ -239,7 +219,3 @@ def _finite(entry: Any) -> Any:
     if isinstance(entry, list):
         return [_finite(value) for value in entry]
     return None if isinstance(entry, float) and not math.isfinite(entry) else entry
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}" if 1e-3 <= abs(value) < 1e4 else f"{value:.2e}"

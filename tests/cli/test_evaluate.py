@@ -79,7 +79,7 @@ def test_scores_are_those_of_the_model_from_the_start_of_each_record(
     assert "note: the linear model is that of all training records" in printed.out
     rest = next(line for line in printed.out.splitlines() if line.startswith("rest "))
     assert rest.split()[1:4] == ["simulated", "80", "30"]
-    assert rest.split()[-2:] == ["0.25", "0.125"]
+    assert rest.split()[-2:] == ["0.250", "0.125"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "scores.json"]
 
 
@@ -97,7 +97,7 @@ def test_without_a_linear_model_its_column_is_empty(tmp_path: Path, monkeypatch,
     printed = capsys.readouterr().out
     assert "has no folder linear/, so no linear model is scored" in printed
     rest = next(line for line in printed.splitlines() if line.startswith("rest "))
-    assert rest.split()[-3:] == ["-", "0.25", "0.125"]
+    assert rest.split()[-3:] == ["–", "0.250", "0.125"]
 
 
 @pytest.mark.numeric
@@ -112,7 +112,7 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
     for part in ("scores", "validation", "sizes", "parameters_net"):
         assert found[part] == metrics[part]
     table = capsys.readouterr().out.split("Simulation RMSE")
-    assert table[1].split("\nnext: ")[0].strip() == table[2].split("\n\n")[0].strip()
+    assert table[1].split("\nnext: ")[0].strip() == table[2].split("\n\nScores in")[0].strip()
 
 
 @pytest.mark.parametrize(

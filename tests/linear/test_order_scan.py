@@ -132,7 +132,7 @@ def test_orders_that_the_data_do_not_reach_for_are_left_out():
 
 
 def test_table_has_a_line_an_order_and_marks_the_chosen(scan: OrderScan):
-    head, *lines = scan.table().splitlines()
+    head, _, *lines = scan.table().splitlines()
     assert head.split()[:3] == ["nx", "fitted", "MDL"]
     assert [line.split()[0] for line in lines] == ["1", "2", "3", "4"]
     assert [line.split()[0] for line in lines if line.endswith("chosen")] == ["3"]

@@ -76,9 +76,9 @@ def test_nonlinear_behaviour_is_left_where_the_error_is_neither_noise_nor_linear
     polynomial = replace(GOOD, sizes={"nx": 3, "nz": 1, "nw": 1, "degree": 3})
     seen = replace(GOOD, noise=None, nonlinear=0.3)
     for found, said in (
-        (rule(GOOD), "nn=20, nz=2 or nw=2. (training error 2 times the noise"),
+        (rule(GOOD), "nn=20, nz=2 or nw=2. (training error 2.00 times the noise"),
         (rule(polynomial), "degree=5"),
-        (rule(seen), "30 % of the error's power"),
+        (rule(seen), "30.0 % of the error's power"),
     ):
         assert said in str(found)
     for other in (

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import lfrtorch
+from lfrtorch._tables import number
 from lfrtorch.analysis.poles import poles_at_rest, roots
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.engine.lfr import LFR
@@ -127,9 +128,7 @@ def test_page_has_the_numbers_and_no_address_outside(single: Run):
     assert len(page.addresses) == 2
     assert "script" not in page.tags
     test = single.responses[-1]
-    lti, error = (
-        html_report.number(lfrtorch.rmse(test.record, y)) for y in (test.y_lti, test.y_hat)
-    )
+    lti, error = (number(lfrtorch.rmse(test.record, y)) for y in (test.y_lti, test.y_hat))
     for words in (
         f"test {lti} {error}",
         f"({error} V beside {lti} V)",
@@ -205,7 +204,7 @@ def test_several_outputs_have_scores_of_their_own():
     for i, name in ((0, "a"), (1, "b")):
         error = np.sqrt(np.mean(test.error[:, i] ** 2))
         lti = np.sqrt(np.mean(test.lti_error[:, i] ** 2))
-        assert f"{name} V {html_report.number(lti)} {html_report.number(error)}" in page.text
+        assert f"{name} V {number(lti)} {number(error)}" in page.text
     assert "test all V" in page.text
     assert page.text.count("maximum number of iterations") == 2
     assert "The best of 2 starts" in page.text
@@ -263,26 +262,3 @@ def test_roots_of_a_known_oscillator():
     (root,) = roots(np.exp(np.array([s, s.conj()]) / 100.0), 100.0)
     assert root["frequency"] == pytest.approx(5.0)
     assert root["damping"] == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(
-    ("value", "shown"),
-    [
-        (0.0, "0"),
-        (1234.56, "1235"),
-        (12.345, "12.3"),
-        (0.00123456, "0.00123"),
-        (9.9999, "10.0"),  # the digits are those of the rounded value
-        (99.99, "100"),
-        (999.9, "1000"),
-        (0.00099999, "0.00100"),
-        (99999.0, "1.00e5"),
-        (9.999e-5, "1.00e-4"),
-        (9.4e-5, "9.40e-5"),
-        (2e6, "2.00e6"),
-        (math.nan, "–"),
-        (None, "–"),
-    ],
-)
-def test_numbers_have_three_digits(value: float | None, shown: str):
-    assert html_report.number(value) == shown

@@ -55,8 +55,8 @@ def test_starts_are_ranked_in_files_and_in_a_table(result):
     assert {start["selection"] for start in metrics["ranking"]} == {None}
     assert metrics["ranking"][0]["validation"] == fitted.starts[0].validation
     lines = report.starts_table(metrics).splitlines()
-    assert lines[1].split() == ["seed", "iterations", "training", "validation", "selection"]
-    assert lines[2].split()[0] == str(metrics["ranking"][0]["seed"])
+    assert lines[2].split() == ["seed", "iterations", "training", "validation", "selection"]
+    assert lines[4].split()[0] == str(metrics["ranking"][0]["seed"])
     assert lines[-1].endswith("others were better")
 
 
@@ -115,7 +115,7 @@ def test_table_shows_published_results_of_these_sizes_only(result):
     assert head == ["record", "source", "samples", "skip", "LTI", "NL-LFR", "everybody", "small"]
     assert row[:4] == ["test", "simulated", "300", "5"]
     assert float(row[5]) == pytest.approx(metrics["scores"]["test"]["rmse"], rel=5e-3)
-    assert row[6:] == ["0.5", "0.25"]
+    assert row[6:] == ["0.500", "0.250"]
     assert lines[5].startswith("validation  not fitted")
     assert lines[-2:] == ["everybody: A (2001)", "small: B (2002)"]
 

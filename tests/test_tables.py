@@ -1,0 +1,61 @@
+"""Numbers and tables as people read them."""
+
+import math
+
+import pytest
+
+from lfrtorch._tables import UNKNOWN, number, percent, quantity, table
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (0.0, "0"),
+        (1234.56, "1235"),
+        (12.345, "12.3"),
+        (-0.1, "-0.100"),
+        (0.00123456, "0.00123"),
+        (9.9999, "10.0"),  # the digits are those of the rounded value
+        (99.99, "100"),
+        (999.9, "1000"),
+        (0.00099999, "0.00100"),
+        (99999.0, "1.00e5"),
+        (9.999e-5, "1.00e-4"),
+        (9.4e-5, "9.40e-5"),
+        (2e6, "2.00e6"),
+        (math.nan, UNKNOWN),
+        (math.inf, UNKNOWN),
+        (None, UNKNOWN),
+    ],
+)
+def test_numbers_have_three_digits(value: float | None, shown: str):
+    assert number(value) == shown
+
+
+def test_more_digits_on_request():
+    assert number(0.99913, digits=4) == "0.9991"
+    assert number(0.99996, digits=4) == "1.000"
+    assert number(1e-7, digits=1) == "1e-7"
+
+
+def test_units_follow_the_number():
+    assert quantity(0.02, "V") == "0.0200 V"
+    assert quantity(0.02, "") == "0.0200"
+    assert percent(0.5) == "50.0 %"
+    assert percent(None) == percent(math.nan) == UNKNOWN
+
+
+def test_columns_of_words_start_at_the_left_and_others_end_at_the_right():
+    rows = [["test", "V", 300, 0.5], ["validation", "", 4, None]]
+    head, rule, first, second = table(["record", "unit", "samples", "RMSE"], rows).splitlines()
+    assert head.split() == ["record", "unit", "samples", "RMSE"]
+    assert set(rule) == {"-", " "}
+    assert first.split() == ["test", "V", "300", "0.500"]
+    assert second.split() == ["validation", "4", UNKNOWN]
+    assert (first.index("test"), first.index("V")) == (0, head.index("unit"))
+    assert len(first) == len(second) == len(head)
+    assert first.index("300") + 3 == second.index("4") + 1 == head.index("samples") + 7
+
+
+def test_a_table_without_rows_is_its_head():
+    assert table(["a", "b"], []).splitlines()[0].split() == ["a", "b"]
