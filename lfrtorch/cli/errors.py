@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 from collections.abc import Iterator
@@ -15,13 +16,19 @@ from lfrtorch.distributed import ProcessLost
 
 @contextmanager
 def user_errors(rank: str = "0") -> Iterator[None]:
-    """User errors end the program with one message and exit code 1, no traceback."""
+    """User errors end the program with one message and exit code 1, no traceback.
+
+    A message names the group of the configuration, which a function's argument belongs to:
+    ``data: seed is -1``.
+    """
     error = "error" if rank == "0" else f"error on rank {rank}"
     try:
         yield
         return
     except InstantiationException as failed:
-        print(f"{error}: {failed.__cause__ or failed}", file=sys.stderr)
+        group = re.search(r"^full_key: (.+)$", str(failed), re.MULTILINE)
+        where = f"{group[1]}: " if group and failed.__cause__ else ""
+        print(f"{error}: {where}{failed.__cause__ or failed}", file=sys.stderr)
     except (ValueError, OSError, ProcessLost) as failed:
         print(f"{error}: {failed}", file=sys.stderr)
     except Terminated as end:
