@@ -11,6 +11,9 @@ from typing import Any
 import pytest
 import torch
 from hypothesis import settings
+from shapes import install
+
+install()
 
 ROOT = Path(__file__).resolve().parents[1]
 

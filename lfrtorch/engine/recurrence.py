@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
 from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
@@ -25,27 +26,25 @@ def has_kernels(tensor: Tensor) -> bool:
     return tensor.device.type in COMPILED_ON
 
 
-def linear_recurrence(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
-    """All states of s(k+1) = F(k) s(k) + g(k), s(0) = s0.
-
-    Shape:
-        F: (R, T, n, n), g: (R, T, n, m), s0: (R, n, m) -> (R, T + 1, n, m).
-    """
+def linear_recurrence(
+    F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], s0: Float[Tensor, "R n m"]
+) -> Float[Tensor, "R T+1 n m"]:
+    """All states of s(k+1) = F(k) s(k) + g(k), s(0) = s0."""
     return compiled(F, g, s0) if has_kernels(F) else scan(F, g, s0)
 
 
-def adjoint_recurrence(F: Tensor, g: Tensor, end: Tensor) -> Tensor:
-    """All states of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end: the same back in time.
-
-    Shape:
-        F: (R, T, n, n), g: (R, T, n, m), end: (R, n, m) -> (R, T + 1, n, m).
-    """
+def adjoint_recurrence(
+    F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], end: Float[Tensor, "R n m"]
+) -> Float[Tensor, "R T+1 n m"]:
+    """All states of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end: the same back in time."""
     if has_kernels(F):
         return compiled(F, g, end, backwards=True)
     return scan(F.mT.flip(1), g.flip(1), end).flip(1)
 
 
-def loop(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+def loop(
+    F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], s0: Float[Tensor, "R n m"]
+) -> Float[Tensor, "R T+1 n m"]:
     """The recurrence written out: the oracle of the two others."""
     states = [s0]
     for k in range(F.shape[1]):
@@ -53,7 +52,13 @@ def loop(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
     return torch.stack(states, dim=1)
 
 
-def compiled(F: Tensor, g: Tensor, s0: Tensor, *, backwards: bool = False) -> Tensor:
+def compiled(
+    F: Float[Tensor, "R T n n"],
+    g: Float[Tensor, "R T n m"],
+    s0: Float[Tensor, "R n m"],
+    *,
+    backwards: bool = False,
+) -> Float[Tensor, "R T+1 n m"]:
     """Either recurrence in machine code, records in parallel; CPU tensors of one dtype."""
     R, T, n, m = g.shape
     s = g.new_empty(R, T + 1, n, m)
@@ -108,7 +113,9 @@ NOTHING = 1e-30
 """States of unit size that have faded to less are zero."""
 
 
-def scan(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+def scan(
+    F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], s0: Float[Tensor, "R n m"]
+) -> Float[Tensor, "R T+1 n m"]:
     """The recurrence in about 3 √T batched products: chunks of √T steps side by side.
 
     Each chunk is run from a zero state together with its transition matrices, the chunks' end

@@ -1,0 +1,68 @@
+"""Checks the shapes that stand in the package's annotations, at every call.
+
+jaxtyping's own import hook decorates every function. Numba cannot compile the decorated kernels,
+and types without a shape are basedpyright's business.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from types import CodeType
+from typing import Any
+
+from beartype import beartype
+from jaxtyping import jaxtyped
+
+checked = jaxtyped(typechecker=beartype)
+
+
+def install() -> None:
+    """Check the modules of the package that are imported from now on."""
+    sys.meta_path.insert(0, _Finder())
+
+
+class _Finder(PathFinder):
+    @classmethod
+    def find_spec(cls, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        if not fullname.startswith("lfrtorch."):
+            return None
+        spec = super().find_spec(fullname, path, target)
+        if spec and isinstance(spec.loader, SourceFileLoader):
+            spec.loader = _Loader(spec.loader.name, spec.loader.path)
+        return spec
+
+
+class _Loader(SourceFileLoader):
+    def get_code(self, fullname: str) -> CodeType | None:
+        path = self.get_filename(fullname)
+        data = self.get_data(path)
+        if b"jaxtyping" not in data:
+            return super().get_code(fullname)
+        tree = ast.parse(data, path)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                _decorate(node)
+        return compile(tree, path, "exec", dont_inherit=True)
+
+
+def _decorate(function: ast.FunctionDef) -> None:
+    """Check the shapes of a function, if it has any, and nothing else of it."""
+    arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    for argument in arguments:
+        if not _has_shape(argument.annotation):
+            argument.annotation = None
+    if not _has_shape(function.returns):
+        function.returns = None
+    if function.returns or any(argument.annotation for argument in arguments):
+        decorator = ast.parse("__import__('shapes').checked", mode="eval").body
+        for node in ast.walk(decorator):
+            ast.copy_location(node, function)
+        function.decorator_list.append(decorator)
+
+
+def _has_shape(annotation: ast.expr | None) -> bool:
+    """Whether it holds a text, as Float[Tensor, "R T ny"] does."""
+    nodes = ast.walk(annotation) if annotation else ()
+    return any(isinstance(node, ast.Constant) and isinstance(node.value, str) for node in nodes)
