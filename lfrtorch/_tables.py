@@ -38,7 +38,13 @@ def quantity(value: float | None, unit: str) -> str:
 
 def percent(ratio: float | None) -> str:
     """100 times a ratio, with the sign %."""
-    return UNKNOWN if ratio is None or not math.isfinite(ratio) else f"{number(100 * ratio)} %"
+    shown = number(in_percent(ratio))
+    return shown if shown == UNKNOWN else f"{shown} %"
+
+
+def in_percent(ratio: float | None) -> float | None:
+    """100 times a ratio, if it is known."""
+    return None if ratio is None else 100 * ratio
 
 
 def cell(value: Cell, digits: int = DIGITS) -> str:

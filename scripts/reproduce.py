@@ -34,10 +34,10 @@ from hydra.utils import instantiate
 
 import lfrtorch
 from lfrtorch._atomic import whole_file
+from lfrtorch._tables import number
 from lfrtorch.cli.config import CONF
 from lfrtorch.dataset import Dataset
 from lfrtorch.reporting import leaderboard
-from lfrtorch.reporting.html import number
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -10,7 +10,7 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,9 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
+from lfrtorch import _tables
 from lfrtorch._atomic import whole_file
+from lfrtorch._tables import in_percent
 from lfrtorch.analysis.poles import roots
 from lfrtorch.cli.config import CONF, require
 from lfrtorch.cli.errors import user_errors
@@ -194,57 +196,29 @@ def table(found: dict[str, Any]) -> str:
     parts = [f"Linear model of order {found['nx']}, {fit['criterion']} error"]
     about = "use", "record", "source", "samples", "skip"
     scores = [
-        [*(s[key] for key in about), o["output"], o["rmse"], o["unit"], percent(o["nrmse"])]
+        [*(s[key] for key in about), o["output"], o["rmse"], o["unit"], in_percent(o["nrmse"])]
         for s in found["scores"]
         for o in s["outputs"]
     ]
     head = ["use", "record", "source", "samples", "skip", "output", "RMSE", "unit", "% of std"]
-    parts.append(columns(head, scores))
+    parts.append(_tables.table(head, scores, digits=4))
     listed = [["pole", p] for p in found["poles"]]
     listed += [[f"zero {n}".strip(), z] for n, zeros in found["zeros"].items() for z in zeros]
     rows = [
         [what, r["frequency"], r["damping"], r["radius"], "pair" if r["imag"] else ""]
         for what, r in listed
     ]
-    parts.append(columns(["", "frequency (Hz)", "damping", "radius", ""], rows))
+    parts.append(_tables.table(["", "frequency (Hz)", "damping", "radius", ""], rows, digits=4))
     rows = [[o["channel"], o["offset"], o["unit"]] for o in found["offsets"]]
-    parts.append(columns(["operating point", "offset", "unit"], rows))
+    parts.append(_tables.table(["operating point", "offset", "unit"], rows, digits=4))
     if found["response_std"]:
         rows = [
-            [r["channel"], r["std"], percent(r["relative"]), r["frequency"]]
+            [r["channel"], r["std"], in_percent(r["relative"]), r["frequency"]]
             for r in found["response_std"]
         ]
         head = ["response", "largest std", "% of response there", "at (Hz)"]
-        parts.append(columns(head, rows))
+        parts.append(_tables.table(head, rows, digits=4))
     return "\n\n".join(parts)
-
-
-def percent(ratio: float | None) -> float | None:
-    """100 times the ratio, where there is one."""
-    return None if ratio is None else 100 * ratio
-
-
-def columns(head: list[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Columns under a head: words to the left, numbers to the right."""
-    rows = list(rows)
-    words = [all(isinstance(row[i], str) for row in rows) for i in range(len(head))]
-    cells = [head, *([cell(value) for value in row] for row in rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    lines = [
-        "  ".join(
-            c.ljust(w) if word else c.rjust(w)
-            for c, w, word in zip(row, widths, words, strict=True)
-        ).rstrip()
-        for row in cells
-    ]
-    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
-
-
-def cell(value: str | float | None) -> str:
-    """A value of the table, numbers with four digits."""
-    if value is None:
-        return "-"
-    return str(value) if isinstance(value, str | int) else f"{value:.4g}"
 
 
 def finite(value: float) -> float | None:

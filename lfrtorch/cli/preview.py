@@ -19,11 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lfrtorch import _tables
 from lfrtorch._atomic import whole_file
 from lfrtorch._checks import number
 from lfrtorch._types import Array
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.linear import cell, columns
 from lfrtorch.files.formats import BLOCK, Table, open_table
 from lfrtorch.files.time_stamps import Uneven, in_seconds, is_time, sampling
 from lfrtorch.records import Channel
@@ -255,7 +255,8 @@ def numbers(found: Survey) -> str:
     unit = "1/sample" if found.fs is None else "Hz"
     head = ["signal", "use", "samples", "missing", "mean", "rms", "min", "max", "% at min"]
     head += ["% at max", "run", f"from {unit}", f"to {unit}", "period", "periods"]
-    table = columns([*head, "noise"], [row(one, found) for one in found.signals])
+    rows = [row(one, found) for one in found.signals]
+    text = _tables.table([*head, "noise"], rows, digits=4)
     methods = {one.method for one in found.signals}
     legend = [
         "rms: about the mean; run: longest at an extreme; from, to: the band of 99 % of the power."
@@ -264,14 +265,14 @@ def numbers(found: Survey) -> str:
         legend.append("Noise: the scatter from period to period.")
     if "spectrum" in methods:
         legend.append("Noise ~: a guess from the quietest part of the spectrum.")
-    return f"{table}\n{' '.join(legend)}"
+    return f"{text}\n{' '.join(legend)}"
 
 
 def row(one: SignalSurvey, found: Survey) -> list[str | float | None]:
     """What the table says of a signal."""
     use = "" if not found.inputs else "input" if one in found.inputs else "output"
     ends = one.minimum, one.maximum
-    noise = None if one.noise is None else cell(one.noise)
+    noise = None if one.noise is None else _tables.number(one.noise, 4)
     return [
         str(one.channel),
         use,
@@ -280,7 +281,7 @@ def row(one: SignalSurvey, found: Survey) -> list[str | float | None]:
         one.mean,
         one.rms,
         *(end.value for end in ends),
-        *(round(100 * end.samples / one.samples, 2) for end in ends),
+        *(100 * end.samples / one.samples for end in ends),
         max(end.run for end in ends),
         *(one.band or (None, None)),
         one.period,

@@ -16,13 +16,13 @@ import numpy as np
 from omegaconf import DictConfig, ListConfig
 
 import lfrtorch
-from lfrtorch import _checkpoint
+from lfrtorch import _checkpoint, _tables
 from lfrtorch._atomic import refuse_existing, whole_file
 from lfrtorch._checks import integer, number
 from lfrtorch._types import Array
 from lfrtorch.cli.config import CONF
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.linear import columns, finite, percent
+from lfrtorch.cli.linear import finite
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import Block, FileStream
@@ -69,7 +69,7 @@ def simulate(cfg: DictConfig) -> None:
         rows += scored(path, model, result.scores, cfg.skip) if stream.y else []
     if rows:
         head = ["file", "output", "unit", "samples", "skip", "RMSE", "NRMSE (%)"]
-        print(f"\n{columns(head, rows)}")
+        print(f"\n{_tables.table(head, rows)}")
 
 
 class Written(NamedTuple):
@@ -215,7 +215,7 @@ def scored(path: Path, model: lfrtorch.Model, scores: BlockScores, skip: int) ->
             int(scores.samples[i]),
             skip,
             finite(scores.rmse[i]),
-            percent(finite(scores.nrmse[i])),
+            _tables.in_percent(finite(scores.nrmse[i])),
         ]
         for i, channel in enumerate(model.outputs)
     ]

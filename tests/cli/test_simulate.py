@@ -132,8 +132,8 @@ def test_measured_outputs_are_scored(folder: Path, monkeypatch, capsys):
     for i, row in enumerate(rows):
         rmse = np.sqrt(np.mean(NOISE[100:, i] ** 2))
         assert row[:5] == ["both.csv", f"y{i + 1}", "mm", "200", "100"]
-        assert float(row[5]) == pytest.approx(rmse, rel=1e-3)
-        assert float(row[6]) == pytest.approx(100 * rmse / np.std(Y[100:, i]), rel=1e-3)
+        assert float(row[5]) == pytest.approx(rmse, rel=5e-3)
+        assert float(row[6]) == pytest.approx(100 * rmse / np.std(Y[100:, i]), rel=5e-3)
     assert len(rows) == 2
 
 
