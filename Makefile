@@ -39,8 +39,8 @@ check: $(READY)  ## format, lint, types, import order
 	@$(BIN)/basedpyright
 	@$(BIN)/lint-imports --no-logo
 
-bench: $(READY)  ## costs against what is required (PEERS=DIR, ARGS=--quick)
-	@$(BIN)/python benchmarks/engine.py $(if $(PEERS),--peers "$(PEERS)") $(ARGS)
+bench: $(READY)  ## costs against what is required (PEERS=DIR, ARGS=--quick), or beside BASELINE=DIR
+	@$(BIN)/python benchmarks/$(if $(BASELINE),baseline.py "$(BASELINE)",engine.py $(if $(PEERS),--peers "$(PEERS)")) $(ARGS)
 
 reproduce: $(READY)  ## the public benchmarks at hand -> RESULTS.md (ARGS="silverbox data.root=DIR")
 	@$(BIN)/python scripts/reproduce.py $(ARGS)

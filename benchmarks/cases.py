@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import problems
@@ -36,7 +37,7 @@ RESTART = 4
 
 def main() -> None:
     """Measure one case and print it."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("case", choices=CASES)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--threads", type=int, default=1)
@@ -108,7 +109,7 @@ def parts(folder: Path, name: str, repetitions: int = REPETITIONS) -> dict:
     return {"parts_s": measured}
 
 
-def long(folder: Path, start: str, periods: int) -> dict:
+def long(folder: Path, start: Literal["periodic", "zero"], periods: int) -> dict:
     """One record of many periods beside one of a single period."""
     problem = problems.problem(folder, "boucwen", start=start, periods=periods)
     seconds = one_trial(search(problem, 1 + RESTART)[1][1:])

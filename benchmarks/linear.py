@@ -23,7 +23,7 @@ import torch
 
 import lfrtorch
 from lfrtorch import Record
-from lfrtorch._types import Array
+from lfrtorch._types import Array, Complex
 from lfrtorch.datasets import boucwen, parwh, silverbox, wiener_hammerstein
 from lfrtorch.linear.resolvent import frequency_response
 
@@ -32,7 +32,7 @@ HERE = Path(__file__).resolve().parent
 
 def main() -> int:
     """All tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--root", type=Path, default=None)
     parser.add_argument("--peers", type=Path, default=None)
     parser.add_argument("--quick", action="store_true", help="fewer seeds and realisations")
@@ -60,11 +60,11 @@ def levels(seeds: int, realisations: int) -> None:
     lines = np.arange(1, 4096)
     responses = {}
     for level in parwh.LEVELS:
-        total: Array | complex = 0.0
+        total = np.zeros(len(lines), dtype=complex)
         for i in range(realisations):
             u = parwh.multisine(rms=level / 1000, seed=10_000 + i)
             total = total + np.fft.rfft(parwh.simulate(u))[lines] / np.fft.rfft(u)[lines]
-        responses[level] = np.asarray(total) / realisations
+        responses[level] = total / realisations
     for seed in range(seeds):
         data = parwh.load(source="stand-in", seed=seed)
         floors, found, seconds, ratios = [], [], [], []
@@ -111,7 +111,7 @@ def measured(root: Path | None) -> None:
     head("Measured benchmarks, official tests, simulation RMSE with offset (mV)")
     row("benchmark", "nx", "error", "tests", "seconds")
     rule(5)
-    loads: list[tuple[Callable[..., lfrtorch.dataset.Dataset], int]] = [
+    loads: list[tuple[Callable[..., lfrtorch.Dataset], int]] = [
         (wiener_hammerstein.load, 6),
         (silverbox.load, 2),
     ]
@@ -144,7 +144,9 @@ def beside(folder: Path | None, realisations: int) -> None:
         variance = theirs.get("var_total")
         weight = np.ones(frf.G.shape) if variance is None else 1.0 / variance
 
-        def errors(G: Array, weight: Array = weight, frf: lfrtorch.FRF = frf, G0: Array = truth):
+        def errors(
+            G: Complex, weight: Array = weight, frf: lfrtorch.FRF = frf, G0: Complex = truth
+        ) -> tuple[str, str]:
             fit = np.sqrt(np.mean(weight * np.abs(G - frf.G) ** 2))
             if weight.min() == 1.0:
                 fit /= np.sqrt(np.mean(np.abs(frf.G) ** 2))
@@ -159,12 +161,13 @@ def beside(folder: Path | None, realisations: int) -> None:
             turns = (theirs.get(f"{solver}_{turn}") for turn in ("first", "again"))
             seconds = ["" if turn is None else f"{turn:.2f}" for turn in turns]
             row(name, label, *errors(theirs[f"{solver}_G"]), *seconds)
-        seconds = []
+        seconds, models = [], []
         for _ in range(4):
             begin = time.perf_counter()
             frf = lfrtorch.estimate_frf(records)
-            model = lfrtorch.estimate_bla(frf, nx, weight=weight)
+            models.append(lfrtorch.estimate_bla(frf, nx, weight=weight))
             seconds.append(time.perf_counter() - begin)
+        model = models[-1]
         assert model.fit is not None
         label = f"lfrtorch, {model.fit.iterations} iterations"
         again = f"{np.median(seconds[1:]):.2f}"

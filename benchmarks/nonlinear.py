@@ -33,7 +33,7 @@ NEURONS, DEGREE = 15, 3
 
 def main() -> int:
     """The table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--peers", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--peer-only", action="store_true", help="without ours")
@@ -82,13 +82,11 @@ def theirs(seed: int, data: Dataset, python: Path, limits: Sequence[int]) -> Non
     u, y = (
         np.stack([getattr(r, side) for r in data.train], axis=-1)[..., None] for side in ("u", "y")
     )
-    tests = {f"u_{record.name}": record.u for record in data.tests}
+    arrays: dict = {f"u_{record.name}": record.u for record in data.tests}
+    arrays |= {"lines": np.arange(1, 4096), "fs": data.train[0].fs, "degree": DEGREE, **SIZES}
     with tempfile.TemporaryDirectory() as place:
         given, found = Path(place) / "given.npz", Path(place) / "found.npz"
-        np.savez(
-            given, u=u, y=y, lines=np.arange(1, 4096), fs=data.train[0].fs, degree=DEGREE,
-            limits=limits, **SIZES, **tests,
-        )  # fmt: skip
+        np.savez(given, u=u, y=y, limits=limits, **arrays)
         command = [str(python), str(HERE / "peer_nl.py"), str(given), str(found)]
         environment = os.environ | {"PYTHONHASHSEED": "0"}
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)

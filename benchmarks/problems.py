@@ -33,17 +33,24 @@ RADIUS = 0.9
 """Of the poles of a synthetic system."""
 
 
-def prepare(folder: Path, peers: Path | None) -> dict[str, int]:
-    """Write the problems to the folder, with the peers' records where there are any."""
-    parameters = {}
+def write_signals(folder: Path, peers: Path | None = None) -> None:
+    """Write the signals to the folder, the peers' if they are given, with rate and sizes."""
     for name, sizes in SIZES.items():
         u, y = _signals(name, peers)
-        np.savez(folder / f"{name}.npz", u=u, y=y)
+        about: dict = {"fs": RATES[name], **sizes}
+        np.savez(folder / f"{name}.npz", u=u, y=y, **about)
+
+
+def prepare(folder: Path, peers: Path | None) -> dict[str, int]:
+    """Write signals and models to the folder."""
+    write_signals(folder, peers)
+    parameters = {}
+    for name, sizes in SIZES.items():
         bla = lfrtorch.estimate_bla(
             records(folder, name), sizes["nx"], offset=False, max_iter=BLA_ITERATIONS
         )
-        rest = {key: size for key, size in sizes.items() if key != "nx"}
-        model = lfrtorch.initialise(bla, records(folder, name), **rest)
+        nz, nw, nn = (sizes[size] for size in ("nz", "nw", "nn"))
+        model = lfrtorch.initialise(bla, records(folder, name), nz=nz, nw=nw, nn=nn)
         model.save(folder / name)
         parameters[name] = model.parameter_count
     return parameters
@@ -60,10 +67,18 @@ def records(
         ]
 
 
-def problem(folder: Path, name: str, ridge: float = RIDGE, **options: object) -> SimulationError:
+def problem(
+    folder: Path,
+    name: str,
+    ridge: float = RIDGE,
+    *,
+    start: Literal["periodic", "zero"] = "periodic",
+    periods: int = 1,
+) -> SimulationError:
     """The residual that a fit of the problem minimises."""
     model = lfrtorch.load(folder / name)
-    return SimulationError(model, records(folder, name, **options), ridge=ridge)
+    data = records(folder, name, start=start, periods=periods)
+    return SimulationError(model, data, ridge=ridge)
 
 
 def synthetic(
@@ -126,8 +141,8 @@ def _parallel_wh(rng: np.random.Generator) -> tuple[Array, Array]:
         (signal.cheby2(3, 30, 0.35), lambda v: v / (1.0 + 0.1 * v**2), signal.butter(3, 0.2)),
     )
     settled = np.tile(u, 3)
-    y = sum(
+    outputs = [
         signal.lfilter(*behind, static(signal.lfilter(*ahead, settled)))
         for ahead, static, behind in branches
-    )
-    return u, y[-T:]
+    ]
+    return u, np.sum(outputs, axis=0)[-T:]
