@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfrtorch._types import Array
 from lfrtorch.records import Record
+
+
+def rms(signal: ArrayLike, axis: int | None = None) -> Array:
+    """Root mean square of all values, or along an axis; not finite if the signal diverges."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.sqrt(np.mean(np.square(signal), axis=axis))
 
 
 def rmse(record: Record, y_hat: Array) -> float:
@@ -19,8 +26,7 @@ def rmse(record: Record, y_hat: Array) -> float:
             f"record '{record.name}' has an output of shape {record.y.shape} and the simulation "
             f"{np.shape(y_hat)}; simulate this record."
         )
-    error = record.y[record.skip :] - y_hat[record.skip :]
-    return float(np.sqrt(np.mean(error**2)))
+    return float(rms(record.y[record.skip :] - y_hat[record.skip :]))
 
 
 def nrmse(record: Record, y_hat: Array) -> float:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lfrtorch.metrics import nrmse, rmse
+from lfrtorch.metrics import nrmse, rms, rmse
 from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
@@ -42,3 +42,10 @@ def test_simulation_of_another_shape_is_refused(score, y_hat):
     # (T, 1) - (T,) would broadcast to (T, T): a number, but not the score.
     with pytest.raises(ValueError, match="shape"):
         score(Record(Y, Y), y_hat)
+
+
+def test_root_mean_square_of_all_values_or_along_an_axis():
+    signal = np.array([[3.0, 0.0], [-3.0, 4.0]])
+    assert rms(signal, axis=0) == pytest.approx([3.0, np.sqrt(8.0)])
+    assert float(rms(signal)) == pytest.approx(np.sqrt(34.0 / 4.0))
+    assert rms([[1e200], [1.0]], axis=0).tolist() == [np.inf]  # no warning

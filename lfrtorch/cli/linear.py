@@ -33,6 +33,7 @@ from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, pr
 from lfrtorch.cli.steps import linear_model, loaded
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
+from lfrtorch.metrics import rms
 from lfrtorch.reporting import linear_plots, plots
 
 
@@ -150,7 +151,7 @@ def numbers(
 def score(model: lfrtorch.LinearModel, record: lfrtorch.Record, use: str) -> dict[str, Any]:
     """Simulation errors of each output after the skip window."""
     y = record.y[record.skip :]
-    rmse = np.sqrt(np.mean((y - model.simulate(record)[record.skip :]) ** 2, axis=0))
+    rmse = rms(y - model.simulate(record)[record.skip :], axis=0)
     deviation = np.std(y, axis=0)
     return {
         "use": use,

@@ -34,11 +34,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
+from lfrtorch.metrics import rms
 from lfrtorch.records import Channel, Record
 
 __all__ = ["load"]
@@ -53,7 +52,7 @@ _SKIP = 50  # samples, unscored, of the tests
 _PUBLISHED = (
     Published(
         "deep LRU",
-        {"level_6": float(np.sqrt(np.mean(np.square([0.180, 0.167, 0.368]))))},
+        {"level_6": float(rms([0.180, 0.167, 0.368]))},
         "Forgione et al. (2024), fitted to multisines and swept sines; of its 0.180, 0.167 and "
         "0.368 m/s² for the three outputs",
     ),

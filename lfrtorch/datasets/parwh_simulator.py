@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import butter, cheby1, cheby2, ellip, freqz
 
+from lfrtorch import metrics
 from lfrtorch._checks import number
 from lfrtorch._types import Array
 
@@ -104,7 +105,7 @@ def multisine(
     spectrum = np.zeros(PERIOD // 2 + 1, complex)
     spectrum[_LINES] = np.exp(1j * phase)
     u = np.fft.irfft(spectrum, PERIOD)
-    return rms * u / np.sqrt(np.mean(u**2))
+    return rms * u / metrics.rms(u)
 
 
 def simulate(u: ArrayLike) -> Array:
@@ -149,4 +150,4 @@ def _arrow(rng: np.random.Generator) -> Array:
     spectrum = np.zeros_like(white)
     spectrum[_LINES] = white[_LINES]
     u = np.linspace(0, 1, PERIOD) * np.fft.irfft(spectrum, PERIOD)
-    return _ARROW_RMS * u / np.sqrt(np.mean(u[-PERIOD // 10 :] ** 2))
+    return _ARROW_RMS * u / metrics.rms(u[-PERIOD // 10 :])

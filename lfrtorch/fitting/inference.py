@@ -50,6 +50,7 @@ from lfrtorch.least_squares.simulation_problem import SimulationError
 from lfrtorch.least_squares.static_problem import StaticError
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.resolvent import resolvent
+from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
@@ -402,19 +403,15 @@ def _search(
     xu = np.concatenate([np.hstack([r.x, r.u]) for r in residuals])
     w = np.empty(0)
     for _ in range(ROUNDS):
-        B, N = B / _rms(B), _whitened(N, xu)
+        B, N = B / rms(B, axis=0), _whitened(N, xu)
         problem = InferenceError(residuals, B, N, degree)
         theta = _minimised(problem, STEPS, tolerance=TOLERANCE, patience=2)
         B, N = problem.matrices(theta)
         xu, w = problem.learnt(theta)
     # From z that had drifted from unit covariance the fit was at 2.6 and 3.5 mV after 15 iterations
     # where it is at 0.9 and 2.8 (parallel Wiener-Hammerstein stand-in, two starts).
-    N, size = _whitened(N, xu), OUTPUT_SIZE / _rms(B)
+    N, size = _whitened(N, xu), OUTPUT_SIZE / rms(B, axis=0)
     return B * size, N, xu @ N.T, w / size
-
-
-def _rms(columns: Array) -> Array:
-    return np.sqrt(np.square(columns).mean(axis=0))
 
 
 def _whitened(N: Array, xu: Array) -> Array:
@@ -454,7 +451,7 @@ def _write(
             cell.static.Ww.uniform_(-1.0, 1.0, generator=drawn)
     problem = StaticError(cell.static, *(torch.from_numpy(s).to(cell.A) for s in (z, w)))
     error = MAP_ERROR if is_network(cell.static) else 0.0
-    floor = error * float(np.sqrt(np.square(w).mean()))
+    floor = error * float(rms(w))
     problem.write(_minimised(problem, MAP_STEPS, floor=floor))
 
 

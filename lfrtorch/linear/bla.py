@@ -20,6 +20,7 @@ from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.linear.spectral_data import Weight, lines_of, lines_of_response
 from lfrtorch.linear.subspace import Start
+from lfrtorch.metrics import rms
 from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
 
 Criterion = Literal["simulation", "prediction", "frequency"]
@@ -193,7 +194,7 @@ def estimate_bla(
             model = replace(model, y_offset=model.y_offset + errors.mean(axis=0))
             errors = errors - errors.mean(axis=0)
         if refine == "simulation":
-            rmse = float(np.sqrt(np.mean((errors / scaler.y_scale) ** 2)))
+            rmse = float(rms(errors / scaler.y_scale))
     if rmse > POOR and refine != "frequency":
         notes.append(
             f"the model explains little: {100 * rmse:.0f} % of the output's rms remain. Look "

@@ -13,6 +13,7 @@ from lfrtorch._checks import integer
 from lfrtorch.linear.bla import data_scaler, estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.metrics import rms
 from lfrtorch.records import Record, as_records
 
 ORDERS = range(1, 13)
@@ -115,7 +116,7 @@ def scan_orders(
 
 def _validation(model: LinearModel, records: list[Record], scale: np.ndarray) -> float:
     errors = [((r.y - model.simulate(r)) / scale)[r.skip :] for r in records]
-    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+    return float(rms(np.concatenate(errors)))
 
 
 def _description_length(model: LinearModel, data: Record | Sequence[Record] | FRF) -> float:

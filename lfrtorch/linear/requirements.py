@@ -6,6 +6,7 @@ import numpy as np
 
 from lfrtorch.linear.spectral_data import Lines
 from lfrtorch.linear.subspace import shortest, suffice
+from lfrtorch.metrics import rms
 from lfrtorch.records import Record
 
 NARROW = 1e-10
@@ -61,7 +62,7 @@ def narrow(records: list[Record], nx: int) -> list[str]:
         if r.samples >= wanted
     ]
     rows = np.concatenate([w.reshape(len(w), -1) for w in windows])
-    rows = rows / np.maximum(np.sqrt((rows**2).mean(axis=0)), 1e-300)
+    rows = rows / np.maximum(rms(rows, axis=0), 1e-300)
     size = np.linalg.eigvalsh(rows.T @ rows)
     rank = int((size > NARROW * size[-1]).sum())
     if rank == nu * wanted:

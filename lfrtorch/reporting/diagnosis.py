@@ -12,9 +12,10 @@ from lfrtorch._types import Array
 from lfrtorch.fitting.multistart import LEFT
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.spectra import spectra_of_periods
+from lfrtorch.metrics import rms
 from lfrtorch.records import Record
 from lfrtorch.reporting.advice import Evidence
-from lfrtorch.reporting.simulations import Response, rms
+from lfrtorch.reporting.simulations import Response
 
 AVERAGES = 8
 """Segments for each regressor that a coherence is estimated from, at least."""
@@ -63,7 +64,7 @@ def evidence(
         validation=_error([r.error for r in validation], scale),
         lti_validation=_error([r.lti_error for r in validation], scale),
         outputs=_by_output(validation or train),
-        noise=None if noise is None else float(np.sqrt(np.mean((noise / scale) ** 2))),
+        noise=None if noise is None else float(rms(noise / scale)),
         linear=linear,
         nonlinear=nonlinear,
         transient=_transient(train, scale),
@@ -188,7 +189,7 @@ def _error(errors: Sequence[Array], scale: Array) -> float | None:
     """RMS of errors in units of the scale; None without records or where one diverges."""
     if not errors:
         return None
-    error = float(np.sqrt(np.mean((rms(np.concatenate(errors)) / scale) ** 2)))
+    error = float(rms(rms(np.concatenate(errors), axis=0) / scale))
     return error if math.isfinite(error) else None
 
 
@@ -196,7 +197,7 @@ def _by_output(responses: Sequence[Response]) -> dict[str, float]:
     """The NL-LFR's error over the linear model's by output, where there are several."""
     outputs = responses[0].record.outputs
     lti, error = (
-        rms(np.concatenate(errors))
+        rms(np.concatenate(errors), axis=0)
         for errors in ([r.lti_error for r in responses], [r.error for r in responses])
     )
     if len(outputs) == 1 or not np.isfinite(error).all():
@@ -215,7 +216,7 @@ def _transient(train: Sequence[Response], scale: Array) -> float | None:
             rest.append(error[count:])
     if not first or not sum(map(len, rest)):
         return None
-    beginning, usual = (float(np.mean(rms(np.concatenate(part)))) for part in (first, rest))
+    beginning, usual = (float(np.mean(rms(np.concatenate(part), axis=0))) for part in (first, rest))
     return beginning / usual if 0 < usual < math.inf and math.isfinite(beginning) else None
 
 

@@ -22,9 +22,10 @@ from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.size_search import LEGEND, size_table
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.metrics import rms
 from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.scores import neurons
-from lfrtorch.reporting.simulations import Response, rms
+from lfrtorch.reporting.simulations import Response
 
 USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
 """What the records that are no tests were for."""
@@ -201,10 +202,7 @@ def _channels(response: Response) -> list[tuple[str, str, slice]]:
 
 def _errors(response: Response, of: slice) -> Errors:
     """Of some outputs."""
-    lti, error = (
-        float(np.sqrt(np.mean(rms(signal[:, of]) ** 2)))
-        for signal in (response.lti_error, response.error)
-    )
+    lti, error = (float(rms(signal[:, of])) for signal in (response.lti_error, response.error))
     deviation = float(np.sqrt(np.mean(np.var(response.scored[:, of], axis=0)))) or math.nan
     ratio = lti / error if error > 0 else math.nan
     return Errors(lti, error, ratio, lti / deviation, error / deviation)

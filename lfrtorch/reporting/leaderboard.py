@@ -13,8 +13,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 
-import numpy as np
-
+from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -70,7 +69,7 @@ def entry(
 def errors_of(model: Model, record: Record) -> list[float]:
     """RMSE of each output after the samples that are skipped."""
     error = (record.y - model.simulate(record))[record.skip :]
-    return [float(value) for value in np.sqrt(np.mean(error**2, axis=0))]
+    return rms(error, axis=0).tolist()
 
 
 def table(entries: Sequence[Entry]) -> str:

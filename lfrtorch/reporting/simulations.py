@@ -72,9 +72,3 @@ def respond(
             lti = own.get(record.name, bla) if use == "test" else bla
             found.append(Response(record, use, lti.simulate(record), model.simulate(record)))
     return found
-
-
-def rms(signal: Array) -> Array:
-    """Root mean square (n,) of the channels of a signal (T, n); not finite where it diverges."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.sqrt(np.mean(np.square(signal), axis=0))

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.signal
 
 from lfrtorch._types import Array, Complex
+from lfrtorch.metrics import rms
 
 SEGMENTS = (4, 8)
 """Of a record: the response has lags up to T / 8 or T / 16. The one is taken in which more of the
@@ -73,7 +74,7 @@ def _lags(u: Array, y: Array, length: int) -> Lags:
     _, Syu = scipy.signal.csd(u, y, nperseg=length)
     g = _response(Suu, Syu)
     size, half = np.abs(g), length // 2
-    begun = max(ONSET, CLEAR * float(np.sqrt(np.mean(g[half:] ** 2)) / size.max()))
+    begun = max(ONSET, CLEAR * float(rms(g[half:]) / size.max()))
     excited = np.flatnonzero(Syy > FLOOR * Syy.max())
     gain = np.abs(Syu[excited]) / Syy[excited]
     third = max(len(gain) // 3, 1)
