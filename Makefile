@@ -47,14 +47,14 @@ reproduce: $(READY)  ## the public benchmarks at hand -> RESULTS.md (ARGS="silve
 
 docs: $(READY)  ## guide, notebooks and reference, in site/; a broken link in it is an error
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[docs]'
-	@$(BIN)/sphinx-build -qW --keep-going docs site
-	@echo "Open site/index.html"
+	@$(BIN)/sphinx-build -qW --keep-going -d site/doctrees docs site/html
+	@echo "Open site/html/index.html"
 
 docs-links: docs  ## links to other sites, too; needs the network
-	@$(BIN)/sphinx-build -qW --keep-going -b linkcheck docs site/.links
+	@$(BIN)/sphinx-build -qW --keep-going -d site/doctrees -b linkcheck docs site/links
 
 clean:  ## remove caches and builds; .venv and runs stay
-	@rm -rf build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	@rm -rf build dist site *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	@find . \( -path ./$(VENV) -o -path ./runs \) -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +
 
 # The mark .partial says that a set-up did not come to its end: the next one then starts afresh.

@@ -5,22 +5,30 @@ import re
 from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.util.inspect import TypeAliasForwardRef
 
 project = "lfrtorch"
 author = "lfrtorch contributors"
 release = importlib.metadata.version(project)
 html_title = f"{project} {release}"
 html_theme = "furo"
+html_theme_options = {
+    "source_repository": "https://github.com/lfrtorch/lfrtorch",
+    "source_branch": "main",
+    "source_directory": "docs/",
+}
+html_show_copyright = False
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["**.ipynb_checkpoints"]
+suppress_warnings = ["myst.header"]  # a page of benchmarks/ may leave out a level of headings
 
-# Markdown: formulas, and links to headings.
-myst_enable_extensions = ["dollarmath"]
+# Markdown: links to headings.
 myst_heading_anchors = 3
 
 # Notebooks: an exception in one of them fails the build.
 nb_execution_mode = "force"
+nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
@@ -28,16 +36,21 @@ nb_merge_streams = True
 # Reference: members in the order of the source.
 autodoc_default_options = {"members": True}
 autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"
+autodoc_type_aliases = {name: name for name in ("Array", "Complex", "Integers")}
+TypeAliasForwardRef.__repr__ = lambda self: self.name  # in a union, too
 napoleon_numpy_docstring = False
 napoleon_custom_sections = ["Shape", ("Returns", "Shape")]
+python_display_short_literal_types = True
 python_maximum_signature_line_length = 88
 
 # Every reference must exist. Types of other packages have no page here.
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(collections|matplotlib|numpy|pathlib|scipy|threading|torch|typing)\..*"),
-    ("py:class", r"Tensor|lfrtorch\.distributed\.Shared"),  # the last: a type variable
+    ("py:class", r"Tensor|Array|Complex|Integers"),
+    ("py:class", r"lfrtorch\.distributed\.Shared"),  # a type variable
 ]
 
 # To other sites: `make docs-links`.
@@ -58,7 +71,15 @@ def left_to_the_source(_app: Sphinx, _what: str, name: str, obj: Any, _skip: boo
     return True if field or name.isupper() else None
 
 
+def readable(
+    _app: Sphinx, _what: str, _name: str, _obj: Any, _options: Any, signature: str, returned: str
+) -> tuple[str, str]:
+    """Sphinx cannot parse the default of a field that is made anew for each object."""
+    return signature and signature.replace("<factory>", "..."), returned
+
+
 def setup(app: Sphinx) -> None:
-    """Connect both to autodoc, before napoleon."""
+    """Connect all to autodoc, the first before napoleon."""
     app.connect("autodoc-process-docstring", as_written, priority=400)
     app.connect("autodoc-skip-member", left_to_the_source)
+    app.connect("autodoc-process-signature", readable)

@@ -1,0 +1,65 @@
+"""Notebooks run, commands are understood, links lead somewhere, all exported names have a page."""
+
+import re
+import shlex
+from pathlib import Path
+
+import matplotlib
+import pytest
+from hydra import compose, initialize_config_dir
+from matplotlib import pyplot
+
+import lfrtorch
+from lfrtorch.cli.config import CONF
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+
+COMMAND = re.compile(r"^    lfrtorch (fit|linear|simulate|evaluate) (.+?)(?: +#.*)?$", re.MULTILINE)
+COMMANDS = sorted({found for page in PAGES for found in COMMAND.findall(page.read_text("utf-8"))})
+
+CELL = re.compile(r"^```{code-cell}.*?$(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.slow
+@pytest.mark.numeric
+@pytest.mark.parametrize(
+    "notebook", sorted((DOCS / "notebooks").glob("*.md")), ids=lambda p: p.stem
+)
+def test_notebook_fits_better_than_the_linear_model(
+    notebook: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.chdir(tmp_path)
+    matplotlib.use("agg")
+    cells = "".join(CELL.findall(notebook.read_text(encoding="utf-8")))
+    exec(re.sub(r"^%.*$", "", cells, flags=re.MULTILINE), {})
+    pyplot.close("all")
+    linear, nonlinear = re.findall(
+        r"(?:linear(?: model)?|NL-LFR): ([\d.]+) .m rms", capsys.readouterr().out
+    )
+    assert float(nonlinear) < float(linear) / 3
+
+
+def test_reference_has_all_that_is_exported():
+    text = (DOCS / "api" / "lfrtorch.md").read_text(encoding="utf-8")
+    described = set(re.findall(r"^\.\. auto\w+:: (?:lfrtorch\.)?(\w+)$", text, re.MULTILINE))
+    assert set(lfrtorch.__all__) - described == {"datasets"}  # which has a page of its own
+
+
+@pytest.mark.parametrize(("name", "words"), COMMANDS, ids=[" ".join(each) for each in COMMANDS])
+def test_command_of_the_guide_has_settings_that_exist(name: str, words: str):
+    overrides = [word for word in shlex.split(words) if word not in ("-m", "--help")]
+    if "-m" in words.split():
+        overrides = [word.split(",")[0] for word in overrides]
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        compose("config" if name == "fit" else name, overrides)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_between_pages_lead_to_files(page: Path):
+    for target in re.findall(r"\]\((?!http|#)([^)#]+)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
