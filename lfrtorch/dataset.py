@@ -17,6 +17,11 @@ class Published:
         scores: RMSE in the output's unit, by the name of the test record.
         reference: where it was published.
         sizes: (nz, nw) where the number belongs to one model size only.
+
+    Example:
+        >>> paper = lfrtorch.Published("NL-LFR (paper)", {"multisine": 1.9e-5}, "a paper")
+        >>> paper.scores["multisine"]
+        1.9e-05
     """
 
     label: str
@@ -44,6 +49,11 @@ class Dataset:
         notes: what a reader of the scores should know of the data, a sentence each.
         leaderboard: test records as nonlinearbenchmark.org has them scored: cut by the package
             nonlinear_benchmarks, the start state fitted to the samples that it leaves unscored.
+
+    Example:
+        >>> data = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[record[200:]])
+        >>> [test.samples for test in data.tests]
+        [200]
     """
 
     name: str

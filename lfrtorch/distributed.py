@@ -40,7 +40,13 @@ class ProcessLost(RuntimeError):
 
 
 class Ranks:
-    """One process that holds all records; ``ProcessGroup`` is several."""
+    """One process that holds all records; ``ProcessGroup`` is several.
+
+    Example:
+        >>> ranks = lfrtorch.distributed.Ranks()
+        >>> ranks.share(["first", "second"]), ranks.sum(torch.ones(2))
+        (['first', 'second'], tensor([1., 1.]))
+    """
 
     rank, world = 0, 1
 
@@ -85,6 +91,14 @@ def connect(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Ran
     Raises:
         ValueError: a timeout that is not positive.
         ProcessLost: the others did not come.
+
+    Example:
+        >>> with lfrtorch.distributed.connect() as ranks:  # alone: no torchrun
+        ...     result = lfrtorch.fit(
+        ...         model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=2), ranks=ranks
+        ...     )
+        >>> ranks.rank, ranks.world
+        (0, 1)
     """
     number("timeout", timeout, positive=True)
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:

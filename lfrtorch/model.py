@@ -31,6 +31,12 @@ class Model:
         scaler: physical to normalised units, at both ends.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
+
+    Example:
+        >>> model.sizes, model.parameter_count
+        ({'nx': 1, 'nz': 1, 'nw': 1, 'nn': 4}, 21)
+        >>> model.inputs, model.fs
+        ((Channel(name='u', unit=''),), 100.0)
     """
 
     lfr: LFR
@@ -102,13 +108,25 @@ class Model:
 
         Raises:
             ValueError: an input of the wrong shape, rate or with NaN or infinite samples.
+
+        Example:
+            >>> model.simulate(record).shape
+            (400, 1)
+            >>> model.simulate(np.zeros(50)).shape  # any input, from rest
+            (50, 1)
         """
         return self.scaler.restore_y(self.signals(data, start=start, x0=x0).y[0].double().numpy())
 
     def signals(
         self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None
     ) -> Trajectory:
-        """All signals x, z, w, y of the same simulation, normalised, on the CPU, with R = 1."""
+        """All signals x, z, w, y of the same simulation, normalised, on the CPU, with R = 1.
+
+        Example:
+            >>> trajectory = model.signals(record)
+            >>> trajectory.x.shape, trajectory.z.shape  # (records, samples and one more, nx) and nz
+            (torch.Size([1, 401, 1]), torch.Size([1, 400, 1]))
+        """
         if isinstance(data, Record):
             self.check(data)
             u, start = data.u, start or data.start
@@ -134,7 +152,13 @@ class Model:
         return Trajectory(*(signal.cpu() for signal in trajectory))
 
     def check(self, record: Record) -> None:
-        """Refuse a record of other channels or another sampling frequency with a ValueError."""
+        """Refuse a record of other channels or another sampling frequency with a ValueError.
+
+        Example:
+            >>> model.check(lfrtorch.Record(record.u, record.y, fs=50.0))
+            Traceback (most recent call last):
+            ValueError: record 'record' is sampled at 50.0 Hz and the model at 100.0 Hz; ...
+        """
         for side, signal, channels in (
             ("input", record.u, self.inputs),
             ("output", record.y, self.outputs),
@@ -157,7 +181,14 @@ class Model:
             )
 
     def save(self, folder: str | Path) -> Path:
-        """Write the checkpoint folder; ``lfrtorch.load`` reads it back to the same bits."""
+        """Write the checkpoint folder; ``lfrtorch.load`` reads it back to the same bits.
+
+        Example:
+            >>> folder = model.save("model")
+            >>> again = lfrtorch.load(folder)
+            >>> np.array_equal(again.simulate(record), model.simulate(record))
+            True
+        """
         cell, s = self.lfr.cell, self.scaler
         static: dict[str, Any] | None = None
         if is_network(cell.static):
@@ -202,6 +233,12 @@ def simulate_blocks(
     Raises:
         ValueError: in the block where it is found: an input of the wrong shape or with NaN, or a
             model that diverges; the message says at which sample of the whole input.
+
+    Example:
+        >>> blocks = [record.u[:150], record.u[150:]]
+        >>> y_hat = np.concatenate(list(lfrtorch.simulate_blocks(model, blocks)))
+        >>> np.array_equal(y_hat, model.simulate(record.u))
+        True
     """
     first, state = 0, np.zeros(model.lfr.cell.nx) if x0 is None else x0
     for block in blocks:
@@ -230,6 +267,11 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
     Raises:
         ValueError: no checkpoint, a damaged one, one of another program or a newer version, one
             that holds a linear model, or a file that may carry code (it is not opened).
+
+    Example:
+        >>> folder = model.save("model")
+        >>> lfrtorch.load(folder).sizes
+        {'nx': 1, 'nz': 1, 'nw': 1, 'nn': 4}
     """
     description, weights = _checkpoint.read(folder)
     if "linear" in description:

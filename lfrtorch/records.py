@@ -39,7 +39,12 @@ _MANY_CHANNELS = 16
 
 
 class Channel(NamedTuple):
-    """Name and unit of one signal."""
+    """Name and unit of one signal.
+
+    Example:
+        >>> print(lfrtorch.Channel("force", "N"))
+        force (N)
+    """
 
     name: str
     unit: str = ""
@@ -80,6 +85,13 @@ class Record:
     Raises:
         ValueError: NaN or infinite samples, different lengths, wrong shapes, negative weights, a
             ``skip`` that leaves no sample, or a period that does not fit.
+
+    Example:
+        >>> record = lfrtorch.Record(np.sin(np.arange(100.0)), np.zeros(100), fs=50.0, skip=10)
+        >>> record.samples, record.u.shape, str(record.inputs[0])
+        (100, (100, 1), 'u')
+        >>> record[20:].samples  # a part is a record, too
+        80
     """
 
     u: Array
@@ -265,6 +277,13 @@ class Scaler:
 
     Shape:
         u_offset, u_scale: (nu,), y_offset, y_scale: (ny,); physical units.
+
+    Example:
+        >>> scaler = lfrtorch.Scaler(*(np.array([value]) for value in (0.0, 2.0, 1.0, 10.0)))
+        >>> scaler.normalise_y(np.array([[21.0]]))
+        array([[2.]])
+        >>> scaler.restore_y(np.array([[2.0]]))
+        array([[21.]])
     """
 
     u_offset: Array

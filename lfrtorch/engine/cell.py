@@ -30,6 +30,12 @@ class LFRCell(nn.Module):
     References:
         Schoukens and Tóth, "On the Initialization of Nonlinear LFR Model Identification with the
         Best Linear Approximation", IFAC-PapersOnLine 53(2), 2020, equations (1) and (2).
+
+    Example:
+        >>> cell = lfrtorch.LFRCell(nu=1, ny=1, nx=2, nz=1, nw=1, static=lfrtorch.Network(1, 1, 5))
+        >>> y, x = cell(torch.ones(1), torch.zeros(2))
+        >>> y.shape, x.shape
+        (torch.Size([1]), torch.Size([2]))
     """
 
     def __init__(

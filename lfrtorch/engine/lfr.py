@@ -22,6 +22,13 @@ class LFR(nn.Module):
 
     Shape:
         u: (R, T, nu), x0: (R, nx) -> y: (R, T, ny), normalised units.
+
+    Example:
+        >>> u = torch.ones(3, 100, 1, dtype=torch.float64)  # three records
+        >>> y = model.lfr(u)
+        >>> y.square().mean().backward()
+        >>> y.shape, model.lfr.cell.A.grad.shape
+        (torch.Size([3, 100, 1]), torch.Size([1, 1]))
     """
 
     def __init__(self, cell: LFRCell) -> None:

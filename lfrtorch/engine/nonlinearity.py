@@ -38,6 +38,13 @@ class Network(Module):
 
     Shape:
         Wz: (nn, nz), bz: (nn,), Ww: (nw, nn), bw: (nw,); z: (..., nz) -> w: (..., nw).
+
+    Example:
+        >>> static = lfrtorch.Network(nz=2, nw=1, nn=15)
+        >>> static
+        Network(nz=2, nw=1, nn=15, activation='tanh')
+        >>> static(torch.zeros(8, 2)).shape
+        torch.Size([8, 1])
     """
 
     def __init__(
@@ -102,6 +109,11 @@ class Polynomial(Module):
 
     Raises:
         ValueError: a degree below 1.
+
+    Example:
+        >>> static = lfrtorch.Polynomial(nz=2, nw=1, degree=3)
+        >>> static.C.shape  # 1, z1, z2, z1², z1 z2, z2², z1³, ...
+        torch.Size([1, 10])
     """
 
     _factors: Tensor

@@ -350,6 +350,12 @@ def infer(
     Raises:
         ValueError: records that are not periodic, sizes below 1, or a static map of other sizes or
             without weights.
+
+    Example:
+        >>> model = lfrtorch.infer(bla, record, nz=1, nw=1, nn=4)
+        >>> error = lfrtorch.rmse(record, model.simulate(record))
+        >>> error < lfrtorch.rmse(record, bla.simulate(record))
+        True
     """
     integer("degree", degree, 1)
     data = as_records(records)

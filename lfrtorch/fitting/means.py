@@ -27,6 +27,11 @@ def mean_model(models: Sequence[Model]) -> Model:
 
     Raises:
         ValueError: no model, or models of other channels, scales, rates or static maps.
+
+    Example:
+        >>> models = [lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4, seed=i) for i in range(3)]
+        >>> lfrtorch.mean_model(models).sizes
+        {'nx': 3, 'nz': 3, 'nw': 3, 'nn': 12}
     """
     if not models:
         raise ValueError("there is no model to average; give one or more.")

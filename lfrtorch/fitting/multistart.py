@@ -142,6 +142,20 @@ def fit(
             than processes, another number of lists of monitors, or models to average that have no
             network.
         ProcessLost: before there was an iterate to keep.
+
+    Example:
+        >>> before = lfrtorch.rmse(record, model.simulate(record))
+        >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=20)
+        >>> result = lfrtorch.fit(model, record, trainer=trainer)
+        >>> lfrtorch.rmse(record, result.model.simulate(record)) < before / 10
+        True
+
+        From three starts:
+
+        >>> models = [lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4, seed=i) for i in range(3)]
+        >>> result = lfrtorch.fit(models, record, trainer=trainer)
+        >>> sorted(start.number for start in result.starts)
+        [0, 1, 2]
     """
     alone = isinstance(models, Model)
     starts = [models] if alone else list(models)

@@ -110,6 +110,16 @@ class SizeSearch:
     Args:
         candidates: each of them.
         counts: samples of each block of time, (B,).
+
+    Example:
+        >>> def start(sizes, seed):
+        ...     return lfrtorch.initialise(bla, record, **sizes, seed=seed)
+        >>> short = lfrtorch.LevenbergMarquardt(max_iter=2)
+        >>> search = lfrtorch.search_sizes(
+        ...     start, record, record, nz=1, nw=1, nn=(2, 4), seeds=(0,), trainer=short
+        ... )
+        >>> sorted(entry["nn"] for entry in search.entries())
+        [2, 4]
     """
 
     candidates: tuple[Candidate, ...]
@@ -220,6 +230,16 @@ def search_sizes(
             stable on them.
         KeyboardInterrupt: Ctrl-C, from a monitor as well: there is no choice yet.
         ProcessLost: likewise.
+
+    Example:
+        >>> def start(sizes, seed):
+        ...     return lfrtorch.initialise(bla, record, **sizes, seed=seed)
+        >>> short = lfrtorch.LevenbergMarquardt(max_iter=2)
+        >>> search = lfrtorch.search_sizes(
+        ...     start, record, record, nz=1, nw=1, nn=(2, 4), seeds=(0,), trainer=short
+        ... )
+        >>> search.chosen.sizes["nn"] in (2, 4)
+        True
     """
     given = {"nz": nz, "nw": nw} | ({"nn": nn} if degree is None else {"degree": degree})
     tried = {name: _sizes(name, values) for name, values in given.items()}

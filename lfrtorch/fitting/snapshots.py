@@ -28,6 +28,18 @@ class Snapshots:
 
     Raises:
         ValueError: damaged files.
+
+    Example:
+        >>> from pathlib import Path
+        >>> def fitted(limit):
+        ...     start = lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4)
+        ...     trainer = lfrtorch.LevenbergMarquardt(max_iter=limit)
+        ...     snapshots = lfrtorch.Snapshots(Path("fit"))
+        ...     return lfrtorch.fit(start, record, trainer=trainer, snapshots=snapshots)
+        >>> first = fitted(3)
+        >>> longer = fitted(5)  # goes on from the third iteration
+        >>> longer.history[3].train == first.history[3].train, longer.iterations
+        (True, 5)
     """
 
     def __init__(

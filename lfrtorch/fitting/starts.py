@@ -74,6 +74,14 @@ def initialise(
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
         Schoukens, "Improved initialization of state-space artificial neural networks", ECC 2021.
+
+    Example:
+        >>> model = lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4, seed=1)
+        >>> np.allclose(model.simulate(record), bla.simulate(record))
+        True
+        >>> static = lfrtorch.Polynomial(1, 1, degree=3)
+        >>> lfrtorch.initialise(bla, record, nz=1, nw=1, static=static).sizes["degree"]
+        3
     """
     for name, size in (("nz", nz), ("nw", nw)):
         integer(name, size, 1)

@@ -160,6 +160,13 @@ class FitResult:
         starts: of several starts all, the best first.
         averaged: of how many starts the model is the mean; history and iterate are those of the
             best one.
+
+    Example:
+        >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=3))
+        >>> result.iterations, result.reason, len(result.history)
+        (3, 'maximum number of iterations', 4)
+        >>> result.model is model
+        True
     """
 
     model: Model

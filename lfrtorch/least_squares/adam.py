@@ -46,6 +46,12 @@ class Adam:
     Args:
         max_iter: most steps; each sees all the data.
         learning_rate: step size, in normalised units.
+
+    Example:
+        >>> trainer = lfrtorch.Adam(max_iter=20, learning_rate=1e-2)
+        >>> result = lfrtorch.fit(model, record, trainer=trainer)
+        >>> result.history[-1].train < result.history[0].train
+        True
     """
 
     max_iter: int = 2000

@@ -173,6 +173,12 @@ class LevenbergMarquardt:
         finite_step: h of the directional second derivative (Transtrum et al. use 0.1).
         acceleration_limit: largest 2|a| / |δ| at which the acceleration is trusted.
         max_damping: λ relative to the largest squared singular value that ends the search.
+
+    Example:
+        >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=10, acceleration=False)
+        >>> result = lfrtorch.fit(model, record, trainer=trainer)
+        >>> result.history[-1].train < result.history[0].train
+        True
     """
 
     max_iter: int = 200

@@ -50,6 +50,12 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
 
     Two panels a channel. The model's band is ± 2 standard deviations from the covariance of its
     parameters, where that is known. Without ``frf`` the model is drawn alone.
+
+    Example:
+        >>> from lfrtorch.reporting import linear_plots
+        >>> figure = linear_plots.frequency_response(bla, lfrtorch.estimate_frf(record))
+        >>> [ax.get_ylabel() for ax in figure.axes]
+        ['magnitude (dB)', 'phase (deg)']
     """
     ny, nu = len(model.outputs), len(model.inputs)
     figure = Figure(figsize=(2.5 + 5.5 * nu, 5.5 * ny), layout="constrained")
@@ -103,7 +109,14 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
 
 
 def poles_and_zeros(model: LinearModel) -> Figure:
-    """Poles and zeros in the z plane, as ``zeros`` names them, with the unit circle."""
+    """Poles and zeros in the z plane, as ``zeros`` names them, with the unit circle.
+
+    Example:
+        >>> from lfrtorch.reporting import linear_plots
+        >>> figure = linear_plots.poles_and_zeros(bla)
+        >>> figure.axes[0].get_xlabel()
+        'real part'
+    """
     figure = Figure(figsize=(7.5, 5.5), layout="compressed")
     ax = figure.subplots()
     angle = np.linspace(0, 2 * np.pi, 361)
@@ -135,6 +148,16 @@ def distortion(frf: FRF) -> Figure:
 
     Raises:
         ValueError: a response that was estimated by another method.
+
+    Example:
+        >>> from lfrtorch.reporting import linear_plots
+        >>> signals = lfrtorch.multisine(1024, fs=100.0, band=(0.1, 30.0), grid="random_odd")
+        >>> u = np.tile(signals.u[0, :, 0], 3)
+        >>> y = signal.lfilter([0, 0.3], [1, -0.7], np.tanh(u))
+        >>> periods = lfrtorch.Record(u[1024:], y[1024:], fs=100.0, start="periodic", period=1024)
+        >>> figure = linear_plots.distortion(lfrtorch.estimate_frf(periods, method="fast"))
+        >>> len(figure.axes)  # one output
+        1
     """
     levels = frf.distortion
     if levels is None:
@@ -162,7 +185,14 @@ def distortion(frf: FRF) -> Figure:
 
 
 def order_scan(scan: OrderScan) -> Figure:
-    """Scores and errors of the fit against order, the order chosen marked; singular values."""
+    """Scores and errors of the fit against order, the order chosen marked; singular values.
+
+    Example:
+        >>> from lfrtorch.reporting import linear_plots
+        >>> figure = linear_plots.order_scan(lfrtorch.scan_orders(record, [1, 2]))
+        >>> figure.axes[0].get_xlabel()
+        'order nx'
+    """
     figure = Figure(figsize=(10, 4), layout="constrained")
     errors, carried = figure.subplots(1, 2)
     score = "validation" if scan.validated else "score (MDL)"
@@ -183,7 +213,13 @@ def order_scan(scan: OrderScan) -> Figure:
 
 
 def zeros(model: LinearModel) -> dict[str, Complex]:
-    """Transmission zeros of a square model under the name ``""``, else the zeros by channel."""
+    """Transmission zeros of a square model under the name ``""``, else the zeros by channel.
+
+    Example:
+        >>> from lfrtorch.reporting import linear_plots
+        >>> list(linear_plots.zeros(bla))
+        ['']
+    """
     if len(model.inputs) == len(model.outputs):
         return {"": model.zeros()}
     return {
@@ -194,7 +230,14 @@ def zeros(model: LinearModel) -> dict[str, Complex]:
 
 
 def frequencies(model: LinearModel, frf: FRF | None = None) -> Array:
-    """Hz at which a model is drawn: a grid over the band of the response, and the resonances."""
+    """Hz at which a model is drawn: a grid over the band of the response, and the resonances.
+
+    Example:
+        >>> from lfrtorch.reporting import linear_plots
+        >>> f = linear_plots.frequencies(bla)
+        >>> bool(f[0] > 0), round(float(f[-1]))  # to half the sampling frequency
+        (True, 50)
+    """
     lines = np.array([LOWEST, 1.0]) * model.fs / 2 if frf is None else frf.frequencies
     first, last = float(lines[0]), float(lines[-1])
     spaced = np.geomspace if _wide(first, last) else np.linspace

@@ -31,6 +31,15 @@ class ProgressLine:
     Args:
         every: iterations between lines where the output is not a terminal.
         stream: where to write; standard output where left out.
+
+    Example:
+        >>> from lfrtorch.reporting.monitor import ProgressLine
+        >>> line, trainer = ProgressLine(every=2), lfrtorch.LevenbergMarquardt(max_iter=3)
+        >>> result = lfrtorch.fit(model, record, trainer=trainer, monitors=[line])
+        0/3  train ...
+        2/3  train ...
+        >>> line.close()
+        3/3  train ...
     """
 
     def __init__(self, every: int = 10, stream: TextIO | None = None) -> None:
@@ -78,6 +87,17 @@ class StartsLine:
         starts: how many there are.
         unit: of the errors.
         stream: where to write; standard output where left out.
+
+    Example:
+        >>> from lfrtorch.reporting.monitor import StartsLine
+        >>> models = [lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4, seed=i) for i in range(4)]
+        >>> line, trainer = StartsLine(4), lfrtorch.LevenbergMarquardt(max_iter=16)
+        >>> result = lfrtorch.fit(
+        ...     models, record, trainer=trainer, monitors=[[line]] * 4, watch=line.round
+        ... )
+        round 1 of 3: 4 start(s) to iteration 1, best ...
+        round 2 of 3: 2 start(s) to iteration 2, best ...
+        round 3 of 3: 2 start(s) to iteration 16, best ...
     """
 
     def __init__(self, starts: int, unit: str = "", stream: TextIO | None = None) -> None:
@@ -115,6 +135,12 @@ class TensorBoard:
             out for scalars alone.
         y_lti: output of the linear model on it, (T, ny), for the error beside ours.
         every: iterations between figures; they cost about half a second.
+
+    Example:
+        >>> from lfrtorch.reporting.monitor import TensorBoard
+        >>> board, trainer = TensorBoard("board"), lfrtorch.LevenbergMarquardt(max_iter=2)
+        >>> result = lfrtorch.fit(model, record, trainer=trainer, monitors=[board])
+        >>> board.close()  # tensorboard --logdir board
     """
 
     def __init__(
@@ -176,6 +202,13 @@ class Checkpoint:
         folder: of the checkpoint.
         every: least seconds between two of them, the first is that of the start.
         least: score that an iterate must beat, that of the checkpoint there.
+
+    Example:
+        >>> from lfrtorch.reporting.monitor import Checkpoint
+        >>> keep, trainer = Checkpoint("best", every=0), lfrtorch.LevenbergMarquardt(max_iter=5)
+        >>> result = lfrtorch.fit(model, record, trainer=trainer, monitors=[keep])
+        >>> np.array_equal(lfrtorch.load("best").simulate(record), model.simulate(record))
+        True
     """
 
     def __init__(self, folder: str | Path, every: float = 5.0, least: float = math.inf) -> None:

@@ -31,7 +31,14 @@ SEGMENT, SHORTEST = 4096, 16
 
 
 def errors(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
-    """The spectrum of whole periods in steady state, and else the response against time."""
+    """The spectrum of whole periods in steady state, and else the response against time.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> figure = plots.errors(record, bla.simulate(record), model.simulate(record))
+        >>> figure.axes[0].get_xlabel()  # the record is a whole period: its spectrum
+        'frequency (Hz)'
+    """
     return (spectrum if is_whole(record) else response)(record, y_lti, y_hat)
 
 
@@ -39,6 +46,11 @@ def is_whole(record: Record) -> bool:
     """Whether the scored samples are whole periods in steady state, whose spectrum has no leakage.
 
     Periods with a skip window are no whole periods.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> plots.is_whole(record), plots.is_whole(record[:100])
+        (True, False)
     """
     return record.start == "periodic" and not record.skip
 
@@ -49,6 +61,12 @@ def spectrum(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure
     Shape:
         y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
             is no NL-LFR.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> figure = plots.spectrum(record, bla.simulate(record), model.simulate(record))
+        >>> [line.get_label() for line in figure.axes[0].lines]
+        ['output', 'LTI error', 'NL-LFR error']
     """
     figure, axes = _panels(record)
     y = record.y[record.skip :]
@@ -72,6 +90,11 @@ def density(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
     Shape:
         y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
             is no NL-LFR.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> figure = plots.density(record[:300], bla.simulate(record[:300]))
+        >>> figure.savefig("density.png")
     """
     figure, axes = _panels(record)
     scored = record.samples - record.skip
@@ -96,6 +119,12 @@ def response(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure
     Shape:
         y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
             is no NL-LFR.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> figure = plots.response(record, bla.simulate(record))
+        >>> figure.axes[0].get_xlabel()
+        'time in the record (s)'
     """
     figure, axes = _panels(record)
     t = np.arange(record.skip, record.samples) / record.fs
@@ -117,6 +146,12 @@ def close_up(record: Record, y_lti: Array, y_hat: Array) -> Figure:
 
     Shape:
         y_lti, y_hat: (T, ny), simulated outputs in physical units.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> figure = plots.close_up(record, bla.simulate(record), model.simulate(record))
+        >>> len(figure.axes)  # the output with both errors, and the error of the NL-LFR
+        2
     """
     y = record.y[record.skip :]
     deviation = np.std(y, axis=0)
@@ -149,6 +184,13 @@ def static_map(z: Array, w: Array) -> Figure:
 
     Shape:
         z: (samples, nz), w: (samples, nw), normalised units, along a simulation.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> trajectory = model.signals(record)
+        >>> figure = plots.static_map(trajectory.z[0].numpy(), trajectory.w[0].numpy())
+        >>> figure.axes[0].get_ylabel()
+        'w1'
     """
     step = max(1, len(z) // MOST_POINTS)
     z, w = z[::step], w[::step]
@@ -177,7 +219,15 @@ def static_map(z: Array, w: Array) -> Figure:
 
 
 def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Figure:
-    """Errors on training and validation records against iteration, the kept iterate marked."""
+    """Errors on training and validation records against iteration, the kept iterate marked.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=3))
+        >>> figure = plots.convergence(result.history, result.chosen_iteration, unit="V")
+        >>> figure.axes[0].get_ylabel()
+        'simulation RMSE (V)'
+    """
     figure = Figure(figsize=(7, 4), layout="constrained")
     ax = figure.subplots()
     iterations = [p.iteration for p in history]
@@ -193,7 +243,13 @@ def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Fig
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG file."""
+    """The figure as a PNG file.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> plots.png(plots.response(record, bla.simulate(record)))[1:4]
+        b'PNG'
+    """
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=DPI)
     return stream.getvalue()
@@ -216,7 +272,15 @@ def _signals(
 
 
 def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
-    """A long signal as the smallest and largest sample of each of many short stretches."""
+    """A long signal as the smallest and largest sample of each of many short stretches.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> t = np.arange(100_000) / 1000
+        >>> short_t, short = plots.envelope(t, np.sin(t))
+        >>> len(short), bool(short.max() == np.sin(t).max())
+        (20000, True)
+    """
     stretch = len(signal) // (MOST_POINTS // 2)
     if stretch < 2:
         return t, signal

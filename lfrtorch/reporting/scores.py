@@ -45,7 +45,14 @@ class Score:
 
 
 def score(model: Model, bla: LinearModel | None, record: Record) -> Score:
-    """Scores of the model and of the linear model, where there is one, on one record."""
+    """Scores of the model and of the linear model, where there is one, on one record.
+
+    Example:
+        >>> from lfrtorch.reporting.scores import score
+        >>> found = score(model, bla, record)
+        >>> found.samples, np.allclose(found.rmse, found.lti_rmse)  # the fit has not begun
+        (400, True)
+    """
     y_hat = model.simulate(record)
     return Score(
         rmse=rmse(record, y_hat),

@@ -36,6 +36,14 @@ def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
 
     Shape:
         signals: (T, nu + ny).
+
+    Example:
+        >>> from lfrtorch.reporting.survey_plots import survey_figure
+        >>> from lfrtorch.survey.measurement import survey
+        >>> found = survey(record.u, record.y, fs=record.fs)
+        >>> figure = survey_figure(found, np.hstack([record.u, record.y]))
+        >>> len(figure.axes)  # three of the input, three of the output
+        6
     """
     rows = len(found.signals)
     figure = Figure(figsize=(13, 1.2 + 2.0 * rows), layout="constrained")

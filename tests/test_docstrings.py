@@ -1,0 +1,96 @@
+"""Every public function and class shows an example of its use, and the examples run."""
+
+import doctest
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+import lfrtorch
+from lfrtorch import FRF, LinearModel, Model, analysis, datasets, distributed
+from lfrtorch.reporting import linear_plots, monitor, plots, scores, survey_plots
+
+REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "api" / "lfrtorch.md"
+
+MODULES = [
+    *(importlib.import_module(f"{analysis.__name__}.{m.name}")
+      for m in pkgutil.iter_modules(analysis.__path__)),
+    *(getattr(datasets, name) for name in datasets.__all__),
+    distributed, plots, linear_plots, survey_plots,
+]  # fmt: skip
+
+WITHOUT = {"distributed.ProcessGroup"}
+"""``connect`` makes it where torchrun has started several processes."""
+
+PENDING = {
+    "LinearFit", "LinearModel", "OrderScan", "FRF", "estimate_bla", "estimate_frf", "load_records",
+    "multisine", "nrmse", "rmse", "scan_orders",
+}  # fmt: skip
+UNWRITTEN = ("LinearModel.", "FRF.", "analysis.", "datasets.")
+"""Names, and beginnings of names, whose examples are still to be written."""
+
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+def public() -> Iterator[tuple[str, Any]]:
+    """What users call, by name."""
+    for name in lfrtorch.__all__:
+        thing = getattr(lfrtorch, name)
+        if not isinstance(thing, ModuleType):
+            yield name, thing
+    for module in MODULES:
+        for name in getattr(module, "__all__", vars(module)):
+            thing = getattr(module, name)
+            own = hasattr(module, "__all__") or getattr(thing, "__module__", "") == module.__name__
+            if own and not name.startswith("_"):
+                yield f"{module.__name__.removeprefix('lfrtorch.')}.{name}", thing
+    for thing in (scores.score, *(getattr(monitor, name) for name in MONITORS)):
+        yield f"{thing.__module__.removeprefix('lfrtorch.')}.{thing.__qualname__}", thing
+    for kind in (Model, LinearModel, FRF):
+        for name, thing in vars(kind).items():
+            method = inspect.isfunction(thing) or isinstance(thing, classmethod | staticmethod)
+            if method and not name.startswith("_"):
+                yield f"{kind.__name__}.{name}", getattr(kind, name)
+
+
+def is_shown(thing: Any) -> bool:
+    """Functions and classes, but no exceptions."""
+    return callable(thing) and not (inspect.isclass(thing) and issubclass(thing, Exception))
+
+
+MONITORS = ("ProgressLine", "StartsLine", "TensorBoard", "Checkpoint")
+SHOWN = {name: thing for name, thing in public() if is_shown(thing) and name not in WITHOUT}
+
+
+@pytest.fixture(scope="module")
+def names() -> dict[str, Any]:
+    """What the examples know, as the reference says."""
+    code = REFERENCE.read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+    found: dict[str, Any] = {}
+    exec(code, found)
+    return found
+
+
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", SHOWN)
+def test_example_runs(
+    name: str, names: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    known = names | {"model": deepcopy(names["model"])}  # which a fit changes
+    finder = doctest.DocTestFinder(recurse=False)
+    tests = [test for test in finder.find(SHOWN[name], name, False, known) if test.examples]
+    if not tests and (name in PENDING or name.startswith(UNWRITTEN)):
+        pytest.skip("to be written")
+    assert tests, f"the docstring of {name} has no example"
+    monkeypatch.chdir(tmp_path)
+    report: list[str] = []
+    write: Callable[[str], Any] = report.append
+    for test in tests:
+        doctest.DocTestRunner(optionflags=FLAGS).run(test, out=write)
+    assert not report, "".join(report)
