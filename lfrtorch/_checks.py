@@ -57,7 +57,7 @@ def band(given: Any) -> None:
         raise ValueError(f"band is {given}; give two numbers, the lowest and the highest in Hz.")
 
 
-def lines(given: ArrayLike, samples: int) -> Integers:
+def dft_lines(given: ArrayLike, samples: int) -> Integers:
     """DFT lines, rising; refuse all but whole numbers between 0 and samples / 2."""
     found, last = np.asarray(given), (samples - 1) // 2
     if found.ndim != 1 or found.size == 0 or found.dtype.kind not in "iu":

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfrtorch import _checks
-from lfrtorch._checks import integer, number
-from lfrtorch._checks import lines as checked_lines
+from lfrtorch._checks import dft_lines, integer, number
 from lfrtorch._types import Array, Integers
 
 Grid = Literal["full", "odd", "random_odd"]
@@ -137,7 +136,7 @@ def _candidates(
     if lines is not None:
         if band is not None:
             raise ValueError("both lines and band are given; give one of them.")
-        return checked_lines(lines, samples)
+        return dft_lines(lines, samples)
     low, high = (0.0, fs / 2) if band is None else band
     if not 0 <= low <= high <= fs / 2:
         raise ValueError(

@@ -291,6 +291,18 @@ class Scaler:
     y_offset: Array
     y_scale: Array
 
+    @classmethod
+    def of(cls, records: Sequence[Record], *, offset: bool = True) -> Scaler:
+        """The means of the records' signals, or 0 without ``offset``, and the rms about them."""
+        us, ys = [r.u for r in records], [r.y for r in records]
+
+        def centre(signals: list[Array]) -> Array:
+            mean = np.concatenate(signals).mean(axis=0)
+            return mean if offset else np.zeros_like(mean)
+
+        u_offset, y_offset = centre(us), centre(ys)
+        return cls(u_offset, rms_scale(us, u_offset), y_offset, rms_scale(ys, y_offset))
+
     def normalise_u(self, u: Array) -> Array:
         """Input (T, nu) from physical to normalised units."""
         return (u - self.u_offset) / self.u_scale

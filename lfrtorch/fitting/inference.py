@@ -49,7 +49,7 @@ from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian, LevenbergM
 from lfrtorch.least_squares.simulation_problem import SimulationError
 from lfrtorch.least_squares.static_problem import StaticError
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.resolvent import resolvent
+from lfrtorch.linear.resolvent import solve_resolvent
 from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
@@ -128,7 +128,7 @@ def residual_of(model: Model, record: Record, generator: np.random.Generator) ->
     )
     U, Y = np.fft.rfft(u, axis=0), np.fft.rfft(y, axis=0)
     F = len(U)
-    R = resolvent(A, np.eye(len(A)), np.exp(2j * np.pi * np.arange(F) / T))
+    R = solve_resolvent(A, np.eye(len(A)), np.exp(2j * np.pi * np.arange(F) / T))
     X = (R @ (U @ Bu.T)[:, :, None])[:, :, 0]
     identity = np.broadcast_to(np.eye(len(Cy), dtype=complex), (F, len(Cy), len(Cy)))
     # Line 0 always: an offset of w that no error sees put the start at 3 times the linear error.

@@ -45,11 +45,10 @@ from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import INTERRUPTED, Monitor, StartDiverges, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
-from lfrtorch.linear.bla import data_scaler
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import MARGIN
 from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.records import Record, Scaler, as_records
 
 Sizes = dict[str, Any]
 
@@ -347,7 +346,7 @@ class _Judge:
 
     def __init__(self, records: list[Record], linear: LinearModel | None, ranks: Ranks) -> None:
         self._records, self._ranks = records, ranks
-        self._scale = data_scaler(records, offset=True).y_scale
+        self._scale = Scaler.of(records).y_scale
         blocks = in_blocks([record.y[record.skip :, 0] for record in records])
         self.counts = np.array([len(block) for block in blocks])
         self._linear = nan if linear is None else self._error(self.squares(linear))[0]

@@ -1,11 +1,17 @@
-"""Parametric best linear approximation: subspace start, refined in one of three errors."""
+"""Parametric best linear approximation (BLA): a linear state-space model of an order.
+
+Subspace methods give several first estimates of A and C, and least squares the B and D of each.
+The estimates that fit best are refined a few steps by Levenberg-Marquardt, the best of these to the
+end, as a single search may end in a poor minimum. The result is put into balanced coordinates and
+physical units, with its covariance and notes on what is doubtful.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal, Protocol, get_args
+from typing import Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
@@ -15,50 +21,60 @@ from lfrtorch._types import Array
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel, balancing
 from lfrtorch.linear.refinement import Matrices, Refined, Search
-from lfrtorch.linear.requirements import check_length, check_lines, check_signals, narrow
+from lfrtorch.linear.requirements import (
+    check_length,
+    check_signals,
+    check_spectral_data,
+    excitation_notes,
+)
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
-from lfrtorch.linear.spectral_data import Weight, lines_of, lines_of_response
-from lfrtorch.linear.subspace import Start
+from lfrtorch.linear.spectral_data import (
+    Weight,
+    spectral_data_of_records,
+    spectral_data_of_response,
+)
+from lfrtorch.linear.subspace import SubspaceEstimate
 from lfrtorch.metrics import rms
-from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
+from lfrtorch.records import Record, Scaler, as_records, without_coordinates
 
 Criterion = Literal["simulation", "prediction", "frequency"]
 
 FIRST_STEPS, FINALISTS = 8, 6
-"""Iterations after which the starts are compared, and how many of them go on."""
+"""Iterations after which the searches are compared, and how many of them go on."""
 
 SAME, AGREED = 1.0 + 2e-6, 3
-"""Ratio of the costs of two searches up to which they are in the same minimum, and how many of
-them in a row end the race."""
+"""Ratio of two costs up to which two searches are in the same minimum; the comparison ends if this
+many in a row are in the best one."""
 
 ALIKE, HOPELESS = 1.001, 10.0
-"""Starts whose costs differ by a smaller factor count as one; by a larger one, as not worth it."""
+"""Candidates whose costs differ by a factor below ALIKE count as one; a candidate whose cost is
+HOPELESS times the best is dropped."""
 
 EMPTY = 1e-10
-"""Relative singular value of an order that the data do not carry: rounding errors."""
+"""Relative singular values below this are rounding errors: the data do not carry the order."""
 
 AT_THE_LIMIT = 1.0 - 1e-4
-"""Pole radius above which a model looks like one of unstable data."""
+"""Radius of a pole above which the data may drift or come from an unstable system."""
 
 ROUNDING = 1e-6
-"""Relative error below which a fit is perfect."""
+"""A fit with a relative error below this is perfect."""
 
 POOR = 0.7
-"""Error relative to the output above which a model explains little: less than half its power."""
+"""A model with an error above this part of the output's rms explains little: half its power."""
 
 BETTER = 0.25
-"""Part of the stable models' cost below which the data are those of an unstable one."""
+"""The data come from an unstable system if its cost is below this part of a stable model's."""
 
 
 class LinearLeastSquares(Protocol):
     """Least squares between data and a linear model, in normalised units."""
 
-    def contenders(self, nx: int) -> int:
-        """Starts that are worth a refinement: several where an iteration takes milliseconds."""
+    def most_candidates(self, nx: int) -> int:
+        """How many subspace estimates are refined: several if an iteration takes milliseconds."""
         ...
 
-    def starts(self, nx: int) -> list[Start]:
+    def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
         """Subspace estimates of A and C."""
         ...
 
@@ -67,7 +83,7 @@ class LinearLeastSquares(Protocol):
         ...
 
     def state_deviation(self, matrices: Matrices) -> Array:
-        """Standard deviation (nx,) of the states over the data."""
+        """Standard deviation (nx,) of the states."""
         ...
 
     def search(self, matrices: Matrices) -> Search:
@@ -75,11 +91,11 @@ class LinearLeastSquares(Protocol):
         ...
 
     def improbability(self, search: Search) -> float:
-        """Where a search stands: its cost, and that of start states that no input leads to."""
+        """The cost of a search, raised for initial states that the inputs hardly lead to."""
         ...
 
     def refined(self, search: Search) -> Refined:
-        """What a search has found."""
+        """The present result of a search."""
         ...
 
 
@@ -95,46 +111,46 @@ def estimate_bla(
     coordinates: Literal["balanced", "given"] = "balanced",
     max_iter: int = 200,
 ) -> LinearModel:
-    """Best linear approximation of order ``nx``, stable, by least squares.
+    """Best linear approximation of order ``nx``: a stable model that minimises a squared error.
 
-    Subspace estimates give A and C, a linear least-squares fit B and D; the best of them is refined
-    by Levenberg-Marquardt in the error of choice. Unstable poles of a start are reflected into the
-    unit circle, and the refinement rejects every step that brings one out.
+    Subspace methods estimate A and C, linear least squares B and D, and Levenberg-Marquardt refines
+    the best of these models in the error of choice. Unstable poles of a subspace estimate are
+    reflected into the unit circle, and the refinement rejects every step to an unstable model.
 
-    - ``"simulation"``, the usual one of records: simulated minus measured output. Periodic records
-      in steady state are fitted line by line of their spectra, the same sum of squares at a
+    - ``"simulation"``, the default for records: simulated minus measured output. For periodic
+      records in steady state it is computed from their spectra, the same sum of squares at a
       fraction of the work.
-    - ``"prediction"``: output predicted one sample ahead by an innovation model: more precise where
-      disturbances act on the states. The gain K is part of the model. Records in steady state get
-      an estimated start state, as their noise does not repeat.
-    - ``"frequency"``, the only one of a response: the nonparametric response, weighted by its
-      variance. Records are turned into a response by ``estimate_frf``.
+    - ``"prediction"``: output predicted one sample ahead by an innovation model, more precise if
+      disturbances act on the states. The gain K is part of the model. For records in steady state
+      an initial state is estimated, as their noise does not repeat.
+    - ``"frequency"``, the default for a response and its only one: the nonparametric response,
+      weighted by its variance. ``estimate_frf`` turns records into a response.
 
     Args:
-        data: records, or a nonparametric response. Start states that are given (in another model's
-            coordinates) are estimated.
+        data: records, or a nonparametric response. A given ``x0`` of a record is in the coordinates
+            of another model, so that the initial state is estimated instead.
         nx: order.
-        refine: the error.
+        refine: the error. Default: see above.
         weight: of the errors of a response: one over its ``"total"`` or ``"noise"`` variance,
-            ``"none"``, or weights of one's own. Where left out the total variance, or the noise's
-            where that is all there is, or none.
+            ``"none"``, or own weights. Default: the total variance if it is known, else that of the
+            noise if it is known, else none.
         offset: whether constants are removed and stored as operating point.
-        feedthrough: whether the input acts on the output at once; D is 0 otherwise, as it must be
+        feedthrough: whether the input acts on the output at once; otherwise D is 0, as it must be
             for data under feedback, which a prediction fits without bias.
         coordinates: ``"balanced"`` states, or ``"given"`` by the subspace estimate.
-        max_iter: iterations of the refinement; 0 leaves the start.
+        max_iter: iterations of the refinement; 0 keeps the best subspace estimate.
 
     Shape:
         weight: (F, ny, nu).
 
     Returns:
-        The model, with states of unit standard deviation over the data (of a response: under an
-        input of equal power in all lines), the covariance of its parameters, and notes in ``fit``.
-        The covariance holds for errors of any spectrum, and for white ones where signals are
-        predicted or where there are millions of them.
+        The model, with states of unit standard deviation over the data (for a response: under an
+        input of equal power at all lines), the covariance of its parameters, and notes in ``fit``.
+        The covariance holds for errors of any spectrum; for predictions, and for millions of
+        samples, it assumes white errors.
 
     Raises:
-        ValueError: an order below 1, a constant channel, or data that do not reach for the order.
+        ValueError: an order below 1, a constant channel, or too few data for the order.
 
     References:
         Pintelon and Schoukens, System Identification, 2nd ed., Wiley 2012, chapters 4, 9 and 10.
@@ -157,14 +173,14 @@ def estimate_bla(
             raise ValueError(f"refine is {refine!r}, an error of records; a response has none.")
         refine = "frequency"
         about = data if isinstance(data, FRF) else estimate_frf(records)
-        lines, scaler, known, more = lines_of_response(about, weight, offset=offset)
-        problem = ResponseFit(lines, known=known, feedthrough=feedthrough)
+        spectra, scaler, known, more = spectral_data_of_response(about, weight, offset=offset)
+        problem = ResponseFit(spectra, known=known, feedthrough=feedthrough)
         notes += [*about.notes, *more]
     else:
         if weight is not None:
             raise ValueError("weight is that of a response: use refine='frequency'.")
         refine, about = refine or "simulation", records[0]
-        scaler = data_scaler(records, offset=offset)
+        scaler = Scaler.of(records, offset=offset)
         problem = _of_records(
             records,
             scaler,
@@ -173,14 +189,14 @@ def estimate_bla(
             feedthrough=feedthrough,
         )
     if isinstance(problem, ResponseFit):
-        check_lines(problem.lines, nx)
+        check_spectral_data(problem.data, nx)
     else:
         check_length(records, nx)
-        notes += narrow(records, nx)
+        notes += excitation_notes(records, nx)
 
     balanced = coordinates == "balanced"
-    start, found = _best(problem, _starts(problem, nx), max_iter, balanced=balanced)
-    notes += _findings(problem, start, found)
+    estimate, found = _best(problem, _candidates(problem, nx), max_iter, balanced=balanced)
+    notes += _notes(problem, estimate, found)
     if max_iter and found.iterations >= max_iter:
         notes.append(f"the search was stopped after {max_iter} iterations: raise max_iter.")
     model = _physical(found, scaler, about)
@@ -190,7 +206,7 @@ def estimate_bla(
         model = replace(model, y_offset=model.y_offset + scaler.y_scale * found.constant)
     elif records:
         errors = np.concatenate([(r.y - model.simulate(r))[r.skip :] for r in records])
-        if offset:  # the constant that lines leave out
+        if offset:  # the fit to spectra has eliminated the constant
             model = replace(model, y_offset=model.y_offset + errors.mean(axis=0))
             errors = errors - errors.mean(axis=0)
         if refine == "simulation":
@@ -198,7 +214,7 @@ def estimate_bla(
     if rmse > POOR and refine != "frequency":
         notes.append(
             f"the model explains little: {100 * rmse:.0f} % of the output's rms remain. Look "
-            "at the columns (are input and output swapped?), for drift (try offset=False where "
+            "at the columns (are input and output swapped?), for drift (try offset=False if "
             "the system integrates), a long delay, strong noise or an even nonlinearity."
         )
     return replace(
@@ -209,84 +225,82 @@ def estimate_bla(
             iterations=found.iterations,
             reason=found.reason,
             seconds=time.perf_counter() - clock,
-            singular_values=tuple(map(float, start.singular_values)),
+            singular_values=tuple(map(float, estimate.singular_values)),
             notes=tuple(notes),
         ),
     )
 
 
-def data_scaler(records: list[Record], *, offset: bool) -> Scaler:
-    """Means (or zeros) of the records' signals, and their rms about them."""
-    us, ys = [r.u for r in records], [r.y for r in records]
-
-    def centre(signals: list[Array]) -> Array:
-        mean = np.concatenate(signals).mean(axis=0)
-        return mean if offset else np.zeros_like(mean)
-
-    u_offset, y_offset = centre(us), centre(ys)
-    return Scaler(u_offset, rms_scale(us, u_offset), y_offset, rms_scale(ys, y_offset))
-
-
 def _of_records(
     records: list[Record], scaler: Scaler, *, offset: bool, prediction: bool, feedthrough: bool
 ) -> ResponseFit | SignalFit:
-    """By their lines, where that is the same, or by their signals."""
+    """The fit to the spectra of the records if that is the same, else to their signals."""
     us = [scaler.normalise_u(r.u) for r in records]
     ys = [scaler.normalise_y(r.y) for r in records]
     if not prediction:
-        lines = lines_of(us, ys, records, offset=offset)
-        if lines is not None:
-            return ResponseFit(lines, known=False, feedthrough=feedthrough)
+        spectra = spectral_data_of_records(us, ys, records, offset=offset)
+        if spectra is not None:
+            return ResponseFit(spectra, known=False, feedthrough=feedthrough)
     return SignalFit(us, ys, records, offset=offset, prediction=prediction, feedthrough=feedthrough)
 
 
-def _starts(problem: LinearLeastSquares, nx: int) -> list[tuple[float, Start, Matrices]]:
-    """Cost, A and C, and the system with the best B and D of each subspace estimate, best first."""
+class _Candidate(NamedTuple):
+    """A subspace estimate with the best B and D, and its cost."""
+
+    cost: float
+    estimate: SubspaceEstimate
+    matrices: Matrices
+
+
+def _candidates(problem: LinearLeastSquares, nx: int) -> list[_Candidate]:
+    """The candidates of finite cost, the best one first."""
     found = []
-    for start in problem.starts(nx):
-        cost, matrices = problem.with_input_matrices(start.A, start.C)
+    for estimate in problem.subspace_estimates(nx):
+        cost, matrices = problem.with_input_matrices(estimate.A, estimate.C)
         if np.isfinite(cost):
-            found.append((cost, start, matrices))
+            found.append(_Candidate(cost, estimate, matrices))
     if not found:
         raise ValueError(
             f"no stable linear model of order {nx} could be started from these data; "
             "try a lower nx or a longer record."
         )
-    return sorted(found, key=lambda each: each[0])
+    return sorted(found, key=lambda each: each.cost)
 
 
 def _best(
     problem: LinearLeastSquares,
-    starts: list[tuple[float, Start, Matrices]],
+    candidates: list[_Candidate],
     max_iter: int,
     *,
     balanced: bool,
-) -> tuple[Start, Refined]:
-    """The best of the minima that the starts lead to: after a few steps the best few go on.
+) -> tuple[SubspaceEstimate, Refined]:
+    """The best of the minima that the candidates lead to: after a few steps the best few go on.
 
-    The start that fits best may lead to a poor minimum: at the highest level of the parallel
+    The candidate that fits best may lead to a poor minimum: at the highest level of the parallel
     Wiener-Hammerstein system to one whose error on the data fitted is 4 % above the best one's.
 
-    Where start states are estimated, the most probable minimum is taken. The one of least cost may
-    spend a mode on drift: a pole of 0.999996 that the input hardly moves, from 500 times its
-    deviation, on seven eighths of the cascaded tanks' record.
+    If initial states are estimated, the most probable minimum is taken. The one of least cost may
+    spend a mode on drift: on seven eighths of the cascaded tanks' record a pole of 0.999996, which
+    the input hardly moves, from an initial state of 500 times its deviation.
     """
 
-    field, last = [], 0.0
-    for cost, start, matrices in starts[: problem.contenders(len(starts[0][1].A))]:
-        if cost > ALIKE * last and (not field or cost < HOPELESS * starts[0][0]):
-            field.append((start, matrices))
-            last = cost
-    searches: list[tuple[Start, Search]] = []
-    for start, matrices in field if max_iter > FIRST_STEPS else field[:1]:
+    field: list[_Candidate] = []
+    last = 0.0
+    for candidate in candidates[: problem.most_candidates(len(candidates[0].estimate.A))]:
+        hopeless = field and candidate.cost >= HOPELESS * candidates[0].cost
+        if candidate.cost > ALIKE * last and not hopeless:
+            field.append(candidate)
+            last = candidate.cost
+    searches: list[tuple[SubspaceEstimate, Search]] = []
+    for _, estimate, matrices in field if max_iter > FIRST_STEPS else field[:1]:
         try:
             search = problem.search(_scaled(problem, matrices, balanced=balanced))
-        except ValueError:  # states that the data hardly move: their scaling is all rounding
+        except ValueError:  # the data hardly move some states: their scaling is a rounding error
             search = problem.search(matrices)
-        searches.append((start, search.advance(min(FIRST_STEPS, max_iter))))
+        searches.append((estimate, search.advance(min(FIRST_STEPS, max_iter))))
         costs = [search.state.cost for _, search in searches]
         if len(costs) >= AGREED and max(costs[-AGREED:]) <= SAME * min(costs):
-            break  # so many in a row went to the best minimum so far: the others would
+            break  # the last ones are all in the best minimum: the others would be, too
     searches.sort(key=lambda each: each[1].state.cost)
     costs = [0.0, *(search.state.cost for _, search in searches)]
     distinct = [
@@ -297,24 +311,24 @@ def _best(
     finalists = (distinct or searches)[:FINALISTS]
     for _, search in finalists:
         search.advance(max_iter)
-    start, search = min(finalists, key=lambda each: problem.improbability(each[1]))
-    return start, problem.refined(search)
+    estimate, search = min(finalists, key=lambda each: problem.improbability(each[1]))
+    return estimate, problem.refined(search)
 
 
-def _findings(problem: LinearLeastSquares, start: Start, found: Refined) -> list[str]:
+def _notes(problem: LinearLeastSquares, estimate: SubspaceEstimate, found: Refined) -> list[str]:
     """What the subspace and the poles say of data and order."""
-    nx, notes, s = len(found.A), [], start.singular_values
+    nx, notes, s = len(found.A), [], estimate.singular_values
     if len(s) >= nx and s[nx - 1] < EMPTY:
         carried = int((s > EMPTY).sum())
         notes.append(
             f"order {nx} is above what the data carry: the subspace has {carried} direction(s) "
             f"above rounding errors; try nx={max(1, carried)}."
         )
-    if start.unstable is not None and found.rmse > ROUNDING:
-        cost, _ = problem.with_input_matrices(start.unstable, start.C)
+    if estimate.unstable is not None and found.rmse > ROUNDING:
+        cost, _ = problem.with_input_matrices(estimate.unstable, estimate.C)
         stable, _ = problem.with_input_matrices(found.A, found.C)
         if cost < BETTER * stable:
-            radius = float(np.abs(np.linalg.eigvals(start.unstable)).max())
+            radius = float(np.abs(np.linalg.eigvals(estimate.unstable)).max())
             return [
                 *notes,
                 f"the data come from an unstable system: a pole of radius {radius:.4g} explains "
@@ -331,7 +345,7 @@ def _findings(problem: LinearLeastSquares, start: Start, found: Refined) -> list
 
 
 def _physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearModel:
-    """The model in physical units, with all that is known of its uncertainty."""
+    """The model in physical units, with its covariance."""
     nx = len(found.A)
     by_u, by_y = 1.0 / scaler.u_scale, scaler.y_scale[:, None]
     sizes = [np.ones((nx, nx)), np.tile(by_u, (nx, 1)), np.tile(by_y, (1, nx)), by_y * by_u]
@@ -351,7 +365,7 @@ def _physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearMode
 
 
 def _scaled(problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool) -> Matrices:
-    """The system in balanced coordinates with states of unit deviation."""
+    """The system with states of unit standard deviation, in balanced coordinates if wanted."""
     A, B, C, D = matrices
     T, inverse = _transformation(problem, matrices, balanced=balanced)
     return T @ A @ inverse, T @ B, C @ inverse, D
@@ -360,7 +374,7 @@ def _scaled(problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool) 
 def _transformation(
     problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool
 ) -> tuple[Array, Array]:
-    """T and T⁻¹ (nx, nx) to balanced coordinates, or from the given ones, of unit deviation."""
+    """T and T⁻¹ (nx, nx) that give states of unit deviation, in balanced coordinates if wanted."""
     A, B, C, D = matrices
     T = inverse = np.eye(len(A))
     if balanced:

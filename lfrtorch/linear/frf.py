@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfrtorch import _checks
-from lfrtorch._checks import integer
-from lfrtorch._checks import lines as checked_lines
+from lfrtorch._checks import dft_lines, integer
 from lfrtorch._threads import spread_by_hand
 from lfrtorch._types import Array, Complex, Integers
-from lfrtorch.linear.local_polynomial import half_width, local_polynomial
+from lfrtorch.linear.local_polynomial import fit_local_polynomials, half_width
 from lfrtorch.linear.regression import Regression, covariance, outer, regress
 from lfrtorch.linear.spectra import (
     Removal,
@@ -362,7 +361,7 @@ def _local_polynomial(
         )
     lines = powered_lines(spectra, n)
     if given is not None:
-        chosen = checked_lines(given, spectra.N)
+        chosen = dft_lines(given, spectra.N)
         missing = np.setdiff1d(chosen, lines)
         if missing.size:
             raise ValueError(
@@ -373,7 +372,7 @@ def _local_polynomial(
     lines = in_band(lines, spectra.resolution, band)
     # Line 0 holds the offsets and stays out of all windows.
     U, Y = spectra.U[1 : last + 1], spectra.Y[1 : last + 1]
-    G, cov, determined = local_polynomial(U, Y, lines - 1, order=order, n=n)
+    G, cov, determined = fit_local_polynomials(U, Y, lines - 1, order=order, n=n)
     if not determined.any():
         raise ValueError(
             "the inputs determine the response at no line: they depend on each other, or excite "

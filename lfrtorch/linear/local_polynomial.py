@@ -21,7 +21,7 @@ def half_width(order: int, degrees_of_freedom: int, nu: int, records: int) -> in
     return (rows + order + 1) // 2
 
 
-def local_polynomial(
+def fit_local_polynomials(
     U: Complex, Y: Complex, centres: Integers, *, order: int, n: int
 ) -> tuple[Complex, Complex, NDArray[np.bool_]]:
     """Frequency response at lines of spectra that hold transients, and its covariance.

@@ -16,7 +16,7 @@ from lfrtorch import _checkpoint
 from lfrtorch._types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.linear.resolvent import frequency_response, resolvents, slopes
+from lfrtorch.linear.resolvent import frequency_response, response_jacobian, solve_resolvents
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler, without_coordinates
 
@@ -140,9 +140,9 @@ class LinearModel:
                 "the covariance of this model is not known: estimate_bla finds it in a refinement."
             )
         z = self._z(frequencies)
-        X, L = resolvents(self.A, self.B, self.C, z)
+        X, L = solve_resolvents(self.A, self.B, self.C, z)
         nu = len(self.inputs)
-        J = slopes(X, L, np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu)))
+        J = response_jacobian(X, L, np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu)))
         variance = np.einsum("foip,pq,foiq->foi", J, self.covariance, J.conj(), optimize=True)
         return np.sqrt(np.maximum(variance.real, 0.0))
 

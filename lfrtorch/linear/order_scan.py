@@ -10,11 +10,11 @@ import numpy as np
 
 from lfrtorch import _tables
 from lfrtorch._checks import integer
-from lfrtorch.linear.bla import data_scaler, estimate_bla
+from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rms
-from lfrtorch.records import Record, as_records
+from lfrtorch.records import Record, Scaler, as_records
 
 ORDERS = range(1, 13)
 
@@ -104,7 +104,7 @@ def scan_orders(
                 raise
             break
     if judges:
-        scale = data_scaler(judges, offset=True).y_scale
+        scale = Scaler.of(judges).y_scale
         scores = [_validation(model, judges, scale) for model in models]
     else:
         scores = [_description_length(model, data) for model in models]

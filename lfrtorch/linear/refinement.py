@@ -1,4 +1,4 @@
-"""The search that refines a linear model, and what comes out of it."""
+"""Refinement of a linear model by Levenberg-Marquardt, and its result."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Matrices = tuple[Array, Array, Array, Array]
 """A, B, C, D."""
 
 TOLERANCE = 1e-9
-"""Relative decrease of the cost that counts as none."""
+"""A relative decrease of the cost below this ends the search."""
 
 EXHAUSTED = "maximum number of iterations"
-"""Why a search ended that nothing else ended."""
+"""Reason of a search that reached the maximum number of iterations."""
 
 TRUNCATION = 1e-12
-"""Relative singular value that a covariance leaves out as gauge."""
+"""Relative singular value below which a direction of θ counts as gauge, which has no covariance."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,14 @@ class Refined:
 
     Args:
         A, B, C, D: system matrices.
-        covariance: of their entries, each by rows, one after another; of a start none.
+        covariance: of their entries, row by row, one matrix after another; ``None`` before the
+            first iteration.
         rmse: root mean squared error at the end.
         iterations: of the search.
         reason: why it ended.
-        constant: output (ny,) at rest, where it was a parameter.
-        K: innovation gain, where it was modelled.
-        innovation_covariance: of the innovations, where they were modelled.
+        constant: output (ny,) at rest, ``None`` if it was no parameter.
+        K: innovation gain, ``None`` without a noise model.
+        innovation_covariance: of the innovations, ``None`` without a noise model.
     """
 
     A: Array
@@ -58,14 +59,14 @@ class Refined:
 
 
 class Search:
-    """Levenberg-Marquardt from one start, in as many instalments as wanted.
+    """Levenberg-Marquardt from one initial model, which can be interrupted and continued.
 
     Geodesic acceleration halves the iterations: 60 to 80 instead of 150 and more for order 12 at
     the five levels of the parallel Wiener-Hammerstein system.
 
     Args:
         problem: what is minimised.
-        theta: start (P,).
+        theta: initial parameters (P,).
     """
 
     def __init__(self, problem: Any, theta: Tensor) -> None:
@@ -81,5 +82,5 @@ class Search:
 
     @property
     def reason(self) -> str:
-        """Why it ended where it stands."""
+        """Why it ended."""
         return self.state.reason or EXHAUSTED

@@ -1,10 +1,10 @@
-"""What data must have for a linear model of an order: excitation, length, lines."""
+"""What data must have for a linear model of an order: excitation, length, enough equations."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from lfrtorch.linear.spectral_data import Lines
+from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import shortest, suffice
 from lfrtorch.metrics import rms
 from lfrtorch.records import Record
@@ -41,19 +41,19 @@ def check_length(records: list[Record], nx: int) -> None:
         )
 
 
-def check_lines(lines: Lines, nx: int) -> None:
-    """Refuse fewer lines than unknowns with a ValueError."""
-    nu, ny = lines.U.shape[1], lines.Y.shape[1]
-    unknowns, equations = nx * (nu + ny) + nu * ny, lines.equations
+def check_spectral_data(data: SpectralData, nx: int) -> None:
+    """Refuse fewer equations than unknowns with a ValueError."""
+    nu, ny = data.U.shape[1], data.Y.shape[1]
+    unknowns, equations = nx * (nu + ny) + nu * ny, data.equations
     if equations < unknowns:
         raise ValueError(
-            f"{len(lines.z)} excited line(s) make {equations} equations; order nx={nx} with {nu} "
+            f"{len(data.z)} excited line(s) make {equations} equations; order nx={nx} with {nu} "
             f"input(s) and {ny} output(s) has {unknowns} unknowns: excite more lines, or lower nx."
         )
 
 
-def narrow(records: list[Record], nx: int) -> list[str]:
-    """A note where the input moves in too few directions to tell all parameters apart."""
+def excitation_notes(records: list[Record], nx: int) -> list[str]:
+    """A note if the input moves in too few directions to tell all parameters apart."""
     nu = records[0].u.shape[1]
     wanted = 2 * nx + 1
     windows = [

@@ -1,25 +1,31 @@
-"""Frequency response of a linear state-space model, and its slope with the matrices.
+"""Frequency response of a linear state-space model, and its Jacobian with the matrices.
 
-The response at z is G = C (zI - A)⁻¹ B + D. With X = (zI - A)⁻¹ B and L = C (zI - A)⁻¹ its slope is
-a product: dG = [L I] [dA dB; dC dD] [X; I].
+At a point z of the unit circle the response is G = C (zI - A)⁻¹ B + D. Two parts of it are needed
+for the derivative: X = (zI - A)⁻¹ B, what the inputs do to the states, and L = C (zI - A)⁻¹, what a
+disturbance of the states does to the outputs. A small change of the matrices then changes G by
+dG = [L I] [dA dB; dC dD] [X; I], a product without any further inverse.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.linalg
+from jaxtyping import Complex128, Float, Integer
+from numpy.typing import NDArray
 
 from lfrtorch._types import Array, Complex, Integers
 
 
-def resolvent(A: Array, B: Array, z: Complex) -> Complex:
+def solve_resolvent(
+    A: Float[Array, "nx nx"], B: Float[Array, "nx nu"], z: Complex128[Complex, " F"]
+) -> Complex128[Complex, "F nx nu"]:
     """X = (zI - A)⁻¹ B.
 
-    By a Schur form of A, one substitution over all z together: as accurate as a solution for every
-    z, where eigenvectors would lose digits at poles that lie close together.
-
-    Shape:
-        A: (nx, nx), B: (nx, nu), z: (F,) -> (F, nx, nu).
+    A Schur form A = Q T Qᴴ turns this into a back substitution with zI - T, done for all z at once.
+    It is as accurate as a solution for every z; eigenvectors would lose digits if poles lie close
+    together.
     """
     T, Q = scipy.linalg.schur(A, output="complex")
     forced = Q.conj().T @ B
@@ -31,30 +37,39 @@ def resolvent(A: Array, B: Array, z: Complex) -> Complex:
     return (Q @ X).reshape(nx, nu, F).transpose(2, 0, 1)
 
 
-def resolvents(A: Array, B: Array, C: Array, z: Complex) -> tuple[Complex, Complex]:
-    """X = (zI - A)⁻¹ B and L = C (zI - A)⁻¹.
-
-    Shape:
-        z: (F,) -> X: (F, nx, nu), L: (F, ny, nx).
-    """
-    return resolvent(A, B, z), resolvent(A.T, C.T, z).swapaxes(1, 2)
-
-
-def frequency_response(A: Array, B: Array, C: Array, D: Array, z: Complex) -> Complex:
-    """G (F, ny, nu) at z (F,)."""
-    return np.asarray(C @ resolvent(A, B, z) + D, dtype=np.complex128)
+def solve_resolvents(
+    A: Float[Array, "nx nx"],
+    B: Float[Array, "nx nu"],
+    C: Float[Array, "ny nx"],
+    z: Complex128[Complex, " F"],
+) -> tuple[Complex128[Complex, "F nx nu"], Complex128[Complex, "F ny nx"]]:
+    """X = (zI - A)⁻¹ B and L = C (zI - A)⁻¹."""
+    return solve_resolvent(A, B, z), solve_resolvent(A.T, C.T, z).swapaxes(1, 2)
 
 
-def slopes(X: Complex, L: Complex, U: Complex, columns: Integers | None = None) -> Complex:
-    """Slope of G U with the entries of A, B, C, D, each by rows, one after another.
+def frequency_response(
+    A: Float[Array, "nx nx"],
+    B: Float[Array, "nx nu"],
+    C: Float[Array, "ny nx"],
+    D: Float[Array, "ny nu"],
+    z: Complex128[Complex, " F"],
+) -> Complex128[Complex, "F ny nu"]:
+    """G = C (zI - A)⁻¹ B + D."""
+    return np.asarray(C @ solve_resolvent(A, B, z) + D, dtype=np.complex128)
+
+
+def response_jacobian(
+    X: Complex128[Complex, "F nx nu"],
+    L: Complex128[Complex, "F ny nx"],
+    U: Complex128[Complex, "F nu m"],
+    columns: Integer[NDArray[Any], " K"] | None = None,
+) -> Complex128[Complex, "F ny m K"]:
+    """Derivative of G U with the entries of A, B, C, D, row by row, one matrix after another.
 
     Args:
-        X, L: the resolvents.
+        X, L: see ``solve_resolvents``.
         U: input spectra.
-        columns: the entries wanted; all of them where left out.
-
-    Shape:
-        X: (F, nx, nu), L: (F, ny, nx), U: (F, nu, m), columns: (K,) -> (F, ny, m, K).
+        columns: which entries. Default: all P.
     """
     F, nx, nu = X.shape
     ny = L.shape[1]

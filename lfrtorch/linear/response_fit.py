@@ -1,4 +1,10 @@
-"""Fit of a linear model to spectral lines Y = G(z) U: least squares in the response."""
+"""Fit of a linear model to spectra Y = G(z) U: least squares in the frequency domain.
+
+The error at each DFT line is the measured Y minus G(z) U, where G(z) = C (zI - A)⁻¹ B + D is the
+response of the model. For given A and C it is linear in B and D, which one least-squares problem
+yields; that completes a subspace estimate to a model. Levenberg-Marquardt then refines all four
+matrices. A step that brings a pole out of the unit circle has an infinite cost, and is rejected.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +13,7 @@ import math
 import numpy as np
 import scipy.linalg
 import torch
+from jaxtyping import Complex128, Float
 from torch import Tensor
 
 from lfrtorch._types import Array, Complex
@@ -14,49 +21,49 @@ from lfrtorch.least_squares.gauge import Reduction, reduction
 from lfrtorch.least_squares.linear_systems import Orthogonal
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
-from lfrtorch.linear.resolvent import resolvent, resolvents, slopes
-from lfrtorch.linear.spectral_data import Lines
-from lfrtorch.linear.subspace import LARGEST_POLE, Start, from_spectra
+from lfrtorch.linear.resolvent import response_jacobian, solve_resolvent, solve_resolvents
+from lfrtorch.linear.spectral_data import SpectralData
+from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_spectra
 
-MOST_STARTS, LARGE = 12, 250_000
-"""Starts that are refined, up to so many errors times unknowns."""
+MOST_CANDIDATES, LARGE = 12, 250_000
+"""Subspace estimates that are refined; only one if errors times unknowns are LARGE or more."""
 
 
 class ResponseFit:
-    """Linear fits to lines.
+    """The least-squares problem between spectra and linear models of any order.
 
     Args:
-        lines: what is fitted.
-        known: whether the weights are the inverse variances of the lines.
+        data: what is fitted.
+        known: whether the weights are the inverse variances of the errors.
         feedthrough: whether D is a parameter; it is 0 otherwise.
     """
 
-    def __init__(self, lines: Lines, *, known: bool, feedthrough: bool = True) -> None:
-        self.lines, self.known, self.feedthrough = lines, known, feedthrough
+    def __init__(self, data: SpectralData, *, known: bool, feedthrough: bool = True) -> None:
+        self.data, self.known, self.feedthrough = data, known, feedthrough
 
-    def contenders(self, nx: int) -> int:
-        """Starts that are worth a refinement: one where there are many equations and unknowns."""
-        nu, ny = self.lines.U.shape[1], self.lines.Y.shape[1]
-        return MOST_STARTS if self.lines.Y.size * nx * (nu + ny) < LARGE else 1
+    def most_candidates(self, nx: int) -> int:
+        """How many subspace estimates are refined: one if an iteration takes long."""
+        nu, ny = self.data.U.shape[1], self.data.Y.shape[1]
+        return MOST_CANDIDATES if self.data.Y.size * nx * (nu + ny) < LARGE else 1
 
-    def starts(self, nx: int) -> list[Start]:
+    def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
         """Subspace estimates of A and C."""
-        root = np.ones(len(self.lines.z))
-        if self.lines.weight is not None:
-            root = np.sqrt(self.lines.weight.mean(axis=(1, 2)))
+        root = np.ones(len(self.data.z))
+        if self.data.weight is not None:
+            root = np.sqrt(self.data.weight.mean(axis=(1, 2)))
         root = root[:, None, None]
-        return from_spectra(self.lines.z, root * self.lines.U, root * self.lines.Y, nx)
+        return from_spectra(self.data.z, root * self.data.U, root * self.data.Y, nx)
 
     def with_input_matrices(self, A: Array, C: Array) -> tuple[float, Matrices]:
         """Cost and system with the best B and D for A and C: G is linear in them."""
-        nx, nu, ny = len(A), self.lines.U.shape[1], len(C)
+        nx, nu, ny = len(A), self.data.U.shape[1], len(C)
         matrices = A, np.zeros((nx, nu)), C, np.zeros((ny, nu))
-        X, L = resolvents(*matrices[:3], self.lines.z)
+        X, L = solve_resolvents(*matrices[:3], self.data.z)
         of_B = nx * nx + np.arange(nx * nu)
         of_D = nx * (nx + nu + ny) + np.arange(ny * nu)
         columns = np.concatenate([of_B, of_D]) if self.feedthrough else of_B
-        J = _real(self.lines.weighted(slopes(X, L, self.lines.U, columns))).numpy()
-        r = _real(self.lines.weighted(self.lines.Y)).numpy()
+        J = _real(self.data.weighted(response_jacobian(X, L, self.data.U, columns))).numpy()
+        r = _real(self.data.weighted(self.data.Y)).numpy()
         if not np.isfinite(J).all():
             return np.inf, matrices
         size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
@@ -66,51 +73,51 @@ class ResponseFit:
         return float(np.sum((r - J @ best) ** 2)), matrices
 
     def state_deviation(self, matrices: Matrices) -> Array:
-        """Standard deviation (nx,) of the states over the lines."""
-        X = resolvent(*matrices[:2], self.lines.z)
-        return np.sqrt((np.abs(X @ self.lines.U) ** 2).sum(axis=(0, 2)))
+        """Standard deviation (nx,) of the states."""
+        X = solve_resolvent(*matrices[:2], self.data.z)
+        return np.sqrt((np.abs(X @ self.data.U) ** 2).sum(axis=(0, 2)))
 
     def search(self, matrices: Matrices) -> Search:
-        """A search over A, B, C, D from the given ones."""
-        problem = ResponseError(
-            self.lines, len(matrices[0]), LARGEST_POLE, feedthrough=self.feedthrough
+        """A search over A, B, C, D that starts from the given ones."""
+        problem = ResponseProblem(
+            self.data, len(matrices[0]), LARGEST_POLE, feedthrough=self.feedthrough
         )
         return Search(problem, torch.as_tensor(np.concatenate([m.ravel() for m in matrices])))
 
     def improbability(self, search: Search) -> float:
-        """The cost: lines have no start states."""
+        """The cost: spectra have no initial states."""
         return search.state.cost
 
     def refined(self, search: Search) -> Refined:
-        """Where a search stands, with the covariance there."""
+        """The present result of a search, with its covariance."""
         problem, state = search.problem, search.state
         jacobian = problem.linearise(state.theta)
         return Refined(
             *problem.matrices(state.theta),
             covariance=jacobian.covariance(known=self.known) if state.iteration else None,
-            rmse=math.sqrt(state.cost / self.lines.Y.size),
+            rmse=math.sqrt(state.cost / self.data.Y.size),
             iterations=state.iteration,
             reason=search.reason,
         )
 
 
-class ResponseError:
-    """Residual and slope of a linear model over lines, undefined where a pole passes a limit.
+class ResponseProblem:
+    """Residual and Jacobian of a linear model over spectra; infinite if a pole passes a limit.
 
-    θ holds A, B, C and D, each by rows, one after another.
+    θ holds A, B, C and D, row by row, one matrix after another.
 
     Args:
-        lines: what is fitted.
+        data: what is fitted.
         nx: order.
-        largest_pole: radius that no pole may reach; none where left out.
+        largest_pole: limit for the radius of poles. Default: no limit.
         feedthrough: whether the entries of D may change.
     """
 
     def __init__(
-        self, lines: Lines, nx: int, largest_pole: float = np.inf, *, feedthrough: bool = True
+        self, data: SpectralData, nx: int, largest_pole: float = np.inf, *, feedthrough: bool = True
     ) -> None:
-        self.lines, self.largest_pole = lines, largest_pole
-        nu, ny = lines.U.shape[1], lines.Y.shape[1]
+        self.data, self.largest_pole = data, largest_pole
+        nu, ny = data.U.shape[1], data.Y.shape[1]
         self.shapes = (nx, nx), (nx, nu), (ny, nx), (ny, nu)
         self._fixed: Tensor | None = None
         if not feedthrough:
@@ -129,40 +136,47 @@ class ResponseError:
         """Weighted G U - Y, real parts then imaginary parts, (2 F ny m,)."""
         A, _, C, D = self.matrices(theta)
         if not np.abs(np.linalg.eigvals(A)).max() < self.largest_pole:
-            return torch.full((2 * self.lines.Y.size,), torch.inf, dtype=torch.float64)
+            return torch.full((2 * self.data.Y.size,), torch.inf, dtype=torch.float64)
         X = self._states(theta)
-        return _real(self.lines.weighted((C @ X + D) @ self.lines.U - self.lines.Y))
+        return _real(self.data.weighted((C @ X + D) @ self.data.U - self.data.Y))
 
     def cost(self, residual: Tensor) -> float:
         """|r|²."""
         return float(residual.square().sum())
 
-    def linearise(self, theta: Tensor) -> LinesJacobian:
-        """The slope of the residual without the columns that the coordinates of x make."""
+    def linearise(self, theta: Tensor) -> ResponseJacobian:
+        """The Jacobian of the residual, without the columns of a change of state coordinates."""
         cell = linear_cell(*self.matrices(theta))
-        start = torch.zeros(0, len(cell.A), dtype=torch.float64)
-        self._reduced = reduction(cell, start, before=self._reduced, fixed=self._fixed)
+        initial_states = torch.zeros(0, len(cell.A), dtype=torch.float64)
+        self._reduced = reduction(cell, initial_states, before=self._reduced, fixed=self._fixed)
         A, _, C, _ = self.matrices(theta)
-        X, L = self._states(theta), resolvent(A.T, C.T, self.lines.z).swapaxes(1, 2)
-        J = slopes(X, L, self.lines.U, self._reduced.kept.numpy())
-        return LinesJacobian(self.lines.weighted(J), self._reduced, self.residual(theta))
+        X, L = self._states(theta), solve_resolvent(A.T, C.T, self.data.z).swapaxes(1, 2)
+        J = response_jacobian(X, L, self.data.U, self._reduced.kept.numpy())
+        return ResponseJacobian(self.data.weighted(J), self._reduced, self.residual(theta))
 
     def _states(self, theta: Tensor) -> Complex:
-        """(zI - A)⁻¹ B (F, nx, nu), that of the latest θ kept."""
+        """(zI - A)⁻¹ B (F, nx, nu); the one of the latest θ is cached."""
         if self._latest is None or not torch.equal(self._latest[0], theta):
             A, B, _, _ = self.matrices(theta)
-            self._latest = theta.clone(), resolvent(A, B, self.lines.z)
+            self._latest = theta.clone(), solve_resolvent(A, B, self.data.z)
         return self._latest[1]
 
 
-class LinesJacobian:
-    """Slope of the residual with θ.
+class ResponseJacobian:
+    """Jacobian of the residual with θ.
 
-    Shape:
-        J: (F, ny, m, K) in the columns kept, residual: (2 F ny m,).
+    Args:
+        J: derivative in the columns that are kept.
+        reduced: how these give all columns.
+        residual: real parts, then imaginary parts.
     """
 
-    def __init__(self, J: Complex, reduced: Reduction, residual: Tensor) -> None:
+    def __init__(
+        self,
+        J: Complex128[Complex, "F ny m K"],
+        reduced: Reduction,
+        residual: Float[Tensor, " M"],
+    ) -> None:
         self._J, self._reduced, self._residual = J, reduced, residual
         self._rows = _real(J)
 
@@ -183,12 +197,13 @@ class LinesJacobian:
         """Covariance (P, P) of θ at the minimum.
 
         Args:
-            known: whether the weights are the inverse variances of the lines. Otherwise every line
-                counts with its own error (White's estimate), whatever the variances.
+            known: whether the weights are the inverse variances of the errors. Otherwise the error
+                found at each line stands for its variance (White's estimate).
         """
         inverse = self.system(0.0, TRUNCATION)[0].inverse.numpy()
         if known:
             return inverse / 2  # a complex error of variance 1 has real parts of variance 1/2
+        # Sandwich (JᴴJ)⁻¹ (Σ s sᵀ) (JᴴJ)⁻¹ with the score s = Re(Jᴴ r) of each line.
         J = self._J.reshape(len(self._J), -1, self._J.shape[-1])
         r = torch.complex(*self._residual.chunk(2)).numpy().reshape(J.shape[:2])
         scores = np.einsum("fek,fe->fk", J.conj(), r).real @ self._reduced.expand.numpy()

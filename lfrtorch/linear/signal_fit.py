@@ -1,8 +1,12 @@
-"""Fit of a linear model to signals: simulation error, or prediction error with innovations.
+"""Fit of a linear model to signals: simulation error, or one-step-ahead prediction error.
 
-The one-step-ahead predictor of the innovation model x+ = A x + B u + K e, y = C x + D u + e is a
-linear model, too, driven by u and y: x+ = (A - K C) x + (B - K D) u + K y. Both errors are
-therefore simulation errors of a linear cell; a constant among its inputs is the output's offset.
+The simulation error compares the measured output to the output that the model computes from the
+input alone. The prediction error lets the model see the outputs before each sample, which helps if
+disturbances act on the states: the innovation model is x+ = A x + B u + K e, y = C x + D u + e.
+
+Its predictor is a linear model as well, with the inputs u and y: x+ = (A - K C) x + (B - K D) u +
+K y. So both errors are simulation errors of a linear cell, and the machinery of the nonlinear fit
+minimises them. A constant among the inputs of the cell gives the offset of the output.
 """
 
 from __future__ import annotations
@@ -23,36 +27,33 @@ from lfrtorch.least_squares.linear_systems import Orthogonal
 from lfrtorch.least_squares.simulation_problem import SimulationError
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
-from lfrtorch.linear.subspace import LARGEST_POLE, Start, from_signals
+from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signals
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler
 
-MOST_STARTS, SHORT = 8, 200_000
-"""Starts that are refined, up to so many samples times squared states."""
+MOST_CANDIDATES, SHORT = 8, 200_000
+"""Subspace estimates that are refined; only one if samples times squared states exceed SHORT."""
 
 LARGEST_ROWS = 50_000_000
-"""Entries of a Jacobian that is formed whole for a covariance: 400 MB."""
+"""Entries of the largest Jacobian that is formed as a whole for a covariance: 400 MB."""
 
 ROUNDING = 1e-12
-"""Relative variance of a state that the inputs do not move."""
+"""Smallest variance of a state, relative to the largest: the inputs do not move it."""
 
 OBSERVERS = (0.0, 1e-4, 1e-2, 1.0)
-"""Variance of the state noise over that of the states, times the output error's, of the innovation
-models that a prediction-error fit may start from."""
+"""Variances of the state noise that the initial innovation models of a prediction-error fit assume,
+relative to those of the states and in units of the output noise."""
 
 
 class SignalFit:
-    """Linear fits to records.
+    """The least-squares problem between records and linear models of any order.
 
     Args:
-        us, ys: normalised signals of each record.
-        records: their starts, windows and weights.
-        offset: whether a constant in the output is free.
+        us, ys: normalised signals (T, nu) and (T, ny) of each record.
+        records: their initial states, windows and weights.
+        offset: whether the output has a constant as a parameter.
         prediction: whether the error is that of the one-step-ahead prediction.
         feedthrough: whether D is a parameter; it is 0 otherwise.
-
-    Shape:
-        us: of (T, nu), ys: of (T, ny).
     """
 
     def __init__(
@@ -72,11 +73,11 @@ class SignalFit:
         nu, ny = self._records[0].u.shape[1], self.ny
         self._unit = Scaler(np.zeros(nu), np.ones(nu), np.zeros(ny), np.ones(ny))
 
-    def contenders(self, nx: int) -> int:
-        """Starts that are worth a refinement: one of long records, whose starts are good."""
-        return MOST_STARTS if sum(map(len, self._us)) * nx**2 <= SHORT else 1
+    def most_candidates(self, nx: int) -> int:
+        """How many subspace estimates are refined: one of long records, where they are good."""
+        return MOST_CANDIDATES if sum(map(len, self._us)) * nx**2 <= SHORT else 1
 
-    def starts(self, nx: int) -> list[Start]:
+    def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
         """Subspace estimates of A and C."""
         return from_signals(self._us, self._ys, nx)
 
@@ -110,7 +111,7 @@ class SignalFit:
         return np.concatenate(states).std(axis=0)
 
     def search(self, matrices: Matrices) -> Search:
-        """A search over A, B, C, D and K from the given ones and the best of some observers."""
+        """A search over A, B, C, D and K that starts from the given ones and the best of some K."""
         gains = [np.zeros((len(matrices[0]), self.ny))]
         if self._prediction:
             gains = [self._observer(matrices, part) for part in OBSERVERS]
@@ -119,10 +120,11 @@ class SignalFit:
         return Search(problem, problem.theta)
 
     def improbability(self, search: Search) -> float:
-        """The cost, and x0ᵀ P⁻¹ x0 of each estimated start state, times the error's variance.
+        """The cost plus x0ᵀ P⁻¹ x0 of each estimated initial state, times the error's variance.
 
-        P is the covariance of the states that the inputs lead to from rest: the cost of the most
-        probable model and start states, where the inputs before the records were like those in it.
+        P is the covariance of the states that the inputs lead to from rest. The sum is the cost of
+        the most probable model and initial states, if the inputs before the records were like those
+        in the records.
         """
         problem, state = search.problem, search.state
         x0 = problem.start_states(state.theta)
@@ -138,7 +140,7 @@ class SignalFit:
         return state.cost * (1.0 + unlikely / problem.size)
 
     def refined(self, search: Search) -> Refined:
-        """Where a search stands, with the covariance there."""
+        """The present result of a search, with its covariance."""
         problem, state = search.problem, search.state
         problem.write(state.theta)
         cell = problem.model.lfr.cell
@@ -148,7 +150,7 @@ class SignalFit:
         constant = Dyu[:, -1].copy() if self._offset else None
         if self._prediction:
             K = Bu[:, nu : nu + ny].copy()
-            if constant is not None:  # at rest, where the output that enters by K is itself
+            if constant is not None:  # at rest, where the predictor sees this same output
                 driven = K @ constant + Bu[:, -1]
                 at_rest = np.linalg.solve(np.eye(len(A)) - A - K @ C, driven)
                 constant = np.asarray(constant + C @ at_rest, dtype=np.float64)
@@ -179,10 +181,11 @@ class SignalFit:
     def _spread(
         self, problem: SimulationError, theta: Tensor, cost: float, system: Orthogonal
     ) -> Array:
-        """Covariance of θ: of white innovations, or of simulation errors of any spectrum.
+        """Covariance of θ, for white innovations or for simulation errors of any spectrum.
 
-        The lines of a stationary error are all but independent, whatever its spectrum: each counts
-        with its own error (White's estimate), unless rows by all parameters take too much room.
+        The DFT lines of a stationary error are almost independent, whatever its spectrum. So the
+        error found at each line stands for its variance (White's estimate), unless the Jacobian
+        takes too much memory.
         """
         inverse, spare = system.inverse.numpy(), max(1, problem.size - system.rank)
         if self._prediction or problem.size * len(theta) > LARGEST_ROWS:
@@ -207,7 +210,7 @@ class SignalFit:
         return inverse @ meat @ inverse * (problem.size / spare)
 
     def _driven(self, u: Array, y: Array, record: Record) -> Record:
-        """The record with all inputs of the cell: u, for a prediction y, and a constant."""
+        """The record with all inputs of the cell: u, then y for a prediction, then the constant."""
         inputs = [u]
         if self._prediction:
             inputs.append(y)
@@ -222,7 +225,7 @@ class SignalFit:
         )
 
     def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> SimulationError:
-        """The simulation error of the cell; unless observed, by B, D and the constant alone."""
+        """Least-squares problem of the cell; unless ``observed`` in B, D and the constant alone."""
         A, B, C, D = matrices
         nu, ny = self.nu, self.ny
         width = self._records[0].u.shape[1]
@@ -258,7 +261,7 @@ class SignalFit:
         return problem
 
     def _observer(self, matrices: Matrices, part: float) -> Array:
-        """Kalman gain (nx, ny) for state noise of so much of the states' variance."""
+        """Kalman gain (nx, ny) for state noise of ``part`` of the variance of the states."""
         A, _, C, _ = matrices
         if part == 0.0:
             return np.zeros((len(A), self.ny))
@@ -267,7 +270,7 @@ class SignalFit:
         return np.linalg.solve(C @ P @ C.T + np.eye(self.ny), C @ P @ A.T).T
 
     def _of_system(self, covariance: Array, C: Array, D: Array, K: Array) -> Array:
-        """Covariance of A, B, C, D from that of the cell's parameters and start states."""
+        """Covariance of A, B, C, D from that of the cell's parameters and initial states."""
         nx, nu, ny, width = len(K), self.nu, self.ny, self._records[0].u.shape[1]
         sizes = [nx * nx, nx * width, ny * nx, ny * width]
         ends = np.cumsum(sizes)
@@ -286,12 +289,12 @@ class SignalFit:
 
 
 class _Stable(SimulationError):
-    """Simulation error of a linear cell, undefined where a pole passes LARGEST_POLE.
+    """Simulation error of a linear cell; infinite if a pole passes LARGEST_POLE.
 
     Args:
         model, records: as for ``SimulationError``.
-        outputs: which inputs are the measured outputs of a predictor; its system is then stable,
-            too.
+        outputs: which inputs are the measured outputs, if the cell is a predictor. Then the system
+            that it predicts must be stable as well.
     """
 
     def __init__(self, model: Model, records: Sequence[Record], outputs: slice | None) -> None:

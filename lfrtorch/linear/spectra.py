@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lfrtorch._checks import lines as checked_lines
+from lfrtorch._checks import dft_lines
 from lfrtorch._types import Array, Complex, Integers
 from lfrtorch.linear.regression import outer
 from lfrtorch.records import Record
@@ -219,7 +219,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     inputs = data[0].inputs
     power = np.mean(np.abs(spectra.U[1 : last + 1]) ** 2, axis=1)  # (lines, nu), from line 1
     if given is not None:
-        lines = checked_lines(given, spectra.N)
+        lines = dft_lines(given, spectra.N)
         weak = np.argwhere(power[lines - 1] <= NO_POWER * power.max(axis=0))
         if weak.size:
             line, channel = weak[0]

@@ -1,7 +1,9 @@
-"""Spectral lines that a linear model is fitted to: those of records, or a frequency response.
+"""Spectra that a linear model is fitted to: those of periodic records, or a frequency response.
 
-Lines Y = G(z) U are all that a linear model is asked for: a response (U = I, weighted by its
-variance), or periodic records, whose mean squared simulation error is the sum over their lines.
+In both cases the model is asked for Y = G(z) U at some points z of the unit circle. For a response
+U = I, Y is the response, and the weight of each error is one over its variance. For periodic
+records in steady state U and Y are their spectra: by Parseval's theorem the sum of squared errors
+is the mean squared simulation error, found without a simulation.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Complex128, Float
 
 from lfrtorch._types import Array, Complex
 from lfrtorch.linear.frf import FRF
@@ -19,35 +22,34 @@ from lfrtorch.records import Record, Scaler, rms_scale
 Weight = Literal["total", "noise", "none"]
 
 DEGREES_OF_FREEDOM = 20
-"""Of a variance that is used as a weight."""
+"""Degrees of freedom that a variance needs before it is used as a weight; neighbouring lines are
+averaged until it has them."""
 
 VANISHING = 1e-12
-"""Smallest variance of a line, relative to the largest, that counts as a weight."""
+"""Smallest variance that enters a weight, relative to the largest."""
 
 SILENT = 1e-10
-"""Relative amplitude below which a line of the input is not excited."""
+"""Relative amplitude of the input below which a line is not excited."""
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class SpectralData:
     """What is fitted: Y = G(z) U, and the weight of each error.
 
     Args:
         z: points on the unit circle.
-        U, Y: spectra, scaled so that the sum of squared errors is their mean square.
-        weight: of the errors Y - G U, where they do not count alike.
-
-    Shape:
-        z: (F,), U: (F, nu, m), Y: (F, ny, m), weight: (F, ny, m).
+        U, Y: spectra of m experiments, scaled so that the sum of squared errors is their mean
+            square.
+        weight: of the errors Y - G U. Default: 1 for all.
     """
 
-    z: Complex
-    U: Complex
-    Y: Complex
-    weight: Array | None = None
+    z: Complex128[Complex, " F"]
+    U: Complex128[Complex, "F nu m"]
+    Y: Complex128[Complex, "F ny m"]
+    weight: Float[Array, "F ny m"] | None = None
 
     def weighted(self, errors: Complex) -> Complex:
-        """√weight times errors (F, ny, m), or rows (F, ny, m, K) of them."""
+        """√weight times errors (F, ny, m), or times their Jacobian (F, ny, m, K)."""
         if self.weight is None:
             return errors
         root = np.sqrt(self.weight)
@@ -63,21 +65,18 @@ class Lines:
         return int((counts.sum(axis=(1, 2)) * np.where(real, 1, 2)).sum())
 
 
-def lines_of(
+def spectral_data_of_records(
     us: Sequence[Array], ys: Sequence[Array], records: Sequence[Record], *, offset: bool
-) -> Lines | None:
-    """The lines of periodic records, or None where their simulation error is no sum over lines.
+) -> SpectralData | None:
+    """Spectra of periodic records, or ``None`` if their simulation error is no sum over lines.
 
-    As many columns as inputs carry all that matters of any number of records: what is left of the
-    outputs no linear model changes.
+    The spectra of many records are compressed to nu columns by a QR decomposition: the rest of the
+    outputs is a constant error, which no linear model changes.
 
     Args:
-        us, ys: normalised signals of each record.
-        records: how they are weighted.
-        offset: whether a constant in the output is free, which takes it out of line 0.
-
-    Shape:
-        us: of (T, nu), ys: of (T, ny).
+        us, ys: normalised signals (T, nu) and (T, ny) of each record.
+        records: their weights and periods.
+        offset: whether the model has a constant in its output. It is eliminated from line 0.
     """
     ny = ys[0].shape[1]
     if any(r.start != "periodic" or r.skip for r in records):
@@ -90,6 +89,7 @@ def lines_of(
     for u, y, record in zip(us, ys, records, strict=True):
         N = record.period or len(u)
         U, Y = (np.fft.rfft(s.reshape(-1, N, s.shape[1]).mean(0), axis=0) / N for s in (u, y))
+        # A line stands for itself and its conjugate; lines 0 and N / 2 are their own.
         twice = np.full((len(U), 1), 2.0)
         twice[0] = 1.0
         if N % 2 == 0:
@@ -114,13 +114,13 @@ def lines_of(
     z, U, Y = np.concatenate([z for z, _, _ in parts]), together(1), together(2)
     size = np.abs(U).max(axis=(1, 2))
     excited = size > SILENT * size.max(initial=0.0)
-    return Lines(z[excited], U[excited], Y[excited])
+    return SpectralData(z[excited], U[excited], Y[excited])
 
 
 def _line_0(
     means: list[tuple[Complex, Complex, float]], *, offset: bool
 ) -> tuple[Complex, Complex, Complex]:
-    """Line 0 of all records, less what a constant common to them makes."""
+    """Line 0 of all records, projected across a constant that is common to them."""
     U, Y = (np.stack([mean[side] for mean in means], axis=-1) for side in (0, 1))
     if offset:
         one = np.array([weight for _, _, weight in means])
@@ -130,7 +130,7 @@ def _line_0(
 
 
 def _compressed(U: Complex, Y: Complex) -> tuple[Complex, Complex]:
-    """As many columns as inputs with the same normal equations, where there are more."""
+    """The same normal equations in at most nu columns."""
     nu = U.shape[1]
     if U.shape[2] <= nu:
         return U, Y
@@ -139,10 +139,10 @@ def _compressed(U: Complex, Y: Complex) -> tuple[Complex, Complex]:
     return R[:, :nu], R[:, nu:]
 
 
-def lines_of_response(
+def spectral_data_of_response(
     frf: FRF, weight: Weight | Array | None, *, offset: bool
-) -> tuple[Lines, Scaler, bool, list[str]]:
-    """The lines of a response, scaled to channels of unit size.
+) -> tuple[SpectralData, Scaler, bool, list[str]]:
+    """A frequency response as spectra, scaled to channels of unit size.
 
     Args:
         frf: the response.
@@ -150,7 +150,8 @@ def lines_of_response(
         offset: whether the means of the records are its operating point.
 
     Returns:
-        The lines, the scaling, whether the weights are inverse variances, and notes on the choice.
+        The spectra, the scaling, whether the weights are inverse variances, and notes on the
+        choice of weights.
     """
     weights, known, notes = _weights(frf, weight)
     u_scale = 1.0 / rms_scale([np.abs(frf.G).reshape(-1, frf.G.shape[2])], np.zeros(1))
@@ -161,8 +162,8 @@ def lines_of_response(
     offsets = (frf.u_offset, frf.y_offset) if offset else (np.zeros(nu), np.zeros(ny))
     z = np.exp(2j * np.pi * frf.frequencies / frf.fs)
     U = np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu))
-    lines = Lines(z, U, frf.G / size, None if weights is None else weights * size**2)
-    return lines, Scaler(offsets[0], u_scale, offsets[1], y_scale), known, notes
+    data = SpectralData(z, U, frf.G / size, None if weights is None else weights * size**2)
+    return data, Scaler(offsets[0], u_scale, offsets[1], y_scale), known, notes
 
 
 def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, bool, list[str]]:
@@ -210,9 +211,10 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
 
 
 def _smoothed(variance: Array, degrees_of_freedom: int) -> Array:
-    """Variances (F, ny, nu) averaged over neighbouring lines: a weight must not be drawn by lot.
+    """Variances (F, ny, nu) averaged over neighbouring lines.
 
-    One over an estimate of few degrees of freedom has no finite mean.
+    A weight is one over a variance; one over an estimate of few degrees of freedom has no finite
+    mean, and some lines would outweigh all others by chance.
     """
     half = min((DEGREES_OF_FREEDOM // max(1, degrees_of_freedom)) // 2, (len(variance) - 1) // 2)
     if half == 0:

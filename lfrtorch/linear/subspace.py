@@ -1,7 +1,15 @@
 """Subspace estimates of A and C, from spectra or from signals: where a linear fit starts.
 
-Several horizons, weightings and frequency axes are cheap beside what a poor start costs; whoever
-calls keeps what simulates best.
+A least-squares fit of a state-space model has many minima, and needs a model to start from. A
+subspace method gives one without iterations. It stacks outputs, at several times or multiplied by
+several powers of z, into a large matrix and removes what follows directly from the inputs. What is
+left is spanned by the extended observability matrix [C; C A; C A²; ...]: a singular value
+decomposition finds it, its first rows are C, and A moves each block of rows to the next one. The
+singular values that stand out of the noise are as many as the data carry states.
+
+The result depends on the number of block rows, on the weighting and on the frequency axis. Several
+choices cost little compared to a poor start, so all of them are returned, and the caller keeps the
+one that simulates best.
 
 References:
     McKelvey, Akçay and Ljung, "Subspace-based multivariable system identification from frequency
@@ -19,65 +27,71 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+from jaxtyping import Complex128, Float
 
 from lfrtorch._types import Array, Complex
 
 LARGEST_POLE = 1.0 - 1e-6
-"""Radius that no pole reaches: the margin keeps a model stable when its coordinates change."""
+"""Limit for the radius of poles: the margin keeps a model stable when its coordinates change."""
 
 MOVED_POLE = 0.999
-"""Largest radius that an unstable pole is moved to."""
+"""Largest radius of an unstable pole after it is moved."""
 
 SPECTRAL_HORIZONS = (1, 2)
-"""Block rows in multiples of nx + 1, from spectra, beside the fewest that tell the states apart."""
+"""Block rows for spectra, in multiples of nx + 1; the fewest that tell the states apart are tried
+as well."""
 
 HORIZONS = (2, 3, 5, 10)
-"""The same, from signals."""
+"""Block rows for signals, in multiples of nx + 1."""
 
 MOST_OPERATIONS = 1e10
-"""Multiplications of a decomposition; longer horizons than that allows are left out."""
+"""Most multiplications of a decomposition; horizons that need more are skipped."""
 
 
-class Start(NamedTuple):
+class SubspaceEstimate(NamedTuple):
     """An estimate of A and C.
 
     Args:
-        A: stable, by moving the poles that are not.
+        A: state matrix, with unstable poles moved into the unit circle.
         C: output matrix.
-        singular_values: of the subspace, relative to the size of the outputs: they fall off behind
-            the order that the data carry.
-        unstable: A before poles were moved, where any was.
-
-    Shape:
-        A, unstable: (nx, nx), C: (ny, nx), singular_values: (n,).
+        singular_values: of the subspace, relative to the size of the outputs: they drop after the
+            order that the data carry.
+        unstable: A before its poles were moved, ``None`` if it was stable.
     """
 
-    A: Array
-    C: Array
-    singular_values: Array
-    unstable: Array | None
+    A: Float[Array, "nx nx"]
+    C: Float[Array, "ny nx"]
+    singular_values: Float[Array, " n"]
+    unstable: Float[Array, "nx nx"] | None
 
 
-def from_spectra(z: Complex, U: Complex, Y: Complex, nx: int) -> list[Start]:
-    """Estimates from lines Y = G(z) U of one or several experiments.
+def from_spectra(
+    z: Complex128[Complex, " F"],
+    U: Complex128[Complex, "F nu m"],
+    Y: Complex128[Complex, "F ny m"],
+    nx: int,
+) -> list[SubspaceEstimate]:
+    """Estimates from spectra Y = G(z) U of one or several experiments.
 
-    The powers of z that tell the states apart are all but alike where the lines cover a small part
-    of the circle. A bilinear map of the circle to itself spreads them: from a tenth of the axis, a
-    noise-free system of order 12 is found to 1e-14 with it and to 1e-7 without.
+    The powers of z that tell the states apart are almost equal if the lines cover a small part of
+    the unit circle. A bilinear map of the circle to itself spreads the lines: from a tenth of the
+    frequency axis, a noise-free system of order 12 is found to 1e-14 with the map, to 1e-7 without.
 
-    Shape:
-        z: (F,), U: (F, nu, m), Y: (F, ny, m), scaled to equal uncertainty.
+    Args:
+        z: points on the unit circle.
+        U, Y: spectra, scaled so that all errors of Y have the same variance.
+        nx: order.
     """
     ny, m = Y.shape[1:]
     half = np.angle(z) / 2
     power = (np.abs(Y) ** 2).sum(axis=(1, 2))
     centres = [np.median(half), np.average(half, weights=power if power.any() else None)]
     warps = [0.0, *(np.clip(np.tan(np.pi / 4 - c), -0.99, 0.99) for c in centres)]
-    starts = []
-    # Outputs tell states apart as powers of z do, and better: order 12 with 3 outputs is found on a
-    # tenth of the axis to 1e-14 by 5 block rows, to 1e-6 by 13.
+    estimates = []
+    # Several outputs tell states apart better than further powers of z: order 12 with 3 outputs is
+    # found on a tenth of the axis to 1e-14 by 5 block rows, to 1e-6 by 13.
     fewest = -(-nx // ny) + 1
-    # Few lines: as many block rows as they carry, as long as these tell nx states apart.
+    # Few lines carry few block rows, which must still tell nx states apart.
     most = 2 * len(z) * m // (U.shape[1] + ny)
     wanted = (fewest, *(multiple * (nx + 1) for multiple in SPECTRAL_HORIZONS))
     for q in sorted({min(q, most) for q in wanted}):
@@ -91,48 +105,55 @@ def from_spectra(z: Complex, U: Complex, Y: Complex, nx: int) -> list[Start]:
                 for S in (U, Y)
             ]
             rows = np.vstack(stacked)
+            # L = [L_uu 0; L_yu L_yy]: L_yy is the part of the outputs that is orthogonal to the
+            # inputs, and spans the observability matrix.
             L = _lower(np.hstack([np.real(rows), np.imag(rows)]))
             first = q * U.shape[1]
             noise = np.real(powers @ powers.conj().T)  # covariance of white errors in Y
             noise += 1e-14 * np.trace(noise) * np.eye(q)
             for root in (np.eye(q), np.linalg.cholesky(noise)):
+                # The inverse root gives all rows the same noise; it is undone on the subspace.
                 whiten = np.kron(root, np.eye(ny))
                 outputs = scipy.linalg.solve_triangular(whiten, L[first:], lower=True)
                 observability, s = _observability(outputs, slice(first, None), nx)
                 A_axis, C = _shift(whiten @ observability, ny)
                 eye = np.eye(nx)
-                try:
+                try:  # A = (A_axis + a I) (I + a A_axis)⁻¹ takes the bilinear map back
                     A = np.linalg.solve((eye + a * A_axis).T, (A_axis + a * eye).T).T
                 except np.linalg.LinAlgError:
                     continue
-                starts.append(_stable(A, C, s))
-    return starts
+                estimates.append(_stable(A, C, s))
+    return estimates
 
 
-def from_signals(us: Sequence[Array], ys: Sequence[Array], nx: int) -> list[Start]:
-    """Estimates from records: MOESP with past inputs and outputs, or past inputs, as instruments.
+def from_signals(
+    us: Sequence[Float[Array, "_ nu"]], ys: Sequence[Float[Array, "_ ny"]], nx: int
+) -> list[SubspaceEstimate]:
+    """Estimates from the normalised signals (T, nu) and (T, ny) of records, by MOESP.
 
-    Shape:
-        us: of (T, nu), ys: of (T, ny), normalised.
+    Past inputs and outputs, or past inputs alone, serve as instruments: they depend on the state
+    and not on the later noise.
     """
     nu, ny = us[0].shape[1], ys[0].shape[1]
-    starts = []
+    estimates = []
     for multiple in HORIZONS:
         i = multiple * (nx + 1)
         pairs = [(u, y) for u, y in zip(us, ys, strict=True) if len(u) >= 2 * i]
         columns = sum(len(u) - 2 * i + 1 for u, _ in pairs)
         rows = 2 * i * (nu + ny)
-        if columns < rows or (starts and rows**2 * columns > MOST_OPERATIONS):
+        if columns < rows or (estimates and rows**2 * columns > MOST_OPERATIONS):
             break
         U = np.hstack([_hankel(u, 2 * i) for u, _ in pairs])
         Y = np.hstack([_hankel(y, 2 * i) for _, y in pairs])
+        # Rows: future inputs, past inputs, past outputs, future outputs. The future inputs come
+        # first, so that the columns of L after them hold what these do not explain.
         L = _lower(np.vstack([U[i * nu :], U[: i * nu], Y[: i * ny], Y[i * ny :]]))
         inputs, past_u, past = i * nu, 2 * i * nu, i * (2 * nu + ny)
         for instruments in (past, past_u):
             observability, s = _observability(L[past:], slice(inputs, instruments), nx)
             A, C = _shift(observability, ny)
-            starts.append(_stable(A, C, s))
-    return starts
+            estimates.append(_stable(A, C, s))
+    return estimates
 
 
 def shortest(nx: int, nu: int, ny: int) -> int:
@@ -147,7 +168,7 @@ def suffice(lengths: Sequence[int], nx: int, nu: int, ny: int) -> bool:
 
 
 def _lower(rows: Array) -> Array:
-    """L of rows = L Q, square."""
+    """Square lower triangular L of rows = L Q with orthogonal Q."""
     (R,) = scipy.linalg.qr(rows.T, mode="r", overwrite_a=True, check_finite=False)
     L = np.zeros((len(rows), len(rows)))
     L[:, : len(R[: len(rows)])] = R[: len(rows)].T
@@ -155,7 +176,7 @@ def _lower(rows: Array) -> Array:
 
 
 def _observability(outputs: Array, seen: slice, nx: int) -> tuple[Array, Array]:
-    """Column space of some columns of the outputs, and its singular values relative to all."""
+    """Scaled main directions of the columns ``seen``, and their relative singular values."""
     U, s, _ = np.linalg.svd(outputs[:, seen])
     size = max(float(np.linalg.norm(outputs)), np.finfo(float).tiny)
     return U[:, :nx] * np.sqrt(np.pad(s, (0, max(0, nx - len(s))))[:nx]), s / size
@@ -167,17 +188,17 @@ def _shift(observability: Array, ny: int) -> tuple[Array, Array]:
     return np.asarray(A, dtype=np.float64), observability[:ny]
 
 
-def _stable(A: Array, C: Array, singular_values: Array) -> Start:
-    """With unstable eigenvalues reflected into the unit circle, at most to MOVED_POLE."""
+def _stable(A: Array, C: Array, singular_values: Array) -> SubspaceEstimate:
+    """The estimate with unstable poles reflected into the unit circle, at most to MOVED_POLE."""
     values, vectors = np.linalg.eig(A)
     radius = np.abs(values)
     unstable = radius > LARGEST_POLE
     if not unstable.any():
-        return Start(A, C, singular_values, None)
+        return SubspaceEstimate(A, C, singular_values, None)
     factor = np.minimum(1.0 / np.maximum(radius, 1.0), MOVED_POLE)
     values = values * np.where(unstable, factor / np.maximum(radius, 1e-300), 1.0)
     moved = np.real(vectors * values @ np.linalg.pinv(vectors))
-    return Start(moved, C, singular_values, A)
+    return SubspaceEstimate(moved, C, singular_values, A)
 
 
 def _hankel(signal: Array, rows: int) -> Array:

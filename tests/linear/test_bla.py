@@ -4,7 +4,7 @@ import itertools
 import re
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,10 +14,10 @@ from reference import System, random_system
 
 from lfrtorch._types import Array
 from lfrtorch.linear import bla
-from lfrtorch.linear.bla import data_scaler, estimate_bla
+from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.records import Channel, Record, Start
+from lfrtorch.records import Channel, Record, Scaler, Start
 
 pytestmark = pytest.mark.numeric
 
@@ -47,7 +47,7 @@ def frf_error(model: LinearModel, system: System) -> float:
 
 def normalised(model: LinearModel, record: Record) -> System:
     """The model's matrices between signals of unit deviation."""
-    s = data_scaler([record], offset=True)
+    s = Scaler.of([record])
     C, D = model.C / s.y_scale[:, None], model.D / s.y_scale[:, None] * s.u_scale
     return model.A, model.B * s.u_scale, C, D
 
@@ -582,12 +582,12 @@ def test_error_and_data_must_go_together():
 
 
 class Race:
-    """A problem whose starts are known by their costs; which of them are searched?"""
+    """A problem whose candidates are known by their costs; which of them are searched?"""
 
     def __init__(self, minimum: float | None = None) -> None:
         self.minimum, self.searched = minimum, list[float]()
 
-    def contenders(self, nx: int) -> int:
+    def most_candidates(self, nx: int) -> int:
         return 10
 
     def search(self, matrices: float) -> SimpleNamespace:
@@ -604,20 +604,25 @@ class Race:
         return search.state.cost
 
 
-def test_starts_that_are_alike_or_hopeless_are_not_searched(monkeypatch: pytest.MonkeyPatch):
+def test_candidates_that_are_alike_or_hopeless_are_not_searched(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(bla, "_scaled", lambda problem, matrices, balanced: matrices)
-    race, start = Race(), SimpleNamespace(A=[0])
-    starts: Any = [(cost, start, cost) for cost in (1.0, 1.0005, 2.0, 9.9, 10.1, 50.0)]
-    _, refined = bla._best(race, starts, 100, balanced=True)  # pyright: ignore[reportArgumentType]
+    race, estimate = Race(), cast(Any, SimpleNamespace(A=[0]))
+    candidates: Any = [
+        bla._Candidate(cost, estimate, cast(Any, cost))
+        for cost in (1.0, 1.0005, 2.0, 9.9, 10.1, 50.0)
+    ]
+    _, refined = bla._best(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
     assert race.searched == [1.0, 2.0, 9.9]
     assert refined == 9.9  # the most probable one
-    bla._best(race, starts, bla.FIRST_STEPS, balanced=True)  # pyright: ignore[reportArgumentType]
+    bla._best(race, candidates, bla.FIRST_STEPS, balanced=True)  # pyright: ignore[reportArgumentType]
     assert race.searched[3:] == [1.0]  # without steps to compare them the best one alone
 
 
-def test_starts_that_went_to_one_minimum_end_the_race(monkeypatch: pytest.MonkeyPatch):
+def test_candidates_that_went_to_one_minimum_end_the_race(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(bla, "_scaled", lambda problem, matrices, balanced: matrices)
-    race, start = Race(minimum=0.5), SimpleNamespace(A=[0])
-    starts: Any = [(cost, start, cost) for cost in (1.0, 2.0, 3.0, 4.0, 5.0)]
-    bla._best(race, starts, 100, balanced=True)  # pyright: ignore[reportArgumentType]
+    race, estimate = Race(minimum=0.5), cast(Any, SimpleNamespace(A=[0]))
+    candidates: Any = [
+        bla._Candidate(cost, estimate, cast(Any, cost)) for cost in (1.0, 2.0, 3.0, 4.0, 5.0)
+    ]
+    bla._best(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
     assert race.searched == [1.0, 2.0, 3.0]

@@ -9,7 +9,7 @@ from reference import System, random_system
 from torch import Tensor
 
 from lfrtorch._types import Complex
-from lfrtorch.linear.resolvent import frequency_response, resolvents, slopes
+from lfrtorch.linear.resolvent import frequency_response, response_jacobian, solve_resolvents
 
 pytestmark = pytest.mark.numeric
 
@@ -44,7 +44,7 @@ def test_response_is_its_formula(nx: int, nu: int, ny: int):
 @SIZES
 def test_resolvents_solve_their_equations(nx: int, nu: int, ny: int):
     A, B, C, _ = random_system(nx, nu, ny)
-    X, L = resolvents(A, B, C, Z)
+    X, L = solve_resolvents(A, B, C, Z)
     assert (X.shape, L.shape) == ((len(Z), nx, nu), (len(Z), ny, nx))
     for x, left, z in zip(X, L, Z, strict=True):
         M = z * np.eye(nx) - A
@@ -78,7 +78,7 @@ def test_all_poles_at_the_origin(nx: int):
 
 def test_shift_matrix_as_it_stands():
     A, B, C = np.eye(8, k=-1), np.eye(8, 1), np.eye(1, 8, 7)
-    X, L = resolvents(A, B, C, Z)
+    X, L = solve_resolvents(A, B, C, Z)
     delays = Z[:, None] ** -np.arange(1.0, 9.0)
     # Eight products of numbers of size 1.
     np.testing.assert_allclose(X[:, :, 0], delays, rtol=0, atol=1e-14)
@@ -129,7 +129,7 @@ def by_autograd(system: System, U: Complex) -> Complex:
 @pytest.mark.parametrize("m", [1, 4])
 def test_slopes_are_those_of_autograd(nx: int, nu: int, ny: int, m: int):
     system, U = random_system(nx, nu, ny), some_input(nu, m)
-    J = slopes(*resolvents(*system[:3], Z), U)
+    J = response_jacobian(*solve_resolvents(*system[:3], Z), U)
     expected = by_autograd(system, U)
     assert J.shape == (len(Z), ny, m, (nx + ny) * (nx + nu))
     # eps times the gain of the slowest pole, cubed: 1e-13 of the largest.
@@ -138,18 +138,18 @@ def test_slopes_are_those_of_autograd(nx: int, nu: int, ny: int, m: int):
 
 def test_chosen_columns_are_those_of_all():
     system, U = random_system(3, 2, 3), some_input(2, 2)
-    X, L = resolvents(*system[:3], Z)
-    every = slopes(X, L, U)
+    X, L = solve_resolvents(*system[:3], Z)
+    every = response_jacobian(X, L, U)
     columns = np.array([29, 0, 8, 9, 14, 15, 23, 24])  # both ends of A, B, C and D
-    assert np.array_equal(slopes(X, L, U, columns), every[..., columns])
-    assert slopes(X, L, U, columns[:0]).shape == (len(Z), 3, 2, 0)
+    assert np.array_equal(response_jacobian(X, L, U, columns), every[..., columns])
+    assert response_jacobian(X, L, U, columns[:0]).shape == (len(Z), 3, 2, 0)
 
 
 def test_slopes_at_a_defective_pole_are_central_differences():
     """Where there are no eigenvectors to take."""
     (A, B, C, D), _ = jordan(0.0, 4)
     U = some_input(2, 1)
-    J = slopes(*resolvents(A, B, C, Z), U)
+    J = response_jacobian(*solve_resolvents(A, B, C, Z), U)
     h = 1e-5
     for i in range(J.shape[-1]):
         step = np.zeros(J.shape[-1])

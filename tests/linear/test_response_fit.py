@@ -1,4 +1,4 @@
-"""Lines: the same sum of squares as the simulation error, its slope, and its covariance."""
+"""SpectralData: the same sum of squares as the simulation error, its slope, and its covariance."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,12 @@ from lfrtorch._types import Array, Complex
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.resolvent import frequency_response
-from lfrtorch.linear.response_fit import ResponseError, ResponseFit
-from lfrtorch.linear.spectral_data import Lines, lines_of, lines_of_response
+from lfrtorch.linear.response_fit import ResponseFit, ResponseProblem
+from lfrtorch.linear.spectral_data import (
+    SpectralData,
+    spectral_data_of_records,
+    spectral_data_of_response,
+)
 from lfrtorch.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
@@ -33,8 +37,10 @@ def records_of(
                            period=period)]  # fmt: skip
 
 
-def lines(records: list[Record], *, offset: bool) -> Lines:
-    found = lines_of([r.u for r in records], [r.y for r in records], records, offset=offset)
+def lines(records: list[Record], *, offset: bool) -> SpectralData:
+    found = spectral_data_of_records(
+        [r.u for r in records], [r.y for r in records], records, offset=offset
+    )
     assert found is not None
     return found
 
@@ -52,7 +58,7 @@ def simulation_cost(system: System, records: list[Record], *, offset: bool) -> f
 @pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 3)])
 def test_cost_is_the_simulation_error_up_to_a_constant(nu: int, ny: int, offset: bool):
     records = records_of(3, nu, ny)
-    problem = ResponseError(lines(records, offset=offset), 3)
+    problem = ResponseProblem(lines(records, offset=offset), 3)
     costs = []
     for seed in (1, 2):
         system = random_system(3, nu, ny, seed=seed)
@@ -70,7 +76,7 @@ def test_more_records_than_inputs_are_as_many_columns_as_inputs():
 def test_weights_of_records_count():
     plain = records_of(2, 1, 1, lengths=(64, 64))
     weighted = [Record(r.u, r.y, start="periodic", weight=w) for r, w in zip(plain, (1, 9))]  # noqa: B905
-    problem = ResponseError(lines(weighted, offset=True), 2)
+    problem = ResponseProblem(lines(weighted, offset=True), 2)
     costs = []
     for seed in (1, 2):
         system = random_system(2, seed=seed)
@@ -118,7 +124,7 @@ def test_other_records_are_no_lines():
         Record(record.u, record.y, start="periodic", skip=1),
         Record(record.u, record.y, start="periodic", weight=np.array([1.0, 2.0])),
     ):
-        assert lines_of(*signals, [other], offset=True) is None
+        assert spectral_data_of_records(*signals, [other], offset=True) is None
 
 
 def test_lines_without_input_are_left_out():
@@ -133,7 +139,7 @@ def test_lines_without_input_are_left_out():
 @pytest.mark.parametrize("N", [8, 9])
 @pytest.mark.parametrize(("nu", "ny"), [(1, 1), (2, 3)])
 def test_samples_of_a_period_are_equations_of_its_lines(N: int, nu: int, ny: int):
-    """Lines 0 and N / 2 are real; what has no weight, or a constant takes up, is none."""
+    """SpectralData 0 and N / 2 are real; what has no weight, or a constant takes up, is none."""
     rng = np.random.default_rng(0)
     records = [
         Record(rng.normal(size=(N, nu)), rng.normal(size=(N, ny)), start="periodic")
@@ -145,7 +151,7 @@ def test_samples_of_a_period_are_equations_of_its_lines(N: int, nu: int, ny: int
     weight = np.ones(found.Y.shape)
     weight[0] = 0.0
     weight[1, 0] = 0.0
-    left = Lines(found.z, found.U, found.Y, weight).equations
+    left = SpectralData(found.z, found.U, found.Y, weight).equations
     assert left == ((N - 1) * ny - 2) * nu
 
 
@@ -184,7 +190,7 @@ def test_weights_are_inverse_variances_of_some_20_degrees_of_freedom(
     """From means over so many lines about each one, at most over those there are."""
     variance = 1e-20 * np.random.default_rng(0).uniform(0.5, 2.0, size=F)
     frf = response_of(variance, name, **settings)
-    found, scaler, known, _ = lines_of_response(frf, None, offset=True)
+    found, scaler, known, _ = spectral_data_of_response(frf, None, offset=True)
     assert known
     assert found.weight is not None
     np.testing.assert_allclose(found.Y, 1.0, rtol=1e-12)
@@ -198,17 +204,17 @@ def test_line_without_variance_has_a_large_and_finite_weight():
     variance = np.ones(60)
     variance[30] = 0.0
     frf = response_of(variance, "total", experiments=41)
-    weight = lines_of_response(frf, "total", offset=True)[0].weight
+    weight = spectral_data_of_response(frf, "total", offset=True)[0].weight
     assert weight is not None
     assert np.isfinite(weight).all()
     assert weight[30, 0, 0] > 1e6 * np.delete(weight, 30).max()
 
 
-def some_problem() -> tuple[ResponseError, torch.Tensor]:
+def some_problem() -> tuple[ResponseProblem, torch.Tensor]:
     rng = np.random.default_rng(2)
     z = np.exp(1j * np.linspace(0.1, 3.0, 20))
     U, Y = (rng.normal(size=(20, n, 2)) + 1j * rng.normal(size=(20, n, 2)) for n in (2, 3))
-    problem = ResponseError(Lines(z, U, Y, rng.uniform(0.5, 2.0, size=Y.shape)), 4)
+    problem = ResponseProblem(SpectralData(z, U, Y, rng.uniform(0.5, 2.0, size=Y.shape)), 4)
     system = random_system(4, 2, 3)
     return problem, torch.as_tensor(np.concatenate([m.ravel() for m in system]))
 
@@ -242,9 +248,9 @@ def test_pole_beyond_the_limit_is_refused():
     problem, theta = some_problem()
     A = problem.matrices(theta)[0]
     radius = np.abs(np.linalg.eigvals(A)).max()
-    limited = ResponseError(problem.lines, 4, largest_pole=0.999 * radius)
+    limited = ResponseProblem(problem.data, 4, largest_pole=0.999 * radius)
     assert torch.isinf(limited.residual(theta)).all()
-    assert torch.isfinite(ResponseError(problem.lines, 4, 1.001 * radius).residual(theta)).all()
+    assert torch.isfinite(ResponseProblem(problem.data, 4, 1.001 * radius).residual(theta)).all()
 
 
 def test_search_finds_the_system_of_the_lines():
@@ -252,7 +258,7 @@ def test_search_finds_the_system_of_the_lines():
     z = np.exp(1j * np.linspace(0.1, 3.0, 60))
     U = np.broadcast_to(np.eye(2, dtype=complex), (60, 2, 2))
     G = frequency_response(*system, z)
-    problem = ResponseError(Lines(z, U, G), 4)
+    problem = ResponseProblem(SpectralData(z, U, G), 4)
     theta = torch.as_tensor(np.concatenate([m.ravel() for m in system]))
     theta = theta + 0.03 * torch.as_tensor(np.random.default_rng(4).normal(size=len(theta)))
     optimiser = LevenbergMarquardt(max_iter=100)
@@ -270,7 +276,9 @@ def test_covariance_is_that_of_the_errors_or_of_each_line_by_itself(known: bool)
     system, omega = random_system(nx, nu, ny), np.linspace(0.1, 3.0, F)
     U, E = (rng.normal(size=(F, 2, m)) + 1j * rng.normal(size=(F, 2, m)) for _ in range(2))
     Y, weight = reference.frf(system, omega) @ U + 0.3 * E, rng.uniform(0.5, 2.0, size=(F, ny, m))
-    found = refined(ResponseFit(Lines(np.exp(1j * omega), U, Y, weight), known=known), system, 3)
+    found = refined(
+        ResponseFit(SpectralData(np.exp(1j * omega), U, Y, weight), known=known), system, 3
+    )
     assert found.covariance is not None
     theta = np.concatenate([part.ravel() for part in found.matrices])
 
@@ -312,7 +320,7 @@ def test_covariance_is_that_of_many_fits(known: bool):
     for _ in range(runs):
         noise = rng.normal(size=(F, 1, 1)) + 1j * rng.normal(size=(F, 1, 1))
         Y = G + np.sqrt(variance / 2) * noise
-        fit = ResponseFit(Lines(z, U, Y, 1.0 / variance if known else None), known=known)
+        fit = ResponseFit(SpectralData(z, U, Y, 1.0 / variance if known else None), known=known)
         found = refined(fit, system, 20)
         poles.append(found.A[0, 0])
         assert found.covariance is not None

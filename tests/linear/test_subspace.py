@@ -1,4 +1,4 @@
-"""Subspace starts: exact without noise on any band, stable on any data, of bounded cost."""
+"""Subspace estimates: exact without noise on any band, stable on any data, of bounded cost."""
 
 import itertools
 
@@ -10,7 +10,7 @@ from reference import System, random_system
 from lfrtorch._types import Array
 from lfrtorch.linear import subspace
 from lfrtorch.linear.resolvent import frequency_response
-from lfrtorch.linear.response_fit import Lines, ResponseFit
+from lfrtorch.linear.response_fit import ResponseFit, SpectralData
 from lfrtorch.linear.subspace import (
     LARGEST_POLE,
     MOVED_POLE,
@@ -38,19 +38,21 @@ def few_lines(nx: int, nu: int, ny: int) -> int:
     return max(16, -(-(nx + 1) * (nu + ny) // nu))
 
 
-def lines_of(system: System, band: tuple[float, float], F: int) -> Lines:
+def lines_of(system: System, band: tuple[float, float], F: int) -> SpectralData:
     """Noise-free response at lines inside the band, of largest gain 1."""
     omega = 2 * np.pi * np.linspace(*band, F + 2)[1:-1]
     G = reference.frf(system, omega)
     nu = system[1].shape[1]
     U = np.broadcast_to(np.eye(nu, dtype=complex), (F, nu, nu))
-    return Lines(np.exp(1j * omega), U, G / np.abs(G).max())
+    return SpectralData(np.exp(1j * omega), U, G / np.abs(G).max())
 
 
-def best_error(lines: Lines, nx: int) -> float:
-    """Largest error on the lines of the start that fits best, with its B and D."""
+def best_error(lines: SpectralData, nx: int) -> float:
+    """Largest error on the lines of the estimate that fits best, with its B and D."""
     fit = ResponseFit(lines, known=False)
-    fits = [fit.with_input_matrices(start.A, start.C) for start in fit.starts(nx)]
+    fits = [
+        fit.with_input_matrices(estimate.A, estimate.C) for estimate in fit.subspace_estimates(nx)
+    ]
     _, system = min(fits, key=lambda each: each[0])
     return float(np.abs(frequency_response(*system, lines.z) - lines.Y).max())
 
@@ -101,9 +103,11 @@ def test_several_experiments_at_once():
     omega = np.pi * np.arange(17) / 16
     U = generator.normal(size=(17, 2, 5)) + 1j * generator.normal(size=(17, 2, 5))
     U[[0, -1]] = U[[0, -1]].real
-    lines = Lines(np.exp(1j * omega), U, reference.frf(system, omega) @ U)
+    lines = SpectralData(np.exp(1j * omega), U, reference.frf(system, omega) @ U)
     fit = ResponseFit(lines, known=False)
-    found = [fit.with_input_matrices(start.A, start.C) for start in fit.starts(3)]
+    found = [
+        fit.with_input_matrices(estimate.A, estimate.C) for estimate in fit.subspace_estimates(3)
+    ]
     _, (A, B, C, D) = min(found, key=lambda each: each[0])
     G = reference.frf(system, omega)
     # eps times the slowest pole's gain of 10, and a condition of 1e4.
@@ -112,8 +116,8 @@ def test_several_experiments_at_once():
 
 def test_singular_values_fall_off_behind_the_order():
     lines = lines_of(random_system(3), BANDS["all"], 40)
-    for start in from_spectra(lines.z, lines.U, lines.Y, 5):
-        s = start.singular_values / start.singular_values[0]
+    for estimate in from_spectra(lines.z, lines.U, lines.Y, 5):
+        s = estimate.singular_values / estimate.singular_values[0]
         assert s[2] > 1e-4
         assert s[3] < 1e-6  # its square is the regularisation 1e-14 of the weighting
     assert min(s.singular_values[3] for s in from_spectra(lines.z, lines.U, lines.Y, 5)) < 1e-12
@@ -128,7 +132,7 @@ def test_too_few_lines_give_no_start():
 
 
 def states_before(system: System, x0: Array, u: Array) -> Array:
-    """Output (T, ny) from the start state x0."""
+    """Output (T, ny) from the initial state x0."""
     A, B, C, D = system
     x, y = x0, []
     for u_k in u:
@@ -159,11 +163,11 @@ def test_signals_without_noise_from_any_start_states(nx: int, nu: int, ny: int):
         u[T // 2 :] += 3.0
         us.append(u)
         ys.append(states_before(system, 5.0 * generator.normal(size=nx), u))
-    starts = from_signals(us, ys, nx)
-    assert starts
-    assert all(start.unstable is None for start in starts)
+    estimates = from_signals(us, ys, nx)
+    assert estimates
+    assert all(estimate.unstable is None for estimate in estimates)
     # Rounding times the condition of the Hankel matrices, up to 1e5 with these inputs.
-    assert min(same_outputs(system, start.A, start.C) for start in starts) < 1e-9
+    assert min(same_outputs(system, estimate.A, estimate.C) for estimate in estimates) < 1e-9
 
 
 def test_records_that_are_too_short_give_no_start():
@@ -202,27 +206,29 @@ def test_long_data_limit_the_rows(most: float, monkeypatch):
 # --- any data -------------------------------------------------------------------------------
 
 
-def checked(starts: list[subspace.Start], nx: int, ny: int):
-    assert starts
-    for start in starts:
-        assert (start.A.shape, start.C.shape) == ((nx, nx), (ny, nx))
-        assert np.isfinite(start.A).all()
-        assert np.isfinite(start.C).all()
+def checked(estimates: list[subspace.SubspaceEstimate], nx: int, ny: int):
+    assert estimates
+    for estimate in estimates:
+        assert (estimate.A.shape, estimate.C.shape) == ((nx, nx), (ny, nx))
+        assert np.isfinite(estimate.A).all()
+        assert np.isfinite(estimate.C).all()
         # Moved poles stand at 1 / radius, at most at MOVED_POLE; the others are left.
-        assert np.abs(np.linalg.eigvals(start.A)).max() <= LARGEST_POLE
+        assert np.abs(np.linalg.eigvals(estimate.A)).max() <= LARGEST_POLE
 
 
 @pytest.mark.parametrize("radius", [1.0, 1.05, 1.5])
 def test_unstable_signals(radius: float):
     system = np.array([[radius, 1.0], [0.0, 0.5]]), np.ones((2, 1)), np.eye(1, 2), np.zeros((1, 1))
     u = np.random.default_rng(0).normal(size=(60, 1))
-    starts = from_signals([u], [reference.dlsim(system, u)], 2)
-    checked(starts, 2, 1)
+    estimates = from_signals([u], [reference.dlsim(system, u)], 2)
+    checked(estimates, 2, 1)
     # The data grow to 1e10 in 60 samples, which leaves half the digits.
-    radii = [np.abs(np.linalg.eigvals(s.unstable)).max() for s in starts if s.unstable is not None]
+    radii = [
+        np.abs(np.linalg.eigvals(s.unstable)).max() for s in estimates if s.unstable is not None
+    ]
     assert min(np.abs(np.array(radii) - radius)) < 1e-6
     moved = min(1 / radius, MOVED_POLE)
-    poles = [np.sort(np.abs(np.linalg.eigvals(start.A))) for start in starts]
+    poles = [np.sort(np.abs(np.linalg.eigvals(estimate.A))) for estimate in estimates]
     assert min(np.abs(p - [min(0.5, moved), max(0.5, moved)]).max() for p in poles) < 1e-6
 
 
@@ -230,14 +236,14 @@ def test_unstable_response():
     A = np.array([[1.1, 0.3, 0.0], [-0.3, 1.1, 0.0], [0.0, 0.0, 0.5]])
     system = A, np.ones((3, 1)), np.ones((1, 3)), np.zeros((1, 1))
     lines = lines_of(system, BANDS["all"], 30)
-    starts = from_spectra(lines.z, lines.U, lines.Y, 3)
-    checked(starts, 3, 1)
+    estimates = from_spectra(lines.z, lines.U, lines.Y, 3)
+    checked(estimates, 3, 1)
     radius = np.hypot(1.1, 0.3)
-    for start in starts:
-        assert start.unstable is not None
-        found = np.abs(np.linalg.eigvals(start.unstable)).max()
+    for estimate in estimates:
+        assert estimate.unstable is not None
+        found = np.abs(np.linalg.eigvals(estimate.unstable)).max()
         assert found == pytest.approx(radius, rel=1e-9)
-        poles = np.sort_complex(np.linalg.eigvals(start.A))
+        poles = np.sort_complex(np.linalg.eigvals(estimate.A))
         expected = np.array([0.5, (1.1 - 0.3j) / radius**2, (1.1 + 0.3j) / radius**2])
         np.testing.assert_allclose(poles, np.sort_complex(expected), rtol=0, atol=1e-9)
 
