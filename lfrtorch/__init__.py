@@ -1,5 +1,6 @@
 """Identification of nonlinear LFR state-space models from input-output data.
 
+dataset, settings -> identify -> run: the whole job in one call, or step by step:
 records -> estimate_bla -> initialise or infer -> fit -> simulate, save, load
 records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 """
@@ -38,6 +39,11 @@ from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 
+# the whole job
+from lfrtorch.fitting.settings import Settings, SizesSearch
+from lfrtorch.job import identify
+from lfrtorch.reporting.run import Run
+
 # scores
 from lfrtorch.metrics import nrmse, rmse
 
@@ -60,14 +66,18 @@ __all__ = [
     "Polynomial",
     "Published",
     "Record",
+    "Run",
     "Scaler",
+    "Settings",
     "SizeSearch",
+    "SizesSearch",
     "Snapshots",
     "datasets",
     "distributed",
     "estimate_bla",
     "estimate_frf",
     "fit",
+    "identify",
     "infer",
     "initialise",
     "load",

@@ -47,6 +47,7 @@ class Dataset:
         linear: training records that a test's own linear model is estimated from, by the names of
             test and records; tests without an entry have the linear model of all records.
         notes: what a reader of the scores should know of the data, a sentence each.
+        seed: that simulated data were drawn with.
         leaderboard: test records as nonlinearbenchmark.org has them scored: cut by the package
             nonlinear_benchmarks, the start state fitted to the samples that it leaves unscored.
 
@@ -66,3 +67,4 @@ class Dataset:
     notes: tuple[str, ...] = ()
     linear: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     leaderboard: list[Record] = field(default_factory=list)
+    seed: int | None = None

@@ -1,62 +1,90 @@
-"""The configuration: where it lies, and what is missing from it."""
+"""The configuration: where it lies, and the dataset and settings that it describes."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from torch.nn import Module
 
 import lfrtorch
-from lfrtorch._checks import integer, number
+from lfrtorch._checks import integer
+from lfrtorch.dataset import Dataset
+from lfrtorch.fitting.settings import Settings, SizesSearch
+from lfrtorch.survey.findings import findings
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 CONF = next(folder for folder in (_PACKAGE / "conf", _PACKAGE.parent / "conf") if folder.is_dir())
 """Inside the package if it is installed, at the top of its repository otherwise."""
 
-LAST_SIZE = {"network": ["nn"], "polynomial": ["degree"]}
-"""The size of a kind of static map beside nz and nw."""
 
+def configured(cfg: DictConfig) -> Settings:
+    """The settings of an identification.
 
-def require(cfg: DictConfig) -> None:
-    """Say what is missing from the command line before anything is computed."""
+    Raises:
+        ValueError: settings that cannot be, or no data chosen.
+    """
     require_data(cfg)
-    if cfg.nx is None and cfg.init_from is not None:
-        cfg.nx = opened(cfg).sizes["nx"]
-    if cfg.nx is None:
+    if cfg.nx is None and cfg.init_from is None:
         raise ValueError(
             "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
             "(+bench=boucwen sets it and all else for that benchmark)."
         )
-    for name in ("nx", "nz", "nw", "nn", "degree"):
-        integer(name, cfg[name], 1, word="auto")
-    for name in {"nn", "degree"} - {*sizes_of(cfg)}:
-        if cfg[name] == "auto":
-            used = sizes_of(cfg)[-1]
-            raise ValueError(f"{name} is auto, and this static map has none; give {used}=auto.")
-    if cfg.static.kind == "own" and "auto" in (cfg.nz, cfg.nw):
-        raise ValueError("nz or nw is auto, and a map of one's own is not searched; give numbers.")
-    integer("sizes_search.starts", cfg.sizes_search.starts, 1)
-    number("sizes_search.iterations", cfg.sizes_search.iterations, positive=True)
-    integer("nx_max", cfg.nx_max, 1)
-    integer("seed", cfg.seed, 0)
-    integer("starts", cfg.starts, 1)
-    integer("average", cfg.average, 1)
     if cfg.threads is not None:
         integer("threads", cfg.threads, 1)
     if cfg.dtype not in ("float32", "float64"):
         raise ValueError(f"dtype is {cfg.dtype}; give float64 or float32.")
-    try:
-        torch.empty(0, device=cfg.device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(
-            f"device is {cfg.device}, which torch cannot use here ({reason}); "
-            "device=cpu always works."
-        ) from None
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    return Settings(
+        **{name: plain[name] for name in AS_THEY_ARE},
+        static=partial(own_map, cfg) if cfg.static.kind == "own" else cfg.static.kind,
+        init=cfg.init.method,
+        minor=cfg.init.get("minor"),
+        linear=plain["bla"],
+        trainer=instantiate(cfg.trainer),
+        init_from=None if cfg.init_from is None else opened(cfg),
+        sizes_search=SizesSearch(**plain["sizes_search"]),
+        dtype=getattr(torch, cfg.dtype),
+    )
+
+
+AS_THEY_ARE = (
+    "nx", "nx_max", "nz", "nw", "nn", "activation", "degree", "ridge", "average", "starts",
+    "seed", "device",
+)  # fmt: skip
+"""Settings that are the words of the configuration."""
+
+
+def own_map(cfg: DictConfig, nz: int, nw: int) -> Module:
+    """A static map of the user's own."""
+    options = {name: value for name, value in cfg.static.items() if name != "kind"}
+    return instantiate(options, nz=nz, nw=nw)
+
+
+def opened(cfg: DictConfig) -> lfrtorch.Model:
+    """The model of ``init_from`` as it was saved; sizes that it replaces are named."""
+    own = own_map(cfg, cfg.nz, cfg.nw) if cfg.static.kind == "own" else None
+    model = lfrtorch.load(cfg.init_from, static=own)
+    for name, size in model.sizes.items():
+        if cfg[name] not in (size, None):
+            print(
+                f"note: {name} is {size}, that of the model in '{cfg.init_from}', not {cfg[name]}"
+            )
+    return model
+
+
+def loaded(cfg: DictConfig) -> Dataset:
+    """The records; what is to be known of them is printed."""
+    dataset: Dataset = instantiate(cfg.data)
+    measured = [record for record in dataset.train if record.source == "file"]
+    for note in (*dataset.notes, *(findings(measured) if measured else ())):
+        print(f"note: {note}")
+    return dataset
 
 
 def require_data(cfg: DictConfig) -> None:
@@ -66,24 +94,3 @@ def require_data(cfg: DictConfig) -> None:
             "no data chosen: add +bench=boucwen, or data=file data.path=FILE "
             "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER (or nx=auto)."
         )
-
-
-def sizes_of(cfg: DictConfig) -> list[str]:
-    """Of the static nonlinearity: nz, nw, and a polynomial's degree or a network's nn."""
-    return ["nz", "nw", *LAST_SIZE.get(cfg.static.kind, ())]
-
-
-def static_map(cfg: DictConfig) -> dict[str, Any]:
-    """The arguments of a start that say which static nonlinearity it has."""
-    if cfg.static.kind == "network":
-        return {"nn": cfg.nn, "activation": cfg.activation}
-    if cfg.static.kind == "polynomial":
-        return {"static": lfrtorch.Polynomial(cfg.nz, cfg.nw, cfg.degree)}
-    own = {name: value for name, value in cfg.static.items() if name != "kind"}
-    return {"static": instantiate(own, nz=cfg.nz, nw=cfg.nw)}
-
-
-def opened(cfg: DictConfig) -> lfrtorch.Model:
-    """The model of ``init_from`` as it was saved."""
-    own = static_map(cfg)["static"] if cfg.static.kind == "own" else None
-    return lfrtorch.load(cfg.init_from, static=own)

@@ -16,10 +16,10 @@ from omegaconf import DictConfig
 
 import lfrtorch
 from lfrtorch._atomic import refuse_existing, whole_file
-from lfrtorch.cli.config import CONF, require_data
+from lfrtorch.cli.config import CONF, loaded, require_data
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import program
-from lfrtorch.cli.steps import loaded, same_channels
+from lfrtorch.job import check_channels
 from lfrtorch.reporting import scores as report
 
 
@@ -39,7 +39,7 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
     model, bla = lfrtorch.load(folder), linear_beside(folder)
     dataset = loaded(cfg)
     for record in (*dataset.tests, *dataset.validation, *dataset.selection):
-        same_channels(model, record, folder)
+        check_channels(model, record)
     if bla is None:
         print(f"note: '{folder}' has no folder linear/, so no linear model is scored")
     elif dataset.linear:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM during a fit: it ends between two iterations, and what it found is kept."""
+"""Ctrl-C and SIGTERM: a fit ends between two iterations, and what it found is kept."""
 
 from __future__ import annotations
 
@@ -6,26 +6,22 @@ import signal
 import sys
 from typing import Any, Self
 
-import torch
-
-from lfrtorch.distributed import Ranks
-from lfrtorch.fitting.trainer import Progress
-from lfrtorch.model import Model
-
 
 class Terminated(Exception):
-    """SIGTERM ended the fit; what it had found is written."""
+    """SIGTERM ended the program."""
 
 
 class Termination:
-    """Ctrl-C and SIGTERM as a monitor: the fit ends after an iteration, and files are written.
+    """Ctrl-C and SIGTERM as a request that a fit asks for before each iteration, its ``stop``.
 
-    So no write is torn; a second Ctrl-C ends it at once. A batch system sends SIGTERM before it
-    kills, and torchrun to the processes that are left: several end together where one is asked to.
+    So no write is torn. A second Ctrl-C ends the program at once, and before a fit has begun to ask
+    the first one does. A batch system sends SIGTERM before it kills, and torchrun sends it to the
+    processes that are left.
     """
 
-    def __init__(self, ranks: Ranks) -> None:
-        self.ranks, self.asked = ranks, 0
+    def __init__(self) -> None:
+        self.asked = 0
+        self._fitting = False
         self._signals = [signal.SIGTERM]
         if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background job
             self._signals.append(signal.SIGINT)
@@ -38,14 +34,16 @@ class Termination:
         for each, usual in zip(self._signals, self._usual, strict=True):
             signal.signal(each, usual)
 
-    def __call__(self, model: Model, progress: Progress) -> None:
-        """End the fit where that was asked for."""
-        if self.ranks.sum(torch.tensor(self.asked)):
-            raise KeyboardInterrupt
+    def __call__(self) -> bool:
+        """Whether the fit is to end."""
+        self._fitting = True
+        return bool(self.asked)
 
     def _note(self, number: int, _: Any) -> None:
+        again, self.asked = self.asked == number, number
         if number == signal.SIGINT:
-            if self.asked == number:
+            if again or not self._fitting:
                 raise KeyboardInterrupt
             print("\nending after this iteration; Ctrl-C again: at once", file=sys.stderr)
-        self.asked = number
+        elif not self._fitting:
+            raise Terminated("terminated outside the fit: nothing to keep")

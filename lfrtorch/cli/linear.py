@@ -27,19 +27,20 @@ from lfrtorch import _tables
 from lfrtorch._atomic import whole_file
 from lfrtorch._tables import in_percent
 from lfrtorch.analysis.poles import roots
-from lfrtorch.cli.config import CONF, require
+from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
-from lfrtorch.cli.steps import linear_model, loaded
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
+from lfrtorch.job import linear_model
 from lfrtorch.metrics import rms
 from lfrtorch.reporting import linear_plots, plots
+from lfrtorch.reporting.console import Console
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     """One run, its files written into ``folder``."""
-    require(cfg)
+    settings = configured(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
     dataset = loaded(cfg)
@@ -47,7 +48,10 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     frf, notes = response(cfg, dataset.train)
     # A fit to the response takes the one that the figures show.
     data = frf if frf and cfg.bla.refine == "frequency" else dataset.train
-    model, scan = linear_model(cfg, data, dataset.validation, Ranks())
+    model, scan = linear_model(
+        data, settings, dataset.validation, observer=Console(), ranks=Ranks()
+    )
+    cfg.nx = model.nx
     assert model.fit is not None
     for note in notes:
         if note not in model.fit.notes:

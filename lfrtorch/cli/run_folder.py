@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -69,14 +70,14 @@ def now(word: str) -> str:
     return word
 
 
-def chosen_before(cfg: DictConfig, folder: Path) -> None:
-    """Take the sizes that the run to go on with chose from the data."""
+def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:
+    """The configuration with the sizes that the run to go on with chose from the data."""
     if cfg.resume is None or not (folder / CONFIG).is_file():
-        return
+        return cfg
     before = OmegaConf.load(folder / CONFIG)
-    for name in ("nx", "nz", "nw", "nn", "degree"):
-        if cfg[name] == "auto":
-            cfg[name] = OmegaConf.select(before, name)
+    names = [n for n in ("nx", "nz", "nw", "nn", "degree") if cfg[n] == "auto"]
+    chosen = {name: OmegaConf.select(before, name) for name in names}
+    return cast(DictConfig, OmegaConf.merge(cfg, chosen))
 
 
 def program(script: str) -> list[str]:

@@ -149,6 +149,7 @@ def load(
         selection=chosen[1:],
         tests=[_multisine_test(folder, seed + _TEST_OFFSET), _sweep_test(folder)],
         noise_rms=noise_rms,
+        seed=seed,
         published=_PUBLISHED,
     )
 

@@ -167,6 +167,7 @@ def load(
             record("arrow", *data.arrow(), skip=_ARROW_SKIP),
         ],
         noise_rms=noise_rms if path is None else None,
+        seed=seed,
         published=_PUBLISHED,
         notes=notes,
         linear=_linear(chosen, realisations),

@@ -41,6 +41,8 @@ from lfrtorch.fitting.trainer import (
     Monitor,
     Progress,
     Start,
+    Stop,
+    StoppedError,
     Trainer,
 )
 from lfrtorch.least_squares.joint import Stack
@@ -95,6 +97,7 @@ def fit(
     watch: Callable[[Round], None] = lambda _: None,
     ranks: Ranks | None = None,
     snapshots: Snapshots | None = None,
+    stop: Stop | None = None,
 ) -> FitResult:
     """Minimise the simulation error of a model over records; from several starts, keep the best.
 
@@ -132,6 +135,8 @@ def fit(
             the same fit.
         snapshots: where the starts are kept as far as they came. If some are, they go on from
             there, to the same end as if they had not been interrupted (on the same machine).
+        stop: asked before each iteration; the fit ends there if it returns True, for example
+            ``lambda: time.monotonic() > deadline``. Of several processes one ends all.
 
     Returns:
         The fit of the best start, its duration that of all. Of several models ``starts`` has all,
@@ -175,7 +180,9 @@ def fit(
         )
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots
+    halt = Event()
     options = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
+    options["stop"] = _any_of(halt, stop) if ranks is None or ranks.world == 1 else stop
     fits = [
         Fit(model, train, validation, **options, keep=snapshots.keeper(number))
         for number, model in enumerate(starts)
@@ -183,7 +190,7 @@ def fit(
     snapshots.restore(fits)
     unseen = [r for some in (validation, selection) if some for r in as_records(some)]
     judge = _Judge(fits, unseen if selection else [], unseen)
-    together = _Together(fits, watching or [()] * len(fits))
+    together = _Together(fits, watching or [()] * len(fits), halt)
     limit, field = fits[0].trainer.limit, fits
     rounds = ROUNDS if len(fits) > 1 else ()
     ends = sorted({ceil(part * limit) for part in rounds} | {limit})
@@ -193,8 +200,8 @@ def fit(
             continue
         together.advance(field, until)
         field = judge.ranked(field)
-        if not field:  # interrupted before there was anything to keep
-            raise KeyboardInterrupt
+        if not field:
+            raise StoppedError("the fit was stopped before its first iterate")
         watch(Round(number, len(ends), judge.summaries(field), time.perf_counter() - clock))
         cut = next((fit.reason for fit in field if _cut_short(fit)), "")
         if cut:
@@ -298,13 +305,19 @@ class _Judge:
         return next(number for number, other in enumerate(self.fits) if other is fit)
 
 
-class _Together:
-    """The starts of one fit, and who watches them."""
+def _any_of(halt: Event, stop: Stop | None) -> Stop:
+    return lambda: halt.is_set() or (stop is not None and stop())
 
-    def __init__(self, fits: Sequence[Fit], monitors: Sequence[Sequence[Monitor]]) -> None:
-        self._stop, self._one = Event(), Lock()
+
+class _Together:
+    """The starts of one fit, and who watches them; ``halt`` is set if Ctrl-C ends one thread."""
+
+    def __init__(
+        self, fits: Sequence[Fit], monitors: Sequence[Sequence[Monitor]], halt: Event
+    ) -> None:
+        self._halt, self._one = halt, Lock()
         self._monitors = {
-            id(fit): [self._halt, *map(self._in_turn, own)]
+            id(fit): [self._in_turn(monitor) for monitor in own]
             for fit, own in zip(fits, monitors, strict=True)
         }
 
@@ -316,19 +329,19 @@ class _Together:
             if len(fits) > 1 and in_step and first.problem.theta.device.type != "cpu":
                 advance_in_step(fits, until, [self._monitors[id(fit)] for fit in fits])
             elif len(fits) > 1 and first.ranks.world == 1:
-                each_alone(
-                    lambda fit: fit.advance(until, self._monitors[id(fit)]), fits, self._stop.set
-                )
+                each_alone(lambda fit: self._go_on(fit, until), fits, self._halt.set)
             else:
                 for fit in fits:
-                    fit.advance(until, self._monitors[id(fit)])
+                    self._go_on(fit, until)
         except KeyboardInterrupt:
+            if not any(fit.history for fit in fits):
+                raise
             for fit in fits:
                 fit.reason = INTERRUPTED
 
-    def _halt(self, model: Model, progress: Progress) -> None:
-        if self._stop.is_set():
-            raise KeyboardInterrupt
+    def _go_on(self, fit: Fit, until: int) -> None:
+        if fit.history or not fit.stopped():
+            fit.advance(until, self._monitors[id(fit)])
 
     def _in_turn(self, monitor: Monitor) -> Monitor:
         def call(model: Model, progress: Progress) -> None:
@@ -345,7 +358,7 @@ def advance_in_step(
     """Go on with several fits by Levenberg-Marquardt to an iteration, evaluated together.
 
     Raises:
-        KeyboardInterrupt: from a monitor, or by Ctrl-C.
+        KeyboardInterrupt: by Ctrl-C.
     """
     watching = dict(zip(map(id, fits), monitors or [()] * len(fits), strict=True))
     trainer = fits[0].trainer
@@ -354,7 +367,7 @@ def advance_in_step(
         if not fit.history:
             fit.begin(watching[id(fit)])
     try:
-        while live := [f for f in fits if not f.over and f.state.iteration < until]:
+        while live := [f for f in fits if _goes_on(f, until)]:
             clock = time.perf_counter()
             after = trainer.steps(Stack([f.problem for f in live]), [f.state for f in live])
             each = (time.perf_counter() - clock) / len(live)
@@ -371,6 +384,10 @@ def _gone_on(field: list[Fit], kept: list[Fit]) -> list[Fit]:
         if not any(fit is other for other in kept):
             fit.reason = LEFT
     return kept
+
+
+def _goes_on(fit: Fit, until: int) -> bool:
+    return not fit.over and fit.state.iteration < until and not fit.stopped()
 
 
 def _cut_short(fit: Fit) -> bool:

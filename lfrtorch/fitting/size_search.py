@@ -42,7 +42,7 @@ from lfrtorch._tables import number
 from lfrtorch._types import Array, Integers
 from lfrtorch.distributed import LOST, ProcessLost, Ranks
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.trainer import INTERRUPTED, Monitor, StartDiverges, Trainer
+from lfrtorch.fitting.trainer import INTERRUPTED, StartDiverges, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
@@ -204,9 +204,9 @@ def search_sizes(
     seeds: Sequence[int] = SEEDS,
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
-    monitors: Sequence[Monitor] = (),
     watch: Callable[[Candidate], None] = lambda _: None,
     ranks: Ranks | None = None,
+    stop: Stop | None = None,
 ) -> SizeSearch:
     """Models of several sizes, and the smallest that is good enough.
 
@@ -220,14 +220,13 @@ def search_sizes(
         linear: the model that errors are compared with.
         seeds: of the starts.
         trainer: Levenberg-Marquardt with 50 iterations where left out.
-        ridge, ranks: see :func:`lfrtorch.fit`.
-        monitors: of each start.
+        ridge, ranks, stop: see :func:`lfrtorch.fit`.
         watch: called after each model.
 
     Raises:
         ValueError: nothing to try, no records for validation or too short ones, or no model that is
             stable on them.
-        KeyboardInterrupt: Ctrl-C, from a monitor as well: there is no choice yet.
+        StoppedError: by Ctrl-C or ``stop``: there is no choice yet.
         ProcessLost: likewise.
 
     Example:
@@ -268,14 +267,14 @@ def search_sizes(
                     validation,
                     trainer=trainer,
                     ridge=ridge,
-                    monitors=[monitors] * len(models),
                     ranks=ranks,
+                    stop=stop,
                 )
             except StartDiverges:
                 squares = np.full(len(judge.counts), inf)
             else:
                 if result.reason == INTERRUPTED:
-                    raise KeyboardInterrupt
+                    raise StoppedError("the search for sizes was stopped")
                 if result.reason.startswith(LOST):
                     raise ProcessLost(result.reason)
                 squares = judge.squares(result.model)

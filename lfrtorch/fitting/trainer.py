@@ -122,6 +122,9 @@ class Progress:
 Monitor = Callable[[Model, Progress], None]
 """Called at the start and after each iteration, the iterate in the model's weights."""
 
+Stop = Callable[[], bool]
+"""Asked before each iteration; True ends the fit there, and the best iterate is kept."""
+
 Keep = Callable[["Fit", bool], None]
 """Called with a fit after each iteration, and where it pauses (then with True)."""
 
@@ -184,6 +187,10 @@ class FitResult:
         return self.history[-1].iteration
 
 
+class StoppedError(Exception):
+    """A fit or a search was stopped before there was anything to keep."""
+
+
 def nothing(fit: Fit, paused: bool) -> None:
     """Keep no fit."""
 
@@ -195,6 +202,8 @@ class Fit:
         model, train, validation, trainer, ridge, ranks: see :func:`lfrtorch.fit`.
         keep: called with the fit after every iteration, when it may be saved, and with True where
             it pauses.
+        stop: asked before each iteration whether to end there; of several processes each has one,
+            and one that says so ends all.
 
     Raises:
         ValueError: see :func:`lfrtorch.fit`.
@@ -210,8 +219,9 @@ class Fit:
         ridge: Ridge = 0.0,
         ranks: Ranks | None = None,
         keep: Keep = nothing,
+        stop: Stop | None = None,
     ) -> None:
-        self.model, self.keep = model, keep
+        self.model, self.keep, self._stop = model, keep, stop
         self.trainer = LevenbergMarquardt() if trainer is None else trainer
         self.ranks = ranks = Ranks() if ranks is None else ranks
         if ranks.world > 1:
@@ -247,6 +257,13 @@ class Fit:
             return False
         return bool(self.state.reason) or self.state.iteration >= self.trainer.limit
 
+    def stopped(self) -> bool:
+        """Whether the fit is asked to end here, which then is its reason."""
+        asked = self._stop is not None and bool(self.ranks.sum(torch.tensor(int(self._stop()))))
+        if asked:
+            self.reason = INTERRUPTED
+        return asked
+
     @spread_by_hand()
     def advance(self, until: int | None = None, monitors: Sequence[Monitor] = ()) -> Self:
         """Go on to an iteration, the trainer's last where left out; the best is in the model.
@@ -258,7 +275,7 @@ class Fit:
         try:
             if not self.history:
                 self.begin(monitors)
-            while not self.over and self.state.iteration < until:
+            while not self.over and self.state.iteration < until and not self.stopped():
                 clock = time.perf_counter()
                 after = self.trainer.step(self.problem, self.state)
                 self.take(after, time.perf_counter() - clock, monitors)

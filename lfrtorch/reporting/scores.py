@@ -19,9 +19,6 @@ from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
-SEED_STEP = 1000
-"""Between the seeds of several starts."""
-
 
 @dataclass(frozen=True)
 class Score:
@@ -65,20 +62,14 @@ def score(model: Model, bla: LinearModel | None, record: Record) -> Score:
     )
 
 
-def seeds(seed: int, starts: int) -> list[int]:
-    """Seeds of several random starts; those of neighbouring seeds have none in common."""
-    return [seed + SEED_STEP * number for number in range(starts)]
-
-
 def metrics(
     result: FitResult,
     bla: LinearModel,
     dataset: Dataset,
     *,
     own: Mapping[str, LinearModel] | None = None,
-    seed: int,
-    data_seed: int | None,
-    command: str,
+    seeds: Sequence[int],
+    command: str = "",
     search: SizeSearch | None = None,
 ) -> dict:
     """What ``metrics.json`` holds, scores by test record; None where a number is not finite.
@@ -88,8 +79,7 @@ def metrics(
         bla: linear model of all training records.
         dataset: what was fitted, chosen on and is scored.
         own: linear models of single tests, by name (see ``Dataset.linear``).
-        seed: of the first random start.
-        data_seed: of simulated data.
+        seeds: of the random starts.
         command: that made it.
         search: for the sizes, where they were not given.
     """
@@ -97,7 +87,7 @@ def metrics(
     entries = evaluation(model, bla, dataset, own=own, command=command)
     entries["data"] |= {
         "samples": sum(record.samples for record in dataset.train),
-        "seed": data_seed,
+        "seed": dataset.seed,
     }
     entries |= {
         "sizes_search": [] if search is None else search.entries(),
@@ -111,9 +101,7 @@ def metrics(
         "stable_to": loudest(model, dataset.train),
         "starts": max(1, len(result.starts)),
         "averaged": result.averaged,
-        "ranking": [
-            {"seed": seeds(seed, start.number + 1)[-1], **asdict(start)} for start in result.starts
-        ],
+        "ranking": [{"seed": seeds[start.number], **asdict(start)} for start in result.starts],
     }
     return _finite(entries)
 
@@ -167,7 +155,7 @@ def evaluation(
     return _finite(entries)
 
 
-def table(result: dict, published: Sequence[Published]) -> str:
+def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     """The benchmark's table: our linear model and NL-LFR beside the published ones, in one unit."""
     sizes = result["sizes"]
     mine = (sizes["nz"], sizes["nw"])
@@ -202,7 +190,7 @@ def neurons(count: int) -> str:
     return f"{count} neurons" if count else "a map of one's own"
 
 
-def starts_table(result: dict) -> str:
+def starts_table(result: Mapping[str, Any]) -> str:
     """All starts of a fit, the best first."""
     head = ["seed", "iterations", "training", "validation", "selection", ""]
     rows = [

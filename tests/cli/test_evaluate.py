@@ -105,7 +105,7 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
     folder = tmp_path / "run"
     folder.mkdir()
     words = [*file_overrides(csv), "nx=1", "nn=2", "trainer.max_iter=1"]
-    fit.identify(configuration(*words), folder)
+    fit.run(configuration(*words), folder)
     run(monkeypatch, f"checkpoint={folder}", *words, f"out={tmp_path / 'scores.json'}")
     found = json.loads((tmp_path / "scores.json").read_text())
     metrics = json.loads((folder / "metrics.json").read_text())

@@ -34,7 +34,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 import lfrtorch
-from lfrtorch.cli import config, errors, fit, interrupts, run_folder, steps
+from lfrtorch.cli import config, errors, fit, interrupts, run_folder
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
 
@@ -69,10 +69,10 @@ ROUNDING = 1e-12
 def test_every_bench_composes(bench: str):
     cfg = configuration(f"+bench={bench}")
     assert cfg.name == bench
-    config.require(cfg)
+    settings = config.configured(cfg)
     dataset = bench.removesuffix("_record")
     assert cfg.data["_target_"] == f"lfrtorch.datasets.{dataset}.load"
-    assert (cfg.bla.nx, cfg.init.nz, cfg.init.nw) == (cfg.nx, cfg.nz, cfg.nw)
+    assert settings.sizes.items() <= dict(cfg).items()
     arguments = inspect.signature(get_object(cfg.data["_target_"])).parameters
     for name, argument in arguments.items():  # a bench is the loader's own default, spelt out
         default = argument.default
@@ -104,7 +104,7 @@ def test_every_bench_runs_two_iterations(
         cfg.data.root = str(request.getfixturevalue("benchmark_root"))
     cfg.figures = (bench, choice) == ("boucwen", "trainer.max_iter=2")  # of whole periods, once
     try:
-        fit.identify(cfg, tmp_path)
+        fit.run(cfg, tmp_path)
     except InstantiationException as failed:
         if bench not in SIMULATED and isinstance(failed.__cause__, FileNotFoundError):
             pytest.skip(str(failed.__cause__))
@@ -122,18 +122,18 @@ def test_notes_on_the_data_are_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(official, "cache", lambda: tmp_path)  # without files
-    data = steps.loaded(configuration("+bench=parwh", "data.levels=[100]"))
+    data = config.loaded(configuration("+bench=parwh", "data.levels=[100]"))
     assert data.tests[0].source == "stand-in"
     assert capsys.readouterr().out == f"note: {data.notes[0]}\n"
 
 
-@pytest.mark.parametrize("group", ["bla", "data", "init", "trainer"])
+@pytest.mark.parametrize("group", ["bla", "data", "trainer"])
 def test_every_option_of_a_group_is_an_argument_of_its_target(group: str):
     for path in (CONF / group).glob("*.yaml"):
         node = OmegaConf.load(path)
         assert isinstance(node, DictConfig)
-        parameters = inspect.signature(get_object(node["_target_"])).parameters
-        assert set(node) - {"_target_"} <= set(parameters)
+        target = lfrtorch.estimate_bla if group == "bla" else get_object(node["_target_"])
+        assert set(node) - {"_target_"} <= set(inspect.signature(target).parameters)
 
 
 def test_a_static_map_of_ones_own(csv: Path, tmp_path: Path, capsys):
@@ -141,7 +141,7 @@ def test_a_static_map_of_ones_own(csv: Path, tmp_path: Path, capsys):
     cfg = configuration(*words, "static._target_=cli.test_fit.Cubic")
     with open_dict(cfg):
         cfg.static.scale = 0.5
-    fit.identify(cfg, tmp_path)
+    fit.run(cfg, tmp_path)
     model = lfrtorch.load(tmp_path, static=Cubic(1, 1, 0.5))
     assert isinstance(model.lfr.cell.static, Cubic)
     assert model.lfr.cell.static.scale == 0.5
@@ -149,7 +149,7 @@ def test_a_static_map_of_ones_own(csv: Path, tmp_path: Path, capsys):
     cfg.init_from, cfg.nx = str(tmp_path), None
     again = tmp_path / "again"
     again.mkdir()
-    fit.identify(cfg, again)
+    fit.run(cfg, again)
     assert lfrtorch.load(again, static=Cubic(1, 1, 0.5)).sizes["nx"] == 1
 
 
@@ -175,7 +175,7 @@ def test_the_words_of_a_run_are_read_by_their_new_names(tmp_path: Path):
 def test_the_paper_cases_are_one_override():
     for nz, nw in ((1, 1), (2, 1), (2, 2)):
         cfg = configuration("+bench=boucwen", f"nz={nz}", f"nw={nw}")
-        assert (cfg.init.nz, cfg.init.nw, cfg.nn) == (nz, nw, 15)
+        assert config.configured(cfg).sizes == {"nx": 3, "nz": nz, "nw": nw, "nn": 15}
 
 
 @pytest.mark.numeric
@@ -210,8 +210,8 @@ def test_init_from_continues_where_the_run_ended(csv: Path, tmp_path: Path):
     for folder in (first, second):
         folder.mkdir()
     arguments = [*file_overrides(csv), "nx=1"]
-    fit.identify(configuration(*arguments, "trainer.max_iter=5"), first)
-    validation = fit.identify(
+    fit.run(configuration(*arguments, "trainer.max_iter=5"), first)
+    validation = fit.run(
         configuration(*arguments, f"init_from={first}", "trainer.max_iter=0"), second
     )
     before = json.loads((first / "metrics.json").read_text())["validation"]["rmse"]
@@ -225,10 +225,10 @@ def test_polynomial_is_chosen_and_continued(
     for folder in (first, second):
         folder.mkdir()
     arguments = [*file_overrides(csv), "nx=1", "nz=1", "trainer.max_iter=2"]
-    fit.identify(configuration(*arguments, "static=polynomial", "degree=2"), first)
+    fit.run(configuration(*arguments, "static=polynomial", "degree=2"), first)
     cfg = configuration(*arguments, f"init_from={first}")
-    fit.identify(cfg, second)
-    assert cfg.degree == 2
+    fit.run(cfg, second)
+    assert OmegaConf.load(second / "config.yaml").degree == 2
     sizes = json.loads((second / "metrics.json").read_text())["sizes"]
     assert sizes == {"nx": 1, "nz": 1, "nw": 1, "degree": 2}
     assert "nx 1, nz 1, nw 1, degree 2" in capsys.readouterr().out
@@ -242,13 +242,14 @@ def test_init_from_says_which_sizes_it_takes(
     for folder in (first, second):
         folder.mkdir()
     arguments = [*file_overrides(csv), "nx=1", "trainer.max_iter=1"]
-    fit.identify(configuration(*arguments, "nz=1", "nn=4"), first)
+    fit.run(configuration(*arguments, "nz=1", "nn=4"), first)
     cfg = configuration(*arguments, "nn=auto", f"init_from={first}")
-    fit.identify(cfg, second)
-    assert (cfg.nz, cfg.nn) == (1, 4)
+    fit.run(cfg, second)
+    saved = OmegaConf.load(second / "config.yaml")
+    assert (saved.nz, saved.nn) == (1, 4)
     assert "nz is 1, that of the model in" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"has the inputs u and the data u \(N\)"):
-        fit.identify(configuration("+bench=boucwen", f"init_from={first}"), second)
+        fit.run(configuration("+bench=boucwen", f"init_from={first}"), second)
 
 
 @pytest.mark.numeric
@@ -260,7 +261,7 @@ def test_a_resting_test_part_gives_a_score_that_is_null(tmp_path: Path):
     np.savez(tmp_path / "rest.npz", u=u, y=y)
     overrides = ["data=file", f"data.path={tmp_path / 'rest.npz'}", "data.inputs=[u]"]
     overrides += ["data.outputs=[y]", "data.fs=1", "data.test=0.1", "nx=1", "trainer.max_iter=1"]
-    fit.identify(configuration(*overrides), tmp_path)
+    fit.run(configuration(*overrides), tmp_path)
     score = json.loads((tmp_path / "metrics.json").read_text())["scores"]["test"]
     assert score["nrmse"] is None
     assert score["rmse"] >= 0
@@ -274,7 +275,7 @@ def test_a_run_without_test_and_validation_records(tmp_path: Path, capsys):
     overrides = ["data=file", f"data.path={tmp_path / 'all.npz'}", "data.inputs=[u]"]
     overrides += ["data.outputs=[y]", "data.fs=1", "nx=1", "trainer.max_iter=1"]
     overrides += ["data.test=0", "data.validation=0", "figures=true"]
-    fit.identify(configuration(*overrides), tmp_path)
+    fit.run(configuration(*overrides), tmp_path)
     assert "nothing is scored" in capsys.readouterr().out
     assert json.loads((tmp_path / "metrics.json").read_text())["scores"] == {}
     assert (tmp_path / "figures" / "convergence.png").is_file()
@@ -338,7 +339,7 @@ def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, t
     usual = signal.getsignal(signal.SIGTERM)
     cfg = configuration(*file_overrides(csv), "nx=1", "trainer._target_=cli.test_fit.Terminated")
     with pytest.raises(interrupts.Terminated, match="the best model so far is in"):
-        fit.identify(cfg, tmp_path)
+        fit.run(cfg, tmp_path)
     assert signal.getsignal(signal.SIGTERM) == usual
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["fit"]["reason"] == "interrupted"
@@ -352,11 +353,11 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
     cut, whole = tmp_path / "cut", tmp_path / "whole"
     for folder in (cut, whole):
         folder.mkdir()
-    fit.identify(configuration(*settings), whole)
+    fit.run(configuration(*settings), whole)
     with pytest.raises(interrupts.Terminated, match=f"python train.py resume={cut}"):
-        fit.identify(configuration(*settings, "trainer._target_=cli.test_fit.Terminated"), cut)
+        fit.run(configuration(*settings, "trainer._target_=cli.test_fit.Terminated"), cut)
     assert json.loads((cut / "metrics.json").read_text())["fit"]["reason"] == "interrupted"
-    fit.identify(configuration(*settings, f"resume={cut}"), cut)
+    fit.run(configuration(*settings, f"resume={cut}"), cut)
     ends = [json.loads((folder / "metrics.json").read_text()) for folder in (cut, whole)]
     assert ends[0]["scores"] == ends[1]["scores"]
     assert ends[0]["ranking"] == ends[1]["ranking"]
@@ -368,7 +369,7 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
 @pytest.mark.usefixtures("undrawn")
 def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "starts=3", "average=3", "trainer.max_iter=3"]
-    judged = fit.identify(configuration(*settings, "data.validation=0", "figures=true"), tmp_path)
+    judged = fit.run(configuration(*settings, "data.validation=0", "figures=true"), tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert (metrics["averaged"], metrics["sizes"]["nx"]) == (3, 3)
     assert judged == metrics["ranking"][0]["train"]
@@ -379,7 +380,7 @@ def test_the_mean_of_starts_is_a_model_of_the_run(csv: Path, tmp_path: Path):
 
 def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     settings = [*file_overrides(csv), "nx=1", "starts=2", "average=2", "trainer.max_iter=1"]
-    fit.identify(configuration(*settings, "static=polynomial", "figures=false"), tmp_path)
+    fit.run(configuration(*settings, "static=polynomial", "figures=false"), tmp_path)
     assert "note: average is for networks" in capsys.readouterr().out
     assert json.loads((tmp_path / "metrics.json").read_text())["averaged"] == 1
 
@@ -387,7 +388,7 @@ def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.Captu
 def test_a_new_run_forgets_the_one_that_it_replaces(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=2", "threads=3"]
     for seed in (0, 1):
-        fit.identify(configuration(*settings, f"seed={seed}"), tmp_path)
+        fit.run(configuration(*settings, f"seed={seed}"), tmp_path)
     assert torch.get_num_threads() == 3
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["fit"]["iterations"] == 2
@@ -426,16 +427,17 @@ def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path, option
 def test_sizes_are_searched_for(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     arguments = ["nx=auto", "nx_max=2", "nz=auto", "nw=1", "nn=auto", "trainer.max_iter=20"]
     cfg = configuration(*file_overrides(csv), *arguments, "sizes_search.nn=[1,3]")
-    fit.identify(cfg, tmp_path)
+    fit.run(cfg, tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     tried = metrics["sizes_search"]
     assert [(t["nz"], t["nw"], t["nn"]) for t in tried][:2] == [(1, 1, 3), (2, 1, 3)]
     (chosen,) = (t for t in tried if t["chosen"])
-    assert metrics["sizes"] == {"nx": cfg.nx} | {name: chosen[name] for name in ("nz", "nw", "nn")}
+    saved = OmegaConf.load(tmp_path / "config.yaml")
+    assert metrics["sizes"] == {"nx": saved.nx} | {n: chosen[n] for n in ("nz", "nw", "nn")}
     assert metrics["parameters_net"] == chosen["parameters_net"]
     assert chosen["ratio"] < 0.5
-    saved = OmegaConf.load(tmp_path / "config.yaml")
-    assert (saved.init.nz, saved.nn) == (chosen["nz"], chosen["nn"])
+    assert (saved.nz, saved.nn) == (chosen["nz"], chosen["nn"])
+    assert (cfg.nx, cfg.nn) == ("auto", "auto")  # what was asked for stays
     printed = capsys.readouterr().out
     assert "2 starts of 5 iterations for each model" in printed
     assert f"nz {chosen['nz']}, nw 1, nn {chosen['nn']}: {chosen['parameters']} par" in printed
@@ -447,10 +449,10 @@ def test_degree_is_searched_for_with_adam(csv: Path, tmp_path: Path):
     arguments = [*file_overrides(csv), "nx=1", "nz=1", "static=polynomial", "degree=auto"]
     arguments += ["sizes_search.degree=[1,2]", "trainer=adam", "trainer.max_iter=4"]
     cfg = configuration(*arguments)
-    fit.identify(cfg, tmp_path)
+    fit.run(cfg, tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert [t["degree"] for t in metrics["sizes_search"]] == [2, 1]
-    assert metrics["sizes"]["degree"] == cfg.degree
+    assert metrics["sizes"]["degree"] == OmegaConf.load(tmp_path / "config.yaml").degree
 
 
 class Interrupted(lfrtorch.LevenbergMarquardt):
@@ -545,7 +547,7 @@ def test_user_errors_are_one_message(
         (["nn=auto", "static=polynomial"], "nn is auto, and this static map has none"),
         (["nn=auto", "sizes_search.nn=[]"], "nn is empty"),
         (["sizes_search.starts=0"], "sizes_search.starts is 0"),
-        (["init.method=magic"], "init method is 'magic'"),
+        (["init.method=magic"], "init is 'magic'"),
         (["static=polynomial", "degree=0"], "degree is 0"),
         (["static=own", "nz=auto"], "a map of one's own is not searched; give numbers"),
         (["activation=softsign"], "activation is 'softsign'"),
@@ -582,7 +584,7 @@ def test_settings_that_cannot_be_are_one_message(
     given = any(word.startswith(("+bench=", "data=")) for word in overrides)
     cfg = configuration(*([] if given else [*file_overrides(csv), "nx=1"]), *overrides)
     with pytest.raises(SystemExit) as stop, errors.user_errors():
-        fit.identify(cfg, tmp_path)
+        fit.run(cfg, tmp_path)
     assert stop.value.code == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "metrics.json").exists()

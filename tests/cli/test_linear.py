@@ -256,8 +256,7 @@ def test_it_is_a_script_that_runs_anywhere(tmp_path: Path):
 def test_train_takes_the_order_of_a_scan(csv: Path, tmp_path: Path, capsys):
     words = overrides(csv, "a,b", "x", "nx=auto", "nx_max=3", "nn=2", "trainer.max_iter=1")
     cfg = configuration(*words)
-    fit.identify(cfg, tmp_path)
-    assert cfg.nx == 2
+    fit.run(cfg, tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text())["sizes"]["nx"] == 2
     assert "nx: 2\n" in (tmp_path / "config.yaml").read_text()
     printed = capsys.readouterr().out

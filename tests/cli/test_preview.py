@@ -14,7 +14,7 @@ from matplotlib.image import imread
 from scipy.io import savemat
 from scipy.signal import lfilter
 
-from lfrtorch.cli import preview, steps
+from lfrtorch.cli import config, preview
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.findings import examine
 from lfrtorch.survey.measurement import survey
@@ -239,9 +239,9 @@ def test_train_says_the_findings_of_a_file(file: Path, signals, capsys):
         file.parent / "clipped.csv", signals | {"level": np.nan_to_num(signals["level"])}
     )
     words = ["data=file", "data.inputs=[force]", "data.outputs=[level]", "data.fs=50"]
-    steps.loaded(configuration(*words, f"data.path={clipped}"))
+    config.loaded(configuration(*words, f"data.path={clipped}"))
     assert "note: output 'level' has its largest value 0.3" in capsys.readouterr().out
-    steps.loaded(configuration(*words, f"data.path={clean}"))
+    config.loaded(configuration(*words, f"data.path={clean}"))
     assert "note: output" not in capsys.readouterr().out
 
 

@@ -145,7 +145,7 @@ def test_drives_are_identified(tmp_path):
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         words = ["+bench=ced", f"data.root='{tmp_path}'", "figures=false", "starts=4"]
         cfg = compose("config", [*words, "trainer.max_iter=80"])
-    fit.identify(cfg, tmp_path)
+    fit.run(cfg, tmp_path)
     scores = json.loads((tmp_path / "metrics.json").read_text())["scores"]
     for level in ("low", "high"):
         assert scores[level]["rmse"] < 0.05

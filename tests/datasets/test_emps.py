@@ -163,7 +163,7 @@ def scores(root: Path, *words: str) -> dict[str, dict[str, float]]:
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         given = ["+bench=emps", f"data.root='{root}'", "figures=false", "starts=1"]
         cfg = compose("config", [*given, *words])
-    fit.identify(cfg, root)
+    fit.run(cfg, root)
     metrics = json.loads((root / "metrics.json").read_text())
     return metrics["scores"] | {"validation": metrics["validation"]}
 

@@ -222,7 +222,7 @@ def test_run(shaken, tmp_path, capsys):
     overrides = ["+bench=f16", f"data.root='{shaken}'", *sizes.split(), *shorter.split()]
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         cfg = compose("config", overrides)
-    fit.identify(cfg, tmp_path)
+    fit.run(cfg, tmp_path)
     result = json.loads((tmp_path / "metrics.json").read_text())
     assert list(result["scores"]) == ["level_2", "level_4", "level_6"]
     for score in result["scores"].values():

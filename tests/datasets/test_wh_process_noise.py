@@ -154,7 +154,7 @@ def test_run(tmp_path):
     overrides = ["+bench=wh_process_noise", f"data.root='{tmp_path}'", *sizes.split()]
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         cfg = compose("config", overrides)
-    fit.identify(cfg, tmp_path / "run")
+    fit.run(cfg, tmp_path / "run")
     result = json.loads((tmp_path / "run" / "metrics.json").read_text())
 
     u, y = u[:, -1:], y[:, -1:]

@@ -25,7 +25,7 @@ from lfrtorch.fitting.size_search import (
     standard_errors_above,
 )
 from lfrtorch.fitting.starts import initialise
-from lfrtorch.fitting.trainer import Progress
+from lfrtorch.fitting.trainer import StoppedError
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
@@ -274,19 +274,23 @@ def test_a_model_that_explodes_on_validation_diverges():
 
 
 def test_ctrl_c_and_lost_processes_end_the_search():
-    def stop(model: Model, progress: Progress):
-        if progress.iteration == 1:
+    class CtrlC(LevenbergMarquardt):
+        def step(self, problem: Any, state: Any) -> Any:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        search(plant(1, 1), monitors=[stop])
-
-    def lose(model: Model, progress: Progress):
-        if progress.iteration == 1:
+    class Losing(LevenbergMarquardt):
+        def step(self, problem: Any, state: Any) -> Any:
             raise ProcessLost(f"{LOST}: for good")
 
+    with pytest.raises(StoppedError):
+        search(plant(1, 1), trainer=CtrlC())
     with pytest.raises(ProcessLost, match="for good"):
-        search(plant(1, 1), monitors=[lose])
+        search(plant(1, 1), trainer=Losing())
+
+
+def test_a_search_ends_if_it_is_asked_to():
+    with pytest.raises(StoppedError):
+        search(plant(1, 1), stop=lambda: True)
 
 
 def test_the_first_process_decides():

@@ -80,7 +80,7 @@ class Run:
 
     def page(self, advice: tuple[Advice, ...] = (), search=(), **options) -> Page:
         metrics = report.metrics(
-            self.result, self.bla, self.dataset, seed=0, data_seed=None, command="train.py a=1"
+            self.result, self.bla, self.dataset, seeds=range(2), command="train.py a=1"
         )
         metrics["sizes_search"] = search
         images = {"convergence": b"PNG 1", "near": b"PNG 2"}

@@ -32,26 +32,33 @@ def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:
         Published("large", {"test": 0.125}, "C (2003)", sizes=(2, 2)),
     )
     data = Dataset(
-        "saturation", train, validation, test, noise_rms=0.01, published=others, notes=("a note",)
+        "saturation",
+        train,
+        validation,
+        test,
+        noise_rms=0.01,
+        published=others,
+        notes=("a note",),
+        seed=3,
     )
     bla = lfrtorch.estimate_bla(train, nx=2)
     model = lfrtorch.initialise(bla, train, nz=1, nw=1, nn=3)
     return lfrtorch.fit(model, train, validation, trainer=lfrtorch.Adam(max_iter=2)), bla, data
 
 
+SEEDS = [7, 1007, 2007]
+
+
 def test_starts_are_ranked_in_files_and_in_a_table(result):
     _, bla, data = result
-    models = [
-        lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=3, seed=seed)
-        for seed in report.seeds(7, 3)
-    ]
+    models = [lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=3, seed=seed) for seed in SEEDS]
     fitted = lfrtorch.fit(
         models, data.train, data.validation, trainer=lfrtorch.LevenbergMarquardt(max_iter=4)
     )
-    metrics = report.metrics(fitted, bla, data, seed=7, data_seed=None, command="")
+    metrics = report.metrics(fitted, bla, data, seeds=SEEDS)
     assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
     assert metrics["starts"] == 3
-    assert sorted(start["seed"] for start in metrics["ranking"]) == [7, 1007, 2007]
+    assert sorted(start["seed"] for start in metrics["ranking"]) == SEEDS
     assert {start["selection"] for start in metrics["ranking"]} == {None}
     assert metrics["ranking"][0]["validation"] == fitted.starts[0].validation
     lines = report.starts_table(metrics).splitlines()
@@ -64,9 +71,7 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
     fitted, bla, data = result
     data = replace(data, linear={"test": ("train",)})
     own = lfrtorch.estimate_bla(data.train, nx=1)
-    metrics = report.metrics(
-        fitted, bla, data, own={"test": own}, seed=0, data_seed=None, command=""
-    )
+    metrics = report.metrics(fitted, bla, data, own={"test": own}, seeds=[0])
     expected = lfrtorch.rmse(data.tests[0], own.simulate(data.tests[0]))
     assert metrics["scores"]["test"]["lti_rmse"] == expected
     assert metrics["linear"] == {"test": ["train"]}
@@ -76,7 +81,7 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
 
 def test_metrics_are_what_the_model_scores(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, bla, data, seed=0, data_seed=3, command="python train.py")
+    metrics = report.metrics(fitted, bla, data, seeds=[0], command="python train.py")
     test, validation = data.tests[0], data.validation[0]
     y_hat = fitted.model.simulate(test)
     assert metrics["scores"]["test"] == {
@@ -108,7 +113,7 @@ def test_pooled_validation_weighs_samples():
 
 def test_table_shows_published_results_of_these_sizes_only(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, bla, data, seed=0, data_seed=None, command="")
+    metrics = report.metrics(fitted, bla, data, seeds=[0])
     lines = report.table(metrics, data.published).splitlines()
     assert lines[0] == "Simulation RMSE (V), nx 2, nz 1, nw 1, 3 neurons"
     head, row = lines[2].split(), lines[4].split()

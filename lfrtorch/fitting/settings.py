@@ -1,0 +1,194 @@
+"""All choices of an identification, checked before anything is computed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from inspect import signature
+from typing import Any, Literal
+
+import torch
+from torch.nn import Module
+
+from lfrtorch._checks import integer, number
+from lfrtorch.engine.nonlinearity import Polynomial
+from lfrtorch.fitting.trainer import Trainer
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.simulation_problem import Ridge
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.model import Model
+
+Size = int | Literal["auto"]
+"""A number, or one that the data choose."""
+
+LAST_SIZE = {"network": "nn", "polynomial": "degree"}
+"""The third size of a static nonlinearity, after nz and nw."""
+
+SEED_STEP = 1000
+"""Between the seeds of several starts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SizesSearch:
+    """What is tried for the sizes that are ``"auto"``.
+
+    Args:
+        nz, nw, nn, degree: the numbers to try. nz and nw are crossed, then nn or degree follows.
+        starts: most random starts of each candidate, as far as the fit has as many; 2 at least.
+        iterations: part of the iterations of the fit that each start gets.
+
+    Examples:
+        >>> SizesSearch(nn=(5, 10), starts=2).nn
+        (5, 10)
+    """
+
+    nz: Sequence[int] = (1, 2)
+    nw: Sequence[int] = (1, 2)
+    nn: Sequence[int] = (5, 10, 15, 25)
+    degree: Sequence[int] = (2, 3, 5)
+    starts: int = 4
+    iterations: float = 0.25
+
+    def __post_init__(self) -> None:
+        integer("sizes_search.starts", self.starts, 1)
+        number("sizes_search.iterations", self.iterations, positive=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How a model is identified; see :func:`lfrtorch.identify`.
+
+    Args:
+        nx: states. ``"auto"``: the lowest order up to ``nx_max`` that does as well as the best.
+            Required, unless ``init_from`` brings it.
+        nx_max: highest order that ``nx="auto"`` tries.
+        nz, nw: inputs and outputs of the static nonlinearity; ``"auto"`` searches for them.
+        nn, activation: neurons of ``static="network"``, or ``"auto"``, and their function.
+        degree: of ``static="polynomial"``, or ``"auto"``.
+        static: ``"network"``, ``"polynomial"``, or what makes a map of one's own: called with the
+            keywords nz and nw it returns a module from (..., nz) to (..., nw), for example the
+            module's class.
+        init: where the fit starts, see :func:`lfrtorch.initialise`; ``"inference"``, for periodic
+            records, is :func:`lfrtorch.infer`.
+        minor: see :func:`lfrtorch.initialise`. Default: its own.
+        linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
+        trainer: the search. Default: Levenberg-Marquardt.
+        ridge, average: see :func:`lfrtorch.fit`.
+        starts: random starts, of which the best is kept.
+        seed: of the first start; the others have seed + 1000, seed + 2000, ...
+        init_from: a model to go on from, in place of ``init``; its sizes replace those given here.
+        sizes_search: what is tried for the sizes that are ``"auto"``.
+        device, dtype: of the fit.
+
+    Raises:
+        ValueError: a setting that cannot be.
+
+    Examples:
+        >>> settings = Settings(nx=2, nn="auto", starts=3)
+        >>> settings.searched, settings.seeds
+        (('nn',), (0, 1000, 2000))
+    """
+
+    nx: Size | None = None
+    nx_max: int = 12
+    nz: Size = 2
+    nw: Size = 1
+    nn: Size = 15
+    activation: str = "tanh"
+    degree: Size = 3
+    static: Literal["network", "polynomial"] | Callable[..., Module] = "network"
+    init: Literal["zero_output", "paper", "inference"] = "zero_output"
+    minor: float | None = None
+    linear: Mapping[str, Any] = field(default_factory=dict)
+    trainer: Trainer = field(default_factory=LevenbergMarquardt)
+    ridge: Ridge = 0.0
+    average: int = 1
+    starts: int = 1
+    seed: int = 0
+    init_from: Model | None = None
+    sizes_search: SizesSearch = field(default_factory=SizesSearch)
+    device: str = "cpu"
+    dtype: torch.dtype = torch.float64
+
+    def __post_init__(self) -> None:
+        if self.init_from is None:
+            self._check_sizes()
+        for name, size in () if self.init_from is None else self.init_from.sizes.items():
+            object.__setattr__(self, name, size)
+        for name in ("nx_max", "starts", "average"):
+            integer(name, getattr(self, name), 1)
+        integer("seed", self.seed, 0)
+        known = [*signature(estimate_bla).parameters][2:]
+        for name in self.linear:
+            if name not in known:
+                raise ValueError(f"linear has no option '{name}'; there are {', '.join(known)}.")
+        if self.init not in ("zero_output", "paper", "inference"):
+            raise ValueError(
+                f"init is {self.init!r}; use 'zero_output', 'paper' or 'inference' (periodic data)."
+            )
+        if self.minor is not None:
+            number("minor", self.minor)
+        if self.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"dtype is {self.dtype}; give torch.float64 or torch.float32.")
+        try:
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(
+                f"device is {self.device}, which torch cannot use here ({reason}); "
+                "the device cpu always works."
+            ) from None
+
+    def _check_sizes(self) -> None:
+        if self.nx is None:
+            raise ValueError(
+                "nx, the number of states, is not set: give nx=2, for example, or nx='auto'."
+            )
+        for name in ("nx", "nz", "nw", "nn", "degree"):
+            integer(name, getattr(self, name), 1, word="auto")
+        if isinstance(self.static, str) and self.static not in LAST_SIZE:
+            raise ValueError(
+                f"static is {self.static!r}; use 'network', 'polynomial', or a module's class."
+            )
+        for name in {"nn", "degree"} - {*self.size_names}:
+            if getattr(self, name) == "auto":
+                used = self.size_names[-1]
+                raise ValueError(f"{name} is auto, and this static map has none; give {used}=auto.")
+        if callable(self.static) and "auto" in (self.nz, self.nw):
+            raise ValueError(
+                "nz or nw is auto, and a map of one's own is not searched; give numbers."
+            )
+
+    @property
+    def size_names(self) -> tuple[str, ...]:
+        """Sizes of the static nonlinearity: nz, nw, and nn or degree."""
+        if self.init_from is not None:
+            return tuple(name for name in self.init_from.sizes if name != "nx")
+        return ("nz", "nw", *(size for kind, size in LAST_SIZE.items() if self.static == kind))
+
+    @property
+    def searched(self) -> tuple[str, ...]:
+        """Those of them that are ``"auto"``."""
+        return tuple(name for name in self.size_names if getattr(self, name) == "auto")
+
+    @property
+    def sizes(self) -> dict[str, Size | None]:
+        """nx, and the sizes of the static nonlinearity."""
+        return {name: getattr(self, name) for name in ("nx", *self.size_names)}
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Of the starts; neighbouring seeds have none in common."""
+        return tuple(self.seed + SEED_STEP * number for number in range(self.starts))
+
+    def static_map(self) -> dict[str, Any]:
+        """The arguments of :func:`lfrtorch.initialise` that say which static map there is."""
+        if self.static == "network":
+            return {"nn": self.nn, "activation": self.activation}
+        if self.static == "polynomial":
+            assert isinstance(self.nz, int)
+            assert isinstance(self.nw, int)
+            assert isinstance(self.degree, int)
+            return {"static": Polynomial(self.nz, self.nw, self.degree)}
+        assert callable(self.static)
+        return {"static": self.static(nz=self.nz, nw=self.nw)}

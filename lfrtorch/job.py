@@ -1,0 +1,266 @@
+"""The whole job: records -> linear model -> sizes -> starts -> fit -> scores and advice."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
+from functools import partial
+from typing import Any, cast
+
+import torch
+
+from lfrtorch._threads import each_alone
+from lfrtorch.dataset import Dataset
+from lfrtorch.distributed import Ranks
+from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.fitting.inference import infer
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.observer import Observer
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.size_search import SizeSearch, search_sizes
+from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.starts import initialise
+from lfrtorch.fitting.trainer import Stop
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.linear.frf import FRF
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.order_scan import OrderScan, scan_orders
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+from lfrtorch.reporting.advice import advise
+from lfrtorch.reporting.diagnosis import evidence
+from lfrtorch.reporting.run import Run
+from lfrtorch.reporting.scores import metrics
+from lfrtorch.reporting.simulations import respond
+
+
+def identify(
+    dataset: Dataset,
+    settings: Settings,
+    *,
+    observer: Observer | None = None,
+    snapshots: Snapshots | None = None,
+    ranks: Ranks | None = None,
+    stop: Stop | None = None,
+) -> Run:
+    """Identify a nonlinear LFR model, from records to scores.
+
+    Args:
+        dataset: records by use.
+        settings: sizes, starts and trainer.
+        observer: who is told of every step. Default: nobody;
+            :class:`lfrtorch.reporting.Console` prints.
+        snapshots: where the starts are kept, for a program that goes on with them.
+        ranks, stop: processes that share the training records, and what ends the fit early, see
+            :func:`lfrtorch.fit`.
+
+    Returns:
+        The models, their scores and all that was chosen on the way. If the fit was interrupted, or
+        a process was lost, it is that of the best iterate so far, and ``run.fit.reason`` says so.
+
+    Raises:
+        ValueError: settings or records that do not fit together.
+        StoppedError: by ``stop`` or Ctrl-C during the search for sizes.
+        ProcessLost: one of the processes was lost before the fit itself.
+
+    Examples:
+        >>> import numpy as np, lfrtorch
+        >>> u = np.random.default_rng(0).standard_normal(600)
+        >>> y = np.zeros(600)
+        >>> for k in range(599):
+        ...     y[k + 1] = 0.7 * y[k] + np.tanh(u[k])
+        >>> parts = [lfrtorch.Record(u[p], y[p], name=name, skip=20) for name, p in
+        ...     (("train", slice(0, 400)), ("test", slice(400, 600)))]
+        >>> dataset = lfrtorch.Dataset("saturation", parts[:1], [], parts[1:])
+        >>> settings = lfrtorch.Settings(nx=1, nz=1, nn=4,
+        ...     trainer=lfrtorch.LevenbergMarquardt(max_iter=10))
+        >>> run = lfrtorch.identify(dataset, settings)
+        >>> score = run.metrics["scores"]["test"]
+        >>> score["rmse"] < score["lti_rmse"]
+        True
+    """
+    observer = Observer() if observer is None else observer
+    ranks = Ranks() if ranks is None else ranks
+    if settings.init_from is not None:
+        check_channels(settings.init_from, dataset.train[0])
+    linear, order_scan = linear_model(
+        dataset.train, settings, dataset.validation, observer=observer, ranks=ranks
+    )
+    settings = replace(settings, nx=linear.nx)
+    sizes = choose_sizes(dataset, settings, linear, observer=observer, ranks=ranks, stop=stop)
+    if sizes is not None:
+        settings = replace(settings, **sizes.chosen.sizes)
+    models = starting_models(dataset.train, settings, linear)
+    average = settings.average
+    if average > 1 and not all(is_network(model.lfr.cell.static) for model in models):
+        observer.say("note: average is for networks; the best start is kept")
+        average = 1
+    observer.say(
+        f"{dataset.name}: {sum(record.samples for record in dataset.train)} training samples, "
+        f"{models[0].parameter_count} parameters "
+        f"({models[0].net_parameter_count} without the gauge directions), {len(models)} start(s)"
+    )
+    monitors, watch = observer.begin(dataset, settings, linear, models)
+    result = fit(
+        models,
+        dataset.train,
+        dataset.validation,
+        dataset.selection,
+        trainer=settings.trainer,
+        ridge=settings.ridge,
+        average=average,
+        monitors=monitors,
+        watch=watch,
+        ranks=ranks,
+        snapshots=snapshots,
+        stop=stop,
+    )
+    observer.end(result)
+    test_linear = linear_models_of_tests(dataset, settings)
+    simulations = respond(result.model, linear, dataset, test_linear)
+    found = evidence(
+        result,
+        simulations,
+        noise_rms=dataset.noise_rms,
+        continued=settings.init_from is not None,
+        ridge=settings.ridge != 0.0,
+        searched=sizes is not None,
+    )
+    return Run(
+        dataset=dataset,
+        settings=settings,
+        linear=linear,
+        test_linear=test_linear,
+        order_scan=order_scan,
+        size_search=sizes,
+        fit=result,
+        simulations=simulations,
+        metrics=metrics(
+            result, linear, dataset, own=test_linear, seeds=settings.seeds, search=sizes
+        ),
+        advice=advise(found),
+    )
+
+
+def linear_model(
+    data: Sequence[Record] | FRF,
+    settings: Settings,
+    validation: Sequence[Record] = (),
+    *,
+    observer: Observer,
+    ranks: Ranks,
+) -> tuple[LinearModel, OrderScan | None]:
+    """The best linear approximation, and the scan that chose its order if nx is ``"auto"``."""
+    scan: OrderScan | None = None
+    if settings.nx == "auto":
+        orders = range(1, settings.nx_max + 1)
+        scan = scan_orders(data, orders, validation=validation, **settings.linear)
+        observer.say(scan.table())
+        # Rounding may differ from machine to machine, and the order must not.
+        chosen = int(ranks.first(torch.tensor(scan.chosen)))
+        linear = scan.models[scan.orders.index(chosen)]
+    else:
+        linear = estimate_bla(data, cast(int, settings.nx), **settings.linear)
+    found = linear.fit
+    assert found is not None
+    observer.say(
+        f"BLA: order {linear.nx}, {found.criterion} error {found.rmse:.3g} (normalised), "
+        f"{found.iterations} iterations, {found.reason}, {found.seconds:.1f} s"
+    )
+    for note in found.notes:
+        observer.say(f"note: {note}")
+    return linear, scan
+
+
+def choose_sizes(
+    dataset: Dataset,
+    settings: Settings,
+    linear: LinearModel,
+    *,
+    observer: Observer,
+    ranks: Ranks,
+    stop: Stop | None,
+) -> SizeSearch | None:
+    """The search for the sizes that are ``"auto"``; None if none is."""
+    if not settings.searched:
+        return None
+    grid = settings.sizes_search
+    trainer: Any = settings.trainer
+    iterations = math.ceil(grid.iterations * trainer.limit)
+    several = replace(settings, starts=max(2, min(settings.starts, grid.starts)))
+
+    def start(tried: dict[str, Any], seed: int) -> Model:
+        return starting_model(dataset.train, replace(settings, **tried), linear, seed)
+
+    observer.say(f"sizes: {len(several.seeds)} starts of {iterations} iterations for each model")
+    tried = {
+        name: getattr(grid if name in settings.searched else settings, name)
+        for name in settings.size_names
+    }
+    search = search_sizes(
+        start,
+        dataset.train,
+        dataset.validation,
+        **tried,
+        linear=linear,
+        seeds=several.seeds,
+        trainer=replace(trainer, max_iter=iterations),
+        ridge=settings.ridge,
+        watch=lambda candidate: observer.say(str(candidate)),
+        ranks=ranks,
+        stop=stop,
+    )
+    observer.say(search.table())
+    for note in search.notes:
+        observer.say(f"note: {note}")
+    return search
+
+
+def starting_models(
+    train: Sequence[Record], settings: Settings, linear: LinearModel
+) -> list[Model]:
+    """The models that the fit starts from, one a seed; that of ``init_from`` is the only one."""
+    if settings.init_from is None:
+        return [starting_model(train, settings, linear, seed) for seed in settings.seeds]
+    model = deepcopy(settings.init_from)
+    model.lfr.to(device=settings.device, dtype=settings.dtype)
+    return [model]
+
+
+def starting_model(
+    train: Sequence[Record], settings: Settings, linear: LinearModel, seed: int
+) -> Model:
+    """The model that one start begins with."""
+    begin = infer
+    if settings.init != "inference":
+        begin = partial(initialise, method=settings.init, minor=settings.minor)
+    nz, nw = cast(int, settings.nz), cast(int, settings.nw)
+    model = begin(linear, train, nz=nz, nw=nw, seed=seed, **settings.static_map())
+    model.lfr.to(device=settings.device, dtype=settings.dtype)
+    return model
+
+
+def linear_models_of_tests(dataset: Dataset, settings: Settings) -> dict[str, LinearModel]:
+    """Linear models of single tests, if ``dataset.linear`` asks for them, by the test's name."""
+    records = {record.name: record for record in dataset.train}
+    # Tests that share their records share the model.
+    of = list(dict.fromkeys(dataset.linear.values()))
+    estimate = partial(estimate_bla, nx=cast(int, settings.nx), **settings.linear)
+    models = each_alone(estimate, [[records[name] for name in names] for names in of])
+    by_records = dict(zip(of, models, strict=True))
+    return {test: by_records[names] for test, names in dataset.linear.items()}
+
+
+def check_channels(model: Model, record: Record) -> None:
+    """Refuse data of other channels than the model's with a ValueError."""
+    for side, channels, found in (
+        ("inputs", model.inputs, record.inputs),
+        ("outputs", model.outputs, record.outputs),
+    ):
+        if channels != found:
+            raise ValueError(
+                f"the model has the {side} {', '.join(map(str, channels))} and the data "
+                f"{', '.join(map(str, found))}; give data of the same channels."
+            )

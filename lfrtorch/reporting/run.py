@@ -1,0 +1,75 @@
+"""All that an identification found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from lfrtorch.analysis.amplitude_margin import LOUDER
+from lfrtorch.dataset import Dataset
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.size_search import SizeSearch
+from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.order_scan import OrderScan
+from lfrtorch.model import Model
+from lfrtorch.reporting import scores
+from lfrtorch.reporting.advice import Advice
+from lfrtorch.reporting.simulations import Response
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Run:
+    """What :func:`lfrtorch.identify` returns; ``print(run)`` shows the scores.
+
+    Args:
+        dataset: the records.
+        settings: with the sizes that were chosen in the place of ``"auto"``.
+        linear: the best linear approximation of all training records.
+        test_linear: linear models of single tests, by name, see ``Dataset.linear``.
+        order_scan, size_search: how nx and the other sizes were chosen; None if they were given.
+        fit: the nonlinear fit, of the best start or of the mean of several.
+        simulations: every record with both simulations.
+        metrics: what ``metrics.json`` holds: scores by record, sizes, the fit in numbers.
+        advice: what to try next, the most useful first.
+    """
+
+    dataset: Dataset
+    settings: Settings
+    linear: LinearModel
+    test_linear: Mapping[str, LinearModel]
+    order_scan: OrderScan | None
+    size_search: SizeSearch | None
+    fit: FitResult
+    simulations: list[Response]
+    metrics: Mapping[str, Any]
+    advice: list[Advice]
+
+    @property
+    def model(self) -> Model:
+        """The nonlinear model."""
+        return self.fit.model
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{name}={size}" for name, size in self.model.sizes.items())
+        return f"Run({self.dataset.name}, {sizes}, {self.fit.reason})"
+
+    def __str__(self) -> str:
+        fit, parts = self.fit, []
+        parts.append(
+            f"{fit.reason}; kept iteration {fit.chosen_iteration} of {fit.iterations}, "
+            f"{fit.seconds:.1f} s, {1e3 * fit.seconds_per_iteration:.0f} ms an iteration\n"
+        )
+        if len(fit.starts) > 1:
+            parts.append(scores.starts_table(self.metrics) + "\n")
+        if fit.averaged > 1:
+            parts.append(f"The model is the mean of the best {fit.averaged} starts.\n")
+        parts.append(scores.table(self.metrics, self.dataset.published))
+        if self.metrics["stable_to"] < max(LOUDER):
+            parts.append(
+                f"note: stable on the training inputs {self.metrics['stable_to']:g} times as loud, "
+                "and no longer on the next louder ones tried; validate at the amplitudes you will "
+                "use."
+            )
+        return "\n".join(parts)

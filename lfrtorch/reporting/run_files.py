@@ -1,0 +1,65 @@
+"""The folder of a run: checkpoints, scores, figures, report, TensorBoard."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from lfrtorch._atomic import whole_file
+from lfrtorch.reporting import figures, html, plots, scores
+from lfrtorch.reporting.monitor import TensorBoard
+from lfrtorch.reporting.run import Run
+
+
+def write(
+    run: Run,
+    folder: str | Path,
+    *,
+    command: str = "",
+    config: str = "",
+    draw: bool = True,
+    board: TensorBoard | None = None,
+) -> None:
+    """Write the files of a run into a folder, which is made if it is missing.
+
+    ``model/`` and ``linear/`` are checkpoints for :func:`lfrtorch.load` and
+    ``LinearModel.load``; ``metrics.json`` has the numbers, ``figures/`` the figures and
+    ``report.html`` both; ``tensorboard --logdir FOLDER`` shows the history.
+
+    Args:
+        run: what :func:`lfrtorch.identify` returned.
+        folder: of the files; those of an earlier run there are replaced.
+        command, config: that made the run, for ``metrics.json`` and ``report.html``.
+        draw: whether figures and ``report.html`` are made.
+        board: TensorBoard that has the history already. Default: a new one.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    result, dataset = run.fit, run.dataset
+    run.model.save(folder / "model")
+    run.linear.save(folder / "linear")
+    metrics = {**run.metrics, "command": command}
+    with whole_file(folder / "metrics.json") as fresh:
+        fresh.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+    if board is None:
+        board = TensorBoard(folder)
+        board.history(result.history)
+    if run.size_search is not None:
+        board.text("sizes", run.size_search.table())
+    board.text("scores", scores.table(metrics, dataset.published))
+    if draw:
+        drawn = figures.of_run(result, run.linear, dataset, run.simulations)
+        images = {name: plots.png(figure) for name, figure in drawn.items()}
+        (folder / "figures").mkdir(exist_ok=True)
+        for name, image in images.items():
+            (folder / "figures" / f"{name}.png").write_bytes(image)
+            board.image(f"result/{name}", image, result.iterations)
+        more, views = figures.of_tests(run.simulations)
+        images |= {name: plots.png(figure) for name, figure in more.items()}
+        page = html.render(
+            metrics, result, run.linear, dataset, run.simulations, images, run.advice,
+            views=views, config=config,
+        )  # fmt: skip
+        with whole_file(folder / "report.html") as path:
+            path.write_text(page, encoding="utf-8")
+    board.close()
