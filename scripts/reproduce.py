@@ -113,8 +113,8 @@ def main() -> int:
     results = options.results or (out if options.quick else ROOT) / "RESULTS.md"
 
     cases = []
-    for name in CASES:
-        words = [*CASES[name], *(QUICK if options.quick else []), *settings]
+    for name, own in CASES.items():
+        words = [*own, *(QUICK if options.quick else []), *settings]
         cases.append(case(name, words, out, seeds, start=name in names))
     page = results.resolve()
     made = gallery(cases, page.parent / "results", page.parent)

@@ -33,9 +33,8 @@ def recorded(
     """
     counts = [periods] * len(u) if isinstance(periods, int) else periods
     records = []
-    for r, (y_r, u_r, P) in enumerate(zip(y, u, counts, strict=True)):
-        if distortion is not None:
-            y_r = y_r + distortion[r]
+    for r, (plain, u_r, P) in enumerate(zip(y, u, counts, strict=True)):
+        y_r = plain if distortion is None else plain + distortion[r]
         ny = y_r.shape[1]
         offset = np.concatenate([3.0 + np.arange(ny), 5.0 + np.arange(u_r.shape[1])]) + r
         signals = np.tile(np.concatenate([y_r, u_r], axis=1) + offset, (P, 1))

@@ -92,7 +92,8 @@ def lacking(name: str, value: str) -> str:
 def possible(settings: dict[str, str]) -> tuple[dict[str, str], list[str]]:
     """The settings that this CPU can follow, and what it lacks for the others."""
     kept, left_out = {}, []
-    for name, value in settings.items():
+    for name, asked in settings.items():
+        value = asked
         reason = lacking(name, value)
         if reason and (name, value) in NEXT_BEST:
             left_out.append(reason)

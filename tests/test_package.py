@@ -28,7 +28,7 @@ print(lfrtorch.__file__)
 def python(*args: object) -> None:
     """Run this interpreter at the top of the sources."""
     run = subprocess.run(
-        [sys.executable, *map(str, args)], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, *map(str, args)], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stdout + run.stderr
 
@@ -70,7 +70,7 @@ def command(installed: Path, folder: Path, *words: object) -> str:
     env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     run = subprocess.run(
         [installed / "lfrtorch", *map(str, words)],
-        cwd=folder, env=env, capture_output=True, text=True,
+        cwd=folder, env=env, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stdout + run.stderr
     return run.stdout
@@ -108,7 +108,7 @@ def test_every_module_of_an_installed_wheel_imports(installed: Path, tmp_path: P
     env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     found = subprocess.run(
         [installed / "python", "-c", IMPORT_ALL],
-        cwd=tmp_path, env=env, capture_output=True, text=True,
+        cwd=tmp_path, env=env, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert found.returncode == 0, found.stderr
     assert Path(found.stdout.strip()).is_relative_to(installed.parent)

@@ -75,12 +75,12 @@ def find(
             raise FileNotFoundError(
                 f"nonlinear_benchmarks.{loader}() left no '{file}' in '{below}'; it downloads "
                 "nothing where an archive is there already, even an empty one: remove that from "
-                f"'{below / file.split('/')[0]}' and try again."
+                f"'{below / file.partition('/')[0]}' and try again."
             )
     if path is None:
         raise FileNotFoundError(
             f"there is no '{file}' in '{below}'. Give the folder that holds "
-            f"'{file.split('/')[0]}' with root=DIR, or have it downloaded: pip install "
+            f"'{file.partition('/')[0]}' with root=DIR, or have it downloaded: pip install "
             f"'lfrtorch[bench]', then download=True (nonlinear_benchmarks.{loader}())."
         )
     return path
@@ -225,7 +225,7 @@ def _download(below: Path, file: str, loader: str) -> None:
         raise FileNotFoundError(
             f"there is no '{file}' in '{below}', and the package that downloads it cannot be "
             f"imported ({error}): pip install 'lfrtorch[bench]'. Or give the folder that holds "
-            f"'{file.split('/')[0]}' with root=DIR."
+            f"'{file.partition('/')[0]}' with root=DIR."
         ) from error
     below.mkdir(parents=True, exist_ok=True)
     try:
@@ -233,8 +233,8 @@ def _download(below: Path, file: str, loader: str) -> None:
     except Exception as error:  # plain Exceptions among them
         raise OSError(
             f"nonlinear_benchmarks.{loader}() failed ({error!r}); remove what it left in "
-            f"'{below / file.split('/')[0]}' and try again, or give the folder that holds "
-            f"'{file.split('/')[0]}' with root=DIR."
+            f"'{below / file.partition('/')[0]}' and try again, or give the folder that holds "
+            f"'{file.partition('/')[0]}' with root=DIR."
         ) from error
 
 

@@ -84,7 +84,8 @@ class ArrayTable(Table):
         self._signals: list[tuple[str, int]] = []  # of each column
         self._found: dict[str, Signal] = {}
         headers, units, arrays, refused = [], {}, {}, {}
-        for name, signal in found.items():
+        for name, given in found.items():
+            signal = given
             if isinstance(signal, Signal) and len(signal.shape) == 2 and signal.size[0] == 1:
                 signal = replace(signal, transposed=not signal.transposed)
             reason = signal if isinstance(signal, str) else signal.refusal()

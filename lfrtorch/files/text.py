@@ -232,8 +232,8 @@ def _decodes(text: bytes, encoding: str) -> bool:
 
 def _split(lines: Iterator[str] | IO[str], delimiter: str) -> Iterator[_Line]:
     """Cells of the lines that are not blank."""
-    for number, text in enumerate(lines, 1):
-        text = text.rstrip("\r\n")
+    for number, line in enumerate(lines, 1):
+        text = line.rstrip("\r\n")
         if not text.strip(" " if delimiter == "\t" else None):
             continue
         comment = _COMMENT.match(text) is not None

@@ -311,7 +311,7 @@ def test_the_interrupt_key_reaches_the_program(csv: Path, tmp_path: Path):
         cwd=tmp_path,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
         # A shell's background job, which a test run may be, hands down an ignored SIGINT.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     ) as process:
         assert process.stdout is not None
         for line in process.stdout:

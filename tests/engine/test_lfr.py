@@ -45,7 +45,7 @@ def test_gradients_are_those_of_finite_differences(start: Start, step: float, to
 def test_gradient_of_the_start_state_is_that_of_finite_differences():
     lfr = small()
     u, x0 = normal(2, 4, 2).requires_grad_(), normal(2, 2, seed=1).requires_grad_()
-    assert gradcheck(lambda u, x0: lfr(u, x0), (u, x0), eps=1e-5, atol=1e-8, rtol=1e-8)
+    assert gradcheck(lfr, (u, x0), eps=1e-5, atol=1e-8, rtol=1e-8)
 
 
 @pytest.mark.parametrize("start", STARTS)

@@ -26,11 +26,11 @@ def check(cell: LFRCell, left_out: int, R: int = 2):
     kept, expand = reduction(cell, none(cell))
     P = sum(p.numel() for p in cell.parameters() if p.requires_grad)
     assert (len(kept), expand.shape) == (P - left_out, (P - left_out, P))
-    for J in (
+    for whole in (
         output_jacobian(Linearisation(cell, u, simulate(cell, u, u.new_zeros(R, cell.nx)))),
         output_jacobian(Linearisation(cell, u, steady_state(cell, u), periodic=True)),
     ):
-        J = J[..., :P]
+        J = whole[..., :P]
         assert_close(J[..., kept] @ expand, J, rtol=0, atol=1e-8 * float(J.abs().max()))
 
 
