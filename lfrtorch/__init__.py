@@ -47,6 +47,9 @@ from lfrtorch.reporting.run import Run
 # scores
 from lfrtorch.metrics import nrmse, rmse
 
+# errors
+from lfrtorch._errors import InputError, LfrtorchError
+
 __version__ = version("lfrtorch")
 
 __all__ = [
@@ -56,8 +59,10 @@ __all__ = [
     "Channel",
     "Dataset",
     "FitResult",
+    "InputError",
     "LFRCell",
     "LevenbergMarquardt",
+    "LfrtorchError",
     "LinearFit",
     "LinearModel",
     "Model",

@@ -8,11 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from lfrtorch._errors import InputError
+
 
 def refuse_existing(path: str | Path, option: str) -> None:
     """Refuse a path where something is with a ValueError that names the option to replace it."""
     if Path(path).exists():
-        raise ValueError(f"'{path}' exists; give another name, or {option} to replace it.")
+        raise InputError(f"'{path}' exists; give another name, or {option} to replace it.")
 
 
 @contextmanager

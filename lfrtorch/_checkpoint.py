@@ -14,6 +14,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from lfrtorch._errors import InputError
+
 FORMAT = "lfrtorch"
 VERSION = 1
 DESCRIPTION, WEIGHTS = "model.json", "weights.safetensors"
@@ -30,7 +32,7 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
     """
     folder = Path(folder).resolve()  # a link's target is replaced, not the link
     if folder.exists() and not (folder / DESCRIPTION).is_file() and _occupied(folder):
-        raise ValueError(
+        raise InputError(
             f"'{folder}' exists and is not a checkpoint; choose another folder to save to."
         )
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -71,21 +73,21 @@ def read(
     try:
         description = json.loads((folder / DESCRIPTION).read_text())
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(
+        raise InputError(
             f"'{folder / DESCRIPTION}' is damaged or cut off ({error}); "
             "copy the checkpoint again from where it was saved, or train anew."
         ) from None
     if not isinstance(description, dict) or description.get("format") != FORMAT:
-        raise ValueError(f"'{folder / DESCRIPTION}' was not written by {FORMAT}.")
+        raise InputError(f"'{folder / DESCRIPTION}' was not written by {FORMAT}.")
     if not isinstance(description.get("version"), int) or description["version"] > VERSION:
-        raise ValueError(
+        raise InputError(
             f"'{folder}' has checkpoint version {description.get('version')} and this program "
             f"reads up to {VERSION}; install a newer {FORMAT}."
         )
     try:
         weights = load_file(folder / WEIGHTS)
     except (SafetensorError, OSError) as error:
-        raise ValueError(
+        raise InputError(
             f"'{folder / WEIGHTS}' is damaged or missing ({error}); "
             "copy the checkpoint again from where it was saved, or train anew."
         ) from None
@@ -95,7 +97,7 @@ def read(
 def _located(folder: Path, inside: Sequence[str]) -> Path:
     """The folder that holds the description; refuse all else, code above all."""
     if folder.is_file():
-        raise ValueError(
+        raise InputError(
             f"'{folder}' is a file, and a checkpoint is a folder with {DESCRIPTION} and {WEIGHTS}; "
             f"give that folder, or the folder of a run. Other files ({', '.join(CODE[:4])}) may "
             "carry code and are never opened."
@@ -105,18 +107,18 @@ def _located(folder: Path, inside: Sequence[str]) -> Path:
     looked_in = folder if found is None else found
     code = sorted(p.name for p in looked_in.glob("*") if p.suffix.lower() in CODE)
     if not folder.exists():
-        raise ValueError(
+        raise InputError(
             f"there is no '{folder}'; give the folder of a run or of a saved model, a checkpoint."
         )
     if found is None:
-        raise ValueError(
+        raise InputError(
             f"'{folder}' is not a checkpoint: no {DESCRIPTION} in it or in its "
             f"{' or '.join(f'{name}/' for name in inside)} folder; "
             "give the folder of a run or of a saved model."
             + (f" {', '.join(code)} may carry code and is never opened." if code else "")
         )
     if code:
-        raise ValueError(
+        raise InputError(
             f"'{found}' holds {', '.join(code)} beside the model: a checkpoint carries no code; "
             "move the file away if you know where it comes from, or do not trust this folder."
         )

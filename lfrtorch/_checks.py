@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Integers
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -47,23 +48,23 @@ def integer(name: str, value: Any, least: int, *, word: str = "") -> None:
         return
     if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < least:
         other = f", or {word}" if word else ""
-        raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}{other}.")
+        raise InputError(f"{name} is {value!r}; give a whole number of at least {least}{other}.")
 
 
 def band(given: Any) -> None:
     """Refuse what is not a pair of numbers with a ValueError."""
     pair = isinstance(given, Sequence | np.ndarray) and len(given) == 2
     if not pair or not all(isinstance(f, Real) for f in given):
-        raise ValueError(f"band is {given}; give two numbers, the lowest and the highest in Hz.")
+        raise InputError(f"band is {given}; give two numbers, the lowest and the highest in Hz.")
 
 
 def dft_lines(given: ArrayLike, samples: int) -> Integers:
     """DFT lines, rising; refuse all but whole numbers between 0 and samples / 2."""
     found, last = np.asarray(given), (samples - 1) // 2
     if found.ndim != 1 or found.size == 0 or found.dtype.kind not in "iu":
-        raise ValueError(f"lines is {given}; give a list of whole numbers, one a line.")
+        raise InputError(f"lines is {given}; give a list of whole numbers, one a line.")
     if found.min() < 1 or found.max() > last:
-        raise ValueError(
+        raise InputError(
             f"the lines go from {found.min()} to {found.max()}; {samples} samples have lines 1 to "
             f"{last} between 0 and fs / 2: use these, or a longer period."
         )
@@ -75,4 +76,4 @@ def number(name: str, value: Any, *, positive: bool = False) -> None:
     wanted = "a positive number" if positive else "a number of at least 0"
     real = isinstance(value, Real) and not isinstance(value, bool) and float(value) < math.inf
     if not real or not (float(value) > 0 if positive else float(value) >= 0):
-        raise ValueError(f"{name} is {value!r}; give {wanted}.")
+        raise InputError(f"{name} is {value!r}; give {wanted}.")

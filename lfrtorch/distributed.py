@@ -22,6 +22,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from lfrtorch._checks import number
+from lfrtorch._errors import LfrtorchError
 
 Shared = TypeVar("Shared")
 
@@ -35,7 +36,7 @@ AXES = 8
 """Most axes of a tensor that is handed on."""
 
 
-class ProcessLost(RuntimeError):
+class ProcessLostError(LfrtorchError, RuntimeError):
     """Another process ended, or did not answer in time; the message begins with ``LOST``."""
 
 
@@ -67,7 +68,7 @@ class Ranks:
         return part
 
     def close(self) -> None:
-        """Leave the other processes: what they share from now on ends in a ``ProcessLost``."""
+        """Leave the other processes: what they share from now on ends in a ``ProcessLostError``."""
 
     def __enter__(self) -> Self:
         return self
@@ -90,7 +91,7 @@ def connect(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Ran
 
     Raises:
         ValueError: a timeout that is not positive.
-        ProcessLost: the others did not come.
+        ProcessLostError: the others did not come.
 
     Example:
         >>> with lfrtorch.distributed.connect() as ranks:  # alone: no torchrun
@@ -114,7 +115,7 @@ def connect(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Ran
             "nccl" if gpu else "gloo", timeout=timedelta(seconds=timeout), device_id=gpu
         )
     except RuntimeError as error:
-        raise ProcessLost(f"{LOST}: the processes did not meet ({_gist(error)})") from error
+        raise ProcessLostError(f"{LOST}: the processes did not meet ({_gist(error)})") from error
     return ProcessGroup(gpu or "cpu")
 
 
@@ -125,7 +126,7 @@ class ProcessGroup(Ranks):
         device: where its backend works.
 
     Raises:
-        ProcessLost: a process ended, or did not answer in time; from any of the methods.
+        ProcessLostError: a process ended, or did not answer in time; from any of the methods.
     """
 
     def __init__(self, device: str | torch.device = "cpu") -> None:
@@ -165,7 +166,7 @@ class ProcessGroup(Ranks):
         return sent.to(part.device)
 
     def close(self) -> None:
-        """Leave the other processes: what they share from now on ends in a ``ProcessLost``."""
+        """Leave the other processes: what they share from now on ends in a ``ProcessLostError``."""
         if dist.is_initialized():
             dist.destroy_process_group()
 
@@ -178,7 +179,7 @@ class ProcessGroup(Ranks):
         except RuntimeError as error:  # of whatever kind the backend has
             other = f"rank {1 - self.rank}" if self.world == 2 else "one of the others"
             seen = f"rank {self.rank} of {self.world} has no answer from {other}"
-            raise ProcessLost(f"{LOST}: {seen} ({_gist(error)})") from error
+            raise ProcessLostError(f"{LOST}: {seen} ({_gist(error)})") from error
 
 
 def _gist(error: Exception) -> str:

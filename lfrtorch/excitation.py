@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from lfrtorch import _checks
 from lfrtorch._checks import dft_lines, integer, number
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array, Integers
 
 Grid = Literal["full", "odd", "random_odd"]
@@ -135,11 +136,11 @@ def _candidates(
     last = (samples - 1) // 2
     if lines is not None:
         if band is not None:
-            raise ValueError("both lines and band are given; give one of them.")
+            raise InputError("both lines and band are given; give one of them.")
         return dft_lines(lines, samples)
     low, high = (0.0, fs / 2) if band is None else band
     if not 0 <= low <= high <= fs / 2:
-        raise ValueError(
+        raise InputError(
             f"the band is {low} to {high} Hz; give a lower and an upper frequency between 0 and "
             f"fs / 2 = {fs / 2:g} Hz."
         )
@@ -147,7 +148,7 @@ def _candidates(
     first = max(1, int(np.ceil(low * samples / fs * (1 - 1e-12))))
     found = np.arange(first, min(last, int(high * samples / fs * (1 + 1e-12))) + 1)
     if not found.size:
-        raise ValueError(
+        raise InputError(
             f"the band {low:g} to {high:g} Hz holds no line of a period of {samples} samples, "
             f"whose lines are {fs / samples:g} Hz apart; use a wider band or a longer period."
         )
@@ -156,13 +157,13 @@ def _candidates(
 
 def _on_grid(lines: Integers, grid: Any, group: int, generator: np.random.Generator) -> Integers:
     if grid not in get_args(Grid):
-        raise ValueError(f"grid is {grid!r}; use 'full', 'odd' or 'random_odd'.")
+        raise InputError(f"grid is {grid!r}; use 'full', 'odd' or 'random_odd'.")
     if grid == "full":
         return lines
     odd = lines[lines % 2 == 1]
     least = group if grid == "random_odd" else 1
     if odd.size < least:
-        raise ValueError(
+        raise InputError(
             f"grid {grid!r} needs {least} odd line(s) and there are {odd.size}; use a wider band "
             "or a longer period."
         )
@@ -182,18 +183,18 @@ def _amplitudes(amplitude: ArrayLike | None, samples: int, nu: int, excited: Int
         given = given[:, None]
     F = samples // 2 + 1
     if given.shape not in ((F, 1), (F, nu)):
-        raise ValueError(
+        raise InputError(
             f"amplitude has shape {np.shape(amplitude)}; a period of {samples} samples has {F} "
             f"lines from 0 to fs / 2: give ({F},) or ({F}, {nu})."
         )
     A = given[excited]
     if not (np.isfinite(A).all() and (A > 0).all()):
-        raise ValueError("amplitude must be finite and positive at every excited line.")
+        raise InputError("amplitude must be finite and positive at every excited line.")
     return np.broadcast_to(A, (excited.size, nu)).copy()
 
 
 def _rms(rms: ArrayLike, nu: int) -> Array:
     given = np.asarray(rms, dtype=np.float64)
     if given.shape not in ((), (nu,)) or not (np.isfinite(given).all() and (given > 0).all()):
-        raise ValueError(f"rms is {rms}; give a positive number, or one for each of {nu} input(s).")
+        raise InputError(f"rms is {rms}; give a positive number, or one for each of {nu} input(s).")
     return given

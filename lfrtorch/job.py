@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import torch
 
+from lfrtorch._errors import InputError
 from lfrtorch._threads import each_alone
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
@@ -63,7 +64,7 @@ def identify(
     Raises:
         ValueError: settings or records that do not fit together.
         StoppedError: by ``stop`` or Ctrl-C during the search for sizes.
-        ProcessLost: one of the processes was lost before the fit itself.
+        ProcessLostError: one of the processes was lost before the fit itself.
 
     Examples:
         >>> import numpy as np, lfrtorch
@@ -260,7 +261,7 @@ def check_channels(model: Model, record: Record) -> None:
         ("outputs", model.outputs, record.outputs),
     ):
         if channels != found:
-            raise ValueError(
+            raise InputError(
                 f"the model has the {side} {', '.join(map(str, channels))} and the data "
                 f"{', '.join(map(str, found))}; give data of the same channels."
             )

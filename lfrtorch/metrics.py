@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.records import Record
 
@@ -22,7 +23,7 @@ def rmse(record: Record, y_hat: Array) -> float:
         ValueError: ``y_hat`` is not of the shape (T, ny) of the record's output.
     """
     if np.shape(y_hat) != record.y.shape:
-        raise ValueError(
+        raise InputError(
             f"record '{record.name}' has an output of shape {record.y.shape} and the simulation "
             f"{np.shape(y_hat)}; simulate this record."
         )

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from torch.nn import Module
 
 from lfrtorch import _checkpoint
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
@@ -135,15 +136,15 @@ class Model:
             u, start = as_signal(data, self.inputs, "input"), start or "zero"
         check_start(start, "simulation")
         if start == "given" and x0 is None:
-            raise ValueError("start='given' needs a start state: pass x0.")
+            raise InputError("start='given' needs a start state: pass x0.")
         like = self.lfr.cell.A
         v = torch.as_tensor(self.scaler.normalise_u(u)).to(like).unsqueeze(0)
         state = None if x0 is None else torch.as_tensor(np.asarray(x0)).to(like).reshape(1, -1)
         if state is not None and state.shape[1] != self.lfr.cell.nx:
-            raise ValueError(f"x0 has {state.shape[1]} entries; the model has {self.lfr.cell.nx}.")
+            raise InputError(f"x0 has {state.shape[1]} entries; the model has {self.lfr.cell.nx}.")
         if start == "estimated":
             if not isinstance(data, Record):
-                raise ValueError("start='estimated' needs a record: the state is fitted to its y.")
+                raise InputError("start='estimated' needs a record: the state is fitted to its y.")
             y = torch.as_tensor(self.scaler.normalise_y(data.y)).to(like).unsqueeze(0)
             weight = torch.as_tensor(np.array(data.start_factors)).to(like).unsqueeze(0)
             trajectory = estimated_start(self.lfr.cell, v, y, weight)
@@ -165,17 +166,17 @@ class Model:
         ):
             if signal.shape[1] != len(channels):
                 names = ", ".join(channel.name for channel in channels)
-                raise ValueError(
+                raise InputError(
                     f"record '{record.name}' has {signal.shape[1]} {side}(s) and the model "
                     f"{len(channels)} ({names}); give a column for each."
                 )
         if record.x0 is not None and len(record.x0) != self.lfr.cell.nx:
-            raise ValueError(
+            raise InputError(
                 f"record '{record.name}' has a start state x0 of {len(record.x0)} entries and the "
                 f"model {self.lfr.cell.nx} states; give one for each."
             )
         if not np.isclose(record.fs, self.fs):
-            raise ValueError(
+            raise InputError(
                 f"record '{record.name}' is sampled at {record.fs} Hz and the model at {self.fs} "
                 "Hz; resample the record."
             )
@@ -247,7 +248,7 @@ def simulate_blocks(
         y = model.scaler.restore_y(trajectory.y[0].double().numpy())
         lost = ~np.isfinite(y).all(axis=1)
         if lost.any():
-            raise ValueError(
+            raise InputError(
                 f"the model diverges: its output is not finite at sample {first + lost.argmax()}; "
                 "check the units of the inputs and whether they are louder than those it was "
                 "fitted to, or start from another state."
@@ -275,14 +276,14 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
     """
     description, weights = _checkpoint.read(folder)
     if "linear" in description:
-        raise ValueError(
+        raise InputError(
             f"'{folder}' holds a linear model, as estimate_bla makes it; "
             "read it with lfrtorch.LinearModel.load."
         )
     made = description.get("static")
     built_in = ("Network", "Polynomial")
     if isinstance(made, dict) and made.get("type") not in built_in and static is None:
-        raise ValueError(
+        raise InputError(
             f"'{folder}' holds a static nonlinearity of class {made.get('class')}, which is not "
             "part of this package; pass an instance of it: load(folder, static=...)."
         )
@@ -290,7 +291,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         sizes = description["sizes"]
         dtype = getattr(torch, description["dtype"])
         if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
-            raise ValueError(f"dtype is {description['dtype']}")
+            raise InputError(f"dtype is {description['dtype']}")
         scaler = Scaler(
             *(
                 weights.pop(f"scaler.{name}").numpy()
@@ -310,11 +311,11 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         fs = float(description["fs"])
         widths = [s.shape for s in vars(scaler).values()] + [(len(c),) for c in channels]
         if widths != [(size,) for size in 2 * [cell.nu] + 2 * [cell.ny] + [cell.nu, cell.ny]]:
-            raise ValueError("scales or channels are more or fewer than inputs and outputs")
+            raise InputError("scales or channels are more or fewer than inputs and outputs")
         if not (math.isfinite(fs) and fs > 0):
-            raise ValueError(f"fs is {fs}")
+            raise InputError(f"fs is {fs}")
         return Model(LFR(cell), scaler, fs, *channels)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        raise ValueError(
+        raise InputError(
             f"'{folder}' is damaged: its description and weights do not fit ({error})."
         ) from None

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._checks import integer
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 
 Start = Literal["zero", "given", "estimated", "periodic"]
@@ -114,32 +115,32 @@ class Record:
         u = as_signal(self.u, inputs, f"record '{self.name}': input")
         y = as_signal(self.y, outputs, f"record '{self.name}': output")
         if len(u) != len(y):
-            raise ValueError(
+            raise InputError(
                 f"record '{self.name}': the input has {len(u)} samples and the output {len(y)}; "
                 "both must be sampled at the same instants: cut or resample one of them."
             )
         if not (isinstance(self.fs, Real) and np.isfinite(self.fs) and self.fs > 0):
-            raise ValueError(
+            raise InputError(
                 f"record '{self.name}': the sampling frequency is {self.fs} Hz; "
                 "give a positive number of samples per second."
             )
         check_start(self.start, f"record '{self.name}'")
         integer(f"record '{self.name}': skip", self.skip, 0)
         if self.skip >= len(u):
-            raise ValueError(
+            raise InputError(
                 f"record '{self.name}': skip={self.skip} leaves no sample of {len(u)}; "
                 "use a smaller skip or a longer record."
             )
         self._check_period(len(u))
         if (self.start == "given") != (self.x0 is not None):
-            raise ValueError(
+            raise InputError(
                 f"record '{self.name}': start is {self.start!r} and x0 is {self.x0}; "
                 "a start state goes with start='given', and only with it."
             )
         if self.x0 is not None:
             x0 = np.array(self.x0, dtype=np.float64).reshape(-1)
             if not np.isfinite(x0).all():
-                raise ValueError(f"record '{self.name}': x0 is {x0}; give finite numbers.")
+                raise InputError(f"record '{self.name}': x0 is {x0}; give finite numbers.")
             object.__setattr__(self, "x0", x0)
         self._check_weights(len(u), y.shape[1])
         for field, value in (("u", u), ("y", y), ("inputs", inputs), ("outputs", outputs)):
@@ -150,7 +151,7 @@ class Record:
             return
         integer(f"record '{self.name}': period", self.period, 1)
         if self.period > T or (self.start == "periodic" and T % self.period):
-            raise ValueError(
+            raise InputError(
                 f"record '{self.name}' has {T} samples and a period of {self.period}; "
                 + (
                     "a steady-state record holds a whole number of periods: cut it to one."
@@ -162,7 +163,7 @@ class Record:
     def _check_weights(self, T: int, ny: int) -> None:
         weight = np.array(self.weight, dtype=np.float64)
         if weight.shape not in ((), (1,), (ny,)):
-            raise ValueError(
+            raise InputError(
                 f"record '{self.name}': weight has shape {weight.shape}; give one number, or one "
                 f"for each of the {ny} output(s)."
             )
@@ -172,12 +173,12 @@ class Record:
             lines = given[:, None] if given.ndim == 1 else given
             F = T // 2 + 1
             if lines.shape not in ((F, 1), (F, ny)):
-                raise ValueError(
+                raise InputError(
                     f"record '{self.name}': line_weight has shape {given.shape}; "
                     f"{T} samples have {F} lines from 0 to fs / 2: give ({F},) or ({F}, {ny})."
                 )
             if self.start != "periodic" or self.skip:
-                raise ValueError(
+                raise InputError(
                     f"record '{self.name}': line_weight needs start='periodic' and skip=0, not "
                     f"start={self.start!r} and skip={self.skip}."
                 )
@@ -186,7 +187,7 @@ class Record:
             if values is None:
                 continue
             if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
-                raise ValueError(
+                raise InputError(
                     f"record '{self.name}': {name} must be finite, at least 0 and not all 0."
                 )
             object.__setattr__(self, name, values)
@@ -219,7 +220,7 @@ class Record:
             ValueError: not a slice, or one with a step (it would change the rate).
         """
         if not isinstance(window, slice) or window.step not in (None, 1):
-            raise ValueError(f"a record is cut by record[first:last], not by {window!r}.")
+            raise InputError(f"a record is cut by record[first:last], not by {window!r}.")
         u, y = self.u[window], self.y[window]
         period = self.period if self.period is not None and self.period <= len(u) else None
         return replace(
@@ -238,7 +239,7 @@ def as_records(records: Record | Sequence[Record]) -> list[Record]:
         raise _no_record(records)
     found = [records] if isinstance(records, Record) else list(records)
     if not found:
-        raise ValueError("no record given; at least one is needed.")
+        raise InputError("no record given; at least one is needed.")
     for record in found:
         if not isinstance(record, Record):
             raise _no_record(record)
@@ -246,13 +247,13 @@ def as_records(records: Record | Sequence[Record]) -> list[Record]:
     for record in found[1:]:
         same = record.u.shape[1] == first.u.shape[1] and record.y.shape[1] == first.y.shape[1]
         if not same:
-            raise ValueError(
+            raise InputError(
                 f"records '{first.name}' and '{record.name}' differ in channels: "
                 f"{first.u.shape[1]} inputs and {first.y.shape[1]} outputs against "
                 f"{record.u.shape[1]} and {record.y.shape[1]}; give records of the same channels."
             )
         if not np.isclose(record.fs, first.fs):
-            raise ValueError(
+            raise InputError(
                 f"records '{first.name}' and '{record.name}' are sampled at {first.fs} and "
                 f"{record.fs} Hz; resample them to one rate."
             )
@@ -260,7 +261,7 @@ def as_records(records: Record | Sequence[Record]) -> list[Record]:
 
 
 def _no_record(given: object) -> ValueError:
-    return ValueError(
+    return InputError(
         f"the data hold a {type(given).__name__} where a record is expected; "
         "make one of the signals: lfrtorch.Record(u, y, fs=...)."
     )
@@ -319,7 +320,7 @@ class Scaler:
 def check_start(start: str, what: str) -> None:
     """Refuse an unknown kind of start with a ValueError."""
     if start not in get_args(Start):
-        raise ValueError(
+        raise InputError(
             f"{what}: start is {start!r}; use 'zero', 'given', 'estimated' or 'periodic'."
         )
 
@@ -336,7 +337,7 @@ def _channels(given: tuple[Channel, ...], signal: ArrayLike, letter: str) -> tup
     if not given:
         return tuple(Channel(letter if width == 1 else f"{letter}{i + 1}") for i in range(width))
     if len(given) != width:
-        raise ValueError(
+        raise InputError(
             f"{letter} has {width} column(s) but {len(given)} channel name(s) were given; "
             "name every column once."
         )
@@ -357,31 +358,31 @@ def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: 
     """
     array = np.asarray(x)
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"{what} has type {array.dtype}; give real numbers.")
+        raise InputError(f"{what} has type {array.dtype}; give real numbers.")
     array = np.array(array, dtype=np.float64, order="C")  # a copy: it is frozen below
     if array.ndim == 1:
         array = array[:, None]
     if array.ndim != 2:
-        raise ValueError(
+        raise InputError(
             f"{what} has shape {array.shape}; give (T,) for one channel or (T, channels)."
         )
     if array.size == 0:
-        raise ValueError(f"{what} is empty (shape {array.shape}); give at least one sample.")
+        raise InputError(f"{what} is empty (shape {array.shape}); give at least one sample.")
     if array.shape[0] < array.shape[1] and array.shape[1] > _MANY_CHANNELS:
-        raise ValueError(
+        raise InputError(
             f"{what} has shape {array.shape}: more channels than samples. "
             "Time runs along the first axis; transpose the array."
         )
     if array.shape[1] != len(channels):
         names = ", ".join(channel.name for channel in channels)
-        raise ValueError(
+        raise InputError(
             f"{what} has {array.shape[1]} column(s) and {len(channels)} channel(s) are expected "
             f"({names}); give a column for each."
         )
     bad = ~np.isfinite(array)
     if bad.any():
         k, channel = np.argwhere(bad)[0]
-        raise ValueError(
+        raise InputError(
             f"{what} '{channels[channel].name}' has {bad.sum()} NaN or infinite sample(s), the "
             f"first at index {first + k}; cut the record there or interpolate the gap."
         )

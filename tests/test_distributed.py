@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import LOST, ProcessLost, Ranks, connect
+from lfrtorch.distributed import LOST, ProcessLostError, Ranks, connect
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.least_squares import jacobian
@@ -204,7 +204,7 @@ def losing(ranks: Ranks) -> Any:
     seconds = time.monotonic() - begin
     try:
         ranks.sum(torch.ones(1))
-    except ProcessLost as error:
+    except ProcessLostError as error:
         return theta(model), result, seconds, str(error)
 
 

@@ -13,6 +13,7 @@ from torch.nn import Module
 
 import lfrtorch
 from lfrtorch._checks import integer
+from lfrtorch._errors import InputError
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings, SizesSearch
 from lfrtorch.survey.findings import findings
@@ -31,14 +32,14 @@ def configured(cfg: DictConfig) -> Settings:
     """
     require_data(cfg)
     if cfg.nx is None and cfg.init_from is None:
-        raise ValueError(
+        raise InputError(
             "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
             "(+bench=boucwen sets it and all else for that benchmark)."
         )
     if cfg.threads is not None:
         integer("threads", cfg.threads, 1)
     if cfg.dtype not in ("float32", "float64"):
-        raise ValueError(f"dtype is {cfg.dtype}; give float64 or float32.")
+        raise InputError(f"dtype is {cfg.dtype}; give float64 or float32.")
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     return Settings(
         **{name: plain[name] for name in AS_THEY_ARE},
@@ -90,7 +91,7 @@ def loaded(cfg: DictConfig) -> Dataset:
 def require_data(cfg: DictConfig) -> None:
     """Say how data are chosen where none are."""
     if cfg.get("data") is None:
-        raise ValueError(
+        raise InputError(
             "no data chosen: add +bench=boucwen, or data=file data.path=FILE "
             "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER (or nx=auto)."
         )

@@ -10,13 +10,13 @@ from contextlib import contextmanager
 
 from hydra.errors import InstantiationException
 
-from lfrtorch.cli.interrupts import Terminated
-from lfrtorch.distributed import ProcessLost
+from lfrtorch._errors import LfrtorchError
+from lfrtorch.cli.interrupts import TerminatedError
 
 
 @contextmanager
 def user_errors(rank: str = "0") -> Iterator[None]:
-    """User errors end the program with one message and exit code 1, no traceback.
+    """Errors of users end the program with one message and exit code 1; bugs keep their traceback.
 
     A message names the group of the configuration, which a function's argument belongs to:
     ``data: seed is -1``.
@@ -26,16 +26,25 @@ def user_errors(rank: str = "0") -> Iterator[None]:
         yield
         return
     except InstantiationException as failed:
+        if failed.__cause__ and not _of_the_user(failed.__cause__):
+            raise failed.__cause__ from None
         group = re.search(r"^full_key: (.+)$", str(failed), re.MULTILINE)
         where = f"{group[1]}: " if group and failed.__cause__ else ""
         print(f"{error}: {where}{failed.__cause__ or failed}", file=sys.stderr)
-    except (ValueError, OSError, ProcessLost) as failed:
-        print(f"{error}: {failed}", file=sys.stderr)
-    except Terminated as end:
+    except TerminatedError as end:
         if rank == "0":
             print(end, file=sys.stderr)
         sys.exit(128 + signal.SIGTERM)
+    except (LfrtorchError, OSError) as failed:
+        print(f"{error}: {failed}", file=sys.stderr)
     except KeyboardInterrupt as stop:
         print(f"interrupted {str(stop) or 'outside the fit'}: nothing to keep", file=sys.stderr)
         sys.exit(130)
     sys.exit(1)
+
+
+def _of_the_user(cause: BaseException) -> bool:
+    """Whether a call from the configuration failed because of what it was given."""
+    if isinstance(cause, TypeError):
+        return "unexpected keyword argument" in str(cause)
+    return isinstance(cause, LfrtorchError | OSError | ImportError)

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 
 import lfrtorch
 from lfrtorch._atomic import refuse_existing, whole_file
+from lfrtorch._errors import InputError
 from lfrtorch.cli.config import CONF, loaded, require_data
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import program
@@ -26,13 +27,13 @@ from lfrtorch.reporting import scores as report
 def evaluate(cfg: DictConfig, command: str = "") -> None:
     """Print the scores of the checkpoint's model, and write them where that is asked for."""
     if cfg.checkpoint is None:
-        raise ValueError(
+        raise InputError(
             "no model chosen: add checkpoint=DIR, the folder of a run or of a saved model."
         )
     require_data(cfg)
     if cfg.out is not None:
         if Path(cfg.out).suffix.lower() != ".json":
-            raise ValueError(f"out is '{cfg.out}'; the scores are JSON: name it FILE.json.")
+            raise InputError(f"out is '{cfg.out}'; the scores are JSON: name it FILE.json.")
         if not cfg.overwrite:
             refuse_existing(cfg.out, "overwrite=true")
     folder = str(cfg.checkpoint)

@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from lfrtorch._atomic import whole_file
 from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.interrupts import Terminated, Termination
+from lfrtorch.cli.interrupts import TerminatedError, Termination
 from lfrtorch.cli.run_folder import (
     CONFIG,
     SNAPSHOTS,
@@ -39,7 +39,7 @@ from lfrtorch.cli.run_folder import (
     program,
 )
 from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import LOST, ProcessLost, Ranks, connect
+from lfrtorch.distributed import LOST, ProcessLostError, Ranks, connect
 from lfrtorch.fitting.observer import Watching
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.snapshots import Snapshots
@@ -62,7 +62,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
     """One run, its files written into ``folder`` by the first process; returns the validation RMSE.
 
     Raises:
-        ProcessLost, Terminated: the fit ended early, and what it had found is written.
+        ProcessLostError, TerminatedError: the fit ended early, and what it had found is written.
     """
     ranks = Ranks() if ranks is None else ranks
     cfg = chosen_before(cfg, folder)
@@ -82,7 +82,9 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             )
         except StoppedError:
             if stop.asked == signal.SIGTERM:
-                raise Terminated("terminated while sizes were searched: nothing to keep") from None
+                raise TerminatedError(
+                    "terminated while sizes were searched: nothing to keep"
+                ) from None
             raise KeyboardInterrupt("while sizes were searched") from None
         if files is not None:
             print(found)
@@ -97,9 +99,9 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
     reason = found.fit.reason
     best = f"the best model so far is in {folder / 'model'}; {go_on(folder)}"
     if reason.startswith(LOST):
-        raise ProcessLost(f"{reason}; {best}")
+        raise ProcessLostError(f"{reason}; {best}")
     if stop.asked == signal.SIGTERM and reason == INTERRUPTED:
-        raise Terminated(f"the fit was terminated; {best}")
+        raise TerminatedError(f"the fit was terminated; {best}")
     if reason == INTERRUPTED:
         print(go_on(folder))
     judged = found.metrics["validation"]["rmse"]

@@ -6,8 +6,10 @@ import signal
 import sys
 from typing import Any, Self
 
+from lfrtorch._errors import LfrtorchError
 
-class Terminated(Exception):
+
+class TerminatedError(LfrtorchError):
     """SIGTERM ended the program."""
 
 
@@ -46,4 +48,4 @@ class Termination:
                 raise KeyboardInterrupt
             print("\nending after this iteration; Ctrl-C again: at once", file=sys.stderr)
         elif not self._fitting:
-            raise Terminated("terminated outside the fit: nothing to keep")
+            raise TerminatedError("terminated outside the fit: nothing to keep")

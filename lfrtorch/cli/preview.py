@@ -22,10 +22,11 @@ import numpy as np
 from lfrtorch import _tables
 from lfrtorch._atomic import whole_file
 from lfrtorch._checks import number
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.files.formats import BLOCK, Table, open_table
-from lfrtorch.files.time_stamps import Uneven, in_seconds, is_time, sampling
+from lfrtorch.files.time_stamps import UnevenError, in_seconds, is_time, sampling
 from lfrtorch.records import Channel
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.findings import examine
@@ -89,7 +90,7 @@ def matching(patterns: Sequence[str]) -> list[Path]:
         path = Path(pattern).expanduser()
         paths = [path] if path.exists() else sorted(map(Path, glob.glob(str(path))))
         if not paths and glob.has_magic(pattern):
-            raise ValueError(f"no file matches '{pattern}'.")
+            raise InputError(f"no file matches '{pattern}'.")
         found |= dict.fromkeys(paths or [path])
     return list(found)
 
@@ -103,7 +104,7 @@ def figure_path(out: Path | None, path: Path, files: int) -> Path:
     if out is None:
         return Path(f"{path.stem}_preview.png")
     if out.suffix.lower() not in FIGURES:
-        raise ValueError(f"--out is '{out}'; give a name that ends with {', '.join(FIGURES)}.")
+        raise InputError(f"--out is '{out}'; give a name that ends with {', '.join(FIGURES)}.")
     return out if files == 1 else out.with_stem(f"{out.stem}_{path.stem}")
 
 
@@ -159,7 +160,7 @@ def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]
     named = [*inputs, *outputs, *time]
     twice = [table.headers[i] for i in dict.fromkeys(named) if named.count(i) > 1]
     if twice or len(time) > 1:
-        raise ValueError(
+        raise InputError(
             f"'{table.path}': {', '.join(map(repr, twice)) or '--time'} stands for several; "
             "give every column one use, and one column of times."
         )
@@ -167,7 +168,7 @@ def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]
     for i in set(range(len(table.columns))) - set(named):
         try:
             heads[i] = next(table.blocks([i], BLOCK))[:, 0]
-        except ValueError as error:
+        except InputError as error:
             remarks.append(f"left out: {error}")
     if not time:
         time = clocks(table, heads)[:1]
@@ -180,7 +181,7 @@ def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]
         remarks.append(f"{side}: {names}, all other columns")
         inputs, outputs = inputs or others, outputs or others
     if not outputs or (options.inputs and not inputs):
-        raise ValueError(f"'{table.path}' has no columns left to show; it has {table.listed}.")
+        raise InputError(f"'{table.path}' has no columns left to show; it has {table.listed}.")
     return Roles(inputs, outputs, time[0] if time else None), remarks
 
 
@@ -191,7 +192,7 @@ def clocks(table: Table, heads: Mapping[int, Array]) -> tuple[int, ...]:
         named = is_time(table.columns[i])
         try:
             grid = sampling(in_seconds(filled(head), table.columns[i]))
-        except Uneven:
+        except UnevenError:
             even, counter = False, False
         else:
             even, counter = not grid.gaps.size, not named and grid.fs == 1
@@ -205,7 +206,7 @@ def clock(times: Array, channel: Channel, fs: float | None) -> tuple[float | Non
     name = f"'{channel.name}'"
     try:
         grid = sampling(in_seconds(filled(times), channel))
-    except Uneven as error:
+    except UnevenError as error:
         said = f"the time column {name} {error}; resample the signals to an even grid."
         return fs, f"{name} is taken for the time", [said]
     if grid.fs == 1 and not is_time(channel):
@@ -246,7 +247,7 @@ def read(table: Table, wanted: Sequence[int]) -> tuple[Array, bool]:
     signals = np.concatenate(blocks)
     present = np.flatnonzero(~np.isnan(signals).all(axis=1))
     if not present.size:
-        raise ValueError(f"'{table.path}' has no values in the columns to show.")
+        raise InputError(f"'{table.path}' has no values in the columns to show.")
     return signals[: present[-1] + 1], most < T  # spreadsheets end in empty lines
 
 

@@ -14,6 +14,7 @@ from typing import cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from lfrtorch._errors import InputError
 from lfrtorch.distributed import Ranks
 
 WORLD = int(os.environ.get("WORLD_SIZE", "1"))
@@ -40,7 +41,7 @@ def arguments(given: Sequence[str]) -> list[str]:
     if folder != "null":
         overrides = Path(folder) / ".hydra" / "overrides.yaml"
         if not overrides.is_file():
-            raise ValueError(
+            raise InputError(
                 f"resume is '{folder}', which is not the folder of a run: there is no {overrides}; "
                 "give the folder that the run named at its end, runs/NAME/DATE."
             )
@@ -50,12 +51,12 @@ def arguments(given: Sequence[str]) -> list[str]:
         return [*before, *given, f"hydra.run.dir='{escaped}'"]
     for word in given:
         if now(word) != word:
-            raise ValueError(f"{word} is called {now(word)} now.")
+            raise InputError(f"{word} is called {now(word)} now.")
     for name, mark in (("hydra.run.dir", CONFIG), ("hydra.sweep.dir", "multirun.yaml")):
         folder = values.get(name, "").strip("'\"")
         taken = bool(folder) and (Path(folder) / mark).exists()
         if taken and values.get("overwrite", "").lower() != "true":
-            raise ValueError(
+            raise InputError(
                 f"{name} is '{folder}', which holds a run; give another folder, resume={folder} "
                 "to go on with that run, or overwrite=true to replace it."
             )

@@ -19,6 +19,7 @@ import lfrtorch
 from lfrtorch import _checkpoint, _tables
 from lfrtorch._atomic import refuse_existing, whole_file
 from lfrtorch._checks import integer, number
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.cli.config import CONF
 from lfrtorch.cli.errors import user_errors
@@ -120,7 +121,7 @@ def written(
             write(found)
             first += len(y_hat)
         if not first:
-            raise ValueError("there are no samples; give a file with data.")
+            raise InputError("there are no samples; give a file with data.")
     return Written(first, scores, settled, peaks)
 
 
@@ -150,7 +151,7 @@ def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
 def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
     """Refuse another sampling frequency than the model's."""
     if cfg.data.fs is not None and not np.isclose(cfg.data.fs, model.fs):
-        raise ValueError(
+        raise InputError(
             f"data.fs is {cfg.data.fs} Hz and the model's sampling frequency {model.fs:g} Hz; "
             "resample the file."
         )
@@ -181,7 +182,7 @@ def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> A
     if cfg.start == "zero":
         return None
     if not stream.y:
-        raise ValueError(
+        raise InputError(
             "start=estimated needs measured outputs; name their columns with data.outputs=[...], "
             "or use start=zero."
         )
@@ -237,23 +238,23 @@ def require(cfg: DictConfig) -> None:
         ("out", cfg.out, "FILE.csv, which is written, or for several files a FOLDER"),
     ):
         if value is None:
-            raise ValueError(f"{option} is not set: add {option}={example}.")
+            raise InputError(f"{option} is not set: add {option}={example}.")
     if cfg.start not in ("zero", "given", "estimated"):
-        raise ValueError(f"start is {cfg.start!r}; give zero, given (with x0=[...]) or estimated.")
+        raise InputError(f"start is {cfg.start!r}; give zero, given (with x0=[...]) or estimated.")
     if (cfg.start == "given") != (cfg.x0 is not None):
-        raise ValueError(
+        raise InputError(
             f"start is {cfg.start!r} and x0 is {cfg.x0}; "
             "a start state goes with start=given, and only with it."
         )
     x0 = cfg.x0 if isinstance(cfg.x0, ListConfig | None) else [None]
     if not all(isinstance(x, int | float) and np.isfinite(x) for x in x0 or []):
-        raise ValueError(f"x0 is {cfg.x0}; give a list of finite numbers, one a state.")
+        raise InputError(f"x0 is {cfg.x0}; give a list of finite numbers, one a state.")
     integer("estimate", cfg.estimate, 1)
     integer("skip", cfg.skip, 0)
     if cfg.data.fs is not None:
         number("data.fs", cfg.data.fs, positive=True)
     if f".{cfg.format}" not in FORMATS:
-        raise ValueError(f"format is {cfg.format!r}; give csv, npz or parquet.")
+        raise InputError(f"format is {cfg.format!r}; give csv, npz or parquet.")
 
 
 def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
@@ -265,7 +266,7 @@ def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
         stems = [Path(path.name.removesuffix(".gz")).stem for path in paths]
         twice = next((stem for stem in stems if stems.count(stem) > 1), None)
         if twice is not None:
-            raise ValueError(
+            raise InputError(
                 f"several files are called '{twice}', and would be written to one in '{out}'; "
                 "simulate them one by one."
             )
@@ -273,14 +274,14 @@ def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
             (path, out / f"{stem}.{cfg.format}") for path, stem in zip(paths, stems, strict=True)
         ]
     elif out.suffix.lower() not in FORMATS:
-        raise ValueError(f"out is '{out}'; give a file of {', '.join(FORMATS)}, or a folder.")
+        raise InputError(f"out is '{out}'; give a file of {', '.join(FORMATS)}, or a folder.")
     elif len(paths) > 1:
-        raise ValueError(f"{len(paths)} files cannot be written to one, '{out}'; give a folder.")
+        raise InputError(f"{len(paths)} files cannot be written to one, '{out}'; give a folder.")
     else:
         pairs = [(paths[0], out)]
     for path, file in pairs:
         if file.resolve() == path.resolve():
-            raise ValueError(f"'{file}' is the file that is read; give another name to out.")
+            raise InputError(f"'{file}' is the file that is read; give another name to out.")
         if not cfg.overwrite:
             refuse_existing(file, "overwrite=true")
     return pairs
@@ -291,10 +292,10 @@ def about(path: Path) -> Iterator[None]:
     """Name the file in a message that does not."""
     try:
         yield
-    except ValueError as error:
+    except InputError as error:
         if f"'{path}'" in str(error):
             raise
-        raise ValueError(f"'{path}': {error}") from error
+        raise InputError(f"'{path}': {error}") from error
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="simulate")

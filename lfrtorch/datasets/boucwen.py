@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 from scipy.signal import firwin, resample
 
 from lfrtorch._checks import integer, number
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
@@ -117,11 +118,11 @@ def load(
     number("noise_rms", noise_rms)
     trained = _levels("rms", rms)
     if not trained:
-        raise ValueError("rms is empty; give one level or more, in N, for example [50].")
+        raise InputError("rms is empty; give one level or more, in N, for example [50].")
     levels = [trained[0], *_levels("selection_rms", selection_rms)]
     offsets = range(validation_seed_offset, validation_seed_offset + len(levels))
     if 0 in offsets or _TEST_OFFSET in offsets:
-        raise ValueError(
+        raise InputError(
             f"validation_seed_offset={validation_seed_offset} and {len(levels) - 1} level(s) of "
             "selection_rms: none may be the training or simulated test realisation "
             f"(offsets 0 and {_TEST_OFFSET}); use for example 1000."
@@ -175,12 +176,12 @@ def multisine(
     """
     least = ceil(_FS / _BAND[0])
     if not isinstance(samples, Integral) or samples < least:
-        raise ValueError(
+        raise InputError(
             f"a period of {samples} samples at {_FS:g} Hz cannot hold the excited band, "
             f"{_BAND[0]:g} to {_BAND[1]:g} Hz; give a whole number of at least {least} samples."
         )
     if not (np.isfinite(rms) and rms > 0):
-        raise ValueError(f"the input's rms is {rms} N; give a positive number (officially 50 N).")
+        raise InputError(f"the input's rms is {rms} N; give a positive number (officially 50 N).")
     f0 = _FS / samples
     lines = np.arange(floor(_BAND[0] / f0), ceil(_BAND[1] / f0) + 1)
     phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, lines.size)
@@ -228,25 +229,25 @@ def simulate(
     """
     u = np.ascontiguousarray(u, dtype=np.float64)
     if u.ndim != 1 or u.size % _RATIO or u.size < 4 * _RATIO:
-        raise ValueError(
+        raise InputError(
             f"the force has shape {u.shape}; give one dimension at 15 kHz, a multiple of "
             f"{_RATIO} samples and at least {4 * _RATIO}."
         )
     if not np.isfinite(u).all():
-        raise ValueError("the force has NaN or infinite samples; give finite numbers.")
+        raise InputError("the force has NaN or infinite samples; give finite numbers.")
     if prod(factors) != _RATIO or min(factors) < 2:
-        raise ValueError(
+        raise InputError(
             f"decimation factors {tuple(factors)}: 15 kHz to 750 Hz needs factors of 2 or more "
             f"that multiply to {_RATIO}, for example (2, 2, 5)."
         )
     if not (np.isfinite(noise_rms) and noise_rms >= 0):
-        raise ValueError(
+        raise InputError(
             f"the noise rms is {noise_rms} m; give 0 (no noise) or a positive number "
             "(officially 8e-6 m)."
         )
     y = _newmark(u)
     if not np.isfinite(y[-1]):
-        raise ValueError(
+        raise InputError(
             f"the integration fails under a force of up to {np.abs(u).max():.3g} N; "
             "use a smaller one (the benchmark's rms is 50 N)."
         )

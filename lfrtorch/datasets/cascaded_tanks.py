@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from lfrtorch._checks import integer, number
+from lfrtorch._errors import InputError
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
@@ -79,7 +80,7 @@ def load(
     latest = _SAMPLES - held_out
     integer("first", first, 1)
     if first > latest:
-        raise ValueError(
+        raise InputError(
             f"first is {first}, and {held_out} samples are to validate from there on; there "
             f"are {_SAMPLES}: give {latest} at most, or a smaller validation."
         )

@@ -29,6 +29,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lfrtorch._checks import integer
+from lfrtorch._errors import InputError
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
@@ -86,7 +87,7 @@ def load(
     integer("warm_up", warm_up, 1)
     held_out = official.held_out(_SAMPLES, validation)
     if warm_up >= held_out:
-        raise ValueError(
+        raise InputError(
             f"warm_up is {warm_up}, which leaves none of the {held_out} validation samples "
             "to score; give fewer, or a larger validation."
         )

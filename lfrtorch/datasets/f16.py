@@ -34,6 +34,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
@@ -137,7 +138,7 @@ def _checked(levels: Sequence[int], validation_level: int) -> list[int]:
     except (TypeError, ValueError):
         chosen = []
     if len(chosen) < 2 or len(set(chosen)) < len(chosen):
-        raise ValueError(
+        raise InputError(
             f"levels is {levels} and validation_level is {validation_level}; give one or "
             f"more of {', '.join(map(str, _ESTIMATION))} to train, for example [1, 3, 7], and "
             "another one of them to validate on, each once."

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from lfrtorch._checks import number
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.records import Record, Start
 
@@ -65,7 +66,7 @@ def find(
         OSError: the download fails.
     """
     if not isinstance(download, bool):
-        raise ValueError(f"download is {download!r}; give True or False.")
+        raise InputError(f"download is {download!r}; give True or False.")
     below = folder(root)
     path = _present(below, (file, *others))
     if path is None and download:
@@ -158,13 +159,13 @@ def read_struct(path: Path, name: str, fields: Sequence[str], advice: str = _AGA
         (struct,) = loadmat(path, variable_names=[name])[name].ravel()
         matrices = [np.asarray(struct[field]) for field in fields]
     except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
-        raise ValueError(
+        raise InputError(
             f"'{path}' holds no readable struct '{name}' with {' and '.join(fields)} ({error!r}); "
             f"{advice}"
         ) from error
     shape = matrices[0].shape
     if len(shape) != 2 or 0 in shape:
-        raise ValueError(
+        raise InputError(
             f"'{path}': '{name}.{fields[0]}' has shape {shape}; expected (samples, records); "
             f"{advice}"
         )
@@ -188,7 +189,7 @@ def held_out(samples: int, validation: float, least: int = 1) -> int:
     number("validation", validation, positive=True)
     count = round(samples * min(validation, 1))
     if not 0 < count <= samples - least:
-        raise ValueError(
+        raise InputError(
             f"validation is {validation}, which leaves {samples - count} of the {samples} "
             f"estimation samples for training, and {count} to validate on; it needs {least} and 1 "
             "at least: give a fraction like 0.2."
@@ -245,7 +246,7 @@ def _unpacked(path: Path, member: str, advice: str) -> BytesIO:
             (name,) = (n for n in archive.namelist() if n.rpartition("/")[2] == member)
             return BytesIO(archive.read(name))
     except Exception as error:  # a damaged archive, too, makes for several kinds
-        raise ValueError(f"'{path}' holds no readable '{member}' ({error!r}); {advice}") from error
+        raise InputError(f"'{path}' holds no readable '{member}' ({error!r}); {advice}") from error
 
 
 def _variable(
@@ -259,7 +260,7 @@ def _variable(
     try:
         found = np.asarray(loadmat(content, variable_names=[name])[name])
     except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
-        raise ValueError(f"'{path}' holds no readable '{name}' ({error!r}); {advice}") from error
+        raise InputError(f"'{path}' holds no readable '{name}' ({error!r}); {advice}") from error
     return _numbers(path, name, found, shapes, advice)
 
 
@@ -272,7 +273,7 @@ def _numbers(
 ) -> Array:
     """What was found of a name, where it has one of the shapes and is real and finite."""
     if found.dtype.kind not in "iuf" or found.shape not in shapes or not np.isfinite(found).all():
-        raise ValueError(
+        raise InputError(
             f"'{path}': '{name}' has shape {found.shape} and type {found.dtype}; expected "
             f"{' or '.join(map(str, shapes))} and real numbers without NaN; {advice}"
         )

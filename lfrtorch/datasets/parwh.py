@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from lfrtorch._checks import integer, number
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
@@ -125,7 +126,7 @@ def load(
         OSError: the download fails.
     """
     if source not in _SOURCES:
-        raise ValueError(f"source is {source!r}; give one of {', '.join(_SOURCES)}.")
+        raise InputError(f"source is {source!r}; give one of {', '.join(_SOURCES)}.")
     integer("seed", seed, 0)
     integer("realisations", realisations, 1)
     integer("periods", periods, 1)
@@ -205,7 +206,7 @@ class _Official:
             ("periods", periods, _PERIODS),
         ):
             if asked > most:
-                raise ValueError(
+                raise InputError(
                     f"{name} is {asked}, and the official data have {most} for training; give "
                     f"1 to {most} (source='stand-in' simulates as many as are asked for)."
                 )
@@ -256,7 +257,7 @@ def _checked(levels: Sequence[int]) -> list[int]:
     except (TypeError, ValueError):
         chosen = []
     if not chosen or len(set(chosen)) < len(chosen):
-        raise ValueError(
+        raise InputError(
             f"levels is {levels}; give one or more of {', '.join(map(str, LEVELS))} (mV rms), "
             "each once, for example [100, 1000]."
         )

@@ -23,6 +23,7 @@ from scipy.signal import butter, cheby1, cheby2, ellip, freqz
 
 from lfrtorch import metrics
 from lfrtorch._checks import number
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 
 FS = 78125.0
@@ -125,7 +126,7 @@ def simulate(u: ArrayLike) -> Array:
     """
     u = np.asarray(u, dtype=np.float64)
     if u.ndim != 1 or not u.size or not np.isfinite(u).all():
-        raise ValueError(
+        raise InputError(
             f"the input has shape {u.shape}; give one dimension of finite numbers, in V."
         )
 

@@ -40,6 +40,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lfrtorch._checks import integer
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
@@ -86,7 +87,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
         path = official.find(root, f"{_FILES}/{file}", _LOADER, download=download)
         u, y = official.read_struct(path, "dataMeas", ("u", "y"))
         if len(u) <= _SKIP:
-            raise ValueError(
+            raise InputError(
                 f"'{path}': 'dataMeas.u' has shape {u.shape}; expected (samples, records) and more "
                 f"than {_SKIP} samples; download the file again."
             )
@@ -107,7 +108,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
     path, u, y = columns(_ESTIMATION)
     trained = u.shape[1] - validation
     if trained < 1:
-        raise ValueError(
+        raise InputError(
             f"validation is {validation}, and '{path}' has {u.shape[1]} record(s), of which "
             f"one at least must train; give 1 to {u.shape[1] - 1}."
         )
@@ -117,7 +118,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
     ]
     path, u, y = columns(_TEST)
     if u.shape[1] != len(_TESTS):
-        raise ValueError(
+        raise InputError(
             f"'{path}': 'dataMeas.u' has shape {u.shape}; expected (samples, {len(_TESTS)}), "
             f"{' and '.join(_TESTS)}; download the file again."
         )

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lfrtorch._checks import integer
+from lfrtorch._errors import InputError
 
 
 class LFRCell(nn.Module):
@@ -52,7 +53,7 @@ class LFRCell(nn.Module):
     ) -> None:
         super().__init__()
         if (static is None) != (nw == 0) or (nz == 0) != (nw == 0):
-            raise ValueError(
+            raise InputError(
                 f"nz={nz}, nw={nw} with static={static}: a static nonlinearity needs nz >= 1 and "
                 "nw >= 1, and a linear model has neither."
             )

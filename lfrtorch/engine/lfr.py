@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from lfrtorch._errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulate import Trajectory, simulate, steady_state
@@ -53,7 +54,7 @@ class LFR(nn.Module):
         """
         check_start(start, "simulation")
         if start == "estimated":
-            raise ValueError("start='estimated' is fitted to a record's output: Model.simulate.")
+            raise InputError("start='estimated' is fitted to a record's output: Model.simulate.")
         if start == "periodic":
             return steady_state(self.cell, u, x0 if guess is None else guess)
         zero = u.new_zeros(len(u), self.cell.nx)

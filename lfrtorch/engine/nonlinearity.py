@@ -15,6 +15,7 @@ from torch.nn import Module, Parameter, ParameterList
 from torch.nn.functional import pad
 
 from lfrtorch._checks import integer
+from lfrtorch._errors import InputError
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "tanh": torch.tanh,
@@ -59,7 +60,7 @@ class Network(Module):
     ) -> None:
         super().__init__()
         if activation not in ACTIVATIONS:
-            raise ValueError(
+            raise InputError(
                 f"activation is {activation!r}; use one of {', '.join(sorted(ACTIVATIONS))}."
             )
         self.activation = activation

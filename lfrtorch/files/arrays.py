@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.files.table import BLOCK, Clock, Table
 
@@ -108,7 +109,7 @@ class ArrayTable(Table):
         lengths = {name: self._found[name].size[0] for name, _ in chosen}
         if len(set(lengths.values())) > 1:
             listed = ", ".join(f"{name!r} has {length}" for name, length in lengths.items())
-            raise ValueError(f"'{self.path}': {listed} samples; give arrays of one length.")
+            raise InputError(f"'{self.path}': {listed} samples; give arrays of one length.")
         T = next(iter(lengths.values()))
         clocks = {name: Clock() for name in lengths}
         with self._stored(self.path) as stored:
@@ -153,7 +154,7 @@ def npz(path: Path) -> ArrayTable:
                         raise
                     found[name] = "is an array of objects; store an array of real numbers"
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(
+        raise InputError(
             f"'{path}' is not a readable .npz file ({error}); write it again with numpy.savez, "
             "arrays of numbers only."
         ) from error
@@ -165,12 +166,12 @@ def npy(path: Path) -> ArrayTable:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, EOFError, ValueError) as error:
-        raise ValueError(
+        raise InputError(
             f"'{path}' is not a readable .npy file ({error}); write it again with numpy.save, "
             "an array of numbers."
         ) from error
     if not isinstance(array, np.ndarray):
-        raise ValueError(f"'{path}' holds several arrays; give it the extension .npz.")
+        raise InputError(f"'{path}' holds several arrays; give it the extension .npz.")
     return _in_memory(path, {path.stem: _signal(array)})
 
 
@@ -185,7 +186,7 @@ def mat(path: Path) -> ArrayTable:
     try:
         variables = scipy_io.loadmat(path, chars_as_strings=False)
     except Exception as error:  # a damaged file raises any of a dozen kinds
-        raise ValueError(
+        raise InputError(
             f"'{path}' is not a readable MATLAB file ({error}); write it again with save."
         ) from error
     found: dict[str, Signal | str] = {}
@@ -296,11 +297,11 @@ def optional(package: str) -> ModuleType:
     try:
         return import_module(package)
     except ImportError as error:
-        raise ValueError(
+        raise InputError(
             f"files of this format need {package}, which is not installed: "
             "pip install 'lfrtorch[files]', or store them as .csv or .npz."
         ) from error
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:
-    return ValueError(f"'{path}' is not a readable HDF5 file ({error}); write it again.")
+    return InputError(f"'{path}' is not a readable HDF5 file ({error}); write it again.")

@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Callable
 from pathlib import Path
 
+from lfrtorch._errors import InputError
 from lfrtorch.files import arrays as array_table
 from lfrtorch.files.parquet import ParquetTable
 from lfrtorch.files.table import BLOCK, Table
@@ -48,7 +49,7 @@ def open_table(path: str | Path) -> Table:
     path = Path(path).expanduser()
     if path.is_dir():
         inside = sorted(p.name for p in path.iterdir() if extension(p) in FORMATS)
-        raise ValueError(
+        raise InputError(
             f"'{path}' is a folder; name a file"
             + (f": {', '.join(inside[:_SHOWN])}." if inside else ", it has none of a known format.")
         )
@@ -57,12 +58,12 @@ def open_table(path: str | Path) -> Table:
     kind = extension(path)
     if kind not in FORMATS:
         instead = _INSTEAD.get(path.suffix.lower(), "convert it")
-        raise ValueError(
+        raise InputError(
             f"'{path}' has the unknown extension '{path.suffix}'; {instead}, or rename it where it "
             f"is one of these: {', '.join(FORMATS)}."
         )
     if path.stat().st_size == 0:
-        raise ValueError(f"'{path}' is empty; give a file with data.")
+        raise InputError(f"'{path}' is empty; give a file with data.")
     return FORMATS[kind](path)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, cast, get_args
 
 from lfrtorch._checks import integer, number
+from lfrtorch._errors import InputError
 from lfrtorch.dataset import Dataset
 from lfrtorch.files.formats import similar
 from lfrtorch.files.measurement import (
@@ -21,8 +22,8 @@ from lfrtorch.files.measurement import (
     Wanted,
     read_measurement,
 )
-from lfrtorch.files.split import SHORTEST, TooShort, cut
-from lfrtorch.files.table import NoColumn
+from lfrtorch.files.split import SHORTEST, TooShortError, cut
+from lfrtorch.files.table import NoColumnError
 from lfrtorch.periods import find_period, find_transient
 from lfrtorch.records import Record
 
@@ -118,12 +119,12 @@ def load_records(
     tests, left, tested = _taken("test", test, left, reader)
     chosen, left, validated = _taken("validation", validation, left, reader)
     if not left:
-        raise ValueError(
+        raise InputError(
             f"validation={validation} and test={test} leave no record for training; "
             f"path has {len(reader.all)} in all."
         )
     if validated + tested >= 1:
-        raise ValueError(
+        raise InputError(
             f"the fractions are validation={validation} and test={test}; they must leave something "
             "for training, for example 0.2 and 0.2."
         )
@@ -133,13 +134,13 @@ def load_records(
         try:
             for use, record in cut(whole.record, validated, tested).items():
                 parts[use].append(record)
-        except TooShort as error:
+        except TooShortError as error:
             if not whole.stretch:
-                raise ValueError(f"'{whole.path}': {error}") from error
+                raise InputError(f"'{whole.path}': {error}") from error
             short = error
             reader.note(whole.record.name, _LEFT_OUT)
     if not parts["train"]:
-        raise ValueError(f"'{left[0].path}': no stretch between gaps is long enough: {short}")
+        raise InputError(f"'{left[0].path}': no stretch between gaps is long enough: {short}")
     if (validated or tested) and any(whole.record.period for whole in left):
         reader.note(
             "",
@@ -159,7 +160,7 @@ class _Reader:
 
     def __init__(self, wanted: Wanted, start: Start, period: Period, skip: int | None) -> None:
         if start not in get_args(Start):
-            raise ValueError(f"start is {start!r}; use 'zero', 'estimated' or 'periodic'.")
+            raise InputError(f"start is {start!r}; use 'zero', 'estimated' or 'periodic'.")
         if period not in (None, "auto"):
             integer("period", period, 1)
         if skip is not None:
@@ -197,15 +198,15 @@ class _Reader:
                 name = f"{stem}_{i}" if several else stem
                 try:
                     record, notes = self._record(name, measured, stretch)
-                except TooShort as error:
+                except TooShortError as error:
                     if not several:
-                        raise ValueError(f"'{path}': {error}") from error
+                        raise InputError(f"'{path}': {error}") from error
                     self.note(name, _LEFT_OUT)
                 else:
                     self._note_all(name, notes)
                     found.append(_Whole(record, path, stem, several))
             if len(found) == before:
-                raise ValueError(f"'{path}': no stretch between its gaps is long enough to score.")
+                raise InputError(f"'{path}': no stretch between its gaps is long enough to score.")
         self.all += found
         return found
 
@@ -217,23 +218,23 @@ class _Reader:
         """What a file measured, checked to be of a kind with the first."""
         try:
             measured = read_measurement(path, self.wanted)
-        except NoColumn as error:
+        except NoColumnError as error:
             if self._first is None:
                 raise
-            raise ValueError(f"{error} '{self._first.path}' has it.") from error
+            raise InputError(f"{error} '{self._first.path}' has it.") from error
         if self._first is None:
             self._first = measured
         first = self._first
         for side in ("inputs", "outputs"):
             here, there = getattr(measured, side), getattr(first, side)
             if here != there:
-                raise ValueError(
+                raise InputError(
                     f"the {side} of '{path}' are {', '.join(map(str, here))} and those of "
                     f"'{first.path}' {', '.join(map(str, there))}; give files of the same columns "
                     "and units."
                 )
         if abs(measured.fs / first.fs - 1) > _SAME:
-            raise ValueError(
+            raise InputError(
                 f"'{path}' is sampled at {measured.fs:g} Hz and '{first.path}' at {first.fs:g} Hz; "
                 "resample them to one rate."
             )
@@ -250,13 +251,13 @@ class _Reader:
         start: Start = self.start
         if start == "periodic":
             if N is None:
-                raise ValueError(
+                raise InputError(
                     f"start is 'periodic' and the input of '{measured.path}' does not repeat; "
                     "give period in samples, or start='zero'."
                 )
             begin = settling if self.skip is None else self.skip
             if T - begin < N:
-                raise TooShort(
+                raise TooShortError(
                     f"record '{name}' has no whole period of {N} samples: {T} samples, of which "
                     f"{begin} are left out at the start."
                 )
@@ -268,7 +269,7 @@ class _Reader:
             skip = (settling or round(_WARM_UP * T)) if self.skip is None else self.skip
             start = "estimated" if stretch.first else start
             if T - skip < SHORTEST:
-                raise TooShort(
+                raise TooShortError(
                     f"record '{name}' has {max(T - skip, 0)} scored samples of {T}, with "
                     f"skip={skip}; it needs {SHORTEST}."
                 )
@@ -302,7 +303,7 @@ def listed_files(given: Paths | None, option: str) -> list[Path]:
     """The files of paths and patterns, those of a pattern in the order of people's counting."""
     listed = [given] if isinstance(given, str | Path) else list(given or [])
     if not listed or not all(isinstance(path, str | Path) for path in listed):
-        raise ValueError(
+        raise InputError(
             f"{option} is {given!r}; give the path of a file, a pattern as 'runs/*.csv', or a list "
             "of these."
         )
@@ -368,13 +369,13 @@ def _taken(
     if use < 1:
         return [], wholes, float(use)
     if use != int(use):
-        raise ValueError(
+        raise InputError(
             f"{option} is {use}; give a fraction below 1, a whole number of records, or names of "
             "records or files."
         )
     count = int(use)
     if count >= len(wholes):
-        raise ValueError(
+        raise InputError(
             f"{option}={count} takes the last {count} of the {len(wholes)} record(s) there are, "
             "which leaves none for training; give more files, or a fraction below 1."
         )
@@ -392,7 +393,7 @@ def _named(
         if not found:
             path = Path(name).expanduser()
             if not (path.exists() or path.suffix or glob.has_magic(str(name))):
-                raise ValueError(
+                raise InputError(
                     f"{option} names {str(name)!r}, which is neither a file nor one of the "
                     f"records: {', '.join(whole.record.name for whole in known)}."
                 )
@@ -404,7 +405,7 @@ def _named(
             records += [whole.record for whole in fresh]
         used = [whole.record.name for whole in found if whole not in left]
         if used:
-            raise ValueError(
+            raise InputError(
                 f"{option} names {', '.join(map(repr, used))}, which has a use already; name every "
                 "record once in validation and test."
             )

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfrtorch._checks import number
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array, Integers
 from lfrtorch.files.formats import Table, open_table
-from lfrtorch.files.time_stamps import Sampling, Uneven, in_seconds, is_time, sampling
+from lfrtorch.files.time_stamps import Sampling, UnevenError, in_seconds, is_time, sampling
 from lfrtorch.records import Channel
 
 Columns = str | int | Sequence[str | int]
@@ -38,7 +39,7 @@ class Wanted:
         if self.fs is not None:
             number("fs", self.fs, positive=True)
         if self.gaps not in get_args(Gaps):
-            raise ValueError(f"gaps is {self.gaps!r}; use 'error' or 'split'.")
+            raise InputError(f"gaps is {self.gaps!r}; use 'error' or 'split'.")
 
 
 class Stretch(NamedTuple):
@@ -73,23 +74,23 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
     y = table.find(wanted.outputs, "outputs")
     stamps = () if wanted.time is None else table.find(wanted.time, "time")
     if len(stamps) > 1:
-        raise ValueError(f"time is {wanted.time!r}, which is {len(stamps)} columns; name one.")
+        raise InputError(f"time is {wanted.time!r}, which is {len(stamps)} columns; name one.")
     columns = (*u, *y, *stamps)
     twice = [table.headers[i] for i in dict.fromkeys(columns) if columns.count(i) > 1]
     if twice:
-        raise ValueError(
+        raise InputError(
             f"'{path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs "
             "and time; name every column once."
         )
     if wanted.fs is None and not stamps:
-        raise ValueError(
+        raise InputError(
             f"the sampling frequency of '{path}' is not given; say it in Hz with "
             f"fs{_suggested(table, columns)}."
         )
     known = {name for i in (*u, *y) for name in (table.headers[i], table.columns[i].name)}
     strange = [name for name in wanted.units if name not in known]
     if strange:
-        raise ValueError(
+        raise InputError(
             f"units names {', '.join(map(repr, strange))}, which is none of the inputs and "
             f"outputs: {', '.join(table.columns[i].name for i in (*u, *y))}."
         )
@@ -109,7 +110,7 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
     if len(values) and (missing.any() or len(stretches) > 1) and wanted.gaps == "error":
         raise _gap(table, values, columns, grid)
     if not stretches:
-        raise ValueError(f"'{path}' has no sample in which all columns have a value.")
+        raise InputError(f"'{path}' has no sample in which all columns have a value.")
     nu, ny = len(u), len(u) + len(y)
     fs = wanted.fs if grid is None else grid.fs
     assert fs is not None
@@ -145,7 +146,7 @@ def _refuse_infinite(table: Table, values: NDArray, columns: Sequence[int]) -> N
     infinite = np.isinf(values)
     if infinite.any():
         sample, i = np.argwhere(infinite)[0]
-        raise ValueError(
+        raise InputError(
             f"'{table.path}': {infinite.sum()} infinite value(s), the first at "
             f"{table.where(int(sample))} in column {table.headers[columns[i]]!r}; correct them, or "
             "leave the cells empty."
@@ -172,7 +173,7 @@ def _gap(
             f"the time stamps have {grid.gaps.size} gap(s) of {grid.missing.sum()} sample(s) in "
             f"all, the first before {table.where(int(grid.gaps[0]))}"
         )
-    return ValueError(
+    return InputError(
         f"'{table.path}': {', and '.join(said)}; gaps='split' takes every stretch between for a "
         "record of its own, or fill the gaps."
     )
@@ -184,8 +185,8 @@ def _grid(table: Table, t: Array, column: int) -> Sampling:
     k = np.arange(len(t))
     try:
         return sampling(in_seconds(np.interp(k, k[known], t[known]), table.columns[column]))
-    except Uneven as error:
-        raise ValueError(
+    except UnevenError as error:
+        raise InputError(
             f"'{table.path}': the time column {table.headers[column]!r} {error}, at "
             f"{table.where(error.sample)}; resample the signals to an even grid, or give fs "
             "without time if the column is wrong."
@@ -194,7 +195,7 @@ def _grid(table: Table, t: Array, column: int) -> Sampling:
 
 def _agree(wanted: Wanted, grid: Sampling, table: Table, column: int) -> None:
     if wanted.fs is not None and abs(wanted.fs / grid.fs - 1) > max(_SAME, grid.uncertainty):
-        raise ValueError(
+        raise InputError(
             f"fs is {wanted.fs:g} Hz and the time column {table.headers[column]!r} of "
             f"'{table.path}' says {grid.fs:g} Hz; leave fs or time out, whichever is "
             "wrong."

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from lfrtorch._errors import InputError
 from lfrtorch.records import Record
 
 SHORTEST = 10
 """Scored samples of a part."""
 
 
-class TooShort(ValueError):
+class TooShortError(InputError):
     """A record that leaves a part too few samples."""
 
 
@@ -27,7 +28,7 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
         test: fraction of the samples, those at the end.
 
     Raises:
-        TooShort: a part of fewer scored samples than ``SHORTEST``, or of no period.
+        TooShortError: a part of fewer scored samples than ``SHORTEST``, or of no period.
     """
     names = ["train", *["validation"] * bool(validation), *["test"] * bool(test)]
     steady = record.start == "periodic"
@@ -35,7 +36,7 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
     total = record.samples // unit
     held = [max(1, round(total * f)) for f in (validation, test) if f]
     if steady and total - sum(held) < 1:
-        raise TooShort(
+        raise TooShortError(
             f"record '{record.name}' has {total} whole period(s) after the transient, and "
             f"{', '.join(names)} need one each; give a longer record, set validation or "
             "test to 0, or use start='zero'."
@@ -50,7 +51,7 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
         else:
             first = max(begin, record.skip)
             if end - first < SHORTEST:
-                raise TooShort(
+                raise TooShortError(
                     f"record '{record.name}': the {name} part has {max(end - first, 0)} scored "
                     f"samples of {total}, with skip={record.skip}; it needs {SHORTEST}. Change the "
                     "fractions or skip, or give a longer file."

@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.files.formats import BLOCK, open_table
-from lfrtorch.files.table import NoColumn
-from lfrtorch.files.time_stamps import Uneven, in_seconds, sampling
+from lfrtorch.files.table import NoColumnError
+from lfrtorch.files.time_stamps import UnevenError, in_seconds, sampling
 from lfrtorch.records import Channel
 
 Columns = str | int | Sequence[str | int]
@@ -68,7 +69,7 @@ class FileStream:
         self.y = () if unmeasured else self._found(outputs, y, "outputs")
         self.times = () if time is None else self.table.find(time, "time")
         if len(self.times) > 1:
-            raise ValueError(f"time is {time!r}, {len(self.times)} columns; name one.")
+            raise InputError(f"time is {time!r}, {len(self.times)} columns; name one.")
         self.clock = self.table.columns[self.times[0]] if self.times else Channel("sample")
         """Of the time stamps, or of sample numbers where there are none."""
 
@@ -87,7 +88,7 @@ class FileStream:
             missing = ~np.isfinite(block[:, : ends[1]])
             if missing.any():
                 k, i = np.argwhere(missing)[0]
-                raise ValueError(
+                raise InputError(
                     f"{self._at(first + k)}: column {self.table.headers[columns[i]]!r} has no "
                     "finite number; interpolate the gap, or cut the file there and simulate the "
                     "parts."
@@ -109,22 +110,22 @@ class FileStream:
             found = self.table.find(
                 [c.name for c in channels] if wanted is None else wanted, option
             )
-        except NoColumn as error:
+        except NoColumnError as error:
             if wanted is not None:
                 raise
-            raise ValueError(
+            raise InputError(
                 f"{str(error).replace(f', named in {option}', '')} The model has {listed}; "
                 f"say which columns these are with {option}=[...]."
             ) from error
         if len(found) != len(channels):
-            raise ValueError(
+            raise InputError(
                 f"{option} is {len(found)} column(s) of '{self.table.path}' and the model has "
                 f"{len(channels)} ({listed}); give one for each."
             )
         for channel, number in zip(channels, found, strict=True):
             column = self.table.columns[number]
             if channel.unit and column.unit and channel.unit != column.unit:
-                raise ValueError(
+                raise InputError(
                     f"column {column} of '{self.table.path}' is in another unit than the model's "
                     f"{channel}; convert it, or correct its header."
                 )
@@ -136,19 +137,19 @@ class FileStream:
             return
         try:
             grid = sampling(times)
-        except Uneven as error:
-            raise ValueError(
+        except UnevenError as error:
+            raise InputError(
                 f"{self._at(first + error.sample)}: the time column {self.clock} {error}; resample "
                 "the signals to an even grid, or leave out time if the column is wrong."
             ) from error
         if abs(grid.fs / self.fs - 1) > max(SAME, grid.uncertainty):
-            raise ValueError(
+            raise InputError(
                 f"the time column {self.clock} of '{self.table.path}' says {grid.fs:g} Hz and the "
                 f"model runs at {self.fs:g} Hz; resample the signals, or correct the column or its "
                 "unit."
             )
         if grid.gaps.size:
-            raise ValueError(
+            raise InputError(
                 f"{self._at(first + grid.gaps[0])}: {grid.missing[0]} sample(s) are missing before "
                 f"it, as the time column {self.clock} says; fill the gap, or cut the file there "
                 "and simulate the parts."

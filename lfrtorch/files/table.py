@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.records import Channel
 
@@ -27,7 +28,7 @@ _UNIT = re.compile(rf"{_ATOM}(?:[/*·. ]{_ATOM})*")
 _BRACKETS = re.compile(r"(.*?)(\s*)[(\[]\s*([^()\[\]]{1,16}?)\s*[)\]]")
 
 
-class NoColumn(ValueError):
+class NoColumnError(InputError):
     """A file that has no such column."""
 
 
@@ -99,7 +100,7 @@ class Table(ABC):
             or not listed
             or not all(isinstance(w, str | int) and not isinstance(w, bool) for w in listed)
         ):
-            raise ValueError(
+            raise InputError(
                 f"{option} is {wanted!r}; give names of columns or their numbers from 0. "
                 f"'{self.path}' has {self.listed}."
             )
@@ -108,7 +109,7 @@ class Table(ABC):
     def _find(self, wanted: str | int, option: str) -> tuple[int, ...]:
         if isinstance(wanted, int):
             if not 0 <= wanted < len(self.columns):
-                raise NoColumn(
+                raise NoColumnError(
                     f"'{self.path}' has no column number {wanted}, named in {option}; "
                     f"it has {self.listed}, numbered from 0."
                 )
@@ -121,19 +122,19 @@ class Table(ABC):
                 return (found[0],)
             if found:
                 numbers = ", ".join(map(str, found))
-                raise ValueError(
+                raise InputError(
                     f"'{self.path}' has {len(found)} columns {wanted!r}, named in {option}; "
                     f"give the number of one: {numbers}."
                 )
         if wanted in self.refused:
-            raise ValueError(
+            raise InputError(
                 f"'{self.path}': {wanted!r}, named in {option}, {self.refused[wanted]}."
             )
         close = difflib.get_close_matches(wanted, self.headers, n=1, cutoff=CLOSE) or [
             header for header in self.headers if re.split(r"\W+", header)[-1] == wanted
         ]
         meant = f" Did you mean {close[0]!r}?" if len(close) == 1 else ""
-        raise NoColumn(
+        raise NoColumnError(
             f"'{self.path}' has no column {wanted!r}, named in {option}; it has {self.listed}."
             f"{meant}"
         )

@@ -18,6 +18,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.files.table import BLOCK, Clock, Table, bracketed, is_unit
 
@@ -106,7 +107,7 @@ class TextTable(Table):
                 raise
             if isinstance(error, ValueError):
                 self._explain(columns)
-            raise ValueError(
+            raise InputError(
                 f"'{self.path}' is damaged or no text ({error}); write it again."
             ) from error
 
@@ -130,7 +131,7 @@ class TextTable(Table):
         for line in self._lines():
             cells = line.cells
             if any(cells[width:]):
-                raise ValueError(
+                raise InputError(
                     f"'{self.path}', line {line.number}: {len(cells)} cells, where there are "
                     f"{width} columns; give every line the same columns"
                     + (", and numbers a decimal point." if self.layout.delimiter == "," else ".")
@@ -140,7 +141,7 @@ class TextTable(Table):
                 known = _is_date if column in self.layout.dates else self._is_number
                 if not (_is_missing(cell) or known(cell)):
                     kind = "date-time" if column in self.layout.dates else "number"
-                    raise ValueError(
+                    raise InputError(
                         f"'{self.path}', line {line.number}: {cell!r} in column "
                         f"{self.headers[column]!r} is not a {kind}; correct it, or leave the cell "
                         "empty where the value is missing."
@@ -211,7 +212,7 @@ def _encoding(path: Path) -> str:
         for encoding, zeros in (("utf-16-le", start[1::2]), ("utf-16-be", start[::2])):
             if zeros.count(0) > 0.9 * len(zeros):
                 return encoding
-        raise ValueError(
+        raise InputError(
             f"'{path}' is not text, as its zero bytes show; give it the extension of its format, "
             "or save it as text."
         )
@@ -257,17 +258,17 @@ def _layout(path: Path) -> _Layout:
             head = stream.read(_HEAD)
             head += stream.readline()
     except _DAMAGED as error:
-        raise ValueError(f"'{path}' is damaged ({error}); write it again.") from error
+        raise InputError(f"'{path}' is damaged ({error}); write it again.") from error
     text = head.splitlines()
     if not any(line.strip() for line in text):
-        raise ValueError(f"'{path}' is empty; give a file with data.")
+        raise InputError(f"'{path}' is empty; give a file with data.")
     try:
         delimiter, lines = max(
             ((d, list(_split(iter(text), d))) for d in _DELIMITERS),
             key=lambda split: _order(split[0], split[1]),
         )
     except csv.Error as error:
-        raise ValueError(f"'{path}' is not a readable table ({error}); save it again.") from error
+        raise InputError(f"'{path}' is not a readable table ({error}); save it again.") from error
     return _found(path, encoding, delimiter, lines)
 
 
@@ -320,7 +321,7 @@ def _found(path: Path, encoding: str, delimiter: str, lines: list[_Line]) -> _La
     start = next(clean, None)
     if start is None:
         shown = delimiter.join(lines[0].cells)
-        raise ValueError(
+        raise InputError(
             f"'{path}' has no samples: no line of numbers follows its first line, "
             f"{shown[:80]!r}; give a file with data."
         )

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array, Integers
 from lfrtorch.records import Channel
 
@@ -37,7 +38,7 @@ class Sampling(NamedTuple):
     missing: Integers
 
 
-class Uneven(ValueError):
+class UnevenError(InputError):
     """Stamps that are no even grid; ``sample`` is one where that shows."""
 
     def __init__(self, message: str, sample: int) -> None:
@@ -65,10 +66,10 @@ def sampling(t: Array) -> Sampling:
         t: (T,).
 
     Raises:
-        Uneven: stamps that do not rise, or are not evenly spaced between gaps.
+        UnevenError: stamps that do not rise, or are not evenly spaced between gaps.
     """
     if len(t) < 2:
-        raise Uneven("has one sample", 0)
+        raise UnevenError("has one sample", 0)
     digit = _last_digit(t)
     if _rounded(t, digit):
         return _grid(t, digit, np.array([], np.int64))
@@ -96,7 +97,7 @@ def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
     falling = np.flatnonzero(steps < 0)
     if mean <= 0 or falling.size:
         k = int(falling[0]) + 1 if falling.size else 1
-        raise Uneven(f"does not rise: {t[k - 1]:.10g} s is followed by {t[k]:.10g} s", k)
+        raise UnevenError(f"does not rise: {t[k - 1]:.10g} s is followed by {t[k]:.10g} s", k)
     starts = np.concatenate([[0], gaps])
     lengths = np.diff(np.append(starts, len(t)))
     place = np.arange(len(t)) - np.repeat(starts, lengths)
@@ -105,7 +106,7 @@ def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
     if far.any():
         odd = np.abs(steps - np.median(steps))
         odd[gaps - 1] = 0.0
-        raise Uneven(
+        raise UnevenError(
             f"is not evenly spaced: its steps go from {steps.min():.4g} s to {steps.max():.4g} s",
             int(np.argmax(odd)) + 1,
         )

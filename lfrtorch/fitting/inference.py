@@ -41,6 +41,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from lfrtorch._checks import integer
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array, Complex, Integers
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.chebyshev import chebyshev, chebyshev_slope
@@ -361,7 +362,7 @@ def infer(
     data = as_records(records)
     for record in data:
         if record.start != "periodic":
-            raise ValueError(
+            raise InputError(
                 f"record '{record.name}' has start={record.start!r}; inference works line by line "
                 "on records in steady state (start='periodic'): use "
                 "initialise(method='zero_output'), init=zero_output, for others."
@@ -371,7 +372,7 @@ def infer(
     )
     assert plain.lfr.cell.static is not None
     if not list(plain.lfr.cell.static.parameters()):
-        raise ValueError(
+        raise InputError(
             "static has no weights that could be fitted; use initialise(method='paper')."
         )
     model, generator = deepcopy(plain), np.random.default_rng(seed)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lfrtorch._errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, is_network
@@ -34,20 +35,20 @@ def mean_model(models: Sequence[Model]) -> Model:
         {'nx': 3, 'nz': 3, 'nw': 3, 'nn': 12}
     """
     if not models:
-        raise ValueError("there is no model to average; give one or more.")
+        raise InputError("there is no model to average; give one or more.")
     first = models[0]
     cells, networks = [], []
     for model in models:
         static = model.lfr.cell.static
         if not is_network(static):
-            raise ValueError(
+            raise InputError(
                 f"the mean is of models with a network, and one of these has {static!r} as its "
                 "static nonlinearity; average the simulated outputs instead."
             )
         if networks and static.activation != networks[0].activation:
-            raise ValueError("the models have networks of different activations; give one kind.")
+            raise InputError("the models have networks of different activations; give one kind.")
         if not _alike(model, first):
-            raise ValueError(
+            raise InputError(
                 "the models have other channels, scales or rates than each other; give models "
                 "that start from the same linear model and data."
             )

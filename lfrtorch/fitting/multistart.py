@@ -28,6 +28,7 @@ from typing import cast
 import torch
 
 from lfrtorch._checks import integer, renamed
+from lfrtorch._errors import InputError
 from lfrtorch._threads import each_alone, spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, loudest
 from lfrtorch.distributed import LOST, Ranks
@@ -146,7 +147,7 @@ def fit(
         ValueError: no model, one that diverges on the training records at the start, fewer records
             than processes, another number of lists of monitors, or models to average that have no
             network.
-        ProcessLost: before there was an iterate to keep.
+        ProcessLostError: before there was an iterate to keep.
 
     Example:
         >>> before = lfrtorch.rmse(record, model.simulate(record))
@@ -166,15 +167,15 @@ def fit(
     starts = [models] if alone else list(models)
     watching = cast(Sequence[Sequence[Monitor]], [monitors] if alone else monitors)
     if not starts:
-        raise ValueError("there is no model to start from; give one or more.")
+        raise InputError("there is no model to start from; give one or more.")
     if watching and len(watching) != len(starts):
-        raise ValueError(
+        raise InputError(
             f"there are {len(starts)} models and {len(watching)} lists of monitors; give each "
             "model its own."
         )
     integer("average", average, 1)
     if average > 1 and not all(is_network(model.lfr.cell.static) for model in starts):
-        raise ValueError(
+        raise InputError(
             f"average is {average}, and the mean is of models with a network as their static "
             "nonlinearity; give average=1 for other maps."
         )

@@ -11,6 +11,7 @@ import torch
 from torch.nn import Module
 
 from lfrtorch._checks import integer, number
+from lfrtorch._errors import InputError
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.trainer import Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -121,41 +122,41 @@ class Settings:
         known = [*signature(estimate_bla).parameters][2:]
         for name in self.linear:
             if name not in known:
-                raise ValueError(f"linear has no option '{name}'; there are {', '.join(known)}.")
+                raise InputError(f"linear has no option '{name}'; there are {', '.join(known)}.")
         if self.init not in ("zero_output", "paper", "inference"):
-            raise ValueError(
+            raise InputError(
                 f"init is {self.init!r}; use 'zero_output', 'paper' or 'inference' (periodic data)."
             )
         if self.minor is not None:
             number("minor", self.minor)
         if self.dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"dtype is {self.dtype}; give torch.float64 or torch.float32.")
+            raise InputError(f"dtype is {self.dtype}; give torch.float64 or torch.float32.")
         try:
             torch.empty(0, device=self.device)
         except (RuntimeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
-            raise ValueError(
+            raise InputError(
                 f"device is {self.device}, which torch cannot use here ({reason}); "
                 "the device cpu always works."
             ) from None
 
     def _check_sizes(self) -> None:
         if self.nx is None:
-            raise ValueError(
+            raise InputError(
                 "nx, the number of states, is not set: give nx=2, for example, or nx='auto'."
             )
         for name in ("nx", "nz", "nw", "nn", "degree"):
             integer(name, getattr(self, name), 1, word="auto")
         if isinstance(self.static, str) and self.static not in LAST_SIZE:
-            raise ValueError(
+            raise InputError(
                 f"static is {self.static!r}; use 'network', 'polynomial', or a module's class."
             )
         for name in {"nn", "degree"} - {*self.size_names}:
             if getattr(self, name) == "auto":
                 used = self.size_names[-1]
-                raise ValueError(f"{name} is auto, and this static map has none; give {used}=auto.")
+                raise InputError(f"{name} is auto, and this static map has none; give {used}=auto.")
         if callable(self.static) and "auto" in (self.nz, self.nw):
-            raise ValueError(
+            raise InputError(
                 "nz or nw is auto, and a map of one's own is not searched; give numbers."
             )
 

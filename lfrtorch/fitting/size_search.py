@@ -38,11 +38,12 @@ import torch
 
 from lfrtorch import _tables
 from lfrtorch._checks import integer, renamed
+from lfrtorch._errors import InputError
 from lfrtorch._tables import number
 from lfrtorch._types import Array, Integers
-from lfrtorch.distributed import LOST, ProcessLost, Ranks
+from lfrtorch.distributed import LOST, ProcessLostError, Ranks
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.trainer import INTERRUPTED, StartDiverges, Stop, StoppedError, Trainer
+from lfrtorch.fitting.trainer import INTERRUPTED, StartDivergesError, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
@@ -227,7 +228,7 @@ def search_sizes(
         ValueError: nothing to try, no records for validation or too short ones, or no model that is
             stable on them.
         StoppedError: by Ctrl-C or ``stop``: there is no choice yet.
-        ProcessLost: likewise.
+        ProcessLostError: likewise.
 
     Example:
         >>> def start(sizes, seed):
@@ -242,9 +243,9 @@ def search_sizes(
     given = {"nz": nz, "nw": nw} | ({"nn": nn} if degree is None else {"degree": degree})
     tried = {name: _sizes(name, values) for name, values in given.items()}
     if not seeds:
-        raise ValueError("seeds is empty; give one for each start, for example (0, 1000).")
+        raise InputError("seeds is empty; give one for each start, for example (0, 1000).")
     if not validation:
-        raise ValueError(
+        raise InputError(
             "there are no validation records, on which sizes are chosen; give some, or set "
             f"{', '.join(tried)} to numbers."
         )
@@ -270,13 +271,13 @@ def search_sizes(
                     ranks=ranks,
                     stop=stop,
                 )
-            except StartDiverges:
+            except StartDivergesError:
                 squares = np.full(len(judge.counts), inf)
             else:
                 if result.reason == INTERRUPTED:
                     raise StoppedError("the search for sizes was stopped")
                 if result.reason.startswith(LOST):
-                    raise ProcessLost(result.reason)
+                    raise ProcessLostError(result.reason)
                 squares = judge.squares(result.model)
             seconds = time.perf_counter() - clock
             found.append(judge.candidate(sizes, models[0], seconds, squares))
@@ -287,7 +288,7 @@ def search_sizes(
     chosen = searched(*outer, [last[len(last) // 2]]).chosen.sizes
     search = searched([chosen["nz"]], [chosen["nw"]], last)
     if not isfinite(search.chosen.error):
-        raise ValueError(
+        raise InputError(
             "all models that were tried diverge on the validation records; give training data at "
             "amplitudes like theirs, or set the sizes."
         )
@@ -329,7 +330,7 @@ def in_blocks(signals: Sequence[Array]) -> list[Array]:
     """Signals (T,) cut into blocks of about equal length, ``BLOCKS`` of them or a few more."""
     samples = sum(map(len, signals))
     if samples < BLOCKS:
-        raise ValueError(
+        raise InputError(
             f"the validation records have {samples} scored samples; sizes are chosen with "
             f"{BLOCKS} at least. Give longer records, or set the sizes."
         )
@@ -379,7 +380,7 @@ class _Judge:
 def _sizes(name: str, given: int | Sequence[int]) -> list[int]:
     values = [given] if isinstance(given, int | str) else sorted(set(given))
     if not values:
-        raise ValueError(f"{name} is empty; give the numbers to try, for example [1, 2].")
+        raise InputError(f"{name} is empty; give the numbers to try, for example [1, 2].")
     for value in values:
         integer(name, value, 1)
     return values

@@ -9,6 +9,7 @@ from pathlib import Path
 from time import monotonic
 
 from lfrtorch._atomic import whole_file
+from lfrtorch._errors import InputError
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.trainer import Fit, Keep, nothing
 
@@ -55,7 +56,7 @@ class Snapshots:
                 found = json.loads((folder / ROUNDS).read_text())
                 self._count, self.rounds = found["starts"], found["rounds"]
             except (ValueError, KeyError, TypeError) as error:
-                raise ValueError(
+                raise InputError(
                     f"'{folder / ROUNDS}' is damaged ({error}); start from the best model of the "
                     "run instead: init_from=DIR."
                 ) from None
@@ -78,7 +79,7 @@ class Snapshots:
             self._count = len(fits)
             self._write()
         if self._count != len(fits):
-            raise ValueError(
+            raise InputError(
                 f"the run that is to go on has {self._count} start(s), and now there are "
                 f"{len(fits)}; go on with as many, or begin a new run."
             )

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from lfrtorch._checks import integer, number
+from lfrtorch._errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
@@ -87,7 +88,7 @@ def initialise(
         integer(name, size, 1)
     integer("seed", seed, 0)
     if method not in ("zero_output", "paper"):
-        raise ValueError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
+        raise InputError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
     if minor is None:
         minor = 0.0 if method == "paper" else MINOR
     number("minor", minor)
@@ -148,7 +149,7 @@ def _check_sizes(static: Module, nz: int, nw: int, dtype: torch.dtype) -> None:
     except (RuntimeError, IndexError) as error:
         found = error
     if found != (1, 2, nw):
-        raise ValueError(
+        raise InputError(
             f"static gives {found} for z of shape (1, 2, {nz}); with nz={nz} and nw={nw} it must "
             f"give w of shape (1, 2, {nw})."
         )

@@ -13,6 +13,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lfrtorch._atomic import whole_file
+from lfrtorch._errors import InputError
 
 State = TypeVar("State")
 Tensors = dict[str, Tensor]
@@ -39,12 +40,12 @@ def read(path: Path) -> tuple[Numbers, Tensors]:
             about = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise ValueError(
+        raise InputError(
             f"'{path}', where a fit stood, is damaged ({error}); start from the best model of the "
             "run instead: init_from=DIR."
         ) from None
     if about.get("format") != FORMAT:
-        raise ValueError(
+        raise InputError(
             f"'{path}' was written by another version ({about.get('format')}); start from the best "
             "model of the run instead: init_from=DIR."
         )

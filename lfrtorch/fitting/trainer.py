@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from lfrtorch._errors import InputError, LfrtorchError
 from lfrtorch._threads import spread_by_hand
-from lfrtorch.distributed import ProcessLost, Ranks
+from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationError
@@ -31,7 +32,7 @@ _KEPT = ("best", "_chosen", "_first", "_score", "_seconds", "_durations")
 """Numbers of a fit that are saved with it."""
 
 
-class StartDiverges(ValueError):
+class StartDivergesError(InputError):
     """The model diverges on the training records at the start."""
 
 
@@ -187,7 +188,7 @@ class FitResult:
         return self.history[-1].iteration
 
 
-class StoppedError(Exception):
+class StoppedError(LfrtorchError):
     """A fit or a search was stopped before there was anything to keep."""
 
 
@@ -230,7 +231,7 @@ class Fit:
         self.problem = SimulationError(model, train, ridge=ridge, ranks=ranks)
         self.judge = SimulationError(model, validation, solved_starts=True) if validation else None
         if not math.isfinite(self.problem.cost(self.problem.residual(self.problem.theta))):
-            raise StartDiverges(
+            raise StartDivergesError(
                 "the model diverges on the training records at the start; start from a stable "
                 "model."
             )
@@ -269,7 +270,7 @@ class Fit:
         """Go on to an iteration, the trainer's last where left out; the best is in the model.
 
         Raises:
-            ProcessLost: before there was an iterate to keep.
+            ProcessLostError: before there was an iterate to keep.
         """
         until = self.trainer.limit if until is None else until
         try:
@@ -283,7 +284,7 @@ class Fit:
             if not self.history:
                 raise
             self.reason = INTERRUPTED
-        except ProcessLost as lost:
+        except ProcessLostError as lost:
             if not self.history:
                 raise
             self.reason = str(lost)
@@ -325,12 +326,12 @@ class Fit:
             state = state_file.within("state.", tensors, device)
             state = state_file.unpacked(like, numbers["state"], state)
         except TypeError:
-            raise ValueError(
+            raise InputError(
                 f"'{path}' was left by another trainer than {type(self.trainer).__name__}; go "
                 "on with the one that the run had."
             ) from None
         if state.iteration > self.trainer.limit:
-            raise ValueError(
+            raise InputError(
                 f"the fit that is to go on has had {state.iteration} iterations, more than the "
                 f"{self.trainer.limit} asked for; ask for more."
             )

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from lfrtorch._errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Stacked, is_network
@@ -70,14 +71,14 @@ class Stack:
         self.problems = list(problems)
         first = self.problems[0]
         if len({id(problem.model) for problem in problems}) < len(self.problems):
-            raise ValueError("two problems share one model; give each a model of its own.")
+            raise InputError("two problems share one model; give each a model of its own.")
         for problem in self.problems:
             alike = len(problem.theta) == len(first.theta)
             alike &= len(problem.batches) == len(first.batches)
             for mine, other in zip(problem.batches, first.batches, strict=False):
                 alike &= torch.equal(mine.u, other.u) and torch.equal(mine.y, other.y)
             if not alike:
-                raise ValueError(
+                raise InputError(
                     "the problems differ in records, scaling or free parameters; "
                     "a stack is of models of one structure over the same records."
                 )

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from lfrtorch._checks import integer, number
+from lfrtorch._errors import InputError
 from lfrtorch.least_squares.linear_systems import Orthogonal, System
 
 FASTEST_DECREASE = 0.2
@@ -214,7 +215,7 @@ class LevenbergMarquardt:
         residual = problem.residual(theta)
         cost = problem.cost(residual)
         if not math.isfinite(cost):
-            raise ValueError(
+            raise InputError(
                 "the residual is not finite at the start of the search; start from a stable model."
             )
         return LMState(theta, residual, cost)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lfrtorch._checks import number
+from lfrtorch._errors import InputError
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulate import Trajectory, estimated_start, is_compiled
@@ -59,11 +60,11 @@ class SimulationError:
         data = as_records(records)
         estimated = any(record.start == "estimated" for record in data)
         if not self._parameters and not estimated and not solved_starts:
-            raise ValueError("all parameters of the model are frozen; there is nothing to fit.")
+            raise InputError("all parameters of the model are frozen; there is nothing to fit.")
         for record in data:
             model.check(record)
         if len(data) < self.ranks.world:
-            raise ValueError(
+            raise InputError(
                 f"{self.ranks.world} processes share {len(data)} record(s); each needs one: start "
                 "fewer processes, or cut the data into more records."
             )
@@ -200,7 +201,7 @@ class SimulationError:
         """
         start = tensors["start"]
         if start.shape != self._start.shape or not torch.allclose(start, self._start, 1e-6, 1e-6):
-            raise ValueError(
+            raise InputError(
                 "the fit that is to go on began elsewhere: the data, the settings or the package "
                 "have changed since. Start a new one, from its best model: init_from=DIR."
             )
@@ -250,7 +251,7 @@ class SimulationError:
             number(f"ridge of '{group}'" if group else "ridge", value)
             own = [i for i, name in enumerate(names) if _belongs(name, group)]
             if not own:
-                raise ValueError(
+                raise InputError(
                     f"ridge has a group '{group}', and no parameter's name begins so; "
                     f"the parameters are {', '.join(dict.fromkeys(names))}."
                 )

@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple, Protocol, get_args
 import numpy as np
 
 from lfrtorch._checks import integer
+from lfrtorch._errors import InputError
 from lfrtorch._threads import spread_by_hand
 from lfrtorch._types import Array
 from lfrtorch.linear.frf import FRF, estimate_frf
@@ -160,9 +161,9 @@ def estimate_bla(
     integer("nx", nx, 1)
     integer("max_iter", max_iter, 0)
     if coordinates not in ("balanced", "given"):
-        raise ValueError(f"coordinates is {coordinates!r}; use 'balanced' or 'given'.")
+        raise InputError(f"coordinates is {coordinates!r}; use 'balanced' or 'given'.")
     if refine not in (None, *get_args(Criterion)):
-        raise ValueError(f"refine is {refine!r}; use 'simulation', 'prediction' or 'frequency'.")
+        raise InputError(f"refine is {refine!r}; use 'simulation', 'prediction' or 'frequency'.")
     records = [] if isinstance(data, FRF) else [without_coordinates(r) for r in as_records(data)]
     notes: list[str] = []
     if records:
@@ -170,7 +171,7 @@ def estimate_bla(
     about: FRF | Record
     if isinstance(data, FRF) or refine == "frequency":
         if refine not in (None, "frequency"):
-            raise ValueError(f"refine is {refine!r}, an error of records; a response has none.")
+            raise InputError(f"refine is {refine!r}, an error of records; a response has none.")
         refine = "frequency"
         about = data if isinstance(data, FRF) else estimate_frf(records)
         spectra, scaler, known, more = spectral_data_of_response(about, weight, offset=offset)
@@ -178,7 +179,7 @@ def estimate_bla(
         notes += [*about.notes, *more]
     else:
         if weight is not None:
-            raise ValueError("weight is that of a response: use refine='frequency'.")
+            raise InputError("weight is that of a response: use refine='frequency'.")
         refine, about = refine or "simulation", records[0]
         scaler = Scaler.of(records, offset=offset)
         problem = _of_records(
@@ -260,7 +261,7 @@ def _candidates(problem: LinearLeastSquares, nx: int) -> list[_Candidate]:
         if np.isfinite(cost):
             found.append(_Candidate(cost, estimate, matrices))
     if not found:
-        raise ValueError(
+        raise InputError(
             f"no stable linear model of order {nx} could be started from these data; "
             "try a lower nx or a longer record."
         )

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from lfrtorch import _checks
 from lfrtorch._checks import dft_lines, integer
+from lfrtorch._errors import InputError
 from lfrtorch._threads import spread_by_hand
 from lfrtorch._types import Array, Complex, Integers
 from lfrtorch.linear.local_polynomial import fit_local_polynomials, half_width
@@ -167,7 +168,7 @@ class FRF:
         """
         inside = (self.frequencies >= f_low) & (self.frequencies <= f_high)
         if not inside.any():
-            raise ValueError(
+            raise InputError(
                 f"no line from {f_low} to {f_high} Hz; the lines go from "
                 f"{self.frequencies[0]:g} to {self.frequencies[-1]:g} Hz."
             )
@@ -237,7 +238,7 @@ def estimate_frf(
     """
     data = as_records(records)
     if method not in get_args(Method):
-        raise ValueError(
+        raise InputError(
             f"method is {method!r}; use 'auto', 'robust', 'fast' or 'local_polynomial'."
         )
     integer("order", order, 0)
@@ -246,7 +247,7 @@ def estimate_frf(
     if band is not None:
         _checks.band(band)
     if band is not None and not 0 <= band[0] <= band[1]:
-        raise ValueError(
+        raise InputError(
             f"the band is {band[0]} to {band[1]} Hz; give a lower and an upper frequency."
         )
     if method == "auto":
@@ -307,7 +308,7 @@ def _fast(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
     """Distortion from the lines left out, noise from the scatter over periods."""
     if spectra.P.min() < 2:
         record = data[int(np.argmin(spectra.P))]
-        raise ValueError(
+        raise InputError(
             f"record '{record.name}' has one period of {spectra.N} samples after skip; "
             "method='fast' needs two or more to know the noise."
         )
@@ -316,11 +317,11 @@ def _fast(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
         "or use method='robust'."
     )
     if (lines % 2 == 0).any():
-        raise ValueError(f"line {lines[lines % 2 == 0][0]} is even and excited; {advice}")
+        raise InputError(f"line {lines[lines % 2 == 0][0]} is even and excited; {advice}")
     left_out = np.setdiff1d(np.arange(lines[0], lines[-1]), lines)
     odd, even = left_out[left_out % 2 == 1], left_out[left_out % 2 == 0]
     if not odd.size:
-        raise ValueError(f"no odd line is left out between the excited ones; {advice}")
+        raise InputError(f"no odd line is left out between the excited ones; {advice}")
     fitted = _response(spectra, lines)
 
     def level(at: Integers, G: Complex) -> tuple[Level, Complex]:
@@ -355,7 +356,7 @@ def _local_polynomial(
     last = (spectra.N - 1) // 2
     n = half_width(order, degrees_of_freedom, len(data[0].inputs), len(data))
     if 2 * n + 1 > last:
-        raise ValueError(
+        raise InputError(
             f"{spectra.N} samples have {last} lines and a window of local polynomials takes "
             f"{2 * n + 1}; use longer records, a lower order or fewer degrees_of_freedom."
         )
@@ -364,7 +365,7 @@ def _local_polynomial(
         chosen = dft_lines(given, spectra.N)
         missing = np.setdiff1d(chosen, lines)
         if missing.size:
-            raise ValueError(
+            raise InputError(
                 f"an input has no power about line {missing[0]}; give lines about which all "
                 "inputs are excited."
             )
@@ -374,7 +375,7 @@ def _local_polynomial(
     U, Y = spectra.U[1 : last + 1], spectra.Y[1 : last + 1]
     G, cov, determined = fit_local_polynomials(U, Y, lines - 1, order=order, n=n)
     if not determined.any():
-        raise ValueError(
+        raise InputError(
             "the inputs determine the response at no line: they depend on each other, or excite "
             "too few lines; use richer inputs, another band or a lower order."
         )
@@ -413,7 +414,7 @@ def _response(spectra: Spectra, lines: Integers) -> Regression:
     """G at the lines by least squares over the experiments; the rows are experiments."""
     R, nu = spectra.U.shape[1:]
     if nu > R:
-        raise ValueError(
+        raise InputError(
             f"{R} record(s) cannot tell {nu} inputs apart at one line; give at least {nu} "
             "experiments, best of orthogonal multisines (lfrtorch.multisine), or use "
             "method='local_polynomial'."
@@ -421,7 +422,7 @@ def _response(spectra: Spectra, lines: Integers) -> Regression:
     fitted = regress(spectra.U[lines], spectra.Y[lines], nu)
     if not fitted.determined.all():
         line = lines[np.argmin(fitted.determined)]
-        raise ValueError(
+        raise InputError(
             f"the inputs of the {R} experiments depend on each other at line {line} "
             f"({line * spectra.resolution:g} Hz); use orthogonal multisines (lfrtorch.multisine), "
             "or leave the line out."

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from lfrtorch import _checkpoint
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
@@ -112,7 +113,7 @@ class LinearModel:
         if input is not None:
             B, D = B[:, [input]], D[:, [input]]
         if D.shape[0] != D.shape[1]:
-            raise ValueError(
+            raise InputError(
                 f"a model of {D.shape[1]} input(s) and {D.shape[0]} output(s) has no transmission "
                 "zeros in general; ask for those of a channel: zeros(output, input)."
             )
@@ -136,7 +137,7 @@ class LinearModel:
             ValueError: a model without covariance.
         """
         if self.covariance is None:
-            raise ValueError(
+            raise InputError(
                 "the covariance of this model is not known: estimate_bla finds it in a refinement."
             )
         z = self._z(frequencies)
@@ -164,7 +165,7 @@ class LinearModel:
             ValueError: a model without K, or a record of other channels or another rate.
         """
         if self.K is None:
-            raise ValueError(
+            raise InputError(
                 "this model has no innovation gain K: estimate it with refine='prediction'."
             )
         self.to_model().check(without_coordinates(record))
@@ -272,7 +273,7 @@ class LinearModel:
         """
         description, weights = _checkpoint.read(folder, ("linear", "model"))
         if "linear" not in description:
-            raise ValueError(f"'{folder}' holds no linear model; lfrtorch.load reads an NL-LFR.")
+            raise InputError(f"'{folder}' holds no linear model; lfrtorch.load reads an NL-LFR.")
         try:
             made, fit = description["linear"], description["linear"]["fit"]
             if fit is not None:
@@ -293,19 +294,19 @@ class LinearModel:
             ):  # fmt: skip
                 found = (arrays | optional).get(name)
                 if found is not None and found.shape != shape:
-                    raise ValueError(f"{name} is {found.shape}, not {shape}")
+                    raise InputError(f"{name} is {found.shape}, not {shape}")
             return cls(
                 **arrays, fs=float(made["fs"]), inputs=inputs, outputs=outputs, **optional, fit=fit
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
+            raise InputError(
                 f"'{folder}' is damaged: its description and weights do not fit ({error})."
             ) from None
 
     def _z(self, frequencies: ArrayLike) -> Complex:
         f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
         if f.ndim != 1:
-            raise ValueError(f"the frequencies have shape {f.shape}; give one dimension, in Hz.")
+            raise InputError(f"the frequencies have shape {f.shape}; give one dimension, in Hz.")
         return np.exp(2j * np.pi * f / self.fs)
 
 

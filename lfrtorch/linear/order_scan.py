@@ -10,6 +10,7 @@ import numpy as np
 
 from lfrtorch import _tables
 from lfrtorch._checks import integer
+from lfrtorch._errors import InputError
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
@@ -91,7 +92,7 @@ def scan_orders(
         ValueError: no order, or data that reach for none of them.
     """
     if not len(orders):
-        raise ValueError("orders is empty; give at least one, for example range(1, 13).")
+        raise InputError("orders is empty; give at least one, for example range(1, 13).")
     for nx in orders:
         integer("orders", nx, 1)
     judges = as_records(validation) if validation else []

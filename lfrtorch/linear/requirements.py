@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lfrtorch._errors import InputError
 from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import shortest, suffice
 from lfrtorch.metrics import rms
@@ -22,7 +23,7 @@ def check_signals(records: list[Record]) -> None:
         everything = np.concatenate(signals)
         for channel, span in zip(channels, np.ptp(everything, axis=0), strict=True):
             if span == 0:
-                raise ValueError(
+                raise InputError(
                     f"signal '{channel.name}' is constant in all records; "
                     "a model needs an input that excites and an output that responds: "
                     "check the columns."
@@ -34,7 +35,7 @@ def check_length(records: list[Record], nx: int) -> None:
     nu, ny = len(records[0].inputs), len(records[0].outputs)
     lengths = [r.samples for r in records]
     if not suffice(lengths, nx, nu, ny):
-        raise ValueError(
+        raise InputError(
             f"the longest of {len(records)} record(s) has {max(lengths)} samples; order nx={nx} "
             f"with {nu} input(s) and {ny} output(s) needs one of {shortest(nx, nu, ny)}, or many "
             "shorter ones: record more, or lower nx."
@@ -46,7 +47,7 @@ def check_spectral_data(data: SpectralData, nx: int) -> None:
     nu, ny = data.U.shape[1], data.Y.shape[1]
     unknowns, equations = nx * (nu + ny) + nu * ny, data.equations
     if equations < unknowns:
-        raise ValueError(
+        raise InputError(
             f"{len(data.z)} excited line(s) make {equations} equations; order nx={nx} with {nu} "
             f"input(s) and {ny} output(s) has {unknowns} unknowns: excite more lines, or lower nx."
         )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfrtorch._checks import dft_lines
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array, Complex, Integers
 from lfrtorch.linear.regression import outer
 from lfrtorch.records import Record
@@ -79,18 +80,18 @@ def spectra_of_periods(data: Sequence[Record], removal: Removal | None = None) -
     windows = []
     for record in data:
         if _period(record) != N:
-            raise ValueError(
+            raise InputError(
                 f"records '{data[0].name}' and '{record.name}' have periods of {N} and "
                 f"{_period(record)} samples; give records of one period."
             )
         count = (record.samples - record.skip) // N
         if not count:
-            raise ValueError(
+            raise InputError(
                 f"record '{record.name}': skip={record.skip} leaves less than one period of {N} "
                 f"out of {record.samples} samples; skip less or measure longer."
             )
         if removal and count == 1:
-            raise ValueError(
+            raise InputError(
                 f"record '{record.name}' has one period of {N} samples after skip; "
                 "transient=True needs two or more, as it shows between the lines of the period."
             )
@@ -110,7 +111,7 @@ def spectra_of_records(data: Sequence[Record]) -> Spectra:
 
 def _period(record: Record) -> int:
     if record.period is None and record.start != "periodic":
-        raise ValueError(
+        raise InputError(
             f"record '{record.name}' has no period; give Record.period, or use "
             "method='local_polynomial'."
         )
@@ -122,7 +123,7 @@ def _spectra(
 ) -> Spectra:
     """Spectra of whole periods of N samples in a window of each record."""
     if N < 3:
-        raise ValueError(f"{N} samples have no line between 0 and fs / 2; give more.")
+        raise InputError(f"{N} samples have no line between 0 and fs / 2; give more.")
     constant = np.all(
         [
             np.ptp(record.u[window], axis=0) == 0
@@ -131,7 +132,7 @@ def _spectra(
         axis=0,
     )
     if constant.any():
-        raise ValueError(
+        raise InputError(
             f"input '{data[0].inputs[int(np.argmax(constant))].name}' is constant in all records; "
             "leave it out, or give records in which it is excited."
         )
@@ -182,7 +183,7 @@ def _without_transient(signals: Array, N: int, removal: Removal) -> tuple[Comple
     while 2 * (n - n // P) < least:
         n += 1
     if 2 * n + 1 > len(signals):
-        raise ValueError(
+        raise InputError(
             f"{len(signals)} samples have no {2 * n + 1} lines to remove a transient by; use "
             "longer records, a lower order or fewer degrees_of_freedom."
         )
@@ -201,7 +202,7 @@ def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
     """Refuse an input whose periods change, by the relative deviations (R, nu) of a period."""
     if change.max() > LARGEST_CHANGE:
         r, channel = (int(i) for i in np.unravel_index(np.argmax(change), change.shape))
-        raise ValueError(
+        raise InputError(
             f"record '{data[r].name}': the periods of {N} samples of input "
             f"'{data[r].inputs[channel].name}' deviate from their mean by "
             f"{100 * change[r, channel]:.0f} % of its rms; correct Record.period, set Record.skip "
@@ -223,7 +224,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
         weak = np.argwhere(power[lines - 1] <= NO_POWER * power.max(axis=0))
         if weak.size:
             line, channel = weak[0]
-            raise ValueError(
+            raise InputError(
                 f"input '{inputs[channel].name}' has no power at line {lines[line]}; give lines "
                 "where all inputs are excited."
             )
@@ -234,7 +235,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     lines = 1 + np.flatnonzero(excited.all(axis=1))
     if not lines.size:
         counts = zip(inputs, excited.sum(axis=0), strict=True)
-        raise ValueError(
+        raise InputError(
             "no line is excited in every input (lines excited: "
             + ", ".join(f"{count} in '{channel.name}'" for channel, count in counts)
             + "); give the lines, or excite all inputs at the same ones."
@@ -269,7 +270,7 @@ def in_band(lines: Integers, resolution: float, band: tuple[float, float] | None
         return lines
     inside = lines[(lines * resolution >= band[0]) & (lines * resolution <= band[1])]
     if not inside.size:
-        raise ValueError(
+        raise InputError(
             f"no line from {band[0]} to {band[1]} Hz is excited; the excited ones go from "
             f"{lines[0] * resolution:g} to {lines[-1] * resolution:g} Hz."
         )

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Complex128, Float
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array, Complex
 from lfrtorch.linear.frf import FRF
 from lfrtorch.records import Record, Scaler, rms_scale
@@ -173,12 +174,12 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
         weight = np.asarray(weight, dtype=np.float64)
     if isinstance(weight, np.ndarray):
         if weight.shape != frf.G.shape or not (np.isfinite(weight).all() and (weight >= 0).all()):
-            raise ValueError(
+            raise InputError(
                 f"weight has shape {weight.shape}; give finite numbers of at least 0 in the shape "
                 f"of the response, {frf.G.shape}."
             )
         if not weight.any():
-            raise ValueError("weight is 0 everywhere; give some lines a positive one.")
+            raise InputError("weight is 0 everywhere; give some lines a positive one.")
         return weight.astype(np.float64), False, notes
     variances = {"total": frf.var_total, "noise": frf.var_noise}
     if weight is None:
@@ -193,12 +194,12 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
     if weight == "none":
         return None, False, notes
     if not isinstance(weight, str) or weight not in variances:
-        raise ValueError(
+        raise InputError(
             f"weight is {weight!r}; use 'total', 'noise', 'none' or an array (F, ny, nu)."
         )
     variance = variances[weight]
     if variance is None:
-        raise ValueError(
+        raise InputError(
             f"the {weight} variance of the response is not known: {' '.join(frf.notes)} "
             "Use another weight, or measure more."
         )

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import ArrayLike, NDArray
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array, Complex
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
@@ -161,7 +162,7 @@ def distortion(frf: FRF) -> Figure:
     """
     levels = frf.distortion
     if levels is None:
-        raise ValueError(
+        raise InputError(
             f"the response was estimated by the method '{frf.method}', which does not tell odd and "
             "even distortion apart; use estimate_frf(records, method='fast')."
         )

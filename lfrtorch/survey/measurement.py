@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.periods import find_period
 from lfrtorch.records import Channel
@@ -62,7 +63,7 @@ def survey(
     """
     u, y = _columns(u), _columns(y)
     if len(u) != len(y):
-        raise ValueError(
+        raise InputError(
             f"the inputs have {len(u)} samples and the outputs {len(y)}; "
             "give the signals of one record."
         )
@@ -88,5 +89,5 @@ def _columns(signals: ArrayLike) -> Array:
 def _named(given: Sequence[Channel], signals: Array, prefix: str) -> tuple[Channel, ...]:
     count = signals.shape[1]
     if given and len(given) != count:
-        raise ValueError(f"{len(given)} names are given for {count} channels; name each of them.")
+        raise InputError(f"{len(given)} names are given for {count} channels; name each of them.")
     return tuple(given) or tuple(Channel(f"{prefix}{i + 1}") for i in range(count))

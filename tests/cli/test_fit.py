@@ -338,7 +338,7 @@ class Terminated(lfrtorch.LevenbergMarquardt):
 def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, tmp_path: Path):
     usual = signal.getsignal(signal.SIGTERM)
     cfg = configuration(*file_overrides(csv), "nx=1", "trainer._target_=cli.test_fit.Terminated")
-    with pytest.raises(interrupts.Terminated, match="the best model so far is in"):
+    with pytest.raises(interrupts.TerminatedError, match="the best model so far is in"):
         fit.run(cfg, tmp_path)
     assert signal.getsignal(signal.SIGTERM) == usual
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -354,7 +354,7 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
     for folder in (cut, whole):
         folder.mkdir()
     fit.run(configuration(*settings), whole)
-    with pytest.raises(interrupts.Terminated, match=f"python train.py resume={cut}"):
+    with pytest.raises(interrupts.TerminatedError, match=f"python train.py resume={cut}"):
         fit.run(configuration(*settings, "trainer._target_=cli.test_fit.Terminated"), cut)
     assert json.loads((cut / "metrics.json").read_text())["fit"]["reason"] == "interrupted"
     fit.run(configuration(*settings, f"resume={cut}"), cut)

@@ -12,7 +12,7 @@ from reference import random_cell
 from scipy.signal import lfilter
 
 from lfrtorch._tables import number
-from lfrtorch.distributed import LOST, ProcessLost, Ranks
+from lfrtorch.distributed import LOST, ProcessLostError, Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.size_search import (
@@ -280,11 +280,11 @@ def test_ctrl_c_and_lost_processes_end_the_search():
 
     class Losing(LevenbergMarquardt):
         def step(self, problem: Any, state: Any) -> Any:
-            raise ProcessLost(f"{LOST}: for good")
+            raise ProcessLostError(f"{LOST}: for good")
 
     with pytest.raises(StoppedError):
         search(plant(1, 1), trainer=CtrlC())
-    with pytest.raises(ProcessLost, match="for good"):
+    with pytest.raises(ProcessLostError, match="for good"):
         search(plant(1, 1), trainer=Losing())
 
 

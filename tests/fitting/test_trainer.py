@@ -11,7 +11,7 @@ from reference import measure, move, planted, random_cell, random_model, theta
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
-from lfrtorch.distributed import LOST, ProcessLost, Ranks
+from lfrtorch.distributed import LOST, ProcessLostError, Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import EXPLOSION, INTERRUPTED, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
@@ -321,7 +321,7 @@ class Lonely(Ranks):
     def sum(self, part: Tensor) -> Tensor:
         self.sums -= 1
         if self.sums < 0:
-            raise ProcessLost(f"{LOST}: all of them")
+            raise ProcessLostError(f"{LOST}: all of them")
         return part
 
 
@@ -339,7 +339,7 @@ def test_a_lost_process_keeps_the_best():
 def test_a_process_lost_before_the_first_iterate_is_an_error():
     model, train, _ = planted(T=50)
     start = theta(model)
-    with pytest.raises(ProcessLost, match="all of them"):
+    with pytest.raises(ProcessLostError, match="all of them"):
         fit(model, train, ranks=Lonely(2))
     assert torch.equal(theta(model), start)
 

@@ -1,0 +1,70 @@
+"""Errors of users are one line, and bugs keep their traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra.utils import instantiate
+
+from lfrtorch import InputError, LfrtorchError
+from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.interrupts import TerminatedError
+from lfrtorch.distributed import ProcessLostError
+
+
+def fails(kind: Callable[[str], Exception], message: str) -> None:
+    raise kind(message)
+
+
+def printed(capsys: pytest.CaptureFixture[str], call: Callable[[], object]) -> str:
+    with pytest.raises(SystemExit) as stop, user_errors():
+        call()
+    assert stop.value.code == 1
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", [InputError, ProcessLostError, FileNotFoundError, LfrtorchError])
+def test_errors_of_users_are_one_line(kind: Callable[[str], Exception], capsys):
+    assert printed(capsys, lambda: fails(kind, "nx is 0")) == "error: nx is 0\n"
+    target = {"_target_": fails, "kind": kind, "message": "nx is 0"}
+    assert printed(capsys, lambda: instantiate(target)) == "error: nx is 0\n"
+    assert printed(capsys, lambda: instantiate({"a": target})["a"]) == "error: a: nx is 0\n"
+
+
+@pytest.mark.parametrize("kind", [ValueError, TypeError, KeyError])
+def test_bugs_are_raised_as_they_are(kind: Callable[[str], Exception]):
+    with pytest.raises(kind, match="bug") as found, user_errors():  # pyright: ignore
+        fails(kind, "bug")
+    assert found.traceback[-1].name == "fails"
+    with pytest.raises(kind, match="bug") as found, user_errors():  # pyright: ignore
+        instantiate({"_target_": fails, "kind": kind, "message": "bug"})
+    assert found.traceback[-1].name == "fails"
+
+
+def test_an_argument_that_there_is_not_is_an_error_of_the_user(capsys):
+    err = printed(capsys, lambda: instantiate({"_target_": fails, "foo": 1}))
+    assert err.startswith("error: ")
+    assert "unexpected keyword argument 'foo'" in err
+    assert "Error loading 'no.such'" in printed(
+        capsys, lambda: instantiate({"_target_": "no.such"})
+    )
+
+
+def test_other_ranks_say_which_they_are(tmp_path: Path, capsys):
+    with pytest.raises(SystemExit), user_errors("1"):
+        (tmp_path / "no").read_text()
+    assert capsys.readouterr().err.startswith("error on rank 1: ")
+
+
+def test_termination_has_the_exit_code_of_its_signal(capsys):
+    with pytest.raises(SystemExit) as stop, user_errors():
+        raise TerminatedError("ended")
+    assert stop.value.code == 143
+    assert capsys.readouterr().err == "ended\n"
+
+
+def test_bad_input_is_a_value_error_as_well():
+    assert issubclass(InputError, ValueError)
+    assert not issubclass(ProcessLostError, ValueError)
