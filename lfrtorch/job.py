@@ -66,8 +66,7 @@ def identify(
         StoppedError: by ``stop`` or Ctrl-C during the search for sizes.
         ProcessLostError: one of the processes was lost before the fit itself.
 
-    Examples:
-        >>> import numpy as np, lfrtorch
+    Example:
         >>> u = np.random.default_rng(0).standard_normal(600)
         >>> y = np.zeros(600)
         >>> for k in range(599):

@@ -38,8 +38,8 @@ class SizesSearch:
         starts: most random starts of each candidate, as far as the fit has as many; 2 at least.
         iterations: part of the iterations of the fit that each start gets.
 
-    Examples:
-        >>> SizesSearch(nn=(5, 10), starts=2).nn
+    Example:
+        >>> lfrtorch.SizesSearch(nn=(5, 10), starts=2).nn
         (5, 10)
     """
 
@@ -84,8 +84,8 @@ class Settings:
     Raises:
         ValueError: a setting that cannot be.
 
-    Examples:
-        >>> settings = Settings(nx=2, nn="auto", starts=3)
+    Example:
+        >>> settings = lfrtorch.Settings(nx=2, nn="auto", starts=3)
         >>> settings.searched, settings.seeds
         (('nn',), (0, 1000, 2000))
     """

@@ -33,6 +33,15 @@ class Run:
         simulations: every record with both simulations.
         metrics: what ``metrics.json`` holds: scores by record, sizes, the fit in numbers.
         advice: what to try next, the most useful first.
+
+    Example:
+        >>> dataset = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[record[200:]])
+        >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=3)
+        >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(nx=1, nz=1, nn=4, trainer=trainer))
+        >>> run
+        Run(mine, nx=1, nz=1, nw=1, nn=4, maximum number of iterations)
+        >>> run.model.simulate(record).shape
+        (400, 1)
     """
 
     dataset: Dataset
