@@ -153,6 +153,13 @@ def estimate_bla(
     Raises:
         ValueError: an order below 1, a constant channel, or too few data for the order.
 
+    Example:
+        >>> bla = lfrtorch.estimate_bla(record, nx=1)
+        >>> bla.poles.real.round(1)
+        array([0.7])
+        >>> bla.fit.criterion, bla.fit.notes
+        ('simulation', ())
+
     References:
         Pintelon and Schoukens, System Identification, 2nd ed., Wiley 2012, chapters 4, 9 and 10.
         Ljung, System Identification, 2nd ed., Prentice Hall 1999, chapters 7 and 10.

@@ -1,4 +1,12 @@
-"""Nonparametric best linear approximation: frequency response, noise and nonlinear distortion."""
+"""Nonparametric best linear approximation: frequency response, noise and nonlinear distortion.
+
+The best linear approximation (BLA) of a nonlinear system is the linear system whose output is
+nearest to its own, for inputs of one spectrum. What it does not explain is of two kinds. Noise
+changes from period to period of the same input. Nonlinear distortion is the same in every period,
+but looks like noise over frequency and changes from one realisation of the input to the next. So
+periods and realisations together tell how much of an error is noise, and how much a nonlinear model
+can hope to explain.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
+from jaxtyping import Complex128, Float
 from numpy.typing import ArrayLike
 
 from lfrtorch import _checks
@@ -30,16 +39,16 @@ from lfrtorch.records import Channel, Record, as_records
 Method = Literal["auto", "robust", "fast", "local_polynomial"]
 
 ORTHOGONAL = 1e-6
-"""Relative deviation up to which the experiments of a block are orthogonal, of equal powers."""
+"""Largest relative deviation of orthogonal experiments from orthogonality and equal powers."""
 
 SPARE_FREEDOM = 4
-"""The windows of the local polynomial method leave ny + this many degrees of freedom: the estimated
-variance then has a standard deviation of 45 % with one output, and covariances are regular."""
+"""The windows of the local polynomial method leave this many degrees of freedom more than outputs:
+covariances are regular, and with one output a variance has a standard deviation of 45 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Power of the outputs at some lines, and what of it is noise.
+    """Power of the outputs at some lines, and how much of it is noise.
 
     A power is a mean square in squared units of the output: |Y|² of Y = √2 / N · DFT over one
     period, so that the powers of all lines add up to the variance of the signal.
@@ -47,15 +56,12 @@ class Level:
     Args:
         frequencies: of the lines, Hz.
         power: of the mean over the periods, as a mean over the records.
-        noise: expected share of the disturbing noise in it.
-
-    Shape:
-        frequencies: (F,), power, noise: (F, ny).
+        noise: the power that the disturbing noise is expected to have in it.
     """
 
-    frequencies: Array
-    power: Array
-    noise: Array
+    frequencies: Float[Array, " F"]
+    power: Float[Array, "F ny"]
+    noise: Float[Array, "F ny"]
 
     @property
     def distortion(self) -> Array:
@@ -74,7 +80,7 @@ class Distortion:
 
     Args:
         output: the output at the excited lines.
-        odd, even: what the linear model leaves, Y - G U, at the odd and even lines left out.
+        odd, even: the rest Y - G U at the odd and even lines that are not excited.
     """
 
     output: Level
@@ -91,8 +97,8 @@ class Distortion:
 class FRF:
     """Best linear approximation at some frequencies, in physical units, with its covariances.
 
-    The covariance of a line is E[d dᴴ] of the error d of vec(G) = ``G[f].reshape(-1)`` (output,
-    then input), for the estimate as it is, a mean over periods and experiments.
+    The covariance at a line is E[d dᴴ] of the error d of vec(G) = ``G[f].reshape(-1)`` (output,
+    then input). It is that of the estimate, which is a mean over periods and experiments.
 
     Args:
         frequencies: Hz.
@@ -100,28 +106,31 @@ class FRF:
         fs: sampling frequency in Hz.
         u_offset, y_offset: means of the records.
         inputs, outputs: channel names and units.
-        cov_noise: what the disturbing noise makes of it, ``None`` if not available.
-        cov_total: noise and stochastic nonlinear distortion together.
-        experiments: records that were used.
-        periods: of the record that has fewest; 1 without periods.
+        cov_noise: covariance due to the disturbing noise, ``None`` if not available.
+        cov_total: covariance due to noise and stochastic nonlinear distortion together, likewise.
+        experiments: number of records.
+        periods: of the record with the fewest; 1 without periods.
         method: ``"robust"``, ``"fast"`` or ``"local_polynomial"``.
-        distortion: levels at the output, of the fast method alone.
+        distortion: levels at the output, from the fast method alone.
         notes: what is not available, why, and what would give it.
 
-    Shape:
-        frequencies: (F,), G: (F, ny, nu), u_offset: (nu,), y_offset: (ny,),
-        cov_noise, cov_total: (F, ny nu, ny nu).
+    Example:
+        >>> frf = lfrtorch.estimate_frf(record)
+        >>> frf.G.shape == (len(frf.frequencies), 1, 1), frf.method
+        (True, 'robust')
+        >>> bool(frf.frequencies[0] == frf.fs / 400)  # the first line of a period of 400 samples
+        True
     """
 
-    frequencies: Array
-    G: Complex
+    frequencies: Float[Array, " F"]
+    G: Complex128[Complex, "F ny nu"]
     fs: float
-    u_offset: Array
-    y_offset: Array
+    u_offset: Float[Array, " nu"]
+    y_offset: Float[Array, " ny"]
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
-    cov_noise: Complex | None
-    cov_total: Complex | None
+    cov_noise: Complex128[Complex, "F ny*nu ny*nu"] | None
+    cov_total: Complex128[Complex, "F ny*nu ny*nu"] | None
     experiments: int
     periods: int
     method: str
@@ -130,7 +139,7 @@ class FRF:
 
     @property
     def realisations(self) -> int:
-        """Independent realisations M: whole blocks of nu experiments."""
+        """Number M of independent realisations: whole blocks of nu experiments."""
         return self.experiments // len(self.inputs)
 
     @property
@@ -147,8 +156,8 @@ class FRF:
     def var_distortion(self) -> Array | None:
         """Variance (F, ny, nu) of G due to nonlinear distortion in one realisation, or ``None``.
 
-        M (total - noise), at least 0, for M = experiments / nu realisations: it does not fall
-        with their number, and the floor at 0 puts it too high where there is little distortion.
+        It is M (total - noise), at least 0, for M = experiments / nu realisations, so that it does
+        not fall with their number. The floor at 0 makes it too high if there is little distortion.
         """
         total, noise = self.var_total, self.var_noise
         if total is None or noise is None:
@@ -165,6 +174,10 @@ class FRF:
 
         Raises:
             ValueError: there is none.
+
+        Example:
+            >>> lfrtorch.estimate_frf(record).restricted(1.0, 2.0).frequencies.tolist()
+            [1.0, 1.25, 1.5, 1.75, 2.0]
         """
         inside = (self.frequencies >= f_low) & (self.frequencies <= f_high)
         if not inside.any():
@@ -193,44 +206,55 @@ def estimate_frf(
     degrees_of_freedom: int | None = None,
     transient: bool = False,
 ) -> FRF:
-    """Frequency response of the best linear approximation, with the variances the data allow.
+    """Frequency response of the best linear approximation, and its variances as the data allow.
 
     ``"robust"``: the records are experiments with one period length, in steady state after
     ``skip``; the last whole periods of each are used. G is the least-squares fit of the spectra
     over the experiments (one input: the mean of their ratios weighted by input power). What
     changes from period to period is noise; what changes from experiment to experiment is noise and
     distortion. Experiments weigh equally, whatever their number of periods. The total covariance
-    comes from the scatter of the blocks of nu experiments where these are orthogonal multisines,
-    and else from the residuals, as if these had one covariance in all experiments.
+    comes from the scatter of the blocks of nu experiments if these are orthogonal multisines, and
+    else from the residuals, as if these had one covariance in all experiments.
 
     ``"fast"``: the same estimate from as little as one experiment, with a random odd multisine.
-    The outputs at the odd lines left out, less the linear response to what input there is, are
-    odd distortion and noise; interpolated, they give the total covariance at the excited lines.
-    Even distortion falls on even lines and does not disturb G.
+    At the odd lines that are not excited, the output minus the linear response is odd distortion
+    and noise; interpolated, it gives the total covariance at the excited lines. Even distortion
+    falls on even lines and does not disturb G.
 
-    ``"local_polynomial"``: any excitation, transients included, records cut to the shortest one.
-    Noise and distortion are known together only.
+    ``"local_polynomial"``: any excitation, transients included; records are cut to the shortest
+    one. The variances of noise and distortion are known as their sum only.
 
-    ``"auto"``: robust where every record has periods, and else local polynomials.
+    ``"auto"``: robust if every record has periods, else local polynomials.
 
     Args:
-        records: data; ``Record.period`` says that a record is periodic, as does
-            ``start="periodic"`` (of one period, where it names none).
+        records: data. A record is periodic if it has a ``period`` or ``start="periodic"`` (then of
+            one period unless it says otherwise).
         method: see above.
-        lines: DFT lines of the period (or, for local polynomials, of the record), 0 < line < N / 2;
-            by default those that are found to be excited. The fast method needs all of these.
-        band: lowest and highest frequency in Hz; all lines by default.
+        lines: numbers (F,) of DFT lines of the period (of the record, for local polynomials),
+            0 < line < N / 2. Default: those that are excited. The fast method needs all of these.
+        band: lowest and highest frequency in Hz. Default: all lines.
         order: of the local polynomials.
-        degrees_of_freedom: that a window of local polynomials leaves at least; ny + 4 by default.
+        degrees_of_freedom: least number that a window of local polynomials leaves.
+            Default: ny + 4.
         transient: whether the transient of periodic records is removed, by local polynomials at
-            the lines between those of the period. It takes two periods, and adds to the noise.
-
-    Shape:
-        lines: (F,).
+            the lines between those of the period. It takes two periods and adds to the noise.
 
     Raises:
         ValueError: a constant input, records of different periods or without, an input that does
             not repeat or leaves lines without power, too few experiments, periods or lines.
+
+    Example:
+        >>> design = lfrtorch.multisine(50, realisations=3)
+        >>> records = []
+        >>> for period in design.u:
+        ...     u = np.tile(period, (3, 1))
+        ...     y = signal.lfilter([0, 1], [1, -0.5], u + 0.1 * u**3, axis=0)
+        ...     records.append(lfrtorch.Record(u, y, period=50, skip=50))
+        >>> frf = lfrtorch.estimate_frf(records)
+        >>> frf.experiments, frf.periods, frf.G.shape
+        (3, 2, (24, 1, 1))
+        >>> bool((frf.var_total > 1e6 * frf.var_noise).all())  # distortion, and no noise
+        True
 
     References:
         Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,
@@ -305,7 +329,7 @@ def _robust(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
 
 
 def _fast(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
-    """Distortion from the lines left out, noise from the scatter over periods."""
+    """Distortion from the lines that are not excited, noise from the scatter over periods."""
     if spectra.P.min() < 2:
         record = data[int(np.argmin(spectra.P))]
         raise InputError(
@@ -351,7 +375,7 @@ def _local_polynomial(
     order: int,
     degrees_of_freedom: int,
 ) -> FRF:
-    """Noise and distortion together from what smooth functions of frequency leave."""
+    """Noise and distortion together, from the residuals of smooth functions of frequency."""
     spectra = spectra_of_records(data)
     last = (spectra.N - 1) // 2
     n = half_width(order, degrees_of_freedom, len(data[0].inputs), len(data))
@@ -431,7 +455,7 @@ def _response(spectra: Spectra, lines: Integers) -> Regression:
 
 
 def _noise(spectra: Spectra, lines: Integers, fitted: Regression) -> Complex:
-    """Covariance of vec(G) due to the noise: P periods have 1 / P of that of one."""
+    """Covariance of vec(G) due to the noise; the mean of P periods has 1 / P of that of one."""
     C = _residual_noise(spectra.C[lines], fitted.G)
     return covariance(C, fitted.weights / np.sqrt(spectra.P))
 
@@ -461,7 +485,7 @@ def _block_covariance(spectra: Spectra, lines: Integers) -> Complex | None:
 
 
 def _interpolated(at: Integers, lines: Integers, matrices: Complex) -> Complex:
-    """Matrices (F, n, m) at other lines, piecewise linear and constant beyond the ends."""
+    """Matrices (F, n, m) at the lines ``at``: piecewise linear, constant beyond the ends."""
     if len(lines) == 1:
         return np.repeat(matrices, len(at), axis=0)
     left = np.clip(np.searchsorted(lines, at, side="right") - 1, 0, len(lines) - 2)

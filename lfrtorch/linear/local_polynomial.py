@@ -1,19 +1,26 @@
-"""Local polynomial method: frequency response and transient as polynomials in a window of lines."""
+"""Local polynomial method: the frequency response from any excitation, transients included.
+
+In a record that is not periodic, the spectrum of the output is G U plus a transient, as the states
+at its beginning and end differ. Both G and the transient are smooth functions of frequency. So in
+a window of a few neighbouring lines they are polynomials with few coefficients, found by least
+squares; what these do not explain is noise and nonlinear distortion.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Bool, Complex128, Int64
 from numpy.typing import NDArray
 
 from lfrtorch._types import Complex, Integers
 from lfrtorch.linear.regression import DEPENDENT, covariance, outer, regress
 
 CHUNK = 2**21
-"""Complex numbers of the windows that are in memory at a time: 32 MiB, and as much in copies."""
+"""Complex numbers of the windows that are in memory at a time: 32 MiB, and as many in copies."""
 
 
 def half_width(order: int, degrees_of_freedom: int, nu: int, records: int) -> int:
-    """Smallest n of which a window of 2 n + 1 lines leaves so many degrees of freedom.
+    """Smallest n for which a window of 2 n + 1 lines leaves ``degrees_of_freedom``.
 
     R (2 n + 1) equations have (order + 1) (nu + R) unknowns: G, and the transient of each record.
     """
@@ -22,30 +29,35 @@ def half_width(order: int, degrees_of_freedom: int, nu: int, records: int) -> in
 
 
 def fit_local_polynomials(
-    U: Complex, Y: Complex, centres: Integers, *, order: int, n: int
-) -> tuple[Complex, Complex, NDArray[np.bool_]]:
+    U: Complex128[Complex, "lines R nu"],
+    Y: Complex128[Complex, "lines R ny"],
+    centres: Int64[Integers, " F"],
+    *,
+    order: int,
+    n: int,
+) -> tuple[
+    Complex128[Complex, "F ny nu"],
+    Complex128[Complex, "F ny*nu ny*nu"],
+    Bool[NDArray[np.bool_], " F"],
+]:
     """Frequency response at lines of spectra that hold transients, and its covariance.
 
     About each centre k, for the 2 n + 1 lines k + r nearest to it (shifted at the ends)::
 
         Y(k + r) = (Σ_s g_s rˢ) U(k + r) + Σ_s t_s rˢ + V(k + r),    s = 0 .. order
 
-    with g shared by the records and t of each one. The polynomials t are taken out by projection
-    on their orthogonal complement, which is the same for all windows; g_0 = G(k).
+    The records share g, and each has its own t. A projection across all polynomials of the order,
+    the same for all windows, removes t. The result is g_0 = G(k).
 
     Args:
         U, Y: spectra at successive lines.
-        centres: lines wanted, counted from the first one of the spectra.
+        centres: at which lines, counted from the first one of the spectra.
         order: of the polynomials.
         n: half width of the window.
 
     Returns:
         G, the covariance of vec(G) from the residuals (noise and nonlinear distortion together),
-        and the centres about which the input determines G.
-
-    Shape:
-        U: (lines, R, nu), Y: (lines, R, ny), centres: (F,) ->
-        (F, ny, nu), (F, ny nu, ny nu), (F,).
+        and whether the input determines G about each centre.
 
     References:
         Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,
@@ -71,7 +83,7 @@ def fit_local_polynomials(
         shape = len(window), rows, -1
         fitted = regress(X.reshape(shape), projected.reshape(shape), nu)
         C = outer(fitted.residual) / freedom
-        # One line of power alone leaves columns of rounding errors, which do not depend.
+        # If one line alone has power, some columns are rounding errors, which pass as independent.
         sizes = np.linalg.norm(X, axis=(1, 2))  # (line, s, input)
         determined = (sizes > DEPENDENT * sizes.max(axis=1, keepdims=True)).all(axis=(1, 2))
         parts.append((fitted.G, covariance(C, fitted.weights), fitted.determined & determined))

@@ -1,4 +1,4 @@
-"""The linear state-space model in physical units: what a best linear approximation is."""
+"""The linear state-space model in physical units."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 import torch
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from lfrtorch import _checkpoint
@@ -22,8 +23,8 @@ from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler, without_coordinates
 
 SINGULAR = 1e-12
-"""Singular value, relative to the size of the system, that counts as zero where zeros at infinity
-are told from finite ones."""
+"""Singular values below this, relative to the size of the system, count as zero when zeros at
+infinity are taken out."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,14 @@ class LinearFit:
         iterations: of the refinement.
         reason: why it ended.
         seconds: duration of the estimation.
-        singular_values: of the subspace, relative to the size of the outputs: they fall off behind
-            the order that the data carry.
+        singular_values: of the subspace, relative to the size of the outputs: they drop after the
+            order that the data carry.
         notes: what a user should know about data and result.
+
+    Example:
+        >>> fit = bla.fit
+        >>> fit.criterion, fit.rmse < 0.3, len(fit.singular_values) > 1
+        ('simulation', True, True)
     """
 
     criterion: str
@@ -63,28 +69,35 @@ class LinearModel:
         fs: sampling frequency in Hz.
         u_offset, y_offset: operating point.
         inputs, outputs: channel names and units.
-        K: gain of the innovations e, where they were modelled.
-        innovation_covariance: of e, where it was modelled.
-        covariance: of the entries of A, B, C and D, each by rows, one after another.
+        K: gain of the innovations e. Default: no noise model.
+        innovation_covariance: of e. Default: no noise model.
+        covariance: of the P = (nx + ny) (nx + nu) entries of A, B, C and D, row by row, one matrix
+            after another. Default: not known.
         fit: how the model was found.
 
-    Shape:
-        A: (nx, nx), B: (nx, nu), C: (ny, nx), D: (ny, nu), u_offset: (nu,), y_offset: (ny,),
-        K: (nx, ny), innovation_covariance: (ny, ny), covariance: (P, P), P = (nx + ny) (nx + nu).
+    Example:
+        >>> bla.nx, bla.A.shape, bla.fs
+        (1, (1, 1), 100.0)
+        >>> slow = lfrtorch.LinearModel(
+        ...     np.array([[0.9]]), np.array([[1.0]]), np.array([[0.1]]), np.array([[0.0]]), fs=10.0,
+        ...     u_offset=np.zeros(1), y_offset=np.zeros(1), inputs=bla.inputs, outputs=bla.outputs,
+        ... )
+        >>> slow.simulate(np.ones(3)).round(2).ravel().tolist()
+        [0.0, 0.1, 0.19]
     """
 
-    A: Array
-    B: Array
-    C: Array
-    D: Array
+    A: Float[Array, "nx nx"]
+    B: Float[Array, "nx nu"]
+    C: Float[Array, "ny nx"]
+    D: Float[Array, "ny nu"]
     fs: float
-    u_offset: Array
-    y_offset: Array
+    u_offset: Float[Array, " nu"]
+    y_offset: Float[Array, " ny"]
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
-    K: Array | None = None
-    innovation_covariance: Array | None = None
-    covariance: Array | None = None
+    K: Float[Array, "nx ny"] | None = None
+    innovation_covariance: Float[Array, "ny ny"] | None = None
+    covariance: Float[Array, "P P"] | None = None
     fit: LinearFit | None = None
 
     @property
@@ -101,11 +114,14 @@ class LinearModel:
         """Finite zeros in the z plane: those of one channel, or the transmission zeros of all.
 
         Args:
-            output, input: numbers of a channel; left out for the whole model, which then needs as
-                many outputs as inputs.
+            output, input: number of a channel. Default: all, as many outputs as inputs.
 
         Raises:
-            ValueError: other numbers of outputs and inputs (there are no zeros in general).
+            ValueError: different numbers of outputs and inputs (there are no zeros in general).
+
+        Example:
+            >>> bla.zeros().shape
+            (1,)
         """
         B, C, D = self.B, self.C, self.D
         if output is not None:
@@ -124,6 +140,11 @@ class LinearModel:
 
         Shape:
             frequencies: (F,) in Hz -> (F, ny, nu).
+
+        Example:
+            >>> G = bla.frf([0.0, 10.0, 50.0])
+            >>> G.shape, bool(abs(G[0, 0, 0]) > abs(G[2, 0, 0]))  # a low-pass filter
+            ((3, 1, 1), True)
         """
         return frequency_response(self.A, self.B, self.C, self.D, self._z(frequencies))
 
@@ -135,6 +156,10 @@ class LinearModel:
 
         Raises:
             ValueError: a model without covariance.
+
+        Example:
+            >>> bool(bla.frf_std([0.0])[0, 0, 0] < 0.1 * abs(bla.frf([0.0])[0, 0, 0]))
+            True
         """
         if self.covariance is None:
             raise InputError(
@@ -148,10 +173,15 @@ class LinearModel:
         return np.sqrt(np.maximum(variance.real, 0.0))
 
     def simulate(self, data: Record | ArrayLike) -> Array:
-        """Simulated output (T, ny) in physical units, from the record's own start.
+        """Simulated output (T, ny) in physical units, from the record's kind of initial state.
 
-        A bare input (T, nu) is simulated from rest. A start state that is given is in other
-        coordinates; the one that fits best takes its place.
+        A bare input (T, nu) is simulated from rest. A given ``x0`` of a record is in other
+        coordinates; the initial state that fits best takes its place.
+
+        Example:
+            >>> y_hat = bla.simulate(record)
+            >>> y_hat.shape, lfrtorch.nrmse(record, y_hat) < 0.3
+            ((400, 1), True)
         """
         data = without_coordinates(data) if isinstance(data, Record) else data
         return self.to_model().simulate(data)
@@ -163,6 +193,11 @@ class LinearModel:
 
         Raises:
             ValueError: a model without K, or a record of other channels or another rate.
+
+        Example:
+            >>> predictor = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
+            >>> predictor.predict(record).shape
+            (400, 1)
         """
         if self.K is None:
             raise InputError(
@@ -189,11 +224,13 @@ class LinearModel:
         """The same system in the coordinates T x.
 
         Args:
-            T: the transformation.
-            inverse: T⁻¹, where it is known better than by inverting T.
+            T: the transformation (nx, nx).
+            inverse: T⁻¹, if it is known better than by inverting T.
 
-        Shape:
-            T, inverse: (nx, nx).
+        Example:
+            >>> scaled = bla.transformed(np.array([[10.0]]))
+            >>> np.allclose(scaled.B, 10 * bla.B), np.allclose(scaled.frf([1.0]), bla.frf([1.0]))
+            (True, True)
         """
         back = np.asarray(np.linalg.inv(T) if inverse is None else inverse, dtype=np.float64)
         covariance = self.covariance
@@ -212,7 +249,14 @@ class LinearModel:
         )
 
     def write(self, cell: LFRCell, scaler: Scaler) -> None:
-        """Put A, B, C, D into A, Bu, Cy, Dyu of a cell, in the scaler's normalised units."""
+        """Put A, B, C, D into A, Bu, Cy, Dyu of a cell, in the scaler's normalised units.
+
+        Example:
+            >>> cell = lfrtorch.LFRCell(nu=1, ny=1, nx=1, dtype=torch.float64)
+            >>> bla.write(cell, lfrtorch.Scaler.of([record]))
+            >>> bool(cell.A.item() == bla.A[0, 0])
+            True
+        """
         with torch.no_grad():
             for weight, value in (
                 (cell.A, self.A),
@@ -223,14 +267,24 @@ class LinearModel:
                 weight.copy_(torch.as_tensor(np.ascontiguousarray(value)))
 
     def to_model(self) -> Model:
-        """The same as a ``Model`` without static nonlinearity, in the same coordinates."""
+        """The same as a ``Model`` without static nonlinearity, in the same coordinates.
+
+        Example:
+            >>> bla.to_model().sizes["nx"]
+            1
+        """
         nu, ny = len(self.inputs), len(self.outputs)
         unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
         cell = linear_cell(self.A, self.B, self.C, self.D)
         return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs)
 
     def to_scipy(self) -> scipy.signal.StateSpace:
-        """The deviations from the operating point as a ``scipy.signal.StateSpace``."""
+        """The deviations from the operating point as a ``scipy.signal.StateSpace``.
+
+        Example:
+            >>> bla.to_scipy().dt
+            0.01
+        """
         return scipy.signal.StateSpace(self.A, self.B, self.C, self.D, dt=1.0 / self.fs)
 
     def to_control(self) -> Any:
@@ -240,6 +294,10 @@ class LinearModel:
 
         Raises:
             ImportError: the package ``control`` is not installed.
+
+        Example:
+            >>> bla.to_control().dt
+            0.01
         """
         try:
             import control
@@ -254,7 +312,13 @@ class LinearModel:
         )  # fmt: skip
 
     def save(self, folder: str | Path) -> Path:
-        """Write a checkpoint folder; ``LinearModel.load`` reads it back to the same bits."""
+        """Write a checkpoint folder; ``LinearModel.load`` reads it back to the same bits.
+
+        Example:
+            >>> folder = bla.save("filter")
+            >>> bool(lfrtorch.LinearModel.load(folder).A[0, 0] == bla.A[0, 0])
+            True
+        """
         description = {
             "linear": {"fs": self.fs, "fit": None if self.fit is None else asdict(self.fit)},
             "inputs": [c._asdict() for c in self.inputs],
@@ -270,6 +334,11 @@ class LinearModel:
 
         Raises:
             ValueError: no checkpoint, a damaged one, or one that holds another kind of model.
+
+        Example:
+            >>> _ = bla.save("filter")
+            >>> lfrtorch.LinearModel.load("filter").nx
+            1
         """
         description, weights = _checkpoint.read(folder, ("linear", "model"))
         if "linear" not in description:
@@ -355,7 +424,7 @@ def _outputs_reduced(
         C = C[:rank]
         if not free:
             return A, B, C, D
-        # Outputs without direct term are 0: the states that they see are, and stay so.
+        # At a zero, an output without direct term is 0, and so are the states that it sees.
         V = np.roll(V, -free, axis=1)
         A, B, C = V.T @ A @ V, V.T @ B, C @ V
         n = len(A) - free
@@ -364,7 +433,7 @@ def _outputs_reduced(
 
 
 def _range(M: Array, limit: float) -> tuple[Array, int]:
-    """Orthogonal matrix whose first columns, so many, span the range of M."""
+    """An orthogonal matrix, and how many of its first columns span the range of M."""
     U, s, _ = np.linalg.svd(M)
     return U, int((s > limit).sum())
 
@@ -377,7 +446,7 @@ def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     """
     Lp, Lq = _square_root(_gramian(A, B @ B.T)), _square_root(_gramian(A.T, C.T @ C))
     U, s, Vh = np.linalg.svd(Lq.T @ Lp)
-    # A state that is all but uncontrollable or unobservable would be scaled by its rounding error.
+    # A state that is almost uncontrollable or unobservable would be scaled by its rounding error.
     root = np.sqrt(np.maximum(s, s[0] * np.finfo(float).eps))
     return (U / root).T @ Lq.T, Lp @ (Vh.T / root)
 
@@ -385,8 +454,8 @@ def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
 def _gramian(A: Array, Q: Array) -> Array:
     """P = A P Aᵀ + Q by Smith's doubling.
 
-    scipy's solver forms I - A ⊗ A, which is singular to rounding where two poles are close to the
-    unit circle; the sum of A^k Q A^kᵀ stays positive semidefinite there.
+    scipy's solver forms I - A ⊗ A, which is singular to rounding if two poles are close to the unit
+    circle; the sum of A^k Q A^kᵀ stays positive semidefinite there.
     """
     P = Q
     while np.abs(A).max() > np.finfo(float).eps:

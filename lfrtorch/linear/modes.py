@@ -1,10 +1,11 @@
-"""Modes of a linear model: which of them matter, and those that only spoil a start.
+"""Modes of a linear model: which of them matter, and those that only slow a nonlinear fit down.
 
-An order above what the linear approximation carries, as nonlinear systems ask for, leaves the
-estimate modes that fit a few lines of the distortion: close to the unit circle, and next to nothing
-of the output. As part of the start of a nonlinear fit they are of huge sensitivity and hold every
-step short: on the parallel Wiener-Hammerstein stand-in three starts of ten were at 0.6 to 2.5 mV
-after 100 iterations, and with such modes pulled in all of 22 at 0.42 or less after 60.
+A nonlinear system often needs a higher order than its BLA carries. The additional modes of the
+linear model then fit a few lines of the distortion: their poles are close to the unit circle, and
+they add next to nothing to the output. A nonlinear fit that starts from such a model is very
+sensitive to them and takes short steps. On the parallel Wiener-Hammerstein stand-in 3 of 10
+restarts were at 0.6 to 2.5 mV after 100 iterations; with the poles of these modes moved inwards,
+all of 22 were at 0.42 mV or less after 60.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Complex128, Float
 
 from lfrtorch._types import Array, Complex
 from lfrtorch.linear.model import LinearModel, balancing
 from lfrtorch.records import Channel, Record, as_records, without_coordinates
 
 DEFECTIVE = 1e8
-"""Condition of the eigenvectors above which modes cannot be told apart."""
+"""Modes cannot be told apart if the condition number of the eigenvectors is above this."""
 
 MINOR = 1 / 3
 """Largest share in the output that counts as minor. Of the linear models of Bouc-Wen,
@@ -27,23 +29,22 @@ Wiener-Hammerstein, Silverbox and the parallel Wiener-Hammerstein stand-in (orde
 realisations) spurious modes have 0.01 to 0.29, the others 0.40 and more."""
 
 
-def shares(model: LinearModel, data: Record | Sequence[Record]) -> tuple[Complex, Array]:
-    """Poles, and what the mode of each adds to the output, beside the model's error.
+def shares(
+    model: LinearModel, data: Record | Sequence[Record]
+) -> tuple[Complex128[Complex, " nx"], Float[Array, " nx"]]:
+    """Poles, and how much the mode of each adds to the output, relative to the model's error.
 
     Args:
         model: linear model.
-        data: records that it is looked at on.
+        data: records.
 
     Returns:
-        Poles λ, and the rms of what the mode (with its conjugate) adds to the simulated output over
-        the rms of the simulation error; of several outputs the largest.
-
-    Shape:
-        (nx,) and (nx,).
+        Poles λ, and for each the rms of what its mode (with its conjugate) adds to the simulated
+        output, over the rms of the simulation error; of several outputs the largest.
     """
     poles, right, left = _modes(model)
     nx, ny = len(poles), len(model.outputs)
-    # With its conjugate: twice the real part.
+    # A mode and its conjugate add twice the real part.
     parts = [
         (1 + (poles[i].imag != 0)) * (model.C @ np.outer(right[:, i], left[i])).real
         for i in range(nx)
@@ -78,16 +79,16 @@ def without_slow_minor_modes(
 ) -> LinearModel:
     """The model with no minor mode slower than the slowest one that matters.
 
-    The poles of slower ones are moved onto that one's radius at the same angle, their inputs scaled
-    to the same part in the output under white noise.
+    The poles of slower minor modes are moved to the radius of that one, at the same angle. Their
+    inputs are scaled so that they add the same to the output under white noise.
 
     Args:
         model: linear model.
-        data: records that it is a start for.
-        minor: largest of the ``shares`` that counts as minor; 0 changes nothing.
+        data: records of the nonlinear fit.
+        minor: largest of the ``shares`` of a minor mode; 0 changes nothing.
 
     Returns:
-        The model in balanced coordinates, without covariance; as it was where nothing is moved.
+        The model in balanced coordinates, without covariance; the same model if nothing is moved.
     """
     old, share = shares(model, data)
     matters = share > minor

@@ -1,4 +1,4 @@
-"""Order of the best linear approximation: a scan over nx, scored on records that are not fitted."""
+"""Order of the BLA: a scan over nx, scored on records that are not fitted."""
 
 from __future__ import annotations
 
@@ -20,21 +20,26 @@ from lfrtorch.records import Record, Scaler, as_records
 ORDERS = range(1, 13)
 
 MARGIN = 0.01
-"""Relative validation score above the best up to which a lower order is taken."""
+"""A lower order is taken if its validation score exceeds the best by at most this part."""
 
 
 @dataclass(frozen=True)
 class OrderScan:
-    """Linear models of several orders.
+    """Linear models of several orders, and the order that is chosen.
 
     Args:
-        models: one an order.
-        scores: what chooses: the rms of the simulation error over the validation records, each
-            output relative to its rms; without them the error over the data fitted, times
+        models: one for each order.
+        scores: of each model. With validation records the rms of the simulation error over them,
+            each output relative to its rms. Without them the error over the fitted data, times
             √(1 + p ln M / M) for p parameters and M equations (minimum description length).
-        validated: which of the two.
-        chosen: the lowest order whose validation score is within 1 % of the best; without records
-            for validation that of the best score.
+        validated: whether validation records give the scores.
+        chosen: the lowest order whose validation score is within 1 % of the best; without
+            validation records the order of the best score.
+
+    Example:
+        >>> scan = lfrtorch.scan_orders(record, range(1, 3))
+        >>> scan.orders, scan.best.nx == scan.chosen
+        ((1, 2), True)
     """
 
     models: tuple[LinearModel, ...]
@@ -49,17 +54,17 @@ class OrderScan:
 
     @property
     def best(self) -> LinearModel:
-        """The model of the order chosen."""
+        """The model of the chosen order."""
         return self.models[self.orders.index(self.chosen)]
 
     @property
     def singular_values(self) -> tuple[float, ...]:
-        """Of the subspace of the largest order, relative to the size of the outputs."""
+        """Singular values of the largest order's subspace, relative to the size of the outputs."""
         fit = self.models[-1].fit
         return () if fit is None else fit.singular_values
 
     def table(self) -> str:
-        """One line an order."""
+        """A table with one line for each order."""
         how = "validation" if self.validated else "MDL"
         rows = []
         for model, score in zip(self.models, self.scores, strict=True):
@@ -84,12 +89,20 @@ def scan_orders(
 
     Args:
         data: as for ``estimate_bla``.
-        orders: nx of each; those that the data do not reach for are left out.
-        validation: records that choose.
+        orders: the values of nx; those that need more data than there are are left out.
+        validation: records that choose the order.
         options: of ``estimate_bla``.
 
     Raises:
-        ValueError: no order, or data that reach for none of them.
+        ValueError: no order, or too few data for any of them.
+
+    Example:
+        >>> scan = lfrtorch.scan_orders(record, [1, 2, 3])
+        >>> print(scan.table())  # doctest: +ELLIPSIS
+          nx ...
+           1 ...
+           2 ...
+           3 ...
     """
     if not len(orders):
         raise InputError("orders is empty; give at least one, for example range(1, 13).")

@@ -1,44 +1,41 @@
-"""Complex least squares at many spectral lines at once."""
+"""Complex least squares at many DFT lines at once, and the covariance of its solution."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Complex128
 from numpy.typing import NDArray
 
 from lfrtorch._types import Complex
 
 DEPENDENT = 1e-10
-"""A column whose part across the columns before it is relatively below this depends on them."""
+"""A column depends on those before it if its part orthogonal to them is relatively below this."""
 
 
 class Regression(NamedTuple):
-    """Solution of Y = X Θ by line, of which the last nu columns of X are of interest.
+    """Solution of Y = X Θ at each line; the response belongs to the last nu columns of X.
 
     Args:
         G: transpose of the last nu rows of Θ.
         weights: the same rows of the pseudo-inverse of X, so that G = (weights Y)ᵀ.
         residual: Y - X Θ.
-        determined: where the columns of X are independent; elsewhere the rest means nothing.
-
-    Shape:
-        G: (F, ny, nu), weights: (F, nu, R), residual: (F, R, ny), determined: (F,).
+        determined: whether the columns of X are independent. If not, the rest means nothing.
     """
 
-    G: Complex
-    weights: Complex
-    residual: Complex
-    determined: NDArray[np.bool_]
+    G: Complex128[Complex, "F ny nu"]
+    weights: Complex128[Complex, "F nu R"]
+    residual: Complex128[Complex, "F R ny"]
+    determined: Bool[NDArray[np.bool_], " F"]
 
 
-def regress(X: Complex, Y: Complex, nu: int) -> Regression:
-    """Least-squares solution of Y = X Θ at every line, by QR.
+def regress(
+    X: Complex128[Complex, "F R p"], Y: Complex128[Complex, "F R ny"], nu: int
+) -> Regression:
+    """Least-squares solution of Y = X Θ at every line, by QR; nu <= p <= R.
 
     With X = Q R only the last block of R acts on the last nu unknowns.
-
-    Shape:
-        X: (F, R, p), Y: (F, R, ny), p >= nu, R >= p.
     """
     Q, R = np.linalg.qr(X)
     across = np.abs(np.diagonal(R, axis1=1, axis2=2))
@@ -52,23 +49,20 @@ def regress(X: Complex, Y: Complex, nu: int) -> Regression:
     return Regression(G, weights, Y - Q @ QhY, determined)
 
 
-def outer(errors: Complex, other: Complex | None = None) -> Complex:
-    """Sum over the rows r of e_r e_rᴴ at every line (or of e_r o_rᴴ).
-
-    Shape:
-        errors: (F, R, n) -> (F, n, n).
-    """
+def outer(
+    errors: Complex128[Complex, "F R n"], other: Complex128[Complex, "F R m"] | None = None
+) -> Complex128[Complex, "F n _"]:
+    """Sum over the rows r of e_r e_rᴴ at every line, or of e_r o_rᴴ with the rows of ``other``."""
     other = errors if other is None else other
     return errors.swapaxes(1, 2) @ other.conj()
 
 
-def covariance(C: Complex, weights: Complex) -> Complex:
-    """Covariance of vec(G), row-major, where the rows of Y have independent errors of covariance C.
+def covariance(
+    C: Complex128[Complex, "F ny ny"], weights: Complex128[Complex, "F nu R"]
+) -> Complex128[Complex, "F ny*nu ny*nu"]:
+    """Covariance of vec(G), row-major, if the rows of Y have independent errors of covariance C.
 
     δG = Σ_r v_r w_r with E[v vᴴ] = C, so that E[δG_yu δG_y'u'*] = C_yy' Σ_r w_ru w_ru'*.
-
-    Shape:
-        C: (F, ny, ny), weights: (F, nu, R) -> (F, ny nu, ny nu).
     """
     A = weights @ weights.conj().swapaxes(1, 2)
     size = C.shape[1] * A.shape[1]

@@ -1,4 +1,11 @@
-"""Spectra of records by period, and the lines where their inputs have power."""
+"""Spectra of records by period, and the DFT lines at which their inputs have power.
+
+A periodic signal has power at the lines of its period alone, and a steady state repeats. So the
+mean over the periods of a record is its signal, and the scatter of the periods about the mean is
+noise. If the record begins with a transient, the lines between those of the period show it, and it
+can be removed. A response can be estimated only at lines that the inputs excite; they are found by
+their power, compared to the strongest line and to the noise.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Complex128, Float, Int64
 from numpy.typing import ArrayLike
 
 from lfrtorch._checks import dft_lines
@@ -15,16 +23,16 @@ from lfrtorch.linear.regression import outer
 from lfrtorch.records import Record
 
 RELATIVE_POWER = 1e-4
-"""A line is excited where each input has more than this (-40 dB) of its power at its best line."""
+"""Smallest power of each input at an excited line, relative to its best line: -40 dB."""
 
 NOISE_RATIO = 30.0
-"""And more than this many times the noise that the periods show, as a mean over NOISE_LINES lines:
-with two periods of one record, a line of noise alone passes once in 1e8."""
+"""Smallest ratio of power to noise at an excited line, the noise averaged over NOISE_LINES lines.
+With two periods of one record, a line of noise alone passes once in 1e8."""
 
 NOISE_LINES = 21
 
 NO_POWER = 1e-12
-"""An input has no power at a line where it has less than this of the power of its largest line."""
+"""An input has no power at a line if it has less than this part of that of its best line."""
 
 LARGEST_CHANGE = 0.1
 """Largest rms deviation of a period of an input from the mean period, relative to the input's rms
@@ -40,37 +48,34 @@ class Spectra(NamedTuple):
         U, Y: means over the periods of a record.
         C: covariance of the noise of [Y, U] in one period (P times that of the mean over P
             periods), pooled over the records.
-        freedom: degrees of freedom of C, which is 0 where there are none.
+        freedom: degrees of freedom of C; without any, C is 0.
         P: numbers of periods.
         N: samples of a period.
         resolution: fs / N, Hz.
-
-    Shape:
-        U: (F, R, nu), Y: (F, R, ny), C: (F, ny + nu, ny + nu), P: (R,).
     """
 
-    U: Complex
-    Y: Complex
-    C: Complex
+    U: Complex128[Complex, "F R nu"]
+    Y: Complex128[Complex, "F R ny"]
+    C: Complex128[Complex, "F ny+nu ny+nu"]
     freedom: int
-    P: Integers
+    P: Int64[Integers, " R"]
     N: int
     resolution: float
 
-    def frequencies(self, lines: Integers) -> Array:
-        """Frequencies (F,) of the lines, Hz."""
+    def frequencies(self, lines: Int64[Integers, " F"]) -> Float[Array, " F"]:
+        """Frequencies of the lines, Hz."""
         return np.asarray(lines * self.resolution, dtype=np.float64)
 
 
 class Removal(NamedTuple):
-    """How transients are removed: local polynomials of an order, and the freedom these leave."""
+    """How transients are removed: order of local polynomials, and the least freedom they leave."""
 
     order: int
     degrees_of_freedom: int
 
 
 def spectra_of_periods(data: Sequence[Record], removal: Removal | None = None) -> Spectra:
-    """Spectra of the last whole periods after ``skip``, less their transients if wanted.
+    """Spectra of the last whole periods after ``skip``; a ``removal`` takes their transients off.
 
     Raises:
         ValueError: a record without a period or of another one, or shorter than it (with removal:
@@ -146,7 +151,7 @@ def _spectra(
         mean = Z.mean(axis=0)
         D = (Z - mean).swapaxes(0, 1)
         count = len(Z) - 1
-        # Without line 0: a drift of the offset is no change of the input.
+        # Line 0 is left out: a drift of the offset is no change of the input.
         change = np.sum(np.abs(D[1:, :, ny:]) ** 2, axis=(0, 1)) / max(count, 1)
         if removal:
             mean, D = _without_transient(signals, N, removal)
@@ -166,15 +171,13 @@ def _spectra(
 
 
 def _without_transient(signals: Array, N: int, removal: Removal) -> tuple[Complex, Complex]:
-    """Mean spectrum over P periods less the transient, and errors with the covariance of one.
+    """Mean spectrum (F, n) over P periods without the transient, and errors (F, freedom, n).
 
-    In the spectrum of all P N samples the periods have power at every P-th line only. What the
-    lines about each of these hold is transient and noise: polynomials in the line r, of which the
-    value at r = 0 is taken off (Pintelon and Schoukens, 2012, chapter 7). The window is the same
-    about each line, and so are the weights b of this value; it adds |b|² to the noise.
-
-    Shape:
-        signals: (P N, n) -> (F, n), (F, degrees of freedom, n).
+    In the spectrum of all P N samples (P N, n) the periods have power at every P-th line only. The
+    lines about each of these hold transient and noise. A polynomial in the line r is fitted to
+    them, and its value at r = 0 is subtracted (Pintelon and Schoukens, 2012, chapter 7). The window
+    is the same about each line, and so are the weights b of this value, which add |b|² to the
+    noise. The errors have the covariance of the noise of one period.
     """
     P = len(signals) // N
     Z = np.fft.fft(signals, axis=0) * (np.sqrt(2) / len(signals))
@@ -192,6 +195,7 @@ def _without_transient(signals: Array, N: int, removal: Removal) -> tuple[Comple
     vandermonde = (r[:, None] / n) ** np.arange(removal.order + 1)
     b = np.linalg.pinv(vandermonde)[0]
     complement = np.linalg.qr(vandermonde, mode="complete")[0][:, removal.order + 1 :]
+    # The complement is orthogonal to all polynomials of the order: it keeps noise alone.
     at = np.arange(N // 2 + 1) * P
     window = Z[(at[:, None] + r) % len(signals)]
     D = complement.T @ window * np.sqrt(P * (1 + b @ b))
@@ -199,7 +203,7 @@ def _without_transient(signals: Array, N: int, removal: Removal) -> tuple[Comple
 
 
 def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
-    """Refuse an input whose periods change, by the relative deviations (R, nu) of a period."""
+    """Refuse inputs whose periods change; ``change`` (R, nu) is relative to the rms."""
     if change.max() > LARGEST_CHANGE:
         r, channel = (int(i) for i in np.unravel_index(np.argmax(change), change.shape))
         raise InputError(
@@ -246,7 +250,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
 def powered_lines(spectra: Spectra, n: int) -> Integers:
     """The lines between 0 and fs / 2 within n lines of which every input has power.
 
-    What is left out would be estimated from rounding errors.
+    Estimates at other lines would be made of rounding errors.
     """
     last = (spectra.N - 1) // 2
     power = _smooth(np.mean(np.abs(spectra.U[1 : last + 1]) ** 2, axis=1), 2 * n + 1)
@@ -254,7 +258,7 @@ def powered_lines(spectra: Spectra, n: int) -> Integers:
 
 
 def _smooth(power: Array, width: int) -> Array:
-    """Means (F, n) over ``width`` lines about each one, over fewer at the ends."""
+    """Means (F, n) of the power over ``width`` lines about each one, over fewer at the ends."""
     window = np.ones(min(width, len(power)))
     count = np.convolve(np.ones(len(power)), window, "same")
     return np.stack([np.convolve(channel, window, "same") / count for channel in power.T], axis=1)
