@@ -25,7 +25,7 @@ import lfrtorch
 from lfrtorch._threads import spread_by_hand
 from lfrtorch.least_squares.gauge import reduction
 from lfrtorch.least_squares.levenberg_marquardt import LMState
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 
 NEARBY = (1.0 + 1e-12 * i for i in itertools.count())
 """Factors of what is kept from one call to the next where it is the same."""
@@ -179,14 +179,14 @@ def first_call(folder: Path) -> dict:
         stage("estimate_bla")
         model = lfrtorch.initialise(bla, data, nz=2, nw=1, nn=15)
         stage("initialise")
-        search(SimulationError(model, data, ridge=problems.RIDGE), 1)
+        search(SimulationProblem(model, data, ridge=problems.RIDGE), 1)
         stage("first iteration")
         runs.append(stages)
     return {"first_s": runs[0], "again_s": runs[1]}
 
 
 def search(
-    problem: SimulationError, count: int, theta: torch.Tensor | None = None
+    problem: SimulationProblem, count: int, theta: torch.Tensor | None = None
 ) -> tuple[LMState, list[tuple[float, int]]]:
     """Where the search stands after so many iterations, and seconds and trials of each."""
     state = ENDLESS.init(problem, problem.theta if theta is None else theta.clone())

@@ -16,7 +16,7 @@ from scipy import signal
 import lfrtorch
 from lfrtorch import LinearModel, Model, Record
 from lfrtorch._types import Array
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 
 SIZES = {
     "boucwen": {"nx": 3, "nz": 2, "nw": 1, "nn": 15},
@@ -74,16 +74,16 @@ def problem(
     *,
     start: Literal["periodic", "zero"] = "periodic",
     periods: int = 1,
-) -> SimulationError:
+) -> SimulationProblem:
     """The residual that a fit of the problem minimises."""
     model = lfrtorch.load(folder / name)
     data = records(folder, name, start=start, periods=periods)
-    return SimulationError(model, data, ridge=ridge)
+    return SimulationProblem(model, data, ridge=ridge)
 
 
 def synthetic(
     *, samples: int = 8192, count: int = 1, nx: int = 4, nz: int = 2, nw: int = 1, nn: int = 15
-) -> tuple[Model, SimulationError]:
+) -> tuple[Model, SimulationProblem]:
     """A fit of any size: a random linear system with a quadratic output, records from rest."""
     rng = np.random.default_rng(0)
     rotation = np.linalg.qr(rng.standard_normal((nx, nx)))[0]
@@ -98,18 +98,18 @@ def synthetic(
     channels = data[0].inputs, data[0].outputs
     bla = LinearModel(A, B, C / np.sqrt(nx), D, 1.0, none, none, *channels)
     model = lfrtorch.initialise(bla, data, nz=nz, nw=nw, nn=nn)
-    return model, SimulationError(model, data)
+    return model, SimulationProblem(model, data)
 
 
-def plain_gradient(problem: SimulationError, theta: torch.Tensor) -> torch.Tensor:
+def plain_gradient(problem: SimulationProblem, theta: torch.Tensor) -> torch.Tensor:
     """The gradient (P,) of the mean square by autograd through a loop in Python, from rest."""
     problem.write(theta)
-    cell, (batch,) = problem.model.lfr.cell, problem.batches
-    x, outputs = batch.u.new_zeros(len(batch.u), cell.nx), []
-    for u in batch.u.unbind(1):
+    cell, (group,) = problem.model.lfr.cell, problem.groups
+    x, outputs = group.u.new_zeros(len(group.u), cell.nx), []
+    for u in group.u.unbind(1):
         y, x = cell(u, x)
         outputs.append(y)
-    errors = torch.stack(outputs, dim=1) - batch.y
+    errors = torch.stack(outputs, dim=1) - group.y
     gradients = torch.autograd.grad(errors.square().mean(), list(cell.parameters()))
     return torch.cat([gradient.flatten() for gradient in gradients])
 

@@ -17,9 +17,10 @@ from lfrtorch import _checkpoint
 from lfrtorch._errors import InputError
 from lfrtorch._types import Array
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.initial_state import simulate_estimated
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network
-from lfrtorch.engine.simulate import Trajectory, estimated_start
+from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.records import Channel, Record, Scaler, Start, as_signal, check_start
 
 
@@ -147,7 +148,7 @@ class Model:
                 raise InputError("start='estimated' needs a record: the state is fitted to its y.")
             y = torch.as_tensor(self.scaler.normalise_y(data.y)).to(like).unsqueeze(0)
             weight = torch.as_tensor(np.array(data.start_factors)).to(like).unsqueeze(0)
-            trajectory = estimated_start(self.lfr.cell, v, y, weight)
+            trajectory = simulate_estimated(self.lfr.cell, v, y, weight)
         else:
             trajectory = self.lfr.trajectory(v, state, start)
         return Trajectory(*(signal.cpu() for signal in trajectory))

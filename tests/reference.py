@@ -17,7 +17,7 @@ from lfrtorch._types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network
-from lfrtorch.engine.simulate import Trajectory
+from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.linear.refinement import Refined
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit

@@ -9,9 +9,9 @@ from reference import measure, random_cell, random_model
 from torch.testing import assert_close
 
 from lfrtorch.engine.nonlinearity import ACTIVATIONS
-from lfrtorch.least_squares.joint import Stack
+from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.model import Model
 
 pytestmark = pytest.mark.numeric
@@ -24,7 +24,7 @@ def some_model(activation: str = "tanh", dtype: torch.dtype = torch.float64) -> 
     return random_model(cell)
 
 
-def some_problem(model: Model, made_by: Model | None = None) -> SimulationError:
+def some_problem(model: Model, made_by: Model | None = None) -> SimulationProblem:
     made_by, noise = made_by or model, np.random.default_rng(0)
     records = [
         replace(measure(made_by, 60), start="zero", skip=2),
@@ -32,10 +32,10 @@ def some_problem(model: Model, made_by: Model | None = None) -> SimulationError:
         replace(measure(made_by, 40, seed=2), start="estimated"),
     ]
     noisy = [replace(r, y=r.y + 0.1 * noise.normal(size=r.y.shape)) for r in records]
-    return SimulationError(model, noisy, ridge=0.1)
+    return SimulationProblem(model, noisy, ridge=0.1)
 
 
-def searched(problem: SimulationError, steps: int = 4) -> LMState:
+def searched(problem: SimulationProblem, steps: int = 4) -> LMState:
     optimiser = LevenbergMarquardt()
     state = optimiser.init(problem, problem.theta)
     for _ in range(steps):
@@ -76,7 +76,7 @@ def test_several_starts_without_kernels(device: str):
         for shift, model in enumerate(models):
             model.lfr.to(device)
             model.lfr.cell.A.mul_(1.0 - 0.1 * shift)
-    stack = Stack([some_problem(model, models[0]) for model in models])
+    stack = JointProblem([some_problem(model, models[0]) for model in models])
     optimiser = LevenbergMarquardt()
     states = [optimiser.init(p, p.theta) for p in stack.problems]
     for _ in range(3):

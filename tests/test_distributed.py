@@ -33,7 +33,7 @@ from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.model import Model, load
 from lfrtorch.records import Record
 from lfrtorch.reporting.monitor import Checkpoint
@@ -161,7 +161,7 @@ def fitted(name: str, ranks: Ranks) -> tuple[Tensor, FitResult]:
 def slope(ranks: Ranks) -> dict[str, Any]:
     """Cost, gradients and error of the start."""
     model, train, _ = case()
-    problem = SimulationError(model, train, ridge=1e-2, ranks=ranks)
+    problem = SimulationProblem(model, train, ridge=1e-2, ranks=ranks)
     at = problem.theta + 0.01
     r, gradient = problem.gradient(at)
     system, product = problem.linearise(at).system(0.0, 1e-12)

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from lfrtorch.engine import linearised, sensitivity
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.records import Record, Start
 
 pytestmark = pytest.mark.numeric
@@ -40,7 +40,7 @@ def peak_of_an_iteration(T: int, start: Start, nn: int = 15) -> tuple[int, int]:
     """Bytes, and parameters of the model: Bouc-Wen's sizes."""
     model = random_model(random_cell(1, 1, 3, 2, 1, nn))
     noise = np.random.default_rng(0).normal(size=(2, T, 1))
-    problem = SimulationError(model, Record(noise[0], noise[1], model.fs, start))
+    problem = SimulationProblem(model, Record(noise[0], noise[1], model.fs, start))
     optimiser = LevenbergMarquardt()
     state = optimiser.init(problem, problem.theta)
     with Allocations() as allocations:
@@ -61,7 +61,7 @@ def blocks(monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setattr(linearised, "PASS", 2048)
     monkeypatch.setattr(sensitivity, "PASS", 2048)
     monkeypatch.setattr(sensitivity, "BLOCK", 1024)
-    monkeypatch.setattr(jacobian, "KEPT_BYTES", 1 << 24)
+    monkeypatch.setattr(jacobian, "CACHED_BYTES", 1 << 24)
     return 8 * 2048 * 20 * 30  # of neurons and derivatives, whatever the record's length
 
 
@@ -72,7 +72,7 @@ SIGNALS = 8 * T * 40  # 20 or so doubles a sample (x, z, w, y, r, a trial), and 
 
 def test_memory_of_a_long_record_does_not_depend_on_the_number_of_neurons(blocks: int):
     few, many = (peak_of_an_iteration(T, "zero", nn)[0] for nn in (15, 30))
-    assert max(jacobian.KEPT_BYTES, SIGNALS + blocks) < ROWS  # which are too many to be kept
+    assert max(jacobian.CACHED_BYTES, SIGNALS + blocks) < ROWS  # which are too many to be kept
     assert many - few < blocks
     assert few < SIGNALS + blocks
 

@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.newton import newton
+from lfrtorch.engine.newton import newton_states
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
-from lfrtorch.engine.simulate import simulate, steady_state
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.engine.simulation import simulate, steady_state
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -73,9 +73,9 @@ def test_passes_find_the_steady_state_where_newton_fails(monkeypatch: pytest.Mon
     expected = steady_state(cell, u)
 
     def failing(*args: Any, periodic: bool = False, **options: Any) -> Tensor:
-        return torch.nan * expected.x if periodic else newton(*args, **options)
+        return torch.nan * expected.x if periodic else newton_states(*args, **options)
 
-    monkeypatch.setattr("lfrtorch.engine.simulate.newton", failing)
+    monkeypatch.setattr("lfrtorch.engine.simulation.newton_states", failing)
     assert_close(steady_state(cell, u).y, expected.y, rtol=0, atol=1e-8)  # known to 1e-10
 
 
@@ -234,7 +234,7 @@ def test_scored_samples_have_no_part_in_the_start(model: Model):
     other = replace(part, y=np.concatenate([part.y[:100], -part.y[100:]]))
     for record in (part, other):
         np.testing.assert_allclose(model.simulate(record), part.y, rtol=0, atol=1e-8)
-    judge = SimulationError(model, other, solved_starts=True)
+    judge = SimulationProblem(model, other, solve_initial_states=True)
     assert judge.rmse(judge.theta) == pytest.approx(rmse(other, part.y), rel=1e-8)
 
 

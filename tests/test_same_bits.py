@@ -112,13 +112,13 @@ LM = LevenbergMarquardt(max_iter=2)
 @pytest.mark.parametrize(
     ("trainer", "options", "regime", "kept"),
     [
-        (LM, dict, 0.0, jacobian.KEPT_BYTES),  # normal equations
-        (LM, dict, math.inf, jacobian.KEPT_BYTES),  # orthogonal
+        (LM, dict, 0.0, jacobian.CACHED_BYTES),  # normal equations
+        (LM, dict, math.inf, jacobian.CACHED_BYTES),  # orthogonal
         (LM, dict, 0.0, 0),  # rows in blocks
         (LM, dict, math.inf, 0),
-        (LM, own_map, 0.0, jacobian.KEPT_BYTES),
-        (Adam(max_iter=2), dict, 0.0, jacobian.KEPT_BYTES),
-        (Adam(max_iter=2), own_map, 0.0, jacobian.KEPT_BYTES),
+        (LM, own_map, 0.0, jacobian.CACHED_BYTES),
+        (Adam(max_iter=2), dict, 0.0, jacobian.CACHED_BYTES),
+        (Adam(max_iter=2), own_map, 0.0, jacobian.CACHED_BYTES),
     ],
 )
 def test_single_fit(
@@ -129,7 +129,7 @@ def test_single_fit(
     monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setattr(jacobian, "NORMAL", regime)
-    monkeypatch.setattr(jacobian, "KEPT_BYTES", kept)
+    monkeypatch.setattr(jacobian, "CACHED_BYTES", kept)
     train, validation = noisy(records()), noisy([measure(truth(), 500, seed=5)])
 
     def work() -> lfrtorch.FitResult:

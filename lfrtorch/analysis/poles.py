@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from lfrtorch._types import Complex
-from lfrtorch.engine.linearised import slopes
+from lfrtorch.engine.linearised import linearise
 from lfrtorch.model import Model
 
 
@@ -43,4 +43,4 @@ def poles_at_rest(model: Model) -> Complex:
     z = model.lfr.trajectory(u, start="periodic").z
     if not torch.isfinite(z).all():
         z = torch.zeros_like(z)
-    return np.asarray(np.linalg.eigvals(slopes(cell, z).F[0, 0].double().cpu().numpy()), complex)
+    return np.asarray(np.linalg.eigvals(linearise(cell, z).F[0, 0].double().cpu().numpy()), complex)

@@ -13,7 +13,7 @@ from lfrtorch.engine.recurrence import NOTHING
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def emit(
+def jacobian_rows(
     job, A, Bw, Cz, Cy, Dyw, J, v, by_weight, slope, h, Ww, z, x_entries, z_entries, y_entries,
     first, chunks, S, rows,
 ):  # fmt: skip
@@ -104,7 +104,7 @@ def _copy(source, target, column):
 
 @njit(nogil=True, inline="always")
 def _by_weight(Ww, slope, h, z, k, q, d_w, first):
-    """Row q of what ``NetworkSlopes.by_weight`` computes, at sample k, from a column on."""
+    """Row q of what ``NetworkJacobian.by_weight`` computes, at sample k, from a column on."""
     nn, nz = h.shape[1], z.shape[1]
     bz = first + nn * nz
     for n in range(nn):

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from lfrtorch._errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.sensitivity import Linearisation
-from lfrtorch.engine.simulate import Trajectory, simulate, steady_state
+from lfrtorch.engine.simulation import Trajectory, simulate, steady_state
 from lfrtorch.records import Start, check_start
 
 
@@ -21,8 +22,7 @@ class LFR(nn.Module):
     Args:
         cell: the model equations and their weights.
 
-    Shape:
-        u: (R, T, nu), x0: (R, nx) -> y: (R, T, ny), normalised units.
+    Signals are in normalised units.
 
     Example:
         >>> u = torch.ones(3, 100, 1, dtype=torch.float64)  # three records
@@ -38,19 +38,19 @@ class LFR(nn.Module):
 
     def trajectory(
         self,
-        u: Tensor,
-        x0: Tensor | None = None,
+        u: Float[Tensor, "R T nu"],
+        x0: Float[Tensor, "R nx"] | None = None,
         start: Start = "zero",
         *,
-        guess: Tensor | None = None,
+        guess: Float[Tensor, "R T+1 nx"] | Float[Tensor, "R 1 nx"] | None = None,
     ) -> Trajectory:
         """All signals of a simulation, without gradients.
 
         Args:
             u: input.
-            x0: start state; zero where left out. In periodic steady state the guess to begin with.
+            x0: initial state; a first guess in periodic steady state. Default: zero.
             start: ``"periodic"`` for the periodic steady state; otherwise from ``x0``.
-            guess: states (R, T + 1, nx) of a nearby trajectory, which may save time.
+            guess: states of a nearby trajectory, which may save time.
         """
         check_start(start, "simulation")
         if start == "estimated":
@@ -60,7 +60,12 @@ class LFR(nn.Module):
         zero = u.new_zeros(len(u), self.cell.nx)
         return simulate(self.cell, u, zero if x0 is None else x0, guess=guess)
 
-    def forward(self, u: Tensor, x0: Tensor | None = None, start: Start = "zero") -> Tensor:
+    def forward(
+        self,
+        u: Float[Tensor, "R T nu"],
+        x0: Float[Tensor, "R nx"] | None = None,
+        start: Start = "zero",
+    ) -> Float[Tensor, "R T ny"]:
         """Simulated output; ``backward`` costs one adjoint recurrence (no second derivatives)."""
         weights = list(self.cell.parameters())
         if x0 is None:

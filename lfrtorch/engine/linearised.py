@@ -9,13 +9,13 @@ from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.recurrence import linear_recurrence
-from lfrtorch.engine.static_jacobian import static_slopes
+from lfrtorch.engine.static_jacobian import linearise_static
 
 PASS = 1 << 14
 """Samples of a long record that are linearised together."""
 
 
-class Slopes(NamedTuple):
+class Linearised(NamedTuple):
     """The model linearised along a trajectory: x+ = F x, y = H x.
 
     Shape:
@@ -27,13 +27,13 @@ class Slopes(NamedTuple):
 
 
 @torch.no_grad()
-def slopes(cell: LFRCell, z: Tensor) -> Slopes:
+def linearise(cell: LFRCell, z: Tensor) -> Linearised:
     """The linearised model at the inputs z (R, T, nz) of its static nonlinearity."""
     weights = {name: p.detach() for name, p in cell.named_parameters()}
-    return slopes_at(weights, static_slopes(cell.static, z, of_static(weights)).J)
+    return linearise_at(weights, linearise_static(cell.static, z, of_static(weights)).J)
 
 
-def slopes_at(weights: dict[str, Tensor], J: Tensor) -> Slopes:
+def linearise_at(weights: dict[str, Tensor], J: Tensor) -> Linearised:
     """F = A + Bw J Cz and H = Cy + Dyw J Cz for J (R, T, nw, nz), by one product with a matrix.
 
     The product is twenty times faster than as many products of small matrices.
@@ -44,7 +44,7 @@ def slopes_at(weights: dict[str, Tensor], J: Tensor) -> Slopes:
     constant = torch.cat([A, weights["Cy"]], dim=-2).flatten(-2).unsqueeze(-2)
     nx = A.shape[-1]
     both = (J.flatten(-2) @ products + constant).unflatten(-1, (-1, nx))
-    return Slopes(both[..., :nx, :], both[..., nx:, :])
+    return Linearised(both[..., :nx, :], both[..., nx:, :])
 
 
 def of_static(weights: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -67,6 +67,6 @@ def monodromy(cell: LFRCell, z: Tensor) -> Tensor:
     """Transition matrix (R, nx, nx) over a record along z (R, T, nz): the product of all F(k)."""
     Phi = torch.eye(cell.nx).to(z).expand(len(z), cell.nx, cell.nx)
     for part in z.split(max(1, PASS // len(z)), dim=1):
-        F = slopes(cell, part).F
+        F = linearise(cell, part).F
         Phi = linear_recurrence(F, torch.zeros_like(F), Phi)[:, -1]
     return Phi

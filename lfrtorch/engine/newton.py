@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linearised import slopes, spectral_radius
+from lfrtorch.engine.linearised import linearise, spectral_radius
 from lfrtorch.engine.recurrence import linear_recurrence
 
 MAX_NEWTON = 20
@@ -27,7 +27,7 @@ Convergence is quadratic: what is then left is about eps, the rounding of the lo
 
 
 @torch.no_grad()
-def newton(
+def newton_states(
     cell: LFRCell,
     u: Tensor,
     x0: Tensor,
@@ -40,7 +40,7 @@ def newton(
     Args:
         cell: the model. Its matrices may have a leading axis R, one model a record.
         u: input.
-        x0: start state; in periodic steady state the start of the search where ``guess`` is not.
+        x0: initial state; in periodic steady state the start of the search where ``guess`` is not.
         guess: states of a nearby trajectory, whatever their start; x0 at all times where left out.
         periodic: close the boundary by x(T) = x(0) instead of x(0) = x0.
 
@@ -64,7 +64,7 @@ def newton(
         z, w = cell.internal(u, x[:, :-1])
         defect = x[:, :-1] @ cell.A.mT + driven + w @ cell.Bw.mT - x[:, 1:]
         gap = (x[:, -1] if periodic else x0) - x[:, 0]
-        update, transition = (_closed if periodic else _open)(slopes(cell, z).F, defect, gap)
+        update, transition = (_closed if periodic else _open)(linearise(cell, z).F, defect, gap)
         x = x + update
         change, size = (signal.abs().amax(dim=(1, 2)) for signal in (update, x))
         found = change <= tolerance * (1.0 + size)  # False for NaN

@@ -15,7 +15,7 @@ from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Stacked, is_netwo
 Weights = dict[str, Tensor]
 
 
-class StaticSlopes(Protocol):
+class StaticJacobian(Protocol):
     """dw = J dz + (∂w/∂φ) dφ, φ all weights of the map in the order of its parameters.
 
     Shape:
@@ -27,7 +27,7 @@ class StaticSlopes(Protocol):
         """∂w/∂z."""
         ...
 
-    def part(self, records: slice, time: slice) -> StaticSlopes:
+    def part(self, records: slice, time: slice) -> StaticJacobian:
         """The same for some of the records and samples."""
         ...
 
@@ -44,11 +44,11 @@ class StaticSlopes(Protocol):
         ...
 
 
-def static_slopes(static: nn.Module | None, z: Tensor, weights: Weights) -> StaticSlopes:
+def linearise_static(static: nn.Module | None, z: Tensor, weights: Weights) -> StaticJacobian:
     """The map linearised at z (R, T, nz), with the given weights in place of its own."""
     if is_network(static):
-        return NetworkSlopes(static, z, weights)
-    return ModuleSlopes(static, z, weights)
+        return NetworkJacobian(static, z, weights)
+    return ModuleJacobian(static, z, weights)
 
 
 _SLOPES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
@@ -61,7 +61,7 @@ _SLOPES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 """σ'(v) from v and h = σ(v)."""
 
 
-class NetworkSlopes:
+class NetworkJacobian:
     """One hidden layer, in closed form: six times faster than ``torch.func``."""
 
     def __init__(self, network: Network, z: Tensor, weights: Weights) -> None:
@@ -76,7 +76,7 @@ class NetworkSlopes:
         rank_ones = self.Ww.mT.unsqueeze(-1) * self.Wz.unsqueeze(-2)
         self.J = (self.slope @ rank_ones.flatten(-2)).unflatten(-1, (nw, nz))
 
-    def part(self, records: slice, time: slice) -> StaticSlopes:
+    def part(self, records: slice, time: slice) -> StaticJacobian:
         """The same for some of the records and samples."""
         part = copy.copy(self)
         part.z, part.h, part.slope, part.J = (
@@ -114,7 +114,7 @@ class NetworkSlopes:
         return torch.cat([part.flatten(1) for part in parts], dim=-1)
 
 
-class ModuleSlopes:
+class ModuleJacobian:
     """Any module, by ``torch.func``; none at all is a map without inputs, outputs and weights."""
 
     def __init__(self, static: nn.Module | None, z: Tensor, weights: Weights) -> None:
@@ -132,7 +132,7 @@ class ModuleSlopes:
         over_time = vmap(function, in_dims=(None, 0))
         return vmap(over_time, in_dims=(self.by_record, 0))(self.weights, self.z)
 
-    def part(self, records: slice, time: slice) -> StaticSlopes:
+    def part(self, records: slice, time: slice) -> StaticJacobian:
         """The same for some of the records and samples."""
         part = copy.copy(self)
         part.z, part.J = self.z[records, time], self.J[records, time]

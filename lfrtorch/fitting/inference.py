@@ -47,8 +47,8 @@ from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.chebyshev import chebyshev, chebyshev_slope
 from lfrtorch.fitting.starts import OUTPUT_WEIGHTS, initialise
 from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import SimulationError
-from lfrtorch.least_squares.static_problem import StaticError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.static_problem import StaticProblem
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.resolvent import solve_resolvent
 from lfrtorch.metrics import rms
@@ -429,7 +429,7 @@ def _whitened(N: Array, xu: Array) -> Array:
     return scipy.linalg.solve_triangular(root, N, lower=True)
 
 
-def _minimised(problem: InferenceError | StaticError, steps: int, **options: Any) -> Tensor:
+def _minimised(problem: InferenceError | StaticProblem, steps: int, **options: Any) -> Tensor:
     """θ after some steps of Levenberg-Marquardt."""
     search = LevenbergMarquardt(max_iter=steps, **options)
     state = search.init(problem, problem.theta)
@@ -456,7 +456,7 @@ def _write(
         if is_network(cell.static):
             drawn = torch.Generator().manual_seed(int(generator.integers(2**31)))
             cell.static.Ww.uniform_(-1.0, 1.0, generator=drawn)
-    problem = StaticError(cell.static, *(torch.from_numpy(s).to(cell.A) for s in (z, w)))
+    problem = StaticProblem(cell.static, *(torch.from_numpy(s).to(cell.A) for s in (z, w)))
     error = MAP_ERROR if is_network(cell.static) else 0.0
     floor = error * float(rms(w))
     problem.write(_minimised(problem, MAP_STEPS, floor=floor))
@@ -476,7 +476,7 @@ def _safest(model: Model, plain: Model, records: list[Record]) -> Model:
                 weight.copy_(fraction * value)
 
     def cost(candidate: Model) -> float:
-        problem = SimulationError(candidate, records)
+        problem = SimulationProblem(candidate, records)
         return problem.cost(problem.residual(problem.theta))
 
     best, kept = cost(plain), 0.0

@@ -46,9 +46,9 @@ from lfrtorch.fitting.trainer import (
     StoppedError,
     Trainer,
 )
-from lfrtorch.least_squares.joint import Stack
+from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import Ridge, SimulationError
+from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
@@ -122,7 +122,7 @@ def fit(
             the first where the model is too small, and worse at the training's level by up to 6 %.)
             Starts are judged on validation and selection, and without both on training.
         trainer: the search. Default: Levenberg-Marquardt.
-        ridge: weight of |θ - θ_start|², see ``SimulationError``.
+        ridge: weight of |θ - θ_start|², see ``SimulationProblem``.
         average: so many starts go to the end at least, and the model of the result is the mean of
             so many of the best at most (:func:`lfrtorch.mean_model`): of as many as come within
             1 % of the best error on validation and selection, which may be one, and without both
@@ -238,7 +238,7 @@ class _Judge:
     ) -> None:
         self.fits, self._unseen = fits, unseen
         self._errors = [
-            SimulationError(fit.model, records, solved_starts=True) if records else None
+            SimulationProblem(fit.model, records, solve_initial_states=True) if records else None
             for fit in fits
         ]
 
@@ -285,7 +285,7 @@ class _Judge:
         means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]
         scores = [min(map(self._score, self.fits))]
         for mean in means:
-            error = SimulationError(mean, self._unseen, solved_starts=True)
+            error = SimulationProblem(mean, self._unseen, solve_initial_states=True)
             scores.append(error.cost(error.residual(error.theta)))
         scores = self.fits[0].ranks.first(torch.tensor(scores, dtype=torch.float64))
         count = 1 + int((scores <= AS_GOOD**2 * scores.nan_to_num(math.inf).min()).nonzero().max())
@@ -370,7 +370,7 @@ def advance_in_step(
     try:
         while live := [f for f in fits if _goes_on(f, until)]:
             clock = time.perf_counter()
-            after = trainer.steps(Stack([f.problem for f in live]), [f.state for f in live])
+            after = trainer.steps(JointProblem([f.problem for f in live]), [f.state for f in live])
             each = (time.perf_counter() - clock) / len(live)
             for fit, state in zip(live, after, strict=True):
                 fit.take(state, each, watching[id(fit)])

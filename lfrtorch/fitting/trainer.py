@@ -19,7 +19,7 @@ from lfrtorch._threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import Ridge, SimulationError
+from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -228,8 +228,10 @@ class Fit:
         if ranks.world > 1:
             weights = parameters_to_vector(model.lfr.parameters())
             vector_to_parameters(ranks.first(weights), model.lfr.parameters())
-        self.problem = SimulationError(model, train, ridge=ridge, ranks=ranks)
-        self.judge = SimulationError(model, validation, solved_starts=True) if validation else None
+        self.problem = SimulationProblem(model, train, ridge=ridge, ranks=ranks)
+        self.judge = (
+            SimulationProblem(model, validation, solve_initial_states=True) if validation else None
+        )
         if not math.isfinite(self.problem.cost(self.problem.residual(self.problem.theta))):
             raise StartDivergesError(
                 "the model diverges on the training records at the start; start from a stable "
@@ -336,7 +338,7 @@ class Fit:
                 f"{self.trainer.limit} asked for; ask for more."
             )
         if self.ranks.world > 1:  # what was kept is the first one's part
-            self.problem.guesses = [None] * len(self.problem.batches)
+            self.problem.guesses = [None] * len(self.problem.groups)
             state = replace(state, residual=self.problem.residual(state.theta))
         self.state = self.trainer.prolonged(state)
         self.reason = self.state.reason

@@ -17,10 +17,10 @@ from lfrtorch._errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Stacked, is_network
-from lfrtorch.engine.sensitivity import Linearisation
-from lfrtorch.engine.simulate import Trajectory
+from lfrtorch.engine.sensitivity import Linearisation, Rows
+from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.least_squares.jacobian import Jacobian
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 
 
 def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
@@ -57,7 +57,7 @@ def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
     return stack
 
 
-class Stack:
+class JointProblem:
     """Simulation errors of several models of one structure over the same records.
 
     Args:
@@ -67,15 +67,15 @@ class Stack:
         ValueError: problems that share a model, or differ in records, scaling or parameters.
     """
 
-    def __init__(self, problems: Sequence[SimulationError]) -> None:
+    def __init__(self, problems: Sequence[SimulationProblem]) -> None:
         self.problems = list(problems)
         first = self.problems[0]
         if len({id(problem.model) for problem in problems}) < len(self.problems):
             raise InputError("two problems share one model; give each a model of its own.")
         for problem in self.problems:
             alike = len(problem.theta) == len(first.theta)
-            alike &= len(problem.batches) == len(first.batches)
-            for mine, other in zip(problem.batches, first.batches, strict=False):
+            alike &= len(problem.groups) == len(first.groups)
+            for mine, other in zip(problem.groups, first.groups, strict=False):
                 alike &= torch.equal(mine.u, other.u) and torch.equal(mine.y, other.y)
             if not alike:
                 raise InputError(
@@ -89,17 +89,17 @@ class Stack:
         for problem, theta in zip(problems, thetas, strict=True):
             problem.write(theta)
         found: list[list[Trajectory]] = [[] for _ in problems]
-        for i, batch in enumerate(problems[0].batches):
-            R = len(batch.u)
+        for i, group in enumerate(problems[0].groups):
+            R = len(group.u)
             lfr = LFR(stacked([p.model.lfr.cell for p in problems], R))
-            u = batch.u.repeat(len(problems), 1, 1)
-            starts = [p.start_of(i) for p in problems]
+            u = group.u.repeat(len(problems), 1, 1)
+            starts = [p.initial_state(i) for p in problems]
             x0 = None if starts[0] is None else torch.cat([x for x in starts if x is not None])
             near = [x for p in problems if (x := p.guesses[i]) is not None]
             trajectory = lfr.trajectory(
                 u,
                 x0,
-                "periodic" if batch.start == "periodic" else "zero",
+                "periodic" if group.start == "periodic" else "zero",
                 guess=torch.cat(near) if len(near) == len(problems) else None,
             )
             for mine, signals in zip(
@@ -117,24 +117,23 @@ class Stack:
         jacobians = [
             p.linearise(theta, reduce=False) for p, theta in zip(problems, thetas, strict=True)
         ]
-        for i, batch in enumerate(problems[0].batches):
+        for i, group in enumerate(problems[0].groups):
             parts = [jacobian.parts[i] for jacobian in jacobians]
-            R, T, ny = batch.y.shape
+            R, T, ny = group.y.shape
             each = [part.linearisation.trajectory for part in parts]
             trajectory = Trajectory(*(torch.cat(signals) for signals in zip(*each, strict=True)))
             linearisation = Linearisation(
                 stacked([p.model.lfr.cell for p in problems], R),
-                batch.u.repeat(len(problems), 1, 1),
+                group.u.repeat(len(problems), 1, 1),
                 trajectory,
-                periodic=batch.start == "periodic",
+                periodic=group.start == "periodic",
             )
             everything = torch.arange(linearisation.parameters)
-            start = parts[0].has_start
-            columns = len(everything) + start * trajectory.x.shape[2] + 1
+            initial_state = parts[0].has_initial_state
+            columns = len(everything) + initial_state * trajectory.x.shape[2] + 1
             rows = trajectory.y.new_empty(len(trajectory.y), T, ny, columns)
-            end = linearisation.rows(everything, lambda *_: None, start=start, spare=1, out=rows)
-            for part, computed in zip(
-                parts, zip(rows.split(R), end.split(R), strict=True), strict=True
-            ):
-                part.computed = computed
+            blocks = linearisation.rows(everything, initial_state=initial_state, spare=1, out=rows)
+            end = torch.cat([block.end for block in blocks])
+            for part, own, own_end in zip(parts, rows.split(R), end.split(R), strict=True):
+                part.computed = Rows(slice(0, R), slice(0, T), own, own_end)
         return jacobians

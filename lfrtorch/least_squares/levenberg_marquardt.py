@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lfrtorch._checks import integer, number
 from lfrtorch._errors import InputError
-from lfrtorch.least_squares.linear_systems import Orthogonal, System
+from lfrtorch.least_squares.linear_systems import SVDSystem, System
 
 FASTEST_DECREASE = 0.2
 """Smallest factor on λ after a good step; Nielsen has 1/3."""
@@ -102,7 +102,7 @@ class DenseJacobian:
     def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
         """The system and the gradient."""
         R = torch.linalg.qr(self.jacobian, mode="r").R
-        return Orthogonal(R, truncation), self.jacobian.mT @ self.residual
+        return SVDSystem(R, truncation), self.jacobian.mT @ self.residual
 
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J d_theta (M,)."""

@@ -1,4 +1,4 @@
-"""Records of one length and start side by side, and how their errors are weighted."""
+"""Groups of records that are simulated together, and how their errors are weighted."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ EVERY = slice(None)
 
 
 @dataclass
-class Batch:
+class RecordGroup:
     """Records of one length and start, normalised, and how their errors are weighted.
 
     Shape:
         u: (R, T, nu), y: (R, T, ny), x0: (R, nx) of given starts; estimated: (R,), which of the
-        estimated start states is each record's.
+        estimated initial states is each record's.
         scored: (R, T), 1 where a sample counts in the score.
         weight: (R, T, ny), or by spectral line (R, F, ny), F = T // 2 + 1: the factors of the
             errors, 0 where a sample or a line does not count.
-        start_weight: (R, T, ny), the same where the start state of a given model is estimated.
+        start_weight: (R, T, ny), the same where the initial state of a given model is estimated.
     """
 
     u: Tensor
@@ -77,26 +77,26 @@ class Batch:
         return T * torch.fft.irfft(spectrum, T, dim=1)
 
 
-def batches_of(model: Model, records: list[Record], ranks: Ranks) -> list[Batch]:
+def group_records(model: Model, records: list[Record], ranks: Ranks) -> list[RecordGroup]:
     """A process's share of the records, grouped and normalised, in the model's dtype and device."""
     like = model.lfr.cell.A
-    groups: dict[tuple[int, Start, bool], list[Record]] = defaultdict(list)
+    members: dict[tuple[int, Start, bool], list[Record]] = defaultdict(list)
     estimated: dict[tuple[int, Start, bool], list[int]] = defaultdict(list)
     count = itertools.count()
     numbers = [next(count) if record.start == "estimated" else 0 for record in records]
     for record, number in ranks.share(list(zip(records, numbers, strict=True))):
         kind = record.samples, record.start, record.line_weight is not None
-        groups[kind].append(record)
+        members[kind].append(record)
         estimated[kind].append(number)
-    batches = []
+    groups = []
 
     def stacked(arrays: list[NDArray]) -> Tensor:
         return torch.tensor(np.stack(arrays)).to(like)
 
-    for kind, group in groups.items():
+    for kind, group in members.items():
         _, start, spectral = kind
-        batches.append(
-            Batch(
+        groups.append(
+            RecordGroup(
                 u=stacked([model.scaler.normalise_u(record.u) for record in group]),
                 y=stacked([model.scaler.normalise_y(record.y) for record in group]),
                 x0=stacked([r.x0 for r in group if r.x0 is not None]) if start == "given" else None,
@@ -110,7 +110,7 @@ def batches_of(model: Model, records: list[Record], ranks: Ranks) -> list[Batch]
                 start=start,
             )
         )
-    return batches
+    return groups
 
 
 def _factors(record: Record) -> NDArray:

@@ -6,14 +6,14 @@ from torch import Tensor
 from torch.nn import Module
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from lfrtorch.engine.static_jacobian import static_slopes
+from lfrtorch.engine.static_jacobian import linearise_static
 from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian
 
 
-class StaticError:
-    """Residual and slope of static(z) - w, for ``LevenbergMarquardt``.
+class StaticProblem:
+    """Residual and Jacobian of static(z) - w, for ``LevenbergMarquardt``.
 
-    θ is the vector of all parameters of the map, which holds the θ that was evaluated last.
+    θ is the vector of all parameters of the map. The map holds the θ that was evaluated last.
 
     Args:
         static: the map.
@@ -48,5 +48,5 @@ class StaticError:
         """dr/dθ at θ."""
         r = self.residual(theta)
         weights = {name: p.detach() for name, p in self.static.named_parameters()}
-        slopes = static_slopes(self.static, self.z, weights)
-        return DenseJacobian(slopes.by_weight().flatten(0, 2), r)
+        jacobian = linearise_static(self.static, self.z, weights)
+        return DenseJacobian(jacobian.by_weight().flatten(0, 2), r)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lfrtorch._types import Array, Complex
 from lfrtorch.least_squares.gauge import Reduction, reduction
-from lfrtorch.least_squares.linear_systems import Orthogonal
+from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.resolvent import response_jacobian, solve_resolvent, solve_resolvents
@@ -180,10 +180,10 @@ class ResponseJacobian:
         self._J, self._reduced, self._residual = J, reduced, residual
         self._rows = _real(J)
 
-    def system(self, damping: float, truncation: float) -> tuple[Orthogonal, Tensor]:
+    def system(self, damping: float, truncation: float) -> tuple[SVDSystem, Tensor]:
         """The system and the gradient, see ``levenberg_marquardt.Jacobian``."""
         R = torch.linalg.qr(self._rows, mode="r").R
-        return Orthogonal(self._reduced.columns(R), truncation), self.adjoint(self._residual)
+        return SVDSystem(self._reduced.columns(R), truncation), self.adjoint(self._residual)
 
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J d_theta."""

@@ -23,8 +23,8 @@ from torch import Tensor
 from lfrtorch._types import Array
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
-from lfrtorch.least_squares.linear_systems import Orthogonal
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.linear_systems import SVDSystem
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signals
@@ -127,12 +127,12 @@ class SignalFit:
         in the records.
         """
         problem, state = search.problem, search.state
-        x0 = problem.start_states(state.theta)
+        x0 = problem.initial_states(state.theta)
         if self._prediction or not len(x0):
             return state.cost
         problem.write(state.theta)
         driven = torch.cat(
-            [problem.model.lfr.trajectory(batch.u).x.flatten(0, 1) for batch in problem.batches]
+            [problem.model.lfr.trajectory(group.u).x.flatten(0, 1) for group in problem.groups]
         )
         spread, axes = torch.linalg.eigh(driven.mT @ driven / len(driven))
         variances = spread.clamp_min(ROUNDING * float(spread[-1]))
@@ -155,7 +155,7 @@ class SignalFit:
                 at_rest = np.linalg.solve(np.eye(len(A)) - A - K @ C, driven)
                 constant = np.asarray(constant + C @ at_rest, dtype=np.float64)
         system, _ = problem.linearise(state.theta).system(0.0, TRUNCATION)
-        assert isinstance(system, Orthogonal)
+        assert isinstance(system, SVDSystem)
         covariance = None
         if state.iteration:
             spread = self._spread(problem, state.theta, state.cost, system)
@@ -173,13 +173,13 @@ class SignalFit:
         )
         if not self._prediction:
             return found
-        pairs = zip(problem.batches, problem.trajectories(state.theta), strict=True)
+        pairs = zip(problem.groups, problem.trajectories(state.theta), strict=True)
         errors = torch.cat([(b.y - t.y)[b.scored.bool()] for b, t in pairs])
         innovations = np.atleast_2d(np.cov(errors.numpy().T, bias=True))
         return replace(found, K=K, innovation_covariance=innovations)
 
     def _spread(
-        self, problem: SimulationError, theta: Tensor, cost: float, system: Orthogonal
+        self, problem: SimulationProblem, theta: Tensor, cost: float, system: SVDSystem
     ) -> Array:
         """Covariance of θ, for white innovations or for simulation errors of any spectrum.
 
@@ -192,10 +192,10 @@ class SignalFit:
             return inverse * (cost / spare)
         rows, errors = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
         meat, first = np.zeros_like(inverse), 0
-        for batch in problem.batches:
-            shape = batch.residual_shape
+        for group in problem.groups:
+            shape = group.residual_shape
             last = first + shape.numel()
-            if batch.spectral:  # lines already
+            if group.spectral:  # lines already
                 scores = (rows[first:last] * errors[first:last, None]).reshape(*shape, -1).sum(2)
             else:
                 J = np.fft.rfft(rows[first:last].reshape(*shape, -1), axis=1)
@@ -224,7 +224,7 @@ class SignalFit:
             record, u=np.hstack(inputs), y=y, start=start, inputs=(), outputs=(), **weights
         )
 
-    def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> SimulationError:
+    def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> SimulationProblem:
         """Least-squares problem of the cell; unless ``observed`` in B, D and the constant alone."""
         A, B, C, D = matrices
         nu, ny = self.nu, self.ny
@@ -244,7 +244,7 @@ class SignalFit:
         for parameter in (cell.A, cell.Cy):
             parameter.requires_grad_(observed)
         model = Model(LFR(cell), self._unit, first.fs, first.inputs, first.outputs)
-        problem = SimulationError(model, self._records)
+        problem = SimulationProblem(model, self._records)
         if observed:
             measured = slice(nu, nu + ny) if self._prediction else None
             problem = _Stable(model, self._records, measured)
@@ -288,11 +288,11 @@ class SignalFit:
         return change @ covariance @ change.T
 
 
-class _Stable(SimulationError):
+class _Stable(SimulationProblem):
     """Simulation error of a linear cell; infinite if a pole passes LARGEST_POLE.
 
     Args:
-        model, records: as for ``SimulationError``.
+        model, records: as for ``SimulationProblem``.
         outputs: which inputs are the measured outputs, if the cell is a predictor. Then the system
             that it predicts must be stable as well.
     """

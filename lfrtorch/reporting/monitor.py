@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
-from lfrtorch.engine.simulate import spectral_radius
+from lfrtorch.engine.simulation import spectral_radius
 from lfrtorch.fitting.multistart import Round
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.model import Model

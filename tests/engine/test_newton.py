@@ -15,8 +15,8 @@ from torch.testing import assert_close
 
 import lfrtorch.engine.newton
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linearised import slopes as slopes_of
-from lfrtorch.engine.newton import newton
+from lfrtorch.engine.linearised import linearise as linearise_of
+from lfrtorch.engine.newton import newton_states
 from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network
 from lfrtorch.engine.recurrence import compiled, scan
 
@@ -33,7 +33,7 @@ def found(
     **options: Any,
 ) -> Tensor | None:
     with patch.object(lfrtorch.engine.newton, "linear_recurrence", way):
-        x = newton(cell, u, x0, **options)
+        x = newton_states(cell, u, x0, **options)
     return x if torch.isfinite(x).all() else None
 
 
@@ -44,9 +44,9 @@ def states(*arguments, **options) -> Tensor:
 
 
 def iterations(cell: LFRCell, u: Tensor, x0: Tensor, **options) -> int:
-    with patch("lfrtorch.engine.newton.slopes", wraps=slopes_of) as slopes:
+    with patch("lfrtorch.engine.newton.linearise", wraps=linearise_of) as calls:
         states(cell, u, x0, **options)
-    return slopes.call_count
+    return calls.call_count
 
 
 class Cubic(nn.Module):
@@ -251,7 +251,7 @@ def test_record_that_fails_leaves_the_others_alone():
     """The second is driven so hard that a quadratic map diverges."""
     cell = random_cell(static=Square(), feedback=0.2)
     u = normal(2, 40, 1) * torch.tensor([0.1, 1e3]).reshape(2, 1, 1)
-    x = newton(cell, u, u.new_zeros(2, 2))
+    x = newton_states(cell, u, u.new_zeros(2, 2))
     expected = reference.simulate(cell, u[:1], u.new_zeros(1, 2)).x
     assert_close(x[:1], expected, rtol=1e-12, atol=1e-12)
     assert torch.isnan(x[1]).all()

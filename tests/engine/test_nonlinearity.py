@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Polynomial
-from lfrtorch.engine.simulate import simulate
+from lfrtorch.engine.simulation import simulate
 
 pytestmark = pytest.mark.numeric
 

@@ -15,7 +15,7 @@ from lfrtorch.engine import sensitivity
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import ACTIVATIONS
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
-from lfrtorch.engine.simulate import simulate, steady_state
+from lfrtorch.engine.simulation import simulate, steady_state
 
 pytestmark = pytest.mark.numeric
 
@@ -144,11 +144,10 @@ def rows_and_end(linearisation: Linearisation, kept: Tensor) -> list[Tensor]:
     R, T = linearisation.u.shape[:2]
     ny, nx = linearisation.trajectory.y.shape[2], linearisation.state.shape[1]
     whole = linearisation.state.new_full((R, T, ny, len(kept) + nx), torch.nan)
-
-    def visit(records: slice, time: slice, rows: Tensor):
-        whole[records, time] = rows
-
-    end = linearisation.rows(kept, visit, start=True)
+    end = linearisation.state.new_full((R, nx, len(kept) + nx), torch.nan)
+    for block in linearisation.rows(kept, initial_state=True):
+        whole[block.records, block.time] = block.rows
+        end[block.records] = block.end
     return [whole, end]
 
 

@@ -1,4 +1,4 @@
-"""Slopes of the static map at every sample against autograd, one sample at a time."""
+"""Jacobians of the static map at every sample against autograd, one sample at a time."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from torch.func import functional_call
 from torch.testing import assert_close
 
 from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Stacked
-from lfrtorch.engine.static_jacobian import StaticSlopes, static_slopes
+from lfrtorch.engine.static_jacobian import StaticJacobian, linearise_static
 
 pytestmark = pytest.mark.numeric
 
@@ -58,18 +58,18 @@ def expected_slopes(static: nn.Module, weights: dict[str, Tensor], z: Tensor):
     return torch.stack(J), torch.stack(by_weight)
 
 
-def check(slopes: StaticSlopes, static: nn.Module, weights: list[dict[str, Tensor]], z: Tensor):
-    by_weight = slopes.by_weight()
+def check(jacobian: StaticJacobian, static: nn.Module, weights: list[dict[str, Tensor]], z: Tensor):
+    by_weight = jacobian.by_weight()
     for r in range(R):
         for k in range(T):
             J, by = expected_slopes(static, weights[r], z[r, k])
-            assert_close(slopes.J[r, k], J, rtol=1e-12, atol=1e-14)
+            assert_close(jacobian.J[r, k], J, rtol=1e-12, atol=1e-14)
             assert_close(by_weight[r, k], by.double(), rtol=1e-12, atol=1e-14)
     direction, d_w = normal(by_weight.shape[-1], seed=8), normal(R, T, nw, seed=9)
-    assert_close(slopes.tangent(direction), by_weight @ direction, rtol=1e-12, atol=1e-12)
+    assert_close(jacobian.tangent(direction), by_weight @ direction, rtol=1e-12, atol=1e-12)
     expected = (by_weight * d_w.unsqueeze(-1)).sum(dim=(1, 2))
-    assert_close(slopes.adjoint(d_w), expected, rtol=1e-12, atol=1e-12)
-    part = slopes.part(slice(1, 2), slice(2, 4))
+    assert_close(jacobian.adjoint(d_w), expected, rtol=1e-12, atol=1e-12)
+    part = jacobian.part(slice(1, 2), slice(2, 4))
     assert_close(part.by_weight(), by_weight[1:2, 2:4], rtol=1e-14, atol=1e-15)
     assert_close(part.adjoint(d_w[1:2, 2:4]), (by_weight * d_w.unsqueeze(-1))[1:2, 2:4].sum((1, 2)))
 
@@ -78,28 +78,28 @@ def check(slopes: StaticSlopes, static: nn.Module, weights: list[dict[str, Tenso
 def test_network(activation: str):
     static, z = network(activation), normal(R, T, nz)
     weights = weights_of(static)
-    check(static_slopes(static, z, weights), static, [weights, weights], z)
+    check(linearise_static(static, z, weights), static, [weights, weights], z)
 
 
 def test_own_module():
     static, z = Bend(), normal(R, T, nz)
     weights = weights_of(static)
-    check(static_slopes(static, z, weights), static, [weights, weights], z)
+    check(linearise_static(static, z, weights), static, [weights, weights], z)
 
 
 def test_map_without_parameters():
     z = normal(R, T, nz)
-    slopes = static_slopes(Cube(), z, {})
-    assert_close(slopes.J, torch.diag_embed(3 * z**2), rtol=1e-14, atol=0)
-    assert slopes.by_weight().shape == (R, T, nz, 0)
-    assert slopes.adjoint(z).shape == (R, 0)
-    assert torch.equal(slopes.tangent(z.new_zeros(0)), torch.zeros_like(z))
+    jacobian = linearise_static(Cube(), z, {})
+    assert_close(jacobian.J, torch.diag_embed(3 * z**2), rtol=1e-14, atol=0)
+    assert jacobian.by_weight().shape == (R, T, nz, 0)
+    assert jacobian.adjoint(z).shape == (R, 0)
+    assert torch.equal(jacobian.tangent(z.new_zeros(0)), torch.zeros_like(z))
 
 
 def test_no_map():
-    slopes = static_slopes(None, normal(R, T, 0), {})
-    assert slopes.J.shape == (R, T, 0, 0)
-    assert slopes.by_weight().shape == (R, T, 0, 0)
+    jacobian = linearise_static(None, normal(R, T, 0), {})
+    assert jacobian.J.shape == (R, T, 0, 0)
+    assert jacobian.by_weight().shape == (R, T, 0, 0)
 
 
 def test_values_and_slopes_of_own_weights_for_every_record():
@@ -109,7 +109,7 @@ def test_values_and_slopes_of_own_weights_for_every_record():
     for r in range(R):
         assert_close(stacked(z)[r], functional_call(base, each[r], (z[r],)), rtol=1e-14, atol=1e-14)
     check(
-        static_slopes(stacked, z, {n: p.detach() for n, p in stacked.named_parameters()}),
+        linearise_static(stacked, z, {n: p.detach() for n, p in stacked.named_parameters()}),
         base,
         each,
         z,
@@ -121,4 +121,4 @@ def test_network_with_own_weights_for_every_record():
     each = [weights_of(base, seed=10 * r + 1) for r in range(R)]
     stacked = {name: torch.stack([w[name] for w in each]) for name in each[0]}
     stacked |= {name: stacked[name].unsqueeze(1) for name in ("bz", "bw")}
-    check(static_slopes(base, z, stacked), base, each, z)
+    check(linearise_static(base, z, stacked), base, each, z)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting.starts import OUTPUT_RANGE, initialise
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -93,12 +93,12 @@ def test_signals_have_unit_deviation(bla: LinearModel, method):
     T = np.random.default_rng(1).normal(size=(3, 3))  # also from a model in any coordinates
     for start in (bla, bla.transformed(T)):
         model = initialise(start, RECORDS, **SIZES, method=method)
-        problem = SimulationError(model, RECORDS)
+        problem = SimulationProblem(model, RECORDS)
         trajectories = problem.trajectories(problem.theta)
         x = torch.cat([t.x[:, :-1].flatten(0, 1) for t in trajectories])
         z = torch.cat([t.z.flatten(0, 1) for t in trajectories])
-        u = torch.cat([batch.u.flatten(0, 1) for batch in problem.batches])
-        y = torch.cat([batch.y.flatten(0, 1) for batch in problem.batches])
+        u = torch.cat([group.u.flatten(0, 1) for group in problem.groups])
+        y = torch.cat([group.y.flatten(0, 1) for group in problem.groups])
         for signal in (x, z):
             np.testing.assert_allclose(signal.std(dim=0, correction=0).numpy(), 1, rtol=1e-8)
         for signal in (u, y):  # about the operating point, which need not be the mean

@@ -16,7 +16,7 @@ from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import EXPLOSION, INTERRUPTED, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
 from lfrtorch.records import Record
@@ -331,7 +331,7 @@ def test_a_lost_process_keeps_the_best():
     assert result.reason == "a process was lost: all of them"
     chosen = result.history[result.chosen_iteration]
     assert chosen.train < result.history[0].train
-    error = SimulationError(model, train)
+    error = SimulationProblem(model, train)
     # The periodic state is known to 1e-10.
     assert error.rmse(error.theta) == pytest.approx(chosen.train, rel=1e-9, abs=1e-9)
 

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
-from lfrtorch.engine.simulate import simulate, steady_state
+from lfrtorch.engine.simulation import simulate, steady_state
 from lfrtorch.least_squares.gauge import reduction
 
 pytestmark = pytest.mark.numeric

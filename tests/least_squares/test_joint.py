@@ -11,9 +11,9 @@ from torch.testing import assert_close
 
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Polynomial
-from lfrtorch.least_squares.joint import Stack, stacked
+from lfrtorch.least_squares.joint import JointProblem, stacked
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start
 
@@ -62,9 +62,9 @@ def some_records(model: Model) -> list[Record]:
     ]
 
 
-def problems(kind: str) -> list[SimulationError]:
+def problems(kind: str) -> list[SimulationProblem]:
     models = some_models(kind)
-    return [SimulationError(model, some_records(models[0]), ridge=0.1) for model in models]
+    return [SimulationProblem(model, some_records(models[0]), ridge=0.1) for model in models]
 
 
 @KINDS
@@ -82,7 +82,7 @@ def test_output_of_stacked_cells(kind: str, start: Start):
 
 @KINDS
 def test_residuals_and_systems_are_those_of_each_alone(kind: str):
-    stack, alone = Stack(problems(kind)), problems(kind)
+    stack, alone = JointProblem(problems(kind)), problems(kind)
     which = [0, 2]
     thetas = [alone[i].theta + 0.05 for i in which]
     residuals = stack.residuals(which, thetas)
@@ -105,7 +105,7 @@ def test_residuals_and_systems_are_those_of_each_alone(kind: str):
 def test_searches_in_step_are_searches_one_by_one(kind: str):
     """Five steps, in which the searches need different numbers of trials."""
     optimiser = LevenbergMarquardt(max_iter=5)
-    stack, alone = Stack(problems(kind)), problems(kind)
+    stack, alone = JointProblem(problems(kind)), problems(kind)
     states = [optimiser.init(p, p.theta) for p in stack.problems]
     expected = [optimiser.init(p, p.theta) for p in alone]
     for _ in range(6):
@@ -126,7 +126,7 @@ def test_frozen_parameters_stay_frozen():
     for model in models:
         model.lfr.cell.A.requires_grad_(False)
     records = some_records(models[0])[:3]
-    stack = Stack([SimulationError(model, records) for model in models])
+    stack = JointProblem([SimulationProblem(model, records) for model in models])
     thetas = [problem.theta for problem in stack.problems]
     stack.residuals([0, 1, 2], thetas)
     for problem, jacobian in zip(stack.problems, stack.linearise([0, 1, 2], thetas), strict=True):
@@ -137,23 +137,23 @@ def test_frozen_parameters_stay_frozen():
 def test_problems_that_are_no_stack():
     models = some_models("network", 2)
     records = some_records(models[0])
-    one = SimulationError(models[0], records)
+    one = SimulationProblem(models[0], records)
     with pytest.raises(ValueError, match="two problems share one model"):
-        Stack([one, SimulationError(models[0], records)])
+        JointProblem([one, SimulationProblem(models[0], records)])
     with pytest.raises(ValueError, match="differ in records, scaling or free parameters"):
-        Stack([one, SimulationError(models[1], records[:2])])
+        JointProblem([one, SimulationProblem(models[1], records[:2])])
 
 
 @pytest.mark.parametrize("signal", ["u", "y"])
 def test_problems_of_other_signals_are_no_stack(signal: str):
-    """In the second batch of the last problem."""
+    """In the second group of the last problem."""
     models = some_models("network")
     records = some_records(models[0])[1:4:2]
     other = replace(records[1], **{signal: getattr(records[1], signal) + 1e-3})
-    same = [SimulationError(model, records) for model in models[:2]]
-    Stack(same)
+    same = [SimulationProblem(model, records) for model in models[:2]]
+    JointProblem(same)
     with pytest.raises(ValueError, match="differ in records, scaling or free parameters"):
-        Stack([*same, SimulationError(models[2], [records[0], other])])
+        JointProblem([*same, SimulationProblem(models[2], [records[0], other])])
 
 
 def test_problems_of_other_free_parameters_are_no_stack():
@@ -161,14 +161,16 @@ def test_problems_of_other_free_parameters_are_no_stack():
     models[1].lfr.cell.A.requires_grad_(False)
     records = some_records(models[0])
     with pytest.raises(ValueError, match="differ in records, scaling or free parameters"):
-        Stack([SimulationError(model, records) for model in models])
+        JointProblem([SimulationProblem(model, records) for model in models])
 
 
 def test_start_states_that_are_solved_for():
     models = some_models("network", 2)
     records = [record for record in some_records(models[0]) if record.start == "estimated"]
-    stack = Stack([SimulationError(m, records, solved_starts=True) for m in models])
-    alone = [SimulationError(m, records, solved_starts=True) for m in some_models("network", 2)]
+    stack = JointProblem([SimulationProblem(m, records, solve_initial_states=True) for m in models])
+    alone = [
+        SimulationProblem(m, records, solve_initial_states=True) for m in some_models("network", 2)
+    ]
     thetas = [problem.theta for problem in alone]
     for mine, problem, theta in zip(stack.residuals([0, 1], thetas), alone, thetas, strict=True):
         assert_close(mine, problem.residual(theta), rtol=0, atol=1e-10)

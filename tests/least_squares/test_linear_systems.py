@@ -8,16 +8,21 @@ from reference import normal
 from torch import Tensor
 from torch.testing import assert_close
 
-from lfrtorch.least_squares.linear_systems import Gram, Normal, Orthogonal, Triangle
+from lfrtorch.least_squares.linear_systems import (
+    CholeskySystem,
+    GramAccumulator,
+    QRAccumulator,
+    SVDSystem,
+)
 
 pytestmark = pytest.mark.numeric
 
 
-def squares(factor: Triangle | Gram) -> Tensor:
-    return factor.R.mT @ factor.R if isinstance(factor, Triangle) else factor.G
+def squares(factor: QRAccumulator | GramAccumulator) -> Tensor:
+    return factor.R.mT @ factor.R if isinstance(factor, QRAccumulator) else factor.G
 
 
-@pytest.mark.parametrize("kind", [Triangle, Gram])
+@pytest.mark.parametrize("kind", [QRAccumulator, GramAccumulator])
 @pytest.mark.parametrize("threads", [1, 3])
 def test_blocks_are_one_piece(kind, threads: int, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
@@ -28,14 +33,14 @@ def test_blocks_are_one_piece(kind, threads: int, monkeypatch):
 
 
 def test_many_small_blocks_do_not_pile_up():
-    rows, factor = normal(500, 3), Triangle()
+    rows, factor = normal(500, 3), QRAccumulator()
     for block in rows.split(5):
         factor.fold(block)
         assert sum(map(len, factor._parts)) <= 16 * 3 + 3
     assert_close(squares(factor), rows.mT @ rows, rtol=1e-12, atol=1e-11)
 
 
-@pytest.mark.parametrize("kind", [Triangle, Gram])
+@pytest.mark.parametrize("kind", [QRAccumulator, GramAccumulator])
 def test_absorbed_rows_have_their_columns_mixed_and_placed(kind):
     rows, others, mix = normal(50, 4), normal(60, 6, seed=1), normal(6, 3, seed=2)
     total, other = kind(), kind()
@@ -54,7 +59,7 @@ def test_systems_are_the_normal_equations(damping: float):
     J, gradient = normal(20, 6), normal(6, seed=1)
     G = J.mT @ J
     expected = -torch.linalg.solve(G + damping * torch.eye(6), gradient)
-    for system in (Orthogonal(J, 1e-12), Normal(G, 6)):
+    for system in (SVDSystem(J, 1e-12), CholeskySystem(G, 6)):
         assert system.rank == 6
         assert system.scale == pytest.approx(float(torch.linalg.eigvalsh(G)[-1]), rel=1e-12)
         assert_close(system.solve(gradient, damping), expected, rtol=1e-9, atol=1e-12)
@@ -63,7 +68,7 @@ def test_systems_are_the_normal_equations(damping: float):
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
 def test_orthogonal_system_leaves_out_what_is_truncated(unit: float):
     R = unit * torch.diag(torch.tensor([1.0, 1e-3, 1e-13], dtype=torch.float64))
-    system = Orthogonal(R, 1e-12)
+    system = SVDSystem(R, 1e-12)
     assert system.rank == 2
     gradient = unit**2 * torch.ones(3, dtype=torch.float64)
     expected = torch.tensor([-1.0, -1e6, 0.0], dtype=torch.float64)
@@ -72,19 +77,19 @@ def test_orthogonal_system_leaves_out_what_is_truncated(unit: float):
 
 def test_normal_system_that_rounding_made_indefinite_gives_nan():
     G = torch.diag(torch.tensor([1.0, -1e-8], dtype=torch.float64))
-    assert torch.isnan(Normal(G, 2).solve(torch.ones(2).double(), 1e-9)).all()
+    assert torch.isnan(CholeskySystem(G, 2).solve(torch.ones(2).double(), 1e-9)).all()
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_entries_that_are_not_finite_have_no_scale(bad: float):
     G = torch.eye(3, dtype=torch.float64)
     G[0, 1] = bad
-    assert math.isnan(Normal(G, 3).scale)
-    assert math.isnan(Orthogonal(G, 1e-12).scale)
+    assert math.isnan(CholeskySystem(G, 3).scale)
+    assert math.isnan(SVDSystem(G, 1e-12).scale)
 
 
 def test_singular_values_whose_squares_overflow_have_an_infinite_scale():
-    assert Orthogonal(torch.tensor([[1e200]], dtype=torch.float64), 1e-12).scale == math.inf
+    assert SVDSystem(torch.tensor([[1e200]], dtype=torch.float64), 1e-12).scale == math.inf
 
 
 @pytest.mark.parametrize("rows", [4, 6, 20])
@@ -93,7 +98,7 @@ def test_inverse_is_the_pseudo_inverse(rows: int):
     J = normal(rows, 6)
     J[:, 2] = 0.0
     J[:, 5] = J[:, 0] - J[:, 1]
-    G, inverse = J.mT @ J, Orthogonal(J, 1e-12).inverse
+    G, inverse = J.mT @ J, SVDSystem(J, 1e-12).inverse
     # eps times |G| = 70 times its condition 90: 1e-12.
     for product in (G @ inverse, inverse @ G):
         assert_close(product, product.mT, rtol=0, atol=1e-11)

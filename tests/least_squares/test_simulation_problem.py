@@ -8,9 +8,9 @@ import torch
 from reference import measure, normal, random_cell, random_model
 from torch.testing import assert_close
 
-from lfrtorch.least_squares.joint import Stack
+from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import SimulationError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start
@@ -54,7 +54,7 @@ def all_kinds(model: Model, *, given: bool = True) -> list[Record]:
 
 def test_residual_is_the_error_of_all_scored_samples(model: Model):
     records = some_records(model)
-    problem = SimulationError(model, records)
+    problem = SimulationProblem(model, records)
     r = problem.residual(problem.theta)
     expected = [((model.simulate(x) - x.y) / model.scaler.y_scale)[x.skip :] for x in records]
     assert r.shape == (2 * (30 + 30 + 30 + 20),)
@@ -67,7 +67,7 @@ def test_residual_is_the_error_of_all_scored_samples(model: Model):
 def test_rmse_is_that_of_the_metrics(model: Model):
     records = some_records(model)
     for record in records:
-        problem = SimulationError(model, record)
+        problem = SimulationProblem(model, record)
         score = problem.rmse(problem.theta)
         assert score == pytest.approx(rmse(record, model.simulate(record)), rel=1e-9)
 
@@ -77,7 +77,7 @@ RIDGES = pytest.mark.parametrize("ridge", [0.0, 0.5, {"static": 0.1, "A": 0.3, "
 
 @RIDGES
 def test_gradient_and_jacobian_agree(model: Model, ridge):
-    problem = SimulationError(model, all_kinds(model), ridge=ridge)
+    problem = SimulationProblem(model, all_kinds(model), ridge=ridge)
     theta = problem.theta + 0.1
     r, gradient = problem.gradient(theta)
     J = problem.jacobian(theta)
@@ -87,7 +87,7 @@ def test_gradient_and_jacobian_agree(model: Model, ridge):
 
 @RIDGES
 def test_jacobian_is_the_slope_of_the_residual(model: Model, ridge):
-    problem = SimulationError(model, all_kinds(model), ridge=ridge)
+    problem = SimulationProblem(model, all_kinds(model), ridge=ridge)
     theta = problem.theta
     assert len(theta) == model.parameter_count + 3 * 2
     step = 1e-4 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
@@ -115,8 +115,8 @@ def test_system_and_products_are_those_of_the_whole_jacobian(
     That is exact in periodic steady state, which is known to 1e-10.
     """
     monkeypatch.setattr("lfrtorch.engine.sensitivity.BLOCK", 5)
-    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
-    problem = SimulationError(model, all_kinds(model, given=given), ridge=ridge)
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
+    problem = SimulationProblem(model, all_kinds(model, given=given), ridge=ridge)
     theta = problem.theta + 0.1
     r, J = problem.residual(theta), problem.jacobian(theta)
     jacobian = problem.linearise(theta)
@@ -133,10 +133,10 @@ def test_system_and_products_are_those_of_the_whole_jacobian(
 
 def test_weights_multiply_the_squared_errors(model: Model):
     (record,) = some_records(model)[:1]
-    plain = SimulationError(model, record)
+    plain = SimulationProblem(model, record)
     theta = plain.theta + 0.1
     squares = plain.residual(theta).reshape(-1, 2).square().sum(0)
-    weighted = SimulationError(model, replace(record, weight=[0.5, 3.0]))
+    weighted = SimulationProblem(model, replace(record, weight=[0.5, 3.0]))
     assert weighted.cost(weighted.residual(theta)) == pytest.approx(
         float(0.5 * squares[0] + 3.0 * squares[1]), rel=1e-9
     )
@@ -149,7 +149,7 @@ def test_unit_line_weights_are_plain_least_squares(model: Model, T: int):
     record = measure(model, T, start="periodic")
     record = replace(record, y=record.y + noise)
     lines = replace(record, line_weight=np.ones(T // 2 + 1))
-    plain, weighted = SimulationError(model, record), SimulationError(model, lines)
+    plain, weighted = SimulationProblem(model, record), SimulationProblem(model, lines)
     theta = plain.theta + 0.1
     cost = plain.cost(plain.residual(theta))
     assert weighted.cost(weighted.residual(theta)) == pytest.approx(cost, rel=1e-9)
@@ -162,7 +162,7 @@ def test_line_weights_weigh_the_spectrum_of_the_error(model: Model, T: int):
     y = record.y + model.scaler.y_scale * (np.cos(3 * t) + 2.0 * np.sin(5 * t))
     weight = np.zeros(T // 2 + 1)
     weight[[3, 5, 6]] = 4.0, 0.25, 9.0
-    problem = SimulationError(model, replace(record, y=y, line_weight=weight))
+    problem = SimulationProblem(model, replace(record, y=y, line_weight=weight))
     # Σ cos² = Σ sin² = T / 2 over whole periods, in each of two outputs.
     expected = 2 * (4.0 * 1.0 + 0.25 * 4.0) * T / 2
     assert problem.cost(problem.residual(problem.theta)) == pytest.approx(expected, rel=1e-7)
@@ -175,11 +175,11 @@ def test_adjoint_of_the_weights_is_that_of_their_product(model: Model, T: int, b
     rng, record = np.random.default_rng(0), measure(model, T, start="periodic")
     F = T // 2 + 1
     weights = {"line_weight": rng.uniform(0.5, 2.0, (F, 2))} if by_line else {"weight": [0.5, 3.0]}
-    problem = SimulationError(model, [replace(record, **weights)] * 2)
-    (batch,) = problem.batches
-    e, r = normal(2, T, 2), normal(*batch.residual_shape, seed=1)
-    assert batch.residual_shape == (2, 2 * F if by_line else T, 2)
-    weighed, unweighed = batch.weigh(e), batch.unweigh(r)
+    problem = SimulationProblem(model, [replace(record, **weights)] * 2)
+    (group,) = problem.groups
+    e, r = normal(2, T, 2), normal(*group.residual_shape, seed=1)
+    assert group.residual_shape == (2, 2 * F if by_line else T, 2)
+    weighed, unweighed = group.weigh(e), group.unweigh(r)
     assert unweighed.shape == e.shape
     # Sums of some hundred products of size 1.
     assert_close((weighed * r).sum(), (e * unweighed).sum(), rtol=0, atol=1e-11)
@@ -189,11 +189,11 @@ def test_start_state_is_fitted_with_the_parameters(model: Model):
     """A record cut from the middle of another, and the first of its samples thrown away."""
     whole = measure(model, 200)
     later = replace(whole[50:], start="estimated")
-    problem = SimulationError(model, [whole, later])
+    problem = SimulationProblem(model, [whole, later])
     states = model.signals(whole).x[0]
     assert_close(problem.theta[-2:], states[50], rtol=0, atol=1e-7)
     assert problem.rmse(problem.theta) < 1e-8
-    solved = SimulationError(model, [whole, later], solved_starts=True)
+    solved = SimulationProblem(model, [whole, later], solve_initial_states=True)
     assert len(solved.theta) == model.parameter_count
     assert solved.rmse(solved.theta) < 1e-8
 
@@ -201,12 +201,12 @@ def test_start_state_is_fitted_with_the_parameters(model: Model):
 def test_given_start_state(model: Model):
     whole = measure(model, 200)
     state = model.signals(whole).x[0, 50].numpy()
-    problem = SimulationError(model, replace(whole[50:], start="given", x0=state))
+    problem = SimulationProblem(model, replace(whole[50:], start="given", x0=state))
     assert problem.rmse(problem.theta) < 1e-9
 
 
 def test_ridge_by_group_is_of_its_parameters_only(model: Model):
-    problem = SimulationError(model, some_records(model), ridge={"A": 0.25, "static.bz": 4.0})
+    problem = SimulationProblem(model, some_records(model), ridge={"A": 0.25, "static.bz": 4.0})
     theta = problem.theta
     longer = problem.residual(theta + 1.0)[-len(theta) :]
     names = [name for name, p in model.lfr.cell.named_parameters() for _ in range(p.numel())]
@@ -216,14 +216,14 @@ def test_ridge_by_group_is_of_its_parameters_only(model: Model):
 
 def test_ridge_of_an_unknown_group(model: Model):
     with pytest.raises(ValueError, match=r"ridge has a group 'B',.*parameters are A, Bu, .*bw"):
-        SimulationError(model, some_records(model), ridge={"B": 1.0})
+        SimulationProblem(model, some_records(model), ridge={"B": 1.0})
     with pytest.raises(ValueError, match=r"ridge of 'A' is -1; give"):
-        SimulationError(model, some_records(model), ridge={"A": -1})
+        SimulationProblem(model, some_records(model), ridge={"A": -1})
 
 
 def test_penalty_is_no_part_of_the_score(model: Model):
     records = some_records(model)
-    plain, ridged = SimulationError(model, records), SimulationError(model, records, ridge=4.0)
+    plain, ridged = SimulationProblem(model, records), SimulationProblem(model, records, ridge=4.0)
     theta = plain.theta + 0.1
     r, longer = plain.residual(theta), ridged.residual(theta)
     assert_close(longer[: len(r)], r, rtol=0, atol=1e-9)
@@ -233,9 +233,9 @@ def test_penalty_is_no_part_of_the_score(model: Model):
 
 def test_jacobian_is_that_of_its_argument_whatever_the_module_holds(model: Model):
     records = some_records(model)
-    theta = SimulationError(model, records).theta
-    expected = SimulationError(model, records).jacobian(theta)
-    problem, other = SimulationError(model, records), SimulationError(model, records)
+    theta = SimulationProblem(model, records).theta
+    expected = SimulationProblem(model, records).jacobian(theta)
+    problem, other = SimulationProblem(model, records), SimulationProblem(model, records)
     problem.residual(theta)
     other.residual(theta + 0.1)
     assert_close(problem.jacobian(theta), expected, rtol=0, atol=1e-8)
@@ -244,7 +244,7 @@ def test_jacobian_is_that_of_its_argument_whatever_the_module_holds(model: Model
 def test_frozen_parameters_are_no_part_of_theta(model: Model):
     model.lfr.cell.A.requires_grad_(False)
     before = model.lfr.cell.A.clone()
-    problem = SimulationError(model, some_records(model))
+    problem = SimulationProblem(model, some_records(model))
     assert len(problem.theta) == model.parameter_count - 4
     problem.residual(problem.theta + 0.1)
     assert torch.equal(model.lfr.cell.A, before)
@@ -252,7 +252,7 @@ def test_frozen_parameters_are_no_part_of_theta(model: Model):
 
 
 def test_divergence_is_a_residual_that_is_not_finite(model: Model):
-    problem = SimulationError(model, measure(model, 2000))
+    problem = SimulationProblem(model, measure(model, 2000))
     theta = problem.theta
     assert not torch.isfinite(problem.residual(theta + 3.0)).all()
     assert torch.isfinite(problem.residual(theta)).all()
@@ -261,7 +261,7 @@ def test_divergence_is_a_residual_that_is_not_finite(model: Model):
 @pytest.mark.parametrize("ridge", [-1.0, float("nan")])
 def test_negative_ridge(model: Model, ridge: float):
     with pytest.raises(ValueError, match=r"ridge is .*; give a number of at least 0"):
-        SimulationError(model, some_records(model), ridge=ridge)
+        SimulationProblem(model, some_records(model), ridge=ridge)
 
 
 @pytest.mark.parametrize(
@@ -271,7 +271,7 @@ def test_negative_ridge(model: Model, ridge: float):
 def test_records_that_are_not_the_model_s(model: Model, nu: int, ny: int, fs: float, message: str):
     record = Record(np.ones((20, nu)), np.ones((20, ny)), fs, name="lab")
     with pytest.raises(ValueError, match=f"(?s)lab.*{message}"):
-        SimulationError(model, record)
+        SimulationProblem(model, record)
 
 
 def test_integrator_in_steady_state_ends_the_search_with_a_reason():
@@ -283,7 +283,7 @@ def test_integrator_in_steady_state_ends_the_search_with_a_reason():
     model = random_model(cell)
     u = np.tile([1.0, -1.0], 10) * model.scaler.u_scale + model.scaler.u_offset
     record = Record(u, np.ones(20), model.fs, "periodic")
-    problem = SimulationError(model, record)
+    problem = SimulationProblem(model, record)
     optimiser = LevenbergMarquardt()
     state = optimiser.step(problem, optimiser.init(problem, problem.theta))
     assert state.reason == "the Jacobian vanishes or is not finite"
@@ -291,7 +291,7 @@ def test_integrator_in_steady_state_ends_the_search_with_a_reason():
 
 def test_one_record_twice_has_two_start_states(model: Model):
     record = replace(some_records(model)[0], start="estimated")
-    problem = SimulationError(model, [record, record])
+    problem = SimulationProblem(model, [record, record])
     theta = problem.theta + 0.1
     r, gradient = problem.gradient(theta)
     J = problem.jacobian(theta)
@@ -300,7 +300,7 @@ def test_one_record_twice_has_two_start_states(model: Model):
 
 
 def test_theta_changed_in_place_is_another_theta(model: Model):
-    problem = SimulationError(model, some_records(model))
+    problem = SimulationProblem(model, some_records(model))
     theta = problem.theta
     before = problem.residual(theta)
     theta += 0.1
@@ -308,7 +308,7 @@ def test_theta_changed_in_place_is_another_theta(model: Model):
 
 
 def test_weights_of_the_module_are_not_those_of_theta(model: Model):
-    problem = SimulationError(model, some_records(model))
+    problem = SimulationProblem(model, some_records(model))
     theta = problem.theta
     problem.residual(theta)
     kept = theta.clone()
@@ -322,7 +322,7 @@ def test_weights_of_the_module_are_not_those_of_theta(model: Model):
 def test_an_output_without_weight_is_scored_all_the_same(model: Model):
     record = measure(model, 30)
     off = replace(record, y=record.y + model.scaler.y_scale, weight=[0.0, 1.0])
-    problem = SimulationError(model, off)
+    problem = SimulationProblem(model, off)
     expected = np.sqrt(np.mean(model.scaler.y_scale**2))
     assert problem.rmse(problem.theta) == pytest.approx(expected, rel=1e-9)
 
@@ -330,35 +330,35 @@ def test_an_output_without_weight_is_scored_all_the_same(model: Model):
 def test_start_state_of_the_wrong_length(model: Model):
     record = replace(some_records(model)[0], start="given", x0=[1.0])
     with pytest.raises(ValueError, match=r"x0 of 1 entries and the model 2 states"):
-        SimulationError(model, record)
+        SimulationProblem(model, record)
 
 
 def test_nothing_to_fit(model: Model):
     model.lfr.requires_grad_(False)
     with pytest.raises(ValueError, match="all parameters of the model are frozen"):
-        SimulationError(model, some_records(model))
+        SimulationProblem(model, some_records(model))
     start = replace(some_records(model)[0], start="estimated")
-    assert len(SimulationError(model, start).theta) == 2
+    assert len(SimulationProblem(model, start).theta) == 2
 
 
 @pytest.mark.parametrize("spare", [0, -1])
-def test_rows_of_all_batches_share_the_room_for_them(model: Model, spare: int, monkeypatch):
-    """Two of three batches fit exactly; a byte less, and the last does not."""
+def test_rows_of_all_groups_share_the_room_for_them(model: Model, spare: int, monkeypatch):
+    """Two of three groups fit exactly; a byte less, and the last does not."""
     records = some_records(model)
-    problem = SimulationError(model, records)
+    problem = SimulationProblem(model, records)
     columns = len(problem.linearise(problem.theta)._reduced.kept) + 1
     room = 8 * 2 * (2 * 30 + 20) * columns + spare  # of two outputs
-    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", room)
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", room)
     jacobian = problem.linearise(problem.theta)
     jacobian.system(1e-2, 1e-12)
-    kept = [part._kept is not None for part in jacobian.parts]
+    kept = [part._cached is not None for part in jacobian.parts]
     assert kept == [True, False, spare == 0]
     d = torch.ones_like(problem.theta)
     assert_close(jacobian.tangent(d), jacobian.whole() @ d, rtol=0, atol=1e-8)
 
 
 def test_two_jacobians_keep_their_own_rows_and_a_third_takes_over_the_room(model: Model):
-    problem = SimulationError(model, some_records(model))
+    problem = SimulationProblem(model, some_records(model))
     first_theta, second_theta = problem.theta, problem.theta + 0.1
     first, second = problem.linearise(first_theta), problem.linearise(second_theta)
     for jacobian in (first, second):
@@ -366,18 +366,18 @@ def test_two_jacobians_keep_their_own_rows_and_a_third_takes_over_the_room(model
     d = torch.ones_like(first_theta)
     assert_close(first.tangent(d), first.whole() @ d, rtol=0, atol=1e-8)
     assert_close(second.tangent(d), second.whole() @ d, rtol=0, atol=1e-8)
-    rows = second.parts[0]._kept
+    rows = second.parts[0]._cached
     assert rows is not None
     where = rows[0].untyped_storage().data_ptr()
     del second, jacobian, rows
     third = problem.linearise(second_theta)
     third.system(1e-2, 1e-12)
-    assert third.parts[0]._kept is not None
-    assert third.parts[0]._kept[0].untyped_storage().data_ptr() == where
+    assert third.parts[0]._cached is not None
+    assert third.parts[0]._cached[0].untyped_storage().data_ptr() == where
 
 
 def test_a_jacobian_asks_for_room_once(model: Model, monkeypatch):
-    problem = SimulationError(model, some_records(model))
+    problem = SimulationProblem(model, some_records(model))
     jacobian = problem.linearise(problem.theta)
     jacobian.system(1e-2, 1e-12)
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.Memory.take", None)
@@ -402,11 +402,11 @@ def test_fixed_entries_have_columns_of_zeros(
     model: Model, ridge: float, kept: bool, precise: bool, monkeypatch
 ):
     """The other columns are the plain Jacobian's, whichever way a product or a system takes."""
-    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     records = all_kinds(model, given=False)
-    theta = SimulationError(model, records).theta + 0.1
-    plain = SimulationError(model, records, ridge=ridge).jacobian(theta)
-    problem = SimulationError(model, records, ridge=ridge)
+    theta = SimulationProblem(model, records).theta + 0.1
+    plain = SimulationProblem(model, records, ridge=ridge).jacobian(theta)
+    problem = SimulationProblem(model, records, ridge=ridge)
     problem.fixed = some_fixed(model)
     held = torch.cat([problem.fixed, torch.zeros(3 * 2, dtype=torch.bool)])  # start states follow
     r, J = problem.residual(theta), problem.jacobian(theta)
@@ -439,10 +439,10 @@ def test_search_leaves_fixed_entries_and_brings_the_rest_home(
     model: Model, ridge: float, kept: bool, monkeypatch
 ):
     """With geodesic acceleration, whose right side is a product with J by itself."""
-    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     records = [measure(model, 60, seed=i) for i in range(2)]
-    theta = SimulationError(model, records).theta
-    problem = SimulationError(model, records, ridge=1e-8 * ridge)
+    theta = SimulationProblem(model, records).theta
+    problem = SimulationProblem(model, records, ridge=1e-8 * ridge)
     problem.fixed = some_fixed(model)
     away = 0.02 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
     away[problem.fixed] = 0.0
@@ -458,17 +458,17 @@ def test_search_leaves_fixed_entries_and_brings_the_rest_home(
 @pytest.mark.parametrize("kept", [True, False])
 def test_stack_leaves_fixed_entries(kept: bool, monkeypatch):
     """The searches of a stack compute all columns, and move the free entries alone."""
-    monkeypatch.setattr("lfrtorch.least_squares.jacobian.KEPT_BYTES", 1 << 20 if kept else 0)
+    monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     models = [random_model(random_cell(2, 2, 2, 2, 1, 3, seed=i)) for i in range(2)]
     record = measure(models[0], 60)
-    problems = [SimulationError(m, replace(record, y=record.y + 0.1)) for m in models]
+    problems = [SimulationProblem(m, replace(record, y=record.y + 0.1)) for m in models]
     for problem, m in zip(problems, models, strict=True):
         problem.fixed = some_fixed(m)
     starts = [p.theta for p in problems]
     optimiser = LevenbergMarquardt()
     states = [optimiser.init(p, p.theta) for p in problems]
     for _ in range(3):
-        states = optimiser.steps(Stack(problems), states)
+        states = optimiser.steps(JointProblem(problems), states)
     for problem, state, theta in zip(problems, states, starts, strict=True):
         assert torch.equal(state.theta[problem.fixed], theta[problem.fixed])
         assert not torch.equal(state.theta, theta)

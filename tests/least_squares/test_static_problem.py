@@ -7,7 +7,7 @@ from torch.func import jacrev
 
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.static_problem import StaticError
+from lfrtorch.least_squares.static_problem import StaticProblem
 
 pytestmark = pytest.mark.numeric
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.numeric
     [Network(2, 3, 4, dtype=torch.float64), Polynomial(2, 3, 2, dtype=torch.float64)],
 )
 def test_slope(static: torch.nn.Module):
-    problem = StaticError(static, normal(7, 2), normal(7, 3, seed=1))
+    problem = StaticProblem(static, normal(7, 2), normal(7, 3, seed=1))
     theta = problem.theta
     J = problem.linearise(theta)
     names, weights = zip(*static.named_parameters(), strict=True)
@@ -37,7 +37,7 @@ def test_polynomial_is_found_again():
     true.reset_parameters(torch.Generator().manual_seed(0))
     static.reset_parameters(torch.Generator().manual_seed(1))
     z = normal(200, 2)
-    problem = StaticError(static, z, true(z).detach())
+    problem = StaticProblem(static, z, true(z).detach())
     search = LevenbergMarquardt(max_iter=20)
     state = search.init(problem, problem.theta)
     while not state.reason:

@@ -322,7 +322,7 @@ def test_start_states_that_no_input_leads_to_are_improbable():
     records = [Record(u[10:60], noisy[10:60], start="estimated"), Record(u, noisy)]
     both = fit_of(records)
     search = both.search(matrices).advance(1)
-    (x0,) = search.problem.start_states(search.state.theta).numpy()
+    (x0,) = search.problem.initial_states(search.state.theta).numpy()
     search.problem.write(search.state.theta)
     cell = search.problem.model.lfr.cell
     A, B = (m.detach().numpy() for m in (cell.A, cell.Bu))

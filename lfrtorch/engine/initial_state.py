@@ -1,0 +1,133 @@
+"""The initial state of a record, estimated from its output."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linearised import linearise
+from lfrtorch.engine.recurrence import linear_recurrence
+from lfrtorch.engine.simulation import Trajectory, simulate
+
+ITERATIONS, HALVINGS, TOLERANCE = 20, 6, 1e-10
+"""Most Gauss-Newton steps, trials in a step, and the relative decrease that ends the search."""
+
+SEEN = 1e-9
+"""A direction of the initial state is estimated if it moves the weighted output by this much."""
+
+PASSES, FLAT = 8, 1e-4
+"""Passes that estimate the prior's weight, and its least variance relative to the largest."""
+
+ODD = 1e-3
+"""Least part of the cost that the prior must add to make a difference."""
+
+
+@torch.no_grad()
+def simulate_estimated(
+    cell: LFRCell,
+    u: Float[Tensor, "R T nu"],
+    y: Float[Tensor, "R T ny"],
+    weight: Float[Tensor, "R T ny"],
+) -> Trajectory:
+    """Trajectory from the most probable initial state, given the output.
+
+    There are two candidates. Least squares alone follows the noise if there are few samples and
+    many states. The second one adds x0ᵀ P⁻¹ x0 to the squared errors over their variance: a normal
+    prior, whose P is the second moment of the states that the input excites from rest. The variance
+    is estimated in PASSES. The second one is taken unless the first one is more probable under a
+    prior with heavy tails: a system may begin far from where its input would bring it. The two are
+    the same if the model is exact, or if there are far more samples than states.
+
+    Args:
+        cell: the model.
+        u: input.
+        y: output.
+        weight: factors of the errors.
+    """
+    R, nx = len(u), cell.nx
+    counted = (weight != 0).sum(dim=(1, 2))
+    rest = simulate(cell, u, u.new_zeros(R, nx))
+    x = rest.x.nan_to_num(0.0, 0.0, 0.0)
+    # Prior: P = axes diag(moments) axesᵀ, so that |white x0|² = x0ᵀ P⁻¹ x0.
+    moments, axes = torch.linalg.eigh(x.mT @ x / x.shape[1])
+    moments = moments.clamp_min(FLAT * moments[:, -1:])
+    known = torch.isfinite(rest.x).all(dim=(1, 2)) & (moments > 0).all(dim=1)
+    white = torch.where(known[:, None, None], axes.mT / moments.sqrt().unsqueeze(-1), 0.0)
+
+    def variance(found: Trajectory) -> Tensor:
+        errors = (weight * (found.y - y)).square().sum(dim=(1, 2))
+        return errors / (counted - nx).clamp_min(1)
+
+    def odd(found: Trajectory) -> Tensor:
+        return (white @ found.x[:, 0].unsqueeze(-1)).square().sum(dim=(1, 2))
+
+    def improbability(found: Trajectory) -> Tensor:
+        return counted * variance(found).log() + nx * (odd(found) / nx).log1p()
+
+    squares = _fitted_start(cell, u, y, weight, u.new_zeros(R, nx, nx), rest)
+    stayed = ~squares.x[:, 0].any(dim=1)  # Gauss-Newton may fail on many states
+    if not (known & (stayed | (odd(squares) > ODD * counted))).any():
+        return squares
+    probable = rest
+    for _ in range(PASSES):
+        prior = white * variance(probable).nan_to_num(0.0, 0.0).sqrt()[:, None, None]
+        probable = _fitted_start(cell, u, y, weight, prior, probable)
+    least = improbability(squares).nan_to_num(math.inf)
+    better = known & (improbability(probable).nan_to_num(math.inf) < least)
+    pairs = zip(probable, squares, strict=True)
+    return Trajectory(*(torch.where(better[:, None, None], a, b) for a, b in pairs))
+
+
+def _fitted_start(
+    cell: LFRCell,
+    u: Float[Tensor, "R T nu"],
+    y: Float[Tensor, "R T ny"],
+    weight: Float[Tensor, "R T ny"],
+    prior: Float[Tensor, "R nx nx"],
+    best: Trajectory,
+) -> Trajectory:
+    """Trajectory from the initial state that minimises |weight (y_hat - y)|² + |prior x0|².
+
+    Gauss-Newton from ``best``; a step that does not lower the cost is quartered.
+    """
+
+    def squares(trajectory: Trajectory, x0: Tensor) -> Tensor:
+        errors = (weight * (trajectory.y - y)).square().sum(dim=(1, 2))
+        return errors + (prior @ x0.unsqueeze(-1)).square().sum(dim=(1, 2))
+
+    x0 = best.x[:, 0].clone()
+    cost = squares(best, x0)
+    for _ in range(ITERATIONS):
+        F, H = linearise(cell, best.z)
+        # dy(k)/dx0 = H(k) Φ(k) with Φ(k+1) = F(k) Φ(k), Φ(0) = I.
+        identity = torch.eye(cell.nx).to(x0).expand_as(F[:, 0])
+        free = H @ linear_recurrence(F, torch.zeros_like(F), identity)[:, :-1]
+        rows = torch.cat([(weight.unsqueeze(-1) * free).flatten(1, 2), prior], dim=1)
+        errors = (weight * (best.y - y)).flatten(1).unsqueeze(-1)
+        errors = torch.cat([errors, prior @ x0.unsqueeze(-1)], dim=1)
+        usable = torch.isfinite(rows).all(dim=(1, 2)) & torch.isfinite(cost)
+        rows, errors = (torch.where(usable[:, None, None], t, 0.0) for t in (rows, errors))
+        # A state that the output does not show stays where it is.
+        seen = SEEN * weight.abs().amax()
+        step = -(torch.linalg.pinv(rows, atol=seen, rtol=SEEN) @ errors).squeeze(-1)
+        before = cost
+        waiting = usable.clone()
+        for _ in range(HALVINGS):
+            trial = simulate(cell, u, x0 + step)
+            trial_cost = squares(trial, x0 + step)
+            better = waiting & (trial_cost < cost)  # False for NaN
+            x0 = torch.where(better[:, None], x0 + step, x0)
+            cost = torch.where(better, trial_cost, cost)
+            pairs = zip(trial, best, strict=True)
+            best = Trajectory(*(torch.where(better[:, None, None], t, b) for t, b in pairs))
+            waiting &= ~better
+            if not waiting.any():
+                break
+            step = step / 4
+        if not (cost < (1.0 - TOLERANCE) * before).any():
+            break
+    return best

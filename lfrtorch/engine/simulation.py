@@ -1,0 +1,179 @@
+"""Trajectories of the cell over time: from a given state, and the periodic steady state."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lfrtorch._threads import spread
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linearised import monodromy, spectral_radius
+from lfrtorch.engine.newton import newton_states
+from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.engine.recurrence import has_kernels, to_numpy
+from lfrtorch.engine.simulation_kernel import ACTIVATION_CODES, simulate_record
+
+PERIODIC_TOLERANCE = 1e-10
+"""Largest |x(T) - x(0)| relative to 1 + max |x| that counts as periodic (states have unit rms)."""
+
+PERIODIC_ROUNDING = 100.0
+"""The same in multiples of the rounding error, for dtypes that cannot reach the tolerance."""
+
+MET_ROUNDING = 4.0
+"""Distance of two states, in rounding errors, at which their trajectories are taken as one."""
+
+SETTLING_PERIODS = 3
+"""Periods simulated forward before Newton's method takes over; a well damped model needs one."""
+
+MAX_PERIODS = 30
+"""Passes over the record after which the periodic steady state is given up."""
+
+
+class Trajectory(NamedTuple):
+    """Signals of a simulation.
+
+    Shape:
+        x: (R, T + 1, nx), z: (R, T, nz), w: (R, T, nw), y: (R, T, ny), normalised units.
+    """
+
+    x: Tensor
+    z: Tensor
+    w: Tensor
+    y: Tensor
+
+    @property
+    def finite(self) -> bool:
+        """Whether nothing diverged."""
+        return bool(torch.isfinite(self.y).all() and torch.isfinite(self.x[:, -1]).all())
+
+
+@torch.no_grad()
+def simulate(cell: LFRCell, u: Tensor, x0: Tensor, *, guess: Tensor | None = None) -> Trajectory:
+    """Trajectory from the state ``x0``. A model that diverges gives infinite or NaN samples.
+
+    On the CPU a linear model and a ``Network`` are simulated in machine code; any other map, and
+    any other device, by Newton's method over all of time and, where that fails, step by step.
+
+    Args:
+        cell: the model. Its weights may have a leading axis of length R: one model a record.
+        u: input.
+        x0: initial state.
+        guess: states of a nearby trajectory, for Newton's method.
+
+    Shape:
+        u: (R, T, nu), x0: (R, nx), guess: (R, T + 1, nx).
+    """
+    if is_compiled(cell, u):
+        return _compiled(cell, u, x0, None)
+    x = newton_states(cell, u, x0, guess=guess)
+    return _with_loop_where_lost(cell, u, x0, x)
+
+
+def signals(cell: LFRCell, u: Tensor, x: Tensor) -> Trajectory:
+    """The trajectory of given states x (R, T + 1, nx)."""
+    z, w = cell.internal(u, x[:, :-1])
+    return Trajectory(x, z, w, x[:, :-1] @ cell.Cy.mT + u @ cell.Dyu.mT + w @ cell.Dyw.mT)
+
+
+@torch.no_grad()
+def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Trajectory:
+    """Trajectory with x(T) = x(0): the response to the periodic repetition of ``u``.
+
+    In machine code the record is passed until its end state meets its initial state; where that
+    takes more than a few passes, Newton's method on x(T) - x(0) takes over. Elsewhere Newton's
+    method over all of time closes the period, too, and passes follow where it fails. A periodic
+    solution that is not stable, so that no simulation would settle to it, counts as diverged (its
+    record has NaN samples), unless the search starts right on it.
+
+    Shape:
+        u: (R, T, nu), one or more whole periods; guess: (R, nx), start of the search, or
+        (R, T + 1, nx), states of a nearby solution.
+    """
+    x0 = u.new_zeros(len(u), cell.nx) if guess is None else guess
+    compiled = is_compiled(cell, u)
+    if not compiled:
+        states = x0 if x0.ndim == 3 else None
+        x = newton_states(cell, u, x0[:, 0] if x0.ndim == 3 else x0, guess=states, periodic=True)
+        if torch.isfinite(x).all():
+            return signals(cell, u, x)
+    x0 = x0[:, 0] if x0.ndim == 3 else x0
+    identity = torch.eye(cell.nx, dtype=u.dtype, device=u.device)
+    tolerance = max(PERIODIC_TOLERANCE, PERIODIC_ROUNDING * torch.finfo(u.dtype).eps)
+    trajectory = simulate(cell, u, x0)
+    lost = torch.zeros(len(u), dtype=torch.bool, device=u.device)  # diverged, or unstable
+    settled, size = lost, u.new_ones(len(u))
+    for passes in range(MAX_PERIODS + 1):
+        end = trajectory.x[:, -1].clone()
+        if passes == 0:
+            size = 1.0 + trajectory.x.abs().amax(dim=(1, 2))  # of states that hardly change
+        lost |= ~torch.isfinite(end).all(dim=1)
+        settled = (end - x0).abs().amax(dim=1) <= tolerance * size
+        if (settled | lost).all() or passes == MAX_PERIODS:
+            break
+        if passes < SETTLING_PERIODS:
+            closer = end
+        else:
+            transition = monodromy(cell, trajectory.z)
+            lost |= ~settled & ~(spectral_radius(transition) < 1.0)  # False for NaN
+            gap = (end - x0).unsqueeze(-1)
+            closer = x0 + torch.linalg.solve_ex(identity - transition, gap).result.squeeze(-1)
+        x0 = torch.where((settled | lost).unsqueeze(1), x0, closer)
+        if compiled:
+            trajectory = _compiled(cell, u, x0, trajectory)
+        else:
+            trajectory = simulate(cell, u, x0, guess=trajectory.x)
+    failed = (lost | ~settled)[:, None, None]
+    if not failed.any():
+        return trajectory
+    return Trajectory(*(torch.where(failed, torch.nan, signal) for signal in trajectory))
+
+
+def is_compiled(cell: LFRCell, u: Tensor) -> bool:
+    """Whether the cell is simulated in machine code, on signals like ``u``."""
+    return has_kernels(u) and (cell.static is None or is_network(cell.static))
+
+
+def _with_loop_where_lost(cell: LFRCell, u: Tensor, x0: Tensor, x: Tensor) -> Trajectory:
+    """The trajectory of the states x (R, T + 1, nx), NaN ones found step by step."""
+    lost = ~torch.isfinite(x).all(dim=(1, 2))
+    if lost.any():
+        x = torch.where(lost[:, None, None], _loop(cell, u, x0), x)
+    return signals(cell, u, x)
+
+
+def _loop(cell: LFRCell, u: Tensor, x0: Tensor) -> Tensor:
+    """States (R, T + 1, nx), one step after another, any static map and device: the oracle."""
+    states = [x0.unsqueeze(1)]
+    for u_k in u.split(1, dim=1):
+        states.append(cell(u_k, states[-1])[1])
+    return torch.cat(states, dim=1)
+
+
+def _compiled(cell: LFRCell, u: Tensor, x0: Tensor, near: Trajectory | None) -> Trajectory:
+    """Trajectory of a linear cell or one hidden layer, in machine code on the CPU.
+
+    ``near`` is that of the same model and input from another start; once the two have met to
+    rounding, the rest is taken from there. It is overwritten.
+    """
+    R, T = u.shape[:2]
+    if near is None:
+        sizes = ((T + 1, cell.nx), (T, cell.nz), (T, cell.nw), (T, cell.ny))
+        near = Trajectory(*(u.new_full((R, *size), torch.nan) for size in sizes))
+    near.x[:, 0] = x0
+    if cell.static is None:
+        vectors, matrices, activation = [u.new_zeros(0)] * 2, [u.new_zeros(0, 0)] * 2, "tanh"
+    else:
+        assert is_network(cell.static)
+        network = cell.static
+        vectors, matrices = [network.bz, network.bw], [network.Wz.mT, network.Ww]
+        activation = network.activation
+    lti = (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
+    # A leading axis, for one model or one a record.
+    weights = [m if m.ndim == 3 else m.unsqueeze(0) for m in (*lti, *matrices)]
+    weights += [v if v.ndim == 3 else v[None, None] for v in vectors]
+    met_within = MET_ROUNDING * torch.finfo(u.dtype).eps
+    arguments = [to_numpy(u), *map(to_numpy, weights), ACTIVATION_CODES[activation], met_within]
+    spread(simulate_record, R, *arguments, *(signal.numpy() for signal in near))
+    return near

@@ -1,0 +1,105 @@
+"""Initial states that are estimated from the output: known ones, hidden ones, faded ones."""
+
+import pytest
+import torch
+from reference import normal, random_cell
+from torch.testing import assert_close
+
+from lfrtorch.engine.initial_state import simulate_estimated
+from lfrtorch.engine.simulation import simulate
+
+pytestmark = pytest.mark.numeric
+
+
+def test_estimated_initial_state_is_the_one_that_made_the_output():
+    cell, u, x0 = random_cell(2, 2, 3, 2, 2, 4), normal(3, 60, 2), normal(3, 3, seed=1)
+    made = simulate(cell, u, x0)
+    found = simulate_estimated(cell, u, made.y, torch.ones_like(made.y))
+    assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
+    assert_close(found.y, made.y, rtol=0, atol=1e-9)
+
+
+def test_estimated_initial_state_counts_what_is_weighted_only():
+    cell, u, x0 = random_cell(1, 1, 2), normal(2, 60, 1), normal(2, 2, seed=1)
+    y = simulate(cell, u, x0).y
+    weight = torch.ones_like(y)
+    y[:, 3:6] += 10.0
+    weight[:, 3:6] = 0.0
+    found = simulate_estimated(cell, u, y, weight)
+    assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
+
+
+def test_estimated_initial_state_of_a_state_that_no_output_shows_is_the_likeliest():
+    """Given the other one, with the moments that the input gives both."""
+    cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 30, 1)
+    with torch.no_grad():
+        cell.A.copy_(torch.diag(torch.tensor([0.5, 0.4])))
+        cell.Cy[0, 1] = 0.0
+    y = simulate(cell, u, u.new_tensor([[2.0, 3.0]])).y + 1e-4 * normal(1, 30, 1, seed=3)
+    found = simulate_estimated(cell, u, y, torch.ones_like(y))
+    x = simulate(cell, u, u.new_zeros(1, 2)).x[0]
+    moments = x.mT @ x
+    expected = u.new_tensor([[2.0, 2.0 * moments[1, 0] / moments[0, 0]]])
+    assert expected[0, 1] > 1.0
+    # Noise of 1e-4 over an output gain of about 1: a few of it in either state. (Without noise the
+    # likelihoods compared are logarithms of rounding errors.)
+    assert_close(found.x[:, 0], expected, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("shown", [1.0, 1e-12])
+def test_estimated_initial_state_that_the_output_hardly_shows_stays(shown: float, unit: float):
+    """Nothing moves the states, so that nothing else is known about them; whatever the weight."""
+    cell, u = random_cell(1, 1, 2, 0, 0), torch.zeros(1, 30, 1, dtype=torch.float64)
+    with torch.no_grad():
+        cell.A.copy_(torch.diag(torch.tensor([0.5, 0.4])))
+        cell.Cy.copy_(torch.tensor([[shown, 1e-12]]))
+    y = shown * simulate(cell, u, u.new_tensor([[2.0, 0.0]])).x[:, :-1, :1]
+    y = y + 1e-4 * normal(1, 30, 1, seed=3)
+    found = simulate_estimated(cell, u, y, torch.full_like(y, unit)).x[0, 0]
+    # Noise of 1e-4 over an output gain of 1; the other state moves 1e-12 times as far as this one.
+    assert_close(found[0], u.new_tensor(2.0 if shown == 1.0 else 0.0), rtol=0, atol=1e-3)
+    assert abs(float(found[1])) < 1e-9
+
+
+def test_estimated_initial_state_of_a_system_left_alone_is_that_of_least_squares():
+    """The input moves the states a hundredth as far as they are at the start."""
+    cell, u = random_cell(1, 1, 2, radius=0.9), 0.01 * normal(1, 60, 1)
+    x0 = u.new_tensor([[3.0, -2.0]])
+    clean = simulate(cell, u, x0).y
+    found = simulate_estimated(cell, u, clean + 1e-3 * normal(1, 60, 1, seed=3), torch.ones_like(u))
+    assert_close(found.x[:, 0], x0, rtol=0, atol=0.02)
+
+
+def test_estimated_initial_state_of_a_diverging_model_is_not_finite():
+    cell, u = random_cell(1, 1, 2, 0, 0, radius=3.0), normal(1, 2000, 1)
+    y = torch.zeros_like(u)
+    assert not simulate_estimated(cell, u, y, torch.ones_like(y)).finite
+
+
+def test_estimated_initial_state_of_one_record_does_not_hold_up_the_others():
+    """The first is at rest already: nothing improves there."""
+    cell, u, x0 = random_cell(2, 2, 3, 2, 2, 4), normal(4, 60, 2), normal(4, 3, seed=1)
+    x0[0] = 0.0
+    made = simulate(cell, u, x0)
+    found = simulate_estimated(cell, u, made.y, torch.ones_like(made.y))
+    assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
+
+
+def test_estimated_initial_state_that_has_faded_before_the_first_sample_that_counts_stays():
+    cell, u = random_cell(1, 1, 2, 0, 0, radius=0.3), normal(1, 100, 1)
+    y = simulate(cell, u, normal(1, 2)).y + 0.1 * normal(1, 100, 1, seed=3)
+    weight = torch.ones_like(y)
+    weight[:, :90] = 0.0
+    assert torch.equal(simulate_estimated(cell, u, y, weight).x[:, 0], u.new_zeros(1, 2))
+
+
+def test_estimated_initial_state_whose_response_overflows_stays():
+    """The unstable state is not driven, but would be moved by its start."""
+    cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 2000, 1)
+    with torch.no_grad():
+        cell.A.copy_(torch.diag(torch.tensor([0.5, 2.0])))
+        cell.Bu[1] = 0.0
+    y = simulate(cell, u, u.new_zeros(1, 2)).y + 0.1
+    found = simulate_estimated(cell, u, y, torch.ones_like(y))
+    assert torch.equal(found.x[:, 0], u.new_zeros(1, 2))
