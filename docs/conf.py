@@ -49,7 +49,7 @@ python_maximum_signature_line_length = 88
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(collections|matplotlib|numpy|pathlib|scipy|threading|torch|typing)\..*"),
-    ("py:class", r"Tensor|Array|Complex|Integers"),
+    ("py:class", r"Tensor|Array|Complex|Integers|Monitor"),
     ("py:class", r"lfrtorch\.distributed\.Shared"),  # a type variable
 ]
 

@@ -52,21 +52,17 @@ def loop(ax: Axes) -> None:
 def errors(ax: Axes) -> None:
     """Half a second of a test record of the Bouc-Wen system, which is simulated."""
     data = lfrtorch.datasets.boucwen.load(seed=0)
-    bla = lfrtorch.estimate_bla(data.train, nx=3, offset=False)
-    start = lfrtorch.initialise(bla, data.train, nz=2, nw=1, nn=15, seed=0)
-    result = lfrtorch.fit(start, data.train, data.validation, ridge=1e-3)
+    settings = lfrtorch.Settings(nx=3, nz=2, nw=1, nn=15, ridge=1e-3, linear={"offset": False})
+    run = lfrtorch.identify(data, settings)
     record = data.tests[0]
     part = slice(0, 180)
     t = np.arange(180) / record.fs
     ax.plot(t, 1e3 * record.y[part, 0], color=OUTPUT, lw=1.2, label="displacement")
-    for name, model, colour in (
-        ("error, linear", bla, LTI),
-        ("error, NL-LFR", result.model, NL_LFR),
-    ):
+    for name, model, colour in (("linear", run.linear, LTI), ("NL-LFR", run.model, NL_LFR)):
         y_hat = model.simulate(record)
         rmse = 1e6 * lfrtorch.rmse(record, y_hat)
         error = 1e3 * (record.y - y_hat)[part, 0]
-        ax.plot(t, error, color=colour, lw=1.2, label=f"{name}: {rmse:.3g} µm rms")
+        ax.plot(t, error, color=colour, lw=1.2, label=f"error, {name}: {rmse:.3g} µm rms")
     ax.set(xlabel="time (s)", ylabel="mm", xlim=(0, t[-1]))
     ax.legend(loc="upper right", fontsize=8, ncols=3, columnspacing=1, handlelength=1)
     ax.set_ylim(top=1.35 * ax.get_ylim()[1])

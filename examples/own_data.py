@@ -1,4 +1,4 @@
-"""From a measurement file to a model in use, in the order of the README.
+"""From a measurement file to a model in use, as on the command line.
 
 The file stands for yours: a pump fills a tank that empties through a hole, u the pump's voltage and
 y the level, every 0.5 s.
@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import lfrtorch
+from lfrtorch import reporting
 from lfrtorch.survey.findings import findings
 
 
@@ -34,7 +35,7 @@ def write_measurement(path: Path) -> None:
 
 
 def main() -> None:
-    """Look, fit, judge, save, use."""
+    """Look, identify, judge, write, use."""
     path = Path("tank.csv")
     write_measurement(path)
 
@@ -42,20 +43,18 @@ def main() -> None:
     for sentence in (*data.notes, *findings(data.train)):
         print("note:", sentence)
 
-    bla = lfrtorch.estimate_bla(data.train, nx=1)
-    starts = [
-        lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=5, seed=seed) for seed in range(4)
-    ]
-    trainer = lfrtorch.LevenbergMarquardt(max_iter=60)
-    result = lfrtorch.fit(starts, data.train, data.validation, trainer=trainer)
-    print(f"{result.iterations} iterations, {result.seconds:.0f} s: {result.reason}")
+    settings = lfrtorch.Settings(
+        nx=1, nz=1, nw=1, nn=5, starts=4, trainer=lfrtorch.LevenbergMarquardt(max_iter=60)
+    )
+    run = lfrtorch.identify(data, settings)
+    print(run, *run.advice, sep="\n")
 
     (test,) = data.tests
-    for name, model in (("linear model", bla), ("NL-LFR", result.model)):
+    for name, model in (("linear model", run.linear), ("NL-LFR", run.model)):
         error = lfrtorch.rmse(test, model.simulate(test))
         print(f"{name:13} {1e3 * error:6.2f} mm rms on the test, of which noise 5 mm")
 
-    result.model.save("runs/tank")
+    reporting.write(run, "runs/tank")
     tank = lfrtorch.load("runs/tank")
     level = tank.simulate(np.full(600, 2.0))  # from rest at the mean level, at 2 V
     print(

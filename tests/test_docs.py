@@ -17,7 +17,13 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 
 COMMAND = re.compile(r"^    lfrtorch (fit|linear|simulate|evaluate) (.+?)(?: +#.*)?$", re.MULTILINE)
-COMMANDS = sorted({found for page in PAGES for found in COMMAND.findall(page.read_text("utf-8"))})
+COMMANDS = sorted(
+    {
+        found
+        for page in PAGES
+        for found in COMMAND.findall(page.read_text("utf-8").replace("\\\n", " "))
+    }
+)
 
 CELL = re.compile(r"^```{code-cell}.*?$(.*?)^```$", re.MULTILINE | re.DOTALL)
 

@@ -14,6 +14,7 @@ import pytest
 import lfrtorch
 from lfrtorch.cli.command import COMMANDS
 from lfrtorch.datasets import boucwen, official
+from lfrtorch.reporting import plots
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -136,6 +137,7 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(official, "cache", lambda: tmp_path)
     monkeypatch.setattr(boucwen, "_SWEEP", 3000)  # a test that the README does not score
     monkeypatch.setattr(boucwen, "_PERIOD", 2048)  # and a quarter of the multisines
+    monkeypatch.setattr(plots, "DPI", 40)
     defaults = boucwen.load.__kwdefaults__
     assert defaults is not None
     monkeypatch.setitem(defaults, "samples", 2048)
@@ -144,4 +146,5 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     record, y_hat = names["data"].tests[0], names["y_hat"]
     # m; 0.5e-5 here, 1.5e-4 of the linear model: what is reached hangs on rounding.
     assert lfrtorch.rmse(record, y_hat) < 3e-5
-    assert np.array_equal(names["again"].simulate(record), y_hat)
+    assert np.array_equal(names["run"].model.simulate(record), y_hat)
+    assert (tmp_path / "boucwen" / "report.html").is_file()
