@@ -8,7 +8,7 @@ records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
-from lfrtorch import datasets, distributed
+from lfrtorch import datasets, distributed, reporting
 
 # data
 from lfrtorch.dataset import Dataset, Published
@@ -90,6 +90,7 @@ __all__ = [
     "mean_model",
     "multisine",
     "nrmse",
+    "reporting",
     "rmse",
     "scan_orders",
     "search_sizes",

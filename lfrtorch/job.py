@@ -75,7 +75,7 @@ def identify(
         ...     (("train", slice(0, 400)), ("test", slice(400, 600)))]
         >>> dataset = lfrtorch.Dataset("saturation", parts[:1], [], parts[1:])
         >>> settings = lfrtorch.Settings(nx=1, nz=1, nn=4,
-        ...     trainer=lfrtorch.LevenbergMarquardt(max_iter=10))
+        ...     trainer=lfrtorch.LevenbergMarquardt(max_iter=20))
         >>> run = lfrtorch.identify(dataset, settings)
         >>> score = run.metrics["scores"]["test"]
         >>> score["rmse"] < score["lti_rmse"]

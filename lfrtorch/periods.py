@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import fft
+import scipy
 
 from lfrtorch._types import Array
 
@@ -68,8 +68,10 @@ def _differences(u: Array) -> Array:
     last = max(int(_FASTER * T), T // 2)
     worst = np.zeros(last + 1)
     for x in u.T:
-        X = fft.rfft(x, fft.next_fast_len(T + last, real=True))
-        products = fft.irfft(X.real**2 + X.imag**2, fft.next_fast_len(T + last, real=True))
+        X = scipy.fft.rfft(x, scipy.fft.next_fast_len(T + last, real=True))
+        products = scipy.fft.irfft(
+            X.real**2 + X.imag**2, scipy.fft.next_fast_len(T + last, real=True)
+        )
         energy = np.concatenate([[0.0], np.cumsum(x**2)])
         both = energy[T - last : T + 1][::-1] + energy[T] - energy[: last + 1]
         both = np.where(both > 0, both, np.inf)  # nothing there is no repetition

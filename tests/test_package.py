@@ -115,6 +115,18 @@ def test_every_module_of_an_installed_wheel_imports(installed: Path, tmp_path: P
     assert Path(found.stdout.strip()).is_relative_to(installed.parent)
 
 
+HEAVY = ("hydra", "matplotlib", "pandas", "jinja2", "scipy.signal", "scipy.io")
+"""What some functions alone need; together they take more than a second to import."""
+
+
+def test_import_takes_what_it_needs_and_no_more():
+    loaded = f"import sys, lfrtorch; print([m for m in {HEAVY} if m in sys.modules])"
+    run = subprocess.run(
+        [sys.executable, "-c", loaded], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert run.stdout == "[]\n"
+
+
 def test_version_is_the_same_everywhere():
     def first(pattern: str, name: str) -> str:
         found = re.search(pattern, (ROOT / name).read_text(encoding="utf-8"), re.MULTILINE)

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import ArrayLike
-from scipy.signal import firwin, resample
 
 from lfrtorch._checks import integer, number
 from lfrtorch._errors import InputError
@@ -254,7 +254,7 @@ def simulate(
     if noise_rms:
         white = np.random.default_rng(seed).standard_normal(u.size // _RATIO)
         # Zeros above 375 Hz in the spectrum: resample interpolates over the period T exactly.
-        y = y + noise_rms * np.asarray(resample(white, u.size), dtype=np.float64)
+        y = y + noise_rms * np.asarray(scipy.signal.resample(white, u.size), dtype=np.float64)
     for factor in factors:
         y = _decimate(y, factor)
     return y
@@ -305,7 +305,7 @@ def _decimate(x: Array, factor: int) -> Array:
     """
     padded = np.pad(x, _TAPS // 2, mode="reflect", reflect_type="odd")
     windows = np.lib.stride_tricks.sliding_window_view(padded, _TAPS)[::factor]
-    return windows @ firwin(_TAPS, 1 / factor, window="hamming")
+    return windows @ scipy.signal.firwin(_TAPS, 1 / factor, window="hamming")
 
 
 def _levels(name: str, given: float | Sequence[float]) -> list[float]:

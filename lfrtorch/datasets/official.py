@@ -14,8 +14,8 @@ from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.io import loadmat
 
 from lfrtorch._checks import number
 from lfrtorch._errors import InputError
@@ -156,7 +156,7 @@ def read_struct(path: Path, name: str, fields: Sequence[str], advice: str = _AGA
             different shapes or another type, or NaN.
     """
     try:
-        (struct,) = loadmat(path, variable_names=[name])[name].ravel()
+        (struct,) = scipy.io.loadmat(path, variable_names=[name])[name].ravel()
         matrices = [np.asarray(struct[field]) for field in fields]
     except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
         raise InputError(
@@ -258,7 +258,7 @@ def _variable(
 ) -> Array:
     """A variable of a .mat file with one of the shapes."""
     try:
-        found = np.asarray(loadmat(content, variable_names=[name])[name])
+        found = np.asarray(scipy.io.loadmat(content, variable_names=[name])[name])
     except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
         raise InputError(f"'{path}' holds no readable '{name}' ({error!r}); {advice}") from error
     return _numbers(path, name, found, shapes, advice)

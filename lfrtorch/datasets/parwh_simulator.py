@@ -18,8 +18,8 @@ that linear models leave about the errors that are published for it (0.83, 9.46,
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.signal import butter, cheby1, cheby2, ellip, freqz
 
 from lfrtorch import metrics
 from lfrtorch._checks import number
@@ -34,11 +34,6 @@ PERIOD = 16384
 
 _LINES = slice(1, 4096)  # of rfft, that are excited: 2 to 4096 counted from 1 at DC
 _ARROW_RMS = 1.0  # V, of its last tenth
-
-_H1 = cheby1(3, 0.5, 4.4e3, fs=FS)
-_H2 = cheby2(3, 40, 9e3, fs=FS)
-_H3 = butter(3, 6e3, fs=FS)
-_H4 = ellip(3, 0.5, 30, 12e3, fs=FS)
 
 _USES = ("train", "validation", "level", "arrow")  # first number of a record's seed
 
@@ -130,14 +125,19 @@ def simulate(u: ArrayLike) -> Array:
             f"the input has shape {u.shape}; give one dimension of finite numbers, in V."
         )
 
+    H1 = scipy.signal.cheby1(3, 0.5, 4.4e3, fs=FS)
+    H2 = scipy.signal.cheby2(3, 40, 9e3, fs=FS)
+    H3 = scipy.signal.butter(3, 6e3, fs=FS)
+    H4 = scipy.signal.ellip(3, 0.5, 30, 12e3, fs=FS)
+
     def line_by_line(H: tuple, signal: Array) -> Array:
         w = 2 * np.pi * np.fft.rfftfreq(u.size)
-        return np.fft.irfft(freqz(*H, worN=w)[1] * np.fft.rfft(signal), u.size)
+        return np.fft.irfft(scipy.signal.freqz(*H, worN=w)[1] * np.fft.rfft(signal), u.size)
 
-    v1, v2 = line_by_line(_H1, u), line_by_line(_H3, u)
+    v1, v2 = line_by_line(H1, u), line_by_line(H3, u)
     w1 = v1 - 0.4 * _s(v1 - 0.2)
     w2 = v2 - 0.4 * _s(v2 - 0.2) + 0.4 * _s(-v2 - 0.2)
-    return 0.84 * (line_by_line(_H2, w1) + 0.7 * line_by_line(_H4, w2))
+    return 0.84 * (line_by_line(H2, w1) + 0.7 * line_by_line(H4, w2))
 
 
 def _s(v: Array) -> Array:

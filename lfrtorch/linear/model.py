@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.linalg
-import scipy.signal
+import scipy
 import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike

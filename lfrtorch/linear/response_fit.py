@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import scipy.linalg
+import scipy
 import torch
 from jaxtyping import Complex128, Float
 from torch import Tensor

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.signal
+import scipy
 
 from lfrtorch._types import Array
 from lfrtorch.fitting.multistart import LEFT

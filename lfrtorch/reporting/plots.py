@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.signal
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 

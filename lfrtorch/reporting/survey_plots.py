@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.signal
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 

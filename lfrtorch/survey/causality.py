@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.signal
+import scipy
 
 from lfrtorch._types import Array, Complex
 from lfrtorch.metrics import rms

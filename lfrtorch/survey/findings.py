@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.signal
+import scipy
 
 from lfrtorch._types import Array
 from lfrtorch.records import Record, as_records

@@ -1,0 +1,199 @@
+"""The whole job as a function: what it returns, writes and leaves alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import configuration
+from torch.utils.tensorboard import SummaryWriter
+
+import lfrtorch
+from lfrtorch import Adam, Dataset, LevenbergMarquardt, Record, Settings, SizesSearch, identify
+from lfrtorch.cli import config, fit
+from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.trainer import StoppedError
+from lfrtorch.reporting import Console, plots, write
+
+SHORT = LevenbergMarquardt(max_iter=4)
+
+
+def saturation(name: str, seed: int, samples: int = 300) -> Record:
+    """A first-order system that saturates at its input."""
+    u, y = np.random.default_rng(seed).standard_normal(samples), np.zeros(samples)
+    for k in range(samples - 1):
+        y[k + 1] = 0.7 * y[k] + np.tanh(u[k])
+    return Record(u, y, name=name, skip=20)
+
+
+@pytest.fixture
+def dataset() -> Dataset:
+    train, validation, test = map(saturation, ("train", "validation", "test"), range(3))
+    return Dataset("saturation", [train], [validation], [test])
+
+
+def settings(**given) -> Settings:
+    return Settings(**{"nx": 1, "nz": 1, "nn": 3, "trainer": SHORT} | given)
+
+
+@pytest.mark.numeric
+def test_the_job_scores_every_record_and_advises(dataset: Dataset):
+    run = identify(dataset, settings(starts=2, seed=1, trainer=LevenbergMarquardt(max_iter=20)))
+    assert [s.record.name for s in run.simulations] == ["train", "validation", "test"]
+    score = run.metrics["scores"]["test"]
+    assert score["rmse"] == lfrtorch.rmse(dataset.tests[0], run.model.simulate(dataset.tests[0]))
+    assert score["rmse"] < 0.8 * score["lti_rmse"]
+    assert run.advice
+    assert {start["seed"] for start in run.metrics["ranking"]} == {1, 1001}
+    assert "Simulation RMSE, nx 1, nz 1, nw 1, 3 neurons" in str(run)
+    assert repr(run).startswith("Run(saturation, nx=1, nz=1, nw=1, nn=3")
+
+
+@pytest.mark.numeric
+def test_chosen_sizes_are_returned_and_what_was_asked_for_stays(dataset: Dataset):
+    asked = settings(nx="auto", nx_max=2, nn="auto", sizes_search=SizesSearch(nn=(1, 3)))
+    run = identify(dataset, asked)
+    assert (asked.nx, asked.nn) == ("auto", "auto")
+    assert run.order_scan is not None
+    assert run.size_search is not None
+    assert run.settings.sizes == run.model.sizes
+    assert run.settings.nx == run.order_scan.chosen == run.linear.nx
+    assert run.settings.nn == run.size_search.chosen.sizes["nn"]
+
+
+def test_a_model_to_go_on_from_is_not_changed(dataset: Dataset):
+    first = identify(dataset, settings()).model
+    before = [p.clone() for p in first.lfr.parameters()]
+    run = identify(dataset, settings(nx=None, nn=7, init_from=first))
+    assert run.model.sizes == first.sizes
+    assert all(torch.equal(*pair) for pair in zip(before, first.lfr.parameters(), strict=True))
+    other = Record(np.ones((300, 2)), dataset.train[0].y)
+    with pytest.raises(ValueError, match="the model has the inputs"):
+        identify(Dataset("two", [other], [], []), settings(init_from=first))
+
+
+def test_a_map_of_ones_own_is_made_with_its_sizes(dataset: Dataset):
+    class Cubic(torch.nn.Module):
+        def __init__(self, nz: int, nw: int) -> None:
+            super().__init__()
+            self.c = torch.nn.Parameter(torch.full((nw, nz), 0.1))
+
+        def forward(self, z: torch.Tensor) -> torch.Tensor:
+            return z**3 @ self.c.mT
+
+    run = identify(dataset, settings(static=Cubic))
+    assert isinstance(run.model.lfr.cell.static, Cubic)
+
+
+@pytest.mark.parametrize("starts", [1, 3])
+def test_the_job_ends_if_it_is_asked_to(dataset: Dataset, starts: int):
+    asked = 0
+
+    def stop() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > 3
+
+    run = identify(dataset, settings(starts=starts), stop=stop)
+    assert run.fit.reason == "interrupted"
+    assert 0 < run.fit.iterations < 4
+    with pytest.raises(StoppedError):
+        identify(dataset, settings(starts=2), stop=lambda: True)
+
+
+@pytest.mark.numeric
+def test_the_command_line_calls_the_same_function(tmp_path: Path):
+    t = np.arange(400)
+    u = np.sin(0.3 * t) + np.sin(0.7 * t)
+    y = np.convolve(np.tanh(u), [0.0, 0.6, 0.3])[: len(u)]
+    np.savez(tmp_path / "x.npz", u=u, y=y)
+    words = ["data=file", f"data.path={tmp_path / 'x.npz'}", "data.inputs=[u]", "data.outputs=[y]"]
+    cfg = configuration(*words, "data.fs=10", "nx=1", "starts=2", "trainer.max_iter=3")
+    fit.run(cfg, tmp_path)
+    run = identify(config.loaded(cfg), config.configured(cfg))
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["scores"] == run.metrics["scores"]
+    assert metrics["ranking"] == run.metrics["ranking"]
+
+
+@pytest.mark.numeric
+def test_a_run_is_written_for_people_and_programs(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    logged = []
+    monkeypatch.setattr(plots, "DPI", 40)
+    monkeypatch.setattr(SummaryWriter, "add_scalar", lambda _, name, *__: logged.append(name))
+    run = identify(dataset, settings())
+    write(run, tmp_path / "run", command="a notebook")
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics == {**run.metrics, "command": "a notebook"}
+    assert logged.count("rmse/train") == len(run.fit.history)
+    for name in ("report.html", "figures/test.png"):
+        assert (tmp_path / "run" / name).is_file()
+    test = dataset.tests[0]
+    for saved in (
+        lfrtorch.load(tmp_path / "run"),
+        lfrtorch.LinearModel.load(tmp_path / "run" / "linear"),
+    ):
+        found = run.model if isinstance(saved, lfrtorch.Model) else run.linear
+        assert np.array_equal(saved.simulate(test), found.simulate(test))
+    write(run, tmp_path / "bare", draw=False)
+    assert not (tmp_path / "bare" / "report.html").exists()
+
+
+@pytest.mark.numeric
+def test_starts_that_are_kept_go_on(dataset: Dataset, tmp_path: Path):
+    whole = identify(dataset, settings(starts=2))
+    asked = iter([False] * 3)
+    cut = identify(
+        dataset,
+        settings(starts=2),
+        snapshots=Snapshots(tmp_path),
+        stop=lambda: next(asked, True),
+    )
+    assert cut.fit.reason == "interrupted"
+    on = identify(dataset, settings(starts=2), snapshots=Snapshots(tmp_path))
+    assert on.metrics["scores"] == whole.metrics["scores"]
+
+
+def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFixture[str]):
+    identify(dataset, settings(nn="auto", sizes_search=SizesSearch(nn=(1, 3))), observer=Console())
+    printed = capsys.readouterr().out
+    for text in ("BLA: order 1", "sizes: 2 starts of 1 iterations", "training samples", "4/4"):
+        assert text in printed
+    identify(dataset, settings())
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"nx": None}, "nx, the number of states, is not set"),
+        ({"nx": 0}, "nx is 0"),
+        ({"nz": "many"}, "nz is 'many'"),
+        ({"degree": "auto"}, "degree is auto, and this static map has none; give nn=auto"),
+        ({"static": "spline"}, "static is 'spline'"),
+        ({"static": torch.nn.Linear, "nz": "auto"}, "is not searched; give numbers"),
+        ({"init": "magic"}, "init is 'magic'"),
+        ({"minor": -1.0}, "minor is -1"),
+        ({"linear": {"speed": 3}}, "linear has no option 'speed'"),
+        ({"starts": 0}, "starts is 0"),
+        ({"average": 0}, "average is 0"),
+        ({"seed": -1}, "seed is -1"),
+        ({"dtype": torch.float16}, "dtype is torch.float16"),
+        ({"device": "abacus"}, "device is abacus, which torch cannot use here"),
+    ],
+)
+def test_settings_that_cannot_be_say_so(given: dict, message: str):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        settings(**given)
+
+
+def test_settings_know_what_is_searched():
+    assert settings().searched == ()
+    polynomial = settings(static="polynomial", degree="auto", nz="auto", trainer=Adam())
+    assert polynomial.searched == ("nz", "degree")
+    assert settings(seed=7, starts=3).seeds == (7, 1007, 2007)
