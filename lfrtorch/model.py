@@ -157,9 +157,11 @@ class Model:
         """Refuse a record of other channels or another sampling frequency with a ValueError.
 
         Example:
-            >>> model.check(lfrtorch.Record(record.u, record.y, fs=50.0))
-            Traceback (most recent call last):
-            ValueError: record 'record' is sampled at 50.0 Hz and the model at 100.0 Hz; ...
+            >>> try:
+            ...     model.check(lfrtorch.Record(record.u, record.y, fs=50.0))
+            ... except lfrtorch.InputError as error:
+            ...     print(error)
+            record 'record' is sampled at 50.0 Hz and the model at 100.0 Hz; resample the record.
         """
         for side, signal, channels in (
             ("input", record.u, self.inputs),

@@ -92,5 +92,5 @@ def test_example_runs(
     report: list[str] = []
     write: Callable[[str], Any] = report.append
     for test in tests:
-        doctest.DocTestRunner(optionflags=FLAGS).run(test, out=write)
+        doctest.DocTestRunner(verbose=False, optionflags=FLAGS).run(test, out=write)
     assert not report, "".join(report)
