@@ -36,6 +36,7 @@ from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import FitResult
+from lfrtorch._reasons import Reason
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 
@@ -70,6 +71,7 @@ __all__ = [
     "OrderScan",
     "Polynomial",
     "Published",
+    "Reason",
     "Record",
     "Run",
     "Scaler",

@@ -23,10 +23,9 @@ from torch import Tensor
 
 from lfrtorch._checks import number
 from lfrtorch._errors import LfrtorchError
+from lfrtorch._reasons import Reason, told
 
 Shared = TypeVar("Shared")
-
-LOST = "a process was lost"
 
 
 TIMEOUT = 600.0
@@ -37,7 +36,11 @@ AXES = 8
 
 
 class ProcessLostError(LfrtorchError, RuntimeError):
-    """Another process ended, or did not answer in time; the message begins with ``LOST``."""
+    """Another process ended, or did not answer in time: which, and what else is known of it."""
+
+    def __init__(self, detail: str) -> None:
+        super().__init__(told(Reason.PROCESS_LOST, detail))
+        self.detail = detail
 
 
 class Ranks:
@@ -115,7 +118,7 @@ def connect(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Ran
             "nccl" if gpu else "gloo", timeout=timedelta(seconds=timeout), device_id=gpu
         )
     except RuntimeError as error:
-        raise ProcessLostError(f"{LOST}: the processes did not meet ({_gist(error)})") from error
+        raise ProcessLostError(f"the processes did not meet ({_gist(error)})") from error
     return ProcessGroup(gpu or "cpu")
 
 
@@ -179,7 +182,7 @@ class ProcessGroup(Ranks):
         except RuntimeError as error:  # of whatever kind the backend has
             other = f"rank {1 - self.rank}" if self.world == 2 else "one of the others"
             seen = f"rank {self.rank} of {self.world} has no answer from {other}"
-            raise ProcessLostError(f"{LOST}: {seen} ({_gist(error)})") from error
+            raise ProcessLostError(f"{seen} ({_gist(error)})") from error
 
 
 def _gist(error: Exception) -> str:

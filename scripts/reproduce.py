@@ -161,7 +161,7 @@ def run(words: list[str], folder: Path, *, start: bool) -> dict[str, Any] | None
     files = folder / "metrics.json", folder / RUN
     if all(file.is_file() for file in files):
         metrics, about = (json.loads(file.read_text()) for file in files)
-        if metrics["command"] == shown and metrics["fit"]["reason"] != "interrupted":
+        if metrics["command"] == shown and metrics["fit"]["reason"] != lfrtorch.Reason.INTERRUPTED:
             return metrics | about
     if not start:
         return None

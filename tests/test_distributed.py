@@ -26,8 +26,9 @@ from reference import measure, normal, random_cell, random_model
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from lfrtorch._reasons import Reason
 from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import LOST, ProcessLostError, Ranks, connect
+from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.least_squares import jacobian
@@ -291,8 +292,10 @@ def test_outside_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.usefixtures("both")
 def test_a_lost_process_ends_the_fit_with_the_best_model(folder: Path):
     best, result, seconds, again = torch.load(folder / "left.pt", weights_only=False)
-    assert result.reason.startswith(LOST + ": rank 0 of 2 has no answer from rank 1 (")
-    assert again.startswith(LOST)
+    assert result.reason == Reason.PROCESS_LOST
+    assert result.detail.startswith("rank 0 of 2 has no answer from rank 1 (")
+    assert result.outcome == f"a process was lost: {result.detail}"
+    assert again.startswith(Reason.PROCESS_LOST)
     assert result.iterations == 3
     assert seconds < 20
     assert torch.equal(theta(load(folder / "model")), best)
@@ -359,4 +362,4 @@ def test_a_killed_process_leaves_the_last_model(rank: int, tmp_path: Path):
     assert load(folder).sizes["nx"] == 2
     if rank == 1:  # the first process goes on to score what there is
         metrics = json.loads((folder / "metrics.json").read_text())
-        assert metrics["fit"]["reason"].startswith(LOST)
+        assert metrics["fit"]["reason"].startswith(Reason.PROCESS_LOST)

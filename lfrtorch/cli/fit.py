@@ -24,6 +24,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from lfrtorch._atomic import whole_file
+from lfrtorch._reasons import Reason
 from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError, Termination
@@ -39,11 +40,11 @@ from lfrtorch.cli.run_folder import (
     program,
 )
 from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import LOST, ProcessLostError, Ranks, connect
+from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.observer import Watching
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.trainer import INTERRUPTED, FitResult, StoppedError
+from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -98,11 +99,11 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             print(f"TensorBoard: tensorboard --logdir {folder}")
     reason = found.fit.reason
     best = f"the best model so far is in {folder / 'model'}; {go_on(folder)}"
-    if reason.startswith(LOST):
-        raise ProcessLostError(f"{reason}; {best}")
-    if stop.asked == signal.SIGTERM and reason == INTERRUPTED:
+    if reason == Reason.PROCESS_LOST:
+        raise ProcessLostError(f"{found.fit.detail}; {best}")
+    if stop.asked == signal.SIGTERM and reason == Reason.INTERRUPTED:
         raise TerminatedError(f"the fit was terminated; {best}")
-    if reason == INTERRUPTED:
+    if reason == Reason.INTERRUPTED:
         print(go_on(folder))
     judged = found.metrics["validation"]["rmse"]
     return found.fit.history[found.fit.chosen_iteration].train if judged is None else judged

@@ -29,14 +29,14 @@ import torch
 
 from lfrtorch._checks import integer, renamed
 from lfrtorch._errors import InputError
+from lfrtorch._reasons import CUT_SHORT, Reason, told
 from lfrtorch._threads import each_alone, spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, loudest
-from lfrtorch.distributed import LOST, Ranks
+from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import (
-    INTERRUPTED,
     Fit,
     FitResult,
     Monitor,
@@ -62,9 +62,6 @@ the best one after 25 iterations ended in a poor minimum at one of five realisat
 AS_GOOD = 1.01
 """Ratio of errors up to which a mean of more starts is as good: the best of many iterates of some
 starts is so by luck, too, on the records that chose it."""
-
-LEFT = "others were better"
-"""Reason of a start that was left."""
 
 
 @dataclass(frozen=True)
@@ -204,10 +201,11 @@ def fit(
         if not field:
             raise StoppedError("the fit was stopped before its first iterate")
         watch(Round(number, len(ends), judge.summaries(field), time.perf_counter() - clock))
-        cut = next((fit.reason for fit in field if _cut_short(fit)), "")
-        if cut:
+        cut = next((fit for fit in field if fit.reason in CUT_SHORT), None)
+        if cut is not None:
             for fit in field:
-                fit.reason = fit.reason or cut  # of those that had come to the end of the round
+                if not fit.reason:  # it had come to the end of the round
+                    fit.end(cut.reason, cut.detail)
             break
         if until < limit:
             kept = max(FINALISTS, average, ceil(len(field) / 2))
@@ -259,7 +257,7 @@ class _Judge:
                     fit.kept.train,
                     fit.kept.validation,
                     math.nan if error is None else error.rmse(error.theta),
-                    fit.reason,
+                    told(fit.reason, fit.detail),
                 )
             )
         return tuple(found)
@@ -338,7 +336,7 @@ class _Together:
             if not any(fit.history for fit in fits):
                 raise
             for fit in fits:
-                fit.reason = INTERRUPTED
+                fit.end(Reason.INTERRUPTED)
 
     def _go_on(self, fit: Fit, until: int) -> None:
         if fit.history or not fit.stopped():
@@ -383,13 +381,9 @@ def _gone_on(field: list[Fit], kept: list[Fit]) -> list[Fit]:
     """Those that are kept; the others are left."""
     for fit in field:
         if not any(fit is other for other in kept):
-            fit.reason = LEFT
+            fit.end(Reason.OTHERS_BETTER)
     return kept
 
 
 def _goes_on(fit: Fit, until: int) -> bool:
     return not fit.over and fit.state.iteration < until and not fit.stopped()
-
-
-def _cut_short(fit: Fit) -> bool:
-    return fit.reason == INTERRUPTED or fit.reason.startswith(LOST)

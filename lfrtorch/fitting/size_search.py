@@ -39,11 +39,12 @@ import torch
 from lfrtorch import _tables
 from lfrtorch._checks import integer, renamed
 from lfrtorch._errors import InputError
+from lfrtorch._reasons import Reason
 from lfrtorch._tables import number
 from lfrtorch._types import Array, Integers
-from lfrtorch.distributed import LOST, ProcessLostError, Ranks
+from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.trainer import INTERRUPTED, StartDivergesError, Stop, StoppedError, Trainer
+from lfrtorch.fitting.trainer import StartDivergesError, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
@@ -274,10 +275,10 @@ def search_sizes(
             except StartDivergesError:
                 squares = np.full(len(judge.counts), inf)
             else:
-                if result.reason == INTERRUPTED:
+                if result.reason == Reason.INTERRUPTED:
                     raise StoppedError("the search for sizes was stopped")
-                if result.reason.startswith(LOST):
-                    raise ProcessLostError(result.reason)
+                if result.reason == Reason.PROCESS_LOST:
+                    raise ProcessLostError(result.detail)
                 squares = judge.squares(result.model)
             seconds = time.perf_counter() - clock
             found.append(judge.candidate(sizes, models[0], seconds, squares))

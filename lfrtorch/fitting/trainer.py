@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch._errors import InputError, LfrtorchError
+from lfrtorch._reasons import Reason, told
 from lfrtorch._threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
@@ -22,8 +23,6 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
 from lfrtorch.model import Model
 from lfrtorch.records import Record
-
-INTERRUPTED = "interrupted"
 
 EXPLOSION = 100.0
 """Growth of the squared validation error, beyond the start's, in a step that is taken back."""
@@ -139,7 +138,8 @@ class Start:
         iterations: it had.
         train, validation: errors of its best iterate, output unit.
         selection: its error on all records that choose among starts; NaN where there are none.
-        reason: why it ended.
+        reason: why it ended, a :class:`lfrtorch.Reason` or, if a process was lost, a text with the
+            detail.
     """
 
     number: int
@@ -160,14 +160,15 @@ class FitResult:
         chosen_iteration: the iterate that ``model`` holds.
         seconds: duration of the whole fit.
         seconds_per_iteration: median over the accepted iterations but the first, which may compile.
-        reason: why the search ended.
+        reason: why the search ended, a :class:`lfrtorch.Reason`.
+        detail: what else is known of a process that was lost.
         starts: of several starts all, the best first.
         averaged: of how many starts the model is the mean; history and iterate are those of the
             best one.
 
     Example:
         >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=3))
-        >>> result.iterations, result.reason, len(result.history)
+        >>> result.iterations, result.outcome, len(result.history)
         (3, 'maximum number of iterations', 4)
         >>> result.model is model
         True
@@ -181,11 +182,17 @@ class FitResult:
     reason: str
     starts: tuple[Start, ...] = ()
     averaged: int = 1
+    detail: str = ""
 
     @property
     def iterations(self) -> int:
         """Number of iterations."""
         return self.history[-1].iteration
+
+    @property
+    def outcome(self) -> str:
+        """The reason, with its detail, as people read it."""
+        return str(told(self.reason, self.detail))
 
 
 class StoppedError(LfrtorchError):
@@ -240,7 +247,7 @@ class Fit:
         self.state: Any = None
         """The trainer's; None before the first call of ``advance``."""
         self.history: list[Progress] = []
-        self.reason = "no iterations asked for"
+        self.end(Reason.NO_ITERATIONS)
         self.best = math.inf
         """Normalised squared error of the best iterate, on validation where there is one."""
         self._theta_best, self._chosen = self.problem.theta, 0
@@ -260,11 +267,15 @@ class Fit:
             return False
         return bool(self.state.reason) or self.state.iteration >= self.trainer.limit
 
+    def end(self, reason: str, detail: str = "") -> None:
+        """Note why the fit is over."""
+        self.reason, self.detail = reason, detail
+
     def stopped(self) -> bool:
         """Whether the fit is asked to end here, which then is its reason."""
         asked = self._stop is not None and bool(self.ranks.sum(torch.tensor(int(self._stop()))))
         if asked:
-            self.reason = INTERRUPTED
+            self.end(Reason.INTERRUPTED)
         return asked
 
     @spread_by_hand()
@@ -285,11 +296,11 @@ class Fit:
         except KeyboardInterrupt:
             if not self.history:
                 raise
-            self.reason = INTERRUPTED
+            self.end(Reason.INTERRUPTED)
         except ProcessLostError as lost:
             if not self.history:
                 raise
-            self.reason = str(lost)
+            self.end(Reason.PROCESS_LOST, lost.detail)
         finally:
             self.pause()
         return self
@@ -383,6 +394,7 @@ class Fit:
             seconds=self._seconds,
             seconds_per_iteration=float(np.median(usual)) if usual else 0.0,
             reason=self.reason,
+            detail=self.detail,
         )
 
     def _judged(self, state: TrainerState, seconds: float) -> Progress:

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from lfrtorch._checks import integer, number, renamed
-
-SPENT = "maximum number of epochs"
+from lfrtorch._reasons import Reason
 
 
 class Differentiable(Protocol):
@@ -81,15 +80,15 @@ class Adam:
         theta = parameter.detach()
         residual, gradient = problem.gradient(theta)
         iteration = state.iteration + 1
-        reason = SPENT if iteration >= self.max_iter else ""
+        reason = Reason.ALL_EPOCHS if iteration >= self.max_iter else ""
         if not torch.isfinite(gradient).all():
-            reason = "diverged: lower the learning rate"
+            reason = Reason.GRADIENT_DIVERGED
         moments = dict(optimiser.state[parameter])
         return AdamState(theta, residual, gradient, iteration, reason, moments)
 
     def prolonged(self, state: AdamState) -> AdamState:
         """State to go on from where all epochs were spent and there are more now."""
-        spent = state.reason == SPENT and state.iteration < self.max_iter
+        spent = state.reason == Reason.ALL_EPOCHS and state.iteration < self.max_iter
         return replace(state, reason="") if spent else state
 
     def refused(self, before: AdamState, after: AdamState) -> AdamState:

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from lfrtorch._checks import integer, number
 from lfrtorch._errors import InputError
+from lfrtorch._reasons import Reason
 from lfrtorch.least_squares.linear_systems import SVDSystem, System
 
 FASTEST_DECREASE = 0.2
@@ -31,8 +32,6 @@ FASTEST_DECREASE = 0.2
 
 TAKEN_BACK = 10.0
 """Factor on λ after a step that is taken back; what it decreased at the most, and twice more."""
-
-SPENT = "maximum number of iterations"
 
 
 class Jacobian(Protocol):
@@ -129,7 +128,7 @@ class LMState:
         trials: dampings tried in the last step.
         rank: directions that the Jacobian of the last step saw.
         quiet: steps in a row that changed the cost by less than the tolerance.
-        reason: why the search is over; empty while it is not.
+        reason: why the search is over, a ``Reason``; empty while it is not.
     """
 
     theta: Tensor
@@ -246,7 +245,7 @@ class LevenbergMarquardt:
 
     def prolonged(self, state: LMState) -> LMState:
         """State to go on from where all iterations were spent and there are more now."""
-        spent = state.reason == SPENT and state.iteration < self.max_iter
+        spent = state.reason == Reason.ALL_ITERATIONS and state.iteration < self.max_iter
         return replace(state, reason="") if spent else state
 
     def steps(self, stack: ManyLeastSquares, states: Sequence[LMState]) -> list[LMState]:
@@ -286,7 +285,7 @@ class LevenbergMarquardt:
         system, gradient = jacobian.system(relative, self.truncation)
         scale = system.scale
         if not scale > 0:
-            return replace(state, reason="the Jacobian vanishes or is not finite")
+            return replace(state, reason=Reason.JACOBIAN_VANISHES)
         damping = self.damping * scale if state.damping is None else state.damping
         growth, cost = state.growth, state.cost
 
@@ -324,11 +323,11 @@ class LevenbergMarquardt:
                     quiet=quiet,
                 )
                 if accepted.cost <= self.floor**2 * cost_of(torch.ones_like(residual)):
-                    return replace(accepted, reason="converged: the residual vanishes")
+                    return replace(accepted, reason=Reason.RESIDUAL_VANISHES)
                 if quiet >= self.patience:
-                    return replace(accepted, reason="converged: the cost no longer falls")
+                    return replace(accepted, reason=Reason.COST_SETTLED)
                 if accepted.iteration >= self.max_iter:
-                    return replace(accepted, reason=SPENT)
+                    return replace(accepted, reason=Reason.ALL_ITERATIONS)
                 return accepted
             damping *= growth
             growth *= 2.0
@@ -338,7 +337,7 @@ class LevenbergMarquardt:
             gain_ratio=gain_ratio,
             trials=trials,
             rank=system.rank,
-            reason="converged: no step lowers the cost",
+            reason=Reason.NO_STEP_LEFT,
         )
 
     def _acceleration(

@@ -8,6 +8,7 @@ from typing import Any, Self
 
 from torch import Tensor
 
+from lfrtorch._reasons import Reason
 from lfrtorch._types import Array
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 
@@ -16,9 +17,6 @@ Matrices = tuple[Array, Array, Array, Array]
 
 TOLERANCE = 1e-9
 """A relative decrease of the cost below this ends the search."""
-
-EXHAUSTED = "maximum number of iterations"
-"""Reason of a search that reached the maximum number of iterations."""
 
 TRUNCATION = 1e-12
 """Relative singular value below which a direction of θ counts as gauge, which has no covariance."""
@@ -83,4 +81,4 @@ class Search:
     @property
     def reason(self) -> str:
         """Why it ended."""
-        return self.state.reason or EXHAUSTED
+        return self.state.reason or Reason.ALL_ITERATIONS

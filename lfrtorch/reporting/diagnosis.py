@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
+from lfrtorch._reasons import SPENT, Reason
 from lfrtorch._types import Array
-from lfrtorch.fitting.multistart import LEFT
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.spectra import spectra_of_periods
 from lfrtorch.metrics import rms
@@ -175,7 +175,7 @@ def falling(result: FitResult) -> float:
     0 where the search ended for another reason than its limit.
     """
     history = result.history
-    if not result.reason.startswith("maximum number") or len(history) < 2:
+    if result.reason not in SPENT or len(history) < 2:
         return 0.0
     tenth = max(1, len(history) // 10)
     before = min(p.score for p in history[:-tenth])
@@ -230,6 +230,6 @@ def _finished(result: FitResult) -> list[float]:
     found = [
         start.train if math.isnan(start.validation) else start.validation
         for start in result.starts
-        if start.reason != LEFT
+        if start.reason != Reason.OTHERS_BETTER
     ]
     return sorted(error for error in found if math.isfinite(error))

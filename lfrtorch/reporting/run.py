@@ -62,12 +62,12 @@ class Run:
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.model.sizes.items())
-        return f"Run({self.dataset.name}, {sizes}, {self.fit.reason})"
+        return f"Run({self.dataset.name}, {sizes}, {self.fit.outcome})"
 
     def __str__(self) -> str:
         fit, parts = self.fit, []
         parts.append(
-            f"{fit.reason}; kept iteration {fit.chosen_iteration} of {fit.iterations}, "
+            f"{fit.outcome}; kept iteration {fit.chosen_iteration} of {fit.iterations}, "
             f"{fit.seconds:.1f} s, {1e3 * fit.seconds_per_iteration:.0f} ms an iteration\n"
         )
         if len(fit.starts) > 1:

@@ -95,7 +95,7 @@ def metrics(
             "iterations": result.iterations,
             "seconds": result.seconds,
             "seconds_per_iteration": result.seconds_per_iteration,
-            "reason": result.reason,
+            "reason": result.outcome,
         },
         "chosen_iteration": result.chosen_iteration,
         "stable_to": loudest(model, dataset.train),

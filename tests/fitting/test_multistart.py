@@ -11,11 +11,12 @@ from reference import measure, move, planted, random_cell, random_model, theta
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
+from lfrtorch._reasons import Reason
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.multistart import LEFT, Round, advance_in_step, fit
-from lfrtorch.fitting.trainer import INTERRUPTED, Fit, Progress
+from lfrtorch.fitting.multistart import Round, advance_in_step, fit
+from lfrtorch.fitting.trainer import Fit, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.metrics import rmse
@@ -53,7 +54,7 @@ def test_the_better_half_goes_on_round_by_round():
     assert ends == {start.number: start.iterations for one in rounds for start in one.starts}
     assert sorted(ends.values())[:3] == [2, 2, 4]
     assert min(ends[start.number] for start in rounds[-1].starts) > 4
-    assert [start.reason == LEFT for start in result.starts].count(True) == 3
+    assert [start.reason == Reason.OTHERS_BETTER for start in result.starts].count(True) == 3
 
 
 def test_the_best_start_is_what_it_is_alone():
@@ -231,7 +232,7 @@ def test_ctrl_c_keeps_the_best_of_all(threads: int):
         result = fit(models, train, validation, monitors=[[watch]] * 3)
     finally:
         torch.set_num_threads(before)
-    assert result.reason == INTERRUPTED
+    assert result.reason == Reason.INTERRUPTED
     score, weights = min(best.values(), key=lambda each: each[0])
     assert torch.equal(theta(result.model), weights)
     assert result.history[result.chosen_iteration].score == score
@@ -245,8 +246,8 @@ def test_a_stop_after_some_have_come_to_the_end_of_their_round():
             raise KeyboardInterrupt
 
     result = fit(models, train, validation, monitors=[[stop]] * 3)
-    assert result.reason == INTERRUPTED
-    assert {start.reason for start in result.starts} == {INTERRUPTED}
+    assert result.reason == Reason.INTERRUPTED
+    assert {start.reason for start in result.starts} == {Reason.INTERRUPTED}
 
 
 def test_a_failure_ends_all():
@@ -276,7 +277,7 @@ def test_mean_of_as_many_starts_as_are_best_is_taken(judged_on: str):
     stay = LevenbergMarquardt(max_iter=0)
     options: Any = {judged_on: validation, "trainer": stay, "average": 3}
     result = fit(models, train, **options)
-    assert all(start.reason != LEFT for start in result.starts)
+    assert all(start.reason != Reason.OTHERS_BETTER for start in result.starts)
     best = [models[start.number] for start in result.starts]
     means = [mean_model(best[:count]) for count in (1, 2, 3)]
     errors = [rmse(validation, mean.simulate(validation)) for mean in means]

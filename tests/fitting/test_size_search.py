@@ -12,7 +12,7 @@ from reference import random_cell
 from scipy.signal import lfilter
 
 from lfrtorch._tables import number
-from lfrtorch.distributed import LOST, ProcessLostError, Ranks
+from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.size_search import (
@@ -280,7 +280,7 @@ def test_ctrl_c_and_lost_processes_end_the_search():
 
     class Losing(LevenbergMarquardt):
         def step(self, problem: Any, state: Any) -> Any:
-            raise ProcessLostError(f"{LOST}: for good")
+            raise ProcessLostError("for good")
 
     with pytest.raises(StoppedError):
         search(plant(1, 1), trainer=CtrlC())

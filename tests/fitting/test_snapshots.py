@@ -13,11 +13,12 @@ from reference import measure, random_cell, random_model
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
+from lfrtorch._reasons import Reason
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting import state_file, trainer
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.trainer import INTERRUPTED, Fit, FitResult, Progress
+from lfrtorch.fitting.trainer import Fit, FitResult, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.model import Model
@@ -161,7 +162,7 @@ def test_ends_as_without_interruption(tmp_path: Path):
     whole = run(starts(1), data, trainer=optimiser, ridge=1e-3)
     for iterations in (2, 5):  # interrupted twice
         cut = run(starts(1), data, tmp_path, 3, trainer=optimiser, ridge=1e-3)
-        assert (cut.reason, cut.iterations) == (INTERRUPTED, iterations)
+        assert (cut.reason, cut.iterations) == (Reason.INTERRUPTED, iterations)
     resumed = run(starts(1), data, tmp_path, trainer=optimiser, ridge=1e-3)
     assert outcome(resumed) == outcome(whole)
 
@@ -173,7 +174,7 @@ def test_several_starts_end_as_without_interruption(tmp_path: Path):
         folder = tmp_path / str(stop)
         folder.mkdir()
         cut = run(starts(3), data, folder, stop, trainer=optimiser)
-        assert cut.reason == INTERRUPTED
+        assert cut.reason == Reason.INTERRUPTED
         assert len(Snapshots(folder).rounds) == (stop == 5)
         resumed = run(starts(3), data, folder, trainer=optimiser)
         assert outcome(resumed) == outcome(whole)

@@ -11,9 +11,10 @@ from reference import measure, move, planted, random_cell, random_model, theta
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
-from lfrtorch.distributed import LOST, ProcessLostError, Ranks
+from lfrtorch._reasons import Reason
+from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.trainer import EXPLOSION, INTERRUPTED, Fit, Progress
+from lfrtorch.fitting.trainer import EXPLOSION, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
@@ -290,7 +291,7 @@ def test_ctrl_c_keeps_the_best():
             raise KeyboardInterrupt
 
     result = fit(model, train, trainer=Walk((0.01, -0.02, 0.05, 0.0)), monitors=[interrupt])
-    assert result.reason == INTERRUPTED == "interrupted"
+    assert result.reason == Reason.INTERRUPTED == "interrupted"
     assert result.iterations == 3
     best = min(range(4), key=lambda i: seen[i][1])
     assert result.chosen_iteration == best < 3
@@ -307,7 +308,7 @@ def test_ctrl_c_amid_a_trial_keeps_the_best():
 
     model, train, test = planted()
     result = fit(model, train, trainer=Interrupted())
-    assert (result.reason, result.chosen_iteration) == (INTERRUPTED, 2)
+    assert (result.reason, result.chosen_iteration) == (Reason.INTERRUPTED, 2)
     assert rmse(train[0], model.simulate(train[0])) < result.history[0].train
     assert np.isfinite(model.simulate(test)).all()
 
@@ -321,14 +322,15 @@ class Lonely(Ranks):
     def sum(self, part: Tensor) -> Tensor:
         self.sums -= 1
         if self.sums < 0:
-            raise ProcessLostError(f"{LOST}: all of them")
+            raise ProcessLostError("all of them")
         return part
 
 
 def test_a_lost_process_keeps_the_best():
     model, train, _ = planted()
     result = fit(model, train, ranks=Lonely(20))
-    assert result.reason == "a process was lost: all of them"
+    assert (result.reason, result.detail) == (Reason.PROCESS_LOST, "all of them")
+    assert result.outcome == "a process was lost: all of them"
     chosen = result.history[result.chosen_iteration]
     assert chosen.train < result.history[0].train
     error = SimulationProblem(model, train)

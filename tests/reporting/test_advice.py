@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 
 import lfrtorch
-from lfrtorch.fitting.multistart import LEFT
+from lfrtorch._reasons import Reason
 from lfrtorch.fitting.trainer import FitResult, Progress, Start
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import advice
@@ -169,7 +169,7 @@ def fitted() -> tuple[FitResult, list[Response]]:
     starts = (
         Start(0, 20, 1.0, np.nan, np.nan, "converged"),
         Start(1, 20, 1.5, np.nan, np.nan, "converged"),
-        Start(2, 2, 1.2, np.nan, np.nan, LEFT),
+        Start(2, 2, 1.2, np.nan, np.nan, Reason.OTHERS_BETTER),
     )
     result = FitResult(
         model, history([4.0, 2.0, 1.0]), 2, 1.0, 1.0, "maximum number of iterations", starts

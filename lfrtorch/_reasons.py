@@ -1,0 +1,36 @@
+"""Why a search or a fit ended."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Reason(StrEnum):
+    """Why a search or a fit ended; a member equals its text, which files hold and people read.
+
+    A trainer of one's own may give other texts.
+    """
+
+    RESIDUAL_VANISHES = "converged: the residual vanishes"
+    COST_SETTLED = "converged: the cost no longer falls"
+    NO_STEP_LEFT = "converged: no step lowers the cost"
+    JACOBIAN_VANISHES = "the Jacobian vanishes or is not finite"
+    GRADIENT_DIVERGED = "diverged: lower the learning rate"
+    ALL_ITERATIONS = "maximum number of iterations"
+    ALL_EPOCHS = "maximum number of epochs"
+    NO_ITERATIONS = "no iterations asked for"
+    OTHERS_BETTER = "others were better"
+    INTERRUPTED = "interrupted"
+    PROCESS_LOST = "a process was lost"
+
+
+SPENT = (Reason.ALL_ITERATIONS, Reason.ALL_EPOCHS)
+"""Reasons of a search that may go on if it is given more iterations."""
+
+CUT_SHORT = (Reason.INTERRUPTED, Reason.PROCESS_LOST)
+"""Reasons of a fit that something else ended."""
+
+
+def told(reason: str, detail: str) -> str:
+    """The reason, with the detail if there is one."""
+    return f"{reason}: {detail}" if detail else reason
