@@ -48,9 +48,9 @@ python_maximum_signature_line_length = 88
 # Every reference must exist. Types of other packages have no page here.
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(collections|matplotlib|numpy|pathlib|scipy|threading|torch|typing)\..*"),
-    ("py:class", r"Tensor|Array|Complex|Integers|Monitor"),
-    ("py:class", r"lfrtorch\.distributed\.Shared"),  # a type variable
+    ("py:.*", r"(collections|jaxtyping|matplotlib|numpy|pathlib|scipy|threading|torch|typing)\..*"),
+    ("py:class", r"\w+"),  # an alias, or a type variable
+    ("py:class", r"lfrtorch\.distributed\.Shared"),
 ]
 
 # To other sites: `make docs-links`.

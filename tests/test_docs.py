@@ -67,5 +67,6 @@ def test_command_of_the_guide_has_settings_that_exist(name: str, words: str):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_between_pages_lead_to_files(page: Path):
-    for target in re.findall(r"\]\((?!http|#)([^)#]+)", page.read_text(encoding="utf-8")):
+    links = r"(?:\]\((?!http|#)|^```{include} )([^)#\s]+)"
+    for target in re.findall(links, page.read_text(encoding="utf-8"), re.MULTILINE):
         assert (page.parent / target).exists(), target
