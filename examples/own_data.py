@@ -18,7 +18,7 @@ import numpy as np
 
 import lfrtorch
 from lfrtorch import reporting
-from lfrtorch.survey.findings import findings
+from lfrtorch.survey.notes import notes_on
 
 
 def write_measurement(path: Path) -> None:
@@ -40,7 +40,7 @@ def main() -> None:
     write_measurement(path)
 
     data = lfrtorch.load_records(path, inputs="pump", outputs="level", fs=2, start="estimated")
-    for sentence in (*data.notes, *findings(data.train)):
+    for sentence in (*data.notes, *notes_on(data.train)):
         print("note:", sentence)
 
     settings = lfrtorch.Settings(

@@ -40,12 +40,12 @@ class Multisine:
 
     @property
     def odd_detection(self) -> Integers:
-        """Odd lines left out between the first and the last excited one."""
+        """Odd lines between the first and the last excited one that are not excited."""
         return self._left_out(1)
 
     @property
     def even_detection(self) -> Integers:
-        """Even lines left out between the first and the last excited one."""
+        """Even lines between the first and the last excited one that are not excited."""
         return self._left_out(0)
 
     def _left_out(self, parity: int) -> Integers:
@@ -81,25 +81,32 @@ def multisine(
     Args:
         samples: N, of one period.
         fs: sampling frequency in Hz.
-        band: lowest and highest frequency in Hz; all lines between 0 and fs / 2 by default.
-        lines: the DFT lines to choose from, in place of a band.
+        band: lowest and highest frequency in Hz. Default: all lines between 0 and fs / 2.
+        lines: numbers (F,) of the DFT lines to choose from, instead of a band.
         grid: which of these are excited: ``"full"`` all; ``"odd"`` the odd ones; ``"random_odd"``
-            the odd ones but one, drawn at random, of every ``group`` that follow one another.
-            What falls on the lines left out is nonlinear distortion and noise.
+            the odd ones except one of every ``group`` in a row, drawn at random. The lines that
+            are not excited show nonlinear distortion and noise.
         group: odd lines of a group.
         rms: root mean square of each input, in every experiment.
-        amplitude: relative amplitudes of the lines 0 to N / 2, of which the excited ones count;
-            all equal by default.
+        amplitude: relative amplitudes of the lines 0 to N / 2, of which the excited ones count.
+            Default: all equal.
         nu: inputs.
         realisations: number of independent ones, nu experiments each.
         seed: of phases and lines, or a generator to draw them from.
 
     Shape:
-        lines: (F,), rms: () or (nu,), amplitude: (N // 2 + 1,) or (N // 2 + 1, nu).
+        rms: () or (nu,), amplitude: (N // 2 + 1,) or (N // 2 + 1, nu).
 
     Raises:
         ValueError: a band or a grid without lines, lines that are not between 0 and fs / 2, or an
             argument out of range.
+
+    Example:
+        >>> design = lfrtorch.multisine(1000, fs=100.0, band=(1.0, 20.0), grid="odd", nu=2)
+        >>> design.u.shape  # two experiments of two inputs
+        (2, 1000, 2)
+        >>> design.frequencies[[0, -1]].round(1).tolist()
+        [1.1, 19.9]
 
     References:
         Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,

@@ -21,6 +21,10 @@ def rmse(record: Record, y_hat: Array) -> float:
 
     Raises:
         ValueError: ``y_hat`` is not of the shape (T, ny) of the record's output.
+
+    Example:
+        >>> lfrtorch.rmse(record, record.y + 0.5)
+        0.5
     """
     if np.shape(y_hat) != record.y.shape:
         raise InputError(
@@ -34,13 +38,17 @@ def nrmse(record: Record, y_hat: Array) -> float:
     """RMSE over the standard deviation of the measured output, both over the scored samples.
 
     NaN for an output that is constant there.
+
+    Example:
+        >>> lfrtorch.nrmse(record, bla.simulate(record)) < 0.3
+        True
     """
     deviation = float(np.sqrt(np.mean(np.var(record.y[record.skip :], axis=0))))
     return rmse(record, y_hat) / deviation if deviation > 0 else float("nan")
 
 
 class BlockScores:
-    """Scores of each output over blocks of samples, of which sums alone are kept.
+    """Scores of each output over blocks of samples; only sums are kept in memory.
 
     A sample without a measurement (NaN) does not count.
 

@@ -8,28 +8,28 @@ import scipy
 from lfrtorch._types import Array
 
 _ALIKE = 0.02
-"""Mean square of a repetition's difference, over that of two unrelated signals, that is noise yet.
-Two parts of narrow-band noise come to 0.05 now and then."""
+"""Largest difference D(p) that counts as noise. Two parts of narrow-band noise reach 0.05 at
+times."""
 
 _GROWTH = 3.0
-"""By which it may grow with the number of periods between: 4 is what a period has that is a little
-too long or too short."""
+"""Largest growth of D over several periods: a period that is a little wrong has a factor of 4."""
 
 _NEAR = 2.0
-"""The shortest period does as well as the best within this factor: multiples differ in noise."""
+"""The shortest period counts as good if its D is within this factor of the best: noise differs."""
 
 _EXACT = 1e-9  # difference of what repeats exactly, far above rounding
 _FASTER = 0.75  # of the record: the largest shift that is looked at
 
 _SETTLED = 2.0
-"""Mean square difference from the last period, over that of noise, of a period in steady state."""
+"""Largest mean square difference of a period in steady state from the last one, relative to
+noise."""
 
 _SMALL = 1e-5  # rms difference over that of the output which is no transient, noise or not
 _TAIL = 4  # of two periods' difference, its last 1 / 4 is taken for noise
 
 
 def find_period(u: Array) -> int | None:
-    """The shortest period, in samples, that explains the signals; None where they do not repeat.
+    """The shortest period, in samples, that explains the signals; ``None`` if they do not repeat.
 
     For every shift p up to half the record,
 

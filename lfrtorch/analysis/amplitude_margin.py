@@ -10,17 +10,17 @@ from lfrtorch.model import Model
 from lfrtorch.records import Record
 
 LOUDER = (1.25, 1.5, 2.0)
-"""Amplitudes, over those of the data, that a model is tried at."""
+"""Amplitudes at which a model is tried, relative to those of the data."""
 
 RUNAWAY = 100.0
-"""Output, over the rms in the data, of a model that diverges."""
+"""A model diverges if its output exceeds this many times the rms in the data."""
 
 
-def loudest(model: Model, records: Sequence[Record]) -> float:
+def largest_stable_amplitude(model: Model, records: Sequence[Record]) -> float:
     """How many times as loud as in the data the input may be before the model diverges.
 
-    A simulation of finite data says nothing of others: a static map that was fitted where it is
-    bounded may feed back more than it did.
+    A model that is stable on its data may be unstable on others: beyond the amplitudes that it was
+    fitted at, its static nonlinearity may feed back more.
 
     Args:
         model: what is simulated, from rest.
@@ -28,7 +28,12 @@ def loudest(model: Model, records: Sequence[Record]) -> float:
             multiplied.
 
     Returns:
-        The largest of ``LOUDER`` at which no output runs away, 1 where none is.
+        The largest of ``LOUDER`` up to which no output diverges; 1 if there is none.
+
+    Example:
+        >>> from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
+        >>> largest_stable_amplitude(model, [record])
+        2.0
     """
     offset, scale = model.scaler.u_offset, model.scaler.y_scale
     found = 1.0

@@ -12,8 +12,18 @@ from lfrtorch.engine.linearised import linearise
 from lfrtorch.model import Model
 
 
-def roots(values: Complex, fs: float) -> list[dict[str, float | None]]:
-    """Poles or zeros z = exp(s / fs), one of each pair: |s| in Hz, damping ratio, radius of z."""
+def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | None]]:
+    """Poles or zeros z = exp(s / fs) as frequency |s| / 2π in Hz, damping ratio and radius of z.
+
+    Of each conjugate pair there is one.
+
+    Example:
+        >>> from lfrtorch.analysis.poles import frequency_and_damping
+        >>> s = 2 * np.pi * 5.0 * np.array([-0.1 + 0.995j, -0.1 - 0.995j])  # 5 Hz, 10 % damping
+        >>> (pole,) = frequency_and_damping(np.exp(s / 100.0), fs=100.0)
+        >>> round(pole["frequency"], 1), round(pole["damping"], 2)
+        (5.0, 0.1)
+    """
     listed = []
     for z in sorted(values[values.imag >= 0], key=lambda z: (abs(np.angle(z)), abs(z))):
         radius = float(abs(z))
@@ -34,9 +44,14 @@ def roots(values: Complex, fs: float) -> list[dict[str, float | None]]:
 
 @torch.no_grad()
 def poles_at_rest(model: Model) -> Complex:
-    """Poles (nx,) of the NL-LFR linearised where it rests at the input's offset.
+    """Poles (nx,) of the NL-LFR linearised about its rest at the input's offset.
 
-    They are the eigenvalues of A + Bw W'(z) Cz. Where no stable rest is found, z is that of x = 0.
+    They are the eigenvalues of A + Bw W'(z) Cz. If no stable rest is found, z is that of x = 0.
+
+    Example:
+        >>> from lfrtorch.analysis.poles import poles_at_rest
+        >>> bool(abs(poles_at_rest(model)[0]) < 1)
+        True
     """
     cell = model.lfr.cell
     u = cell.A.new_zeros(1, 1, cell.nu)

@@ -16,7 +16,7 @@ from lfrtorch._checks import integer
 from lfrtorch._errors import InputError
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings, SizesSearch
-from lfrtorch.survey.findings import findings
+from lfrtorch.survey.notes import notes_on
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -83,7 +83,7 @@ def loaded(cfg: DictConfig) -> Dataset:
     """The records; what is to be known of them is printed."""
     dataset: Dataset = instantiate(cfg.data)
     measured = [record for record in dataset.train if record.source == "file"]
-    for note in (*dataset.notes, *(findings(measured) if measured else ())):
+    for note in (*dataset.notes, *(notes_on(measured) if measured else ())):
         print(f"note: {note}")
     return dataset
 

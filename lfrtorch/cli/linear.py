@@ -26,7 +26,7 @@ import lfrtorch
 from lfrtorch import _tables
 from lfrtorch._atomic import whole_file
 from lfrtorch._tables import in_percent
-from lfrtorch.analysis.poles import roots
+from lfrtorch.analysis.poles import frequency_and_damping
 from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
@@ -126,8 +126,11 @@ def numbers(
             "seconds": fit.seconds,
         },
         "scores": [score(model, r, use) for use, records in used.items() for r in records],
-        "poles": roots(model.poles, model.fs),
-        "zeros": {name: roots(z, model.fs) for name, z in linear_plots.zeros(model).items()},
+        "poles": frequency_and_damping(model.poles, model.fs),
+        "zeros": {
+            name: frequency_and_damping(z, model.fs)
+            for name, z in linear_plots.zeros(model).items()
+        },
         "offsets": [
             {"channel": channel.name, "offset": float(offset), "unit": channel.unit}
             for channel, offset in zip(

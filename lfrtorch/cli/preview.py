@@ -29,8 +29,8 @@ from lfrtorch.files.formats import BLOCK, Table, open_table
 from lfrtorch.files.time_stamps import UnevenError, in_seconds, is_time, sampling
 from lfrtorch.records import Channel
 from lfrtorch.reporting.survey_plots import survey_figure
-from lfrtorch.survey.findings import examine
-from lfrtorch.survey.measurement import Survey, survey
+from lfrtorch.survey.measurement import Survey, survey_measurement
+from lfrtorch.survey.notes import examine
 from lfrtorch.survey.signal import SignalSurvey
 
 LARGEST = 2**22
@@ -123,14 +123,14 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
         remarks.append(f"the first {len(signals)} samples are read, and no more")
     count = len(roles.inputs)
     u, y = signals[:, :count], signals[:, count:]
-    found = survey(
+    found = survey_measurement(
         u,
         y,
         fs,
         inputs=[table.columns[i] for i in roles.inputs],
         outputs=[table.columns[i] for i in roles.outputs],
     )
-    sentences += [finding.text for finding in examine(found, u, y)]
+    sentences += [note.text for note in examine(found, u, y)]
     if found.fs is None:
         remarks.append("no sampling frequency: give --fs; frequencies are in cycles/sample")
     if not roles.inputs:

@@ -112,6 +112,11 @@ def load(
     Raises:
         ValueError: an argument out of range, or a test file that cannot be used.
         FileNotFoundError: ``root`` holds no test file, or one of a pair is missing.
+
+    Example:
+        >>> data = lfrtorch.datasets.boucwen.load(samples=1024)
+        >>> data.train[0].u.shape, [test.name for test in data.tests]
+        ((1024, 1), ['multisine', 'sweep'])
     """
     integer("seed", seed, 0)
     integer("validation_seed_offset", validation_seed_offset, -seed)
@@ -173,6 +178,11 @@ def multisine(
 
     Raises:
         ValueError: a period that cannot hold the band, or an rms that is not positive.
+
+    Example:
+        >>> u = lfrtorch.datasets.boucwen.multisine(samples=1500)
+        >>> u.shape, round(float(np.std(u)))
+        ((30000,), 50)
     """
     least = ceil(_FS / _BAND[0])
     if not isinstance(samples, Integral) or samples < least:
@@ -199,6 +209,10 @@ def sweep() -> Array:
 
     Shape:
         (3060000,), N.
+
+    Example:
+        >>> lfrtorch.datasets.boucwen.sweep().shape
+        (3060000,)
     """
     t = np.arange(_SWEEP * _RATIO) / (_RATIO * _FS)
     return 40 * np.sin(2 * np.pi * (18 * t + t**2 / 12))
@@ -226,6 +240,11 @@ def simulate(
     Raises:
         ValueError: a force of wrong shape or with NaN, factors that do not give 750 Hz, negative
             noise, or a force too large for the integration.
+
+    Example:
+        >>> force = lfrtorch.datasets.boucwen.multisine(samples=150)
+        >>> lfrtorch.datasets.boucwen.simulate(force).shape
+        (150,)
     """
     u = np.ascontiguousarray(u, dtype=np.float64)
     if u.ndim != 1 or u.size % _RATIO or u.size < 4 * _RATIO:

@@ -73,6 +73,12 @@ def load(
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``.
         OSError: the download fails.
+
+    Example:
+        >>> data = lfrtorch.datasets.cascaded_tanks.load(download=True)  # doctest: +SKIP
+        >>> lfrtorch.datasets.cascaded_tanks.load(root="elsewhere")
+        Traceback (most recent call last):
+        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("skip", skip, 1)
     number("validation", validation)

@@ -73,6 +73,12 @@ def load(
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``, or nothing to download it with.
         OSError: the download fails.
+
+    Example:
+        >>> data = lfrtorch.datasets.ced.load(download=True)  # doctest: +SKIP
+        >>> lfrtorch.datasets.ced.load(root="elsewhere")
+        Traceback (most recent call last):
+        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     trained = _ESTIMATION - official.held_out(_ESTIMATION, validation)
     path = official.find(root, _FILE, "CED", others=_ARCHIVES, download=download)

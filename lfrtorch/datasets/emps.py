@@ -83,6 +83,12 @@ def load(
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``, or nothing to download it with.
         OSError: the download fails.
+
+    Example:
+        >>> data = lfrtorch.datasets.emps.load(download=True)  # doctest: +SKIP
+        >>> lfrtorch.datasets.emps.load(root="elsewhere")
+        Traceback (most recent call last):
+        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("warm_up", warm_up, 1)
     held_out = official.held_out(_SAMPLES, validation)

@@ -91,6 +91,12 @@ def load(
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``, or nothing to download it with.
         OSError: the download fails.
+
+    Example:
+        >>> data = lfrtorch.datasets.f16.load(download=True)  # doctest: +SKIP
+        >>> lfrtorch.datasets.f16.load(root="elsewhere")
+        Traceback (most recent call last):
+        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     trained = _checked(levels, validation_level)
 

@@ -124,6 +124,11 @@ def load(
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``, or nothing to download it with.
         OSError: the download fails.
+
+    Example:
+        >>> data = lfrtorch.datasets.parwh.load(source="stand-in", levels=[100], periods=2)
+        >>> data.train[0].u.shape, len(data.tests)
+        ((32768, 1), 6)
     """
     if source not in _SOURCES:
         raise InputError(f"source is {source!r}; give one of {', '.join(_SOURCES)}.")

@@ -95,6 +95,11 @@ def multisine(
 
     Raises:
         ValueError: an rms that is not positive.
+
+    Example:
+        >>> u = lfrtorch.datasets.parwh.multisine(rms=0.5)
+        >>> u.shape, round(float(np.std(u)), 2)
+        ((16384,), 0.5)
     """
     number("rms", rms, positive=True)
     phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, _LINES.stop - _LINES.start)
@@ -118,6 +123,11 @@ def simulate(u: ArrayLike) -> Array:
 
     Raises:
         ValueError: an input of wrong shape or with NaN.
+
+    Example:
+        >>> u = lfrtorch.datasets.parwh.multisine()
+        >>> lfrtorch.datasets.parwh.simulate(u).shape
+        (16384,)
     """
     u = np.asarray(u, dtype=np.float64)
     if u.ndim != 1 or not u.size or not np.isfinite(u).all():

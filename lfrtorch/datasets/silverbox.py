@@ -77,6 +77,12 @@ def load(
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``.
         OSError: the download fails.
+
+    Example:
+        >>> data = lfrtorch.datasets.silverbox.load(download=True)  # doctest: +SKIP
+        >>> lfrtorch.datasets.silverbox.load(root="elsewhere")
+        Traceback (most recent call last):
+        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("warm_up", warm_up, 0)
     begin, end = _ESTIMATION

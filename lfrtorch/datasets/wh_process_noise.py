@@ -79,6 +79,12 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``, or nothing to download it with.
         OSError: the download fails.
+
+    Example:
+        >>> data = lfrtorch.datasets.wh_process_noise.load(download=True)  # doctest: +SKIP
+        >>> lfrtorch.datasets.wh_process_noise.load(root="elsewhere")
+        Traceback (most recent call last):
+        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("validation", validation, 1)
 

@@ -69,6 +69,12 @@ def load(
         ValueError: an argument out of range, or a file that cannot be used.
         FileNotFoundError: no such file below ``root``.
         OSError: the download fails.
+
+    Example:
+        >>> data = lfrtorch.datasets.wiener_hammerstein.load(download=True)  # doctest: +SKIP
+        >>> lfrtorch.datasets.wiener_hammerstein.load(root="elsewhere")
+        Traceback (most recent call last):
+        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("skip", skip, 0)
     held_out = official.held_out(_ESTIMATION, validation, least=_WARM_UP + skip + 1)

@@ -79,9 +79,9 @@ def load_records(
         inputs: one or several names of columns or arrays, or column numbers from 0. An array of
             several channels is several inputs.
         outputs: likewise.
-        fs: sampling frequency in Hz; it may be left out where there is ``time``.
+        fs: sampling frequency in Hz. Default: from ``time``.
         time: the column of time stamps, in seconds or as ISO date-times, evenly spaced.
-        units: of the channels by name, in place of those in the file's header.
+        units: of the channels by name. Default: those in the file's header.
         validation: records that choose among iterates and are not fitted: a fraction below 1 of
             every record, the part after that for training; a number of records, the last ones;
             names of records of ``path``, which are those of the files without extension; or other
@@ -91,9 +91,9 @@ def load_records(
         start: ``"zero"`` (at rest), ``"estimated"`` (amid the measurement), or ``"periodic"``:
             every record is cut to whole periods in steady state.
         period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
-        skip: samples at the beginning of every record that are left out of cost and score. Where
-            left out they are the periods that the output takes to settle, and 5 % of the record
-            where the input does not repeat.
+        skip: samples at the beginning of every record that are left out of cost and score.
+            Default: the periods that the output takes to settle; 5 % of the record if the input
+            does not repeat.
         gaps: ``"error"`` refuses missing values and missing time stamps, ``"split"`` makes a record
             of every stretch between them.
 
@@ -107,6 +107,15 @@ def load_records(
         ValueError: a file, column or setting that cannot be used, files that do not belong
             together, or a part too short to score.
         FileNotFoundError: no such file.
+
+    Example:
+        >>> header = "force (N);position (mm)"
+        >>> np.savetxt("rig.csv", np.c_[u, y], delimiter=";", header=header, comments="")
+        >>> data = lfrtorch.load_records("rig.csv", inputs="force", outputs="position", fs=100.0)
+        >>> data.train[0].samples, str(data.train[0].outputs[0])
+        (240, 'position (mm)')
+        >>> [len(records) for records in (data.train, data.validation, data.tests)]
+        [1, 1, 1]
     """
     reader = _Reader(
         Wanted(inputs, outputs, fs, time, dict(units or {}), gaps),

@@ -31,7 +31,7 @@ from lfrtorch._checks import integer, renamed
 from lfrtorch._errors import InputError
 from lfrtorch._reasons import CUT_SHORT, Reason, told
 from lfrtorch._threads import each_alone, spread_by_hand
-from lfrtorch.analysis.amplitude_margin import LOUDER, loudest
+from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.means import mean_model
@@ -268,7 +268,9 @@ class _Judge:
         Rounding may differ between processes, and the choice must not.
         """
         models = [fit.model for fit in self.ranked(fits)]
-        reach = torch.tensor([loudest(model, train) for model in models], dtype=torch.float64)
+        reach = torch.tensor(
+            [largest_stable_amplitude(model, train) for model in models], dtype=torch.float64
+        )
         reach = self.fits[0].ranks.first(reach).tolist()
         return [model for model, to in zip(models, reach, strict=True) if to >= max(LOUDER)]
 

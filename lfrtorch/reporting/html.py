@@ -17,7 +17,7 @@ import torch
 from lfrtorch._tables import UNKNOWN, Cell, cell, number, percent, quantity
 from lfrtorch._types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
-from lfrtorch.analysis.poles import poles_at_rest, roots
+from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.size_search import LEGEND, size_table
 from lfrtorch.fitting.trainer import FitResult
@@ -267,7 +267,7 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
                 *(number(p[key], 4) for key in ("frequency", "damping", "radius")),
                 "pair" if p["imag"] else "",
             ]
-            for p in roots(values, bla.fs)
+            for p in frequency_and_damping(values, bla.fs)
         ]
     return {"summary": summary, "notes": notes, "caption": f"{caption}.", "poles": poles}
 

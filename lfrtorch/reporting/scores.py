@@ -10,7 +10,7 @@ from importlib.metadata import version
 from typing import Any
 
 from lfrtorch import _tables
-from lfrtorch.analysis.amplitude_margin import loudest
+from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult
@@ -98,7 +98,7 @@ def metrics(
             "reason": result.outcome,
         },
         "chosen_iteration": result.chosen_iteration,
-        "stable_to": loudest(model, dataset.train),
+        "stable_to": largest_stable_amplitude(model, dataset.train),
         "starts": max(1, len(result.starts)),
         "averaged": result.averaged,
         "ranking": [{"seed": seeds[start.number], **asdict(start)} for start in result.starts],

@@ -39,8 +39,8 @@ def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
 
     Example:
         >>> from lfrtorch.reporting.survey_plots import survey_figure
-        >>> from lfrtorch.survey.measurement import survey
-        >>> found = survey(record.u, record.y, fs=record.fs)
+        >>> from lfrtorch.survey.measurement import survey_measurement
+        >>> found = survey_measurement(record.u, record.y, fs=record.fs)
         >>> figure = survey_figure(found, np.hstack([record.u, record.y]))
         >>> len(figure.axes)  # three of the input, three of the output
         6

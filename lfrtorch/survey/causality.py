@@ -1,9 +1,9 @@
-"""Whether outputs follow inputs: the impulse response at negative and positive lags.
+"""Causality test: whether outputs follow inputs, and after which delay.
 
-The response Syu / Suu of averaged cross spectra, back in the time domain, is two-sided. That of a
-causal system has its energy at lags ≥ 0; that of exchanged signals at negative lags, or, where the
-sampled system has feed-through or its signals are band-limited, at both, with the reverse response
-all causal.
+The impulse response is estimated at negative and positive lags, as the inverse Fourier transform of
+Syu / Suu with averaged cross spectra. A causal system has its energy at lags ≥ 0. If input and
+output are exchanged, the energy is at negative lags; or at both, if the sampled system has
+feedthrough or its signals are band-limited, and then the response from output to input is causal.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from lfrtorch._types import Array, Complex
 from lfrtorch.metrics import rms
 
 SEGMENTS = (4, 8)
-"""Of a record: the response has lags up to T / 8 or T / 16. The one is taken in which more of the
-output is explained: short segments miss long memories and delays, few ones average little."""
+"""Numbers of segments of a record, for lags up to T / 8 or T / 16. The one that explains more of
+the output is taken: short segments miss long memories and delays, few segments average little."""
 
 SHORTEST, LONGEST = 32, 16384
 """Samples of a segment."""
 
 FLOOR = 1e-2
-"""Added to the input's power, relative to its largest: where there is none, the response is 0."""
+"""Added to the input's power, relative to its largest value: without power the response is 0."""
 
 ONSET, CLEAR, UNCLEAR = 0.1, 4.0, 0.5
-"""The response has begun where it is this much of its peak, and so many times its rms at negative
-lags; where that is more than the last of the peak, one cannot tell."""
+"""The response begins when it exceeds ONSET of its peak and CLEAR times its rms at negative lags.
+If that limit is more than UNCLEAR of the peak, the delay is unknown."""
 
 
-class Lags(NamedTuple):
-    """What the two-sided response from an input to an output says.
+class TwoSidedResponse(NamedTuple):
+    """What the impulse response at negative and positive lags says of an input and an output.
 
     Args:
         coherence: share of the output's power that follows from the input, linearly.
-        chance: of that, what unrelated signals would show.
+        chance: coherence that unrelated signals would show.
         causality: (E₊ - E₋) / (E₊ + E₋) of the energies at positive and negative lags: 1 for a
             system with memory, 0 for one without, -1 for a response that comes first.
         reverse: the same from output to input.
         rise: gain of the reverse response at the upper third of the output's frequencies, relative
             to that at the lower third.
-        delay: samples until the response begins; 0 where that is not clear.
+        delay: samples until the response begins; 0 if that is not clear.
         peak: lag of its largest value.
     """
 
@@ -55,20 +55,16 @@ class Lags(NamedTuple):
     peak: int
 
 
-def lags(u: Array, y: Array) -> Lags | None:
-    """The lags between an input and an output, None where the signals are too short or constant.
-
-    Shape:
-        u, y: (T,).
-    """
+def two_sided_response(u: Array, y: Array) -> TwoSidedResponse | None:
+    """The causality test of an input (T,) and an output (T,); ``None`` if short or constant."""
     if np.ptp(u) == 0 or np.ptp(y) == 0:
         return None
     lengths = {min(len(u) // n // 2 * 2, LONGEST) for n in SEGMENTS}
-    found = [_lags(u, y, length) for length in sorted(lengths) if length >= SHORTEST]
+    found = [_by_segments(u, y, length) for length in sorted(lengths) if length >= SHORTEST]
     return max(found, key=lambda one: one.coherence - one.chance, default=None)
 
 
-def _lags(u: Array, y: Array, length: int) -> Lags:
+def _by_segments(u: Array, y: Array, length: int) -> TwoSidedResponse:
     _, Suu = scipy.signal.welch(u, nperseg=length)
     _, Syy = scipy.signal.welch(y, nperseg=length)
     _, Syu = scipy.signal.csd(u, y, nperseg=length)
@@ -79,7 +75,7 @@ def _lags(u: Array, y: Array, length: int) -> Lags:
     gain = np.abs(Syu[excited]) / Syy[excited]
     third = max(len(gain) // 3, 1)
     tiny = np.finfo(float).tiny
-    return Lags(
+    return TwoSidedResponse(
         coherence=float(np.sum(np.abs(Syu) ** 2 / np.maximum(Suu, tiny)) / np.sum(Syy)),
         chance=length / len(u),
         causality=_causality(g),

@@ -21,7 +21,7 @@ class Survey:
 
     Args:
         inputs, outputs: numbers of each signal.
-        fs: sampling frequency in Hz; None where unknown: frequencies are in cycles per sample.
+        fs: sampling frequency in Hz. If it is ``None``, frequencies are in cycles per sample.
         whole: the longest part without missing samples.
     """
 
@@ -36,7 +36,7 @@ class Survey:
         return self.inputs + self.outputs
 
 
-def survey(
+def survey_measurement(
     u: ArrayLike,
     y: ArrayLike,
     fs: float | None = None,
@@ -48,18 +48,23 @@ def survey(
     """Numbers of each signal.
 
     Args:
-        u: inputs as measured, NaN where a sample is missing; no channel where it is not known which
-            signals are inputs.
+        u: inputs as measured, NaN for a missing sample; no channel if it is not known which signals
+            are inputs.
         y: outputs, likewise.
         fs: sampling frequency in Hz.
-        inputs, outputs: names and units; u1, u2 ... and y1, y2 ... where left out.
-        period: samples of a period of the inputs; looked for where left out.
+        inputs, outputs: names and units. Default: u1, u2 ... and y1, y2 ...
+        period: samples of a period of the inputs. Default: it is searched for.
 
     Shape:
         u: (T, nu), y: (T, ny); (T,) is one channel.
 
     Raises:
         ValueError: different lengths, or other numbers of names than of channels.
+
+    Example:
+        >>> found = survey_measurement(u, y, fs=100.0)
+        >>> found.outputs[0].samples, found.outputs[0].missing, found.whole
+        (400, 0, slice(0, 400, None))
     """
     u, y = _columns(u), _columns(y)
     if len(u) != len(y):

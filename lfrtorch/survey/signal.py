@@ -16,24 +16,25 @@ IN_BAND = 0.99
 """Share of the power about the mean that lies in the band; the rest is half below, half above."""
 
 LEAST = 16
-"""Samples from which on there is a spectrum."""
+"""Least samples of a spectrum."""
 
 QUIET = 0.2
-"""Share of the spectrum, its quietest, at whose upper end the level of white noise is read."""
+"""The level of white noise is this quantile of the spectrum."""
 
 LOUD = 0.5
-"""A spectrum whose quietest part is white noise of more than this times the signal's rms tells no
-noise from signal."""
+"""Largest rms of the noise, relative to the signal's, that a spectrum can tell from the signal."""
 
 SEGMENTS, LONGEST = 8, 4096
-"""Of the averaged spectrum: at least so many segments, of at most so many samples."""
+"""The averaged spectrum has at least SEGMENTS segments of at most LONGEST samples."""
 
 CLIPPED_SAMPLES, CLIPPED_RUN, CLIPPED_RATIO, NEIGHBOURS = 5, 3, 5, 5
-"""A signal is clipped where it is at an extreme for so many samples, so many of them in a row, and
-so many times as often as at any of the next values. (A sine in coarse steps has a ratio of 2.4.)"""
+"""A signal is clipped if it is at an extreme for CLIPPED_SAMPLES, CLIPPED_RUN of them in a row, and
+CLIPPED_RATIO times as often as at any of the next NEIGHBOURS values. (A sine in coarse steps has a
+ratio of 2.4.)"""
 
 LEVELS = 16
-"""A signal of no more values was made of levels, as a binary one: it is not clipped."""
+"""A signal with at most this many values consists of levels, like a binary one; it is not
+clipped."""
 
 
 class Extreme(NamedTuple):
@@ -58,8 +59,8 @@ class SignalSurvey(NamedTuple):
         values: how many different ones there are.
         step: smallest difference of two of them.
         band: frequencies in Hz between which ``IN_BAND`` of the power about the mean lies.
-        period: samples of a period, where it repeats.
-        noise: its rms, estimated, where it can be.
+        period: samples of a period, ``None`` if it does not repeat.
+        noise: its estimated rms, ``None`` if it cannot be told from the signal.
         method: of the noise. ``"periods"``: the scatter of whole periods in steady state;
             ``"spectrum"``: a guess, the level of the quietest part of the spectrum as if of white
             noise; more where signal is everywhere, less where a filter took noise away.

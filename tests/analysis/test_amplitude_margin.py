@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import lfrtorch
-from lfrtorch.analysis.amplitude_margin import loudest
+from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
 from lfrtorch.records import Record
 
 
@@ -25,7 +25,7 @@ def test_a_model_that_runs_away_on_louder_inputs_is_found():
         for weight in (cell.Bu, cell.Bw, cell.Cy, cell.Cz):
             weight.fill_(1.0)
         cell.static.C[0, -1] = (2 / (3 * 1.3)) ** 2 / 3
-    assert loudest(model, [record]) == 1.25
+    assert largest_stable_amplitude(model, [record]) == 1.25
     with torch.no_grad():
         cell.static.C.zero_()
-    assert loudest(model, [record]) == 2.0
+    assert largest_stable_amplitude(model, [record]) == 2.0

@@ -276,7 +276,7 @@ def test_train_takes_the_order_of_a_scan(csv: Path, tmp_path: Path, capsys):
     ],
 )
 def test_frequency_and_damping(z: complex, frequency: float | None, damping: float | None):
-    (root,) = linear.roots(np.array([z], dtype=complex), 1.0)
+    (root,) = linear.frequency_and_damping(np.array([z], dtype=complex), 1.0)
     assert root["frequency"] == (None if frequency is None else pytest.approx(frequency))
     assert root["damping"] == (None if damping is None else pytest.approx(damping))
     assert root["radius"] == pytest.approx(abs(z))

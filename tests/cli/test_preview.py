@@ -1,4 +1,4 @@
-"""Measurements looked at from the command line: columns, remarks, table, findings, figure."""
+"""Measurements looked at from the command line: columns, remarks, table, notes, figure."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from scipy.signal import lfilter
 
 from lfrtorch.cli import config, preview
 from lfrtorch.reporting.survey_plots import survey_figure
-from lfrtorch.survey.findings import examine
-from lfrtorch.survey.measurement import survey
+from lfrtorch.survey.measurement import survey_measurement
+from lfrtorch.survey.notes import examine
 
 ROOT = Path(__file__).resolve().parents[2]
 T, FS = 2000, 50.0
@@ -71,7 +71,7 @@ def refused(capsys, *words: str | Path) -> str:
 
 
 @pytest.mark.numeric
-def test_one_command_gives_table_findings_and_figure(file: Path, run):
+def test_one_command_gives_table_notes_and_figure(file: Path, run):
     out = run(file, "--inputs", "force", "--outputs", "level")
     assert f"{file}: {T} samples at 50 Hz" in out
     assert "'time' is taken for the time, 50 Hz" in out
@@ -89,7 +89,7 @@ def test_one_command_gives_table_findings_and_figure(file: Path, run):
 
 @pytest.mark.numeric
 def test_numbers_of_the_table(signals):
-    found = survey(signals["force"], signals["level"], FS)
+    found = survey_measurement(signals["force"], signals["level"], FS)
     row = dict(
         zip(["mean", "rms", "min", "max"], preview.row(found.outputs[0], found)[4:8], strict=True)
     )
@@ -218,14 +218,14 @@ def test_user_errors_are_one_message(words, message, file: Path, capsys):
 
 def test_figure_of_signals_that_say_little():
     signals = np.column_stack([np.full(40, np.nan), np.ones(40), np.arange(40.0)])
-    found = survey(signals[:, :1], signals[:, 1:])
+    found = survey_measurement(signals[:, :1], signals[:, 1:])
     figure = survey_figure(found, signals, "odd")
     figure.draw_without_rendering()
     assert len(figure.axes) == 9
 
 
 def test_figure_marks_where_a_signal_is_clipped(signals):
-    found = survey(signals["force"], signals["level"], FS)
+    found = survey_measurement(signals["force"], signals["level"], FS)
     figure = survey_figure(found, np.column_stack([signals["force"], signals["level"]]))
     time = figure.axes[3]
     assert np.asarray(time.lines[-1].get_ydata())[0] == 0.3
@@ -233,7 +233,7 @@ def test_figure_marks_where_a_signal_is_clipped(signals):
     assert examine(found, signals["force"][:, None], signals["level"][:, None])
 
 
-def test_train_says_the_findings_of_a_file(file: Path, signals, capsys):
+def test_train_says_the_notes_of_a_file(file: Path, signals, capsys):
     clean = written(file.parent / "clean.csv", signals | {"level": np.roll(signals["force"], 1)})
     clipped = written(
         file.parent / "clipped.csv", signals | {"level": np.nan_to_num(signals["level"])}

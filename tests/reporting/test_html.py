@@ -13,7 +13,7 @@ import torch
 
 import lfrtorch
 from lfrtorch._tables import number
-from lfrtorch.analysis.poles import poles_at_rest, roots
+from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.records import Channel, Record
@@ -259,6 +259,6 @@ def test_poles_at_rest_are_those_of_a_step_away_from_it(single: Run):
 
 def test_roots_of_a_known_oscillator():
     s = 2 * np.pi * 5.0 * np.exp(1j * np.arccos(-0.1))  # 5 Hz, damping 0.1
-    (root,) = roots(np.exp(np.array([s, s.conj()]) / 100.0), 100.0)
+    (root,) = frequency_and_damping(np.exp(np.array([s, s.conj()]) / 100.0), 100.0)
     assert root["frequency"] == pytest.approx(5.0)
     assert root["damping"] == pytest.approx(0.1)

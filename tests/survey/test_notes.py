@@ -12,8 +12,8 @@ from scipy.signal import butter, lfilter, sosfilt
 from lfrtorch._types import Array
 from lfrtorch.datasets import boucwen, parwh, silverbox, wiener_hammerstein
 from lfrtorch.records import Channel, Record
-from lfrtorch.survey.findings import examine, findings
-from lfrtorch.survey.measurement import survey
+from lfrtorch.survey.measurement import survey_measurement
+from lfrtorch.survey.notes import examine, notes_on
 
 pytestmark = pytest.mark.numeric
 
@@ -32,9 +32,11 @@ def u(rng):
 
 
 def found(u, y, fs=None, **more) -> dict[str, str]:
-    """Findings by the first word of their kind."""
+    """Notes by the first word of their kind."""
     u, y = (np.asarray(a).reshape(len(y), -1) for a in (u, y))
-    return {kind.split()[0]: text for kind, text in examine(survey(u, y, fs, **more), u, y)}
+    return {
+        kind.split()[0]: text for kind, text in examine(survey_measurement(u, y, fs, **more), u, y)
+    }
 
 
 def lag(u: Array, pole: float = 0.9, noise: float = NOISE) -> Array:
@@ -105,7 +107,7 @@ def test_short_records_raise_no_alarm(pole):
         assert found(u, lag(u, pole, noise=0.1)) == {}
 
 
-# --- each finding, and what is near it and fine --------------------------------------------------
+# --- each note, and what is near it and fine -----------------------------------------------------
 
 
 def test_missing(u):
@@ -255,28 +257,28 @@ def test_unrelated(u, rng):
 # --- records --------------------------------------------------------------------------------------
 
 
-def test_findings_of_records(u):
+def test_notes_of_records(u):
     bad = Record(u, np.minimum(lag(u), 0.3), name="a", outputs=(Channel("level", "V"),))
-    (sentence,) = findings(bad)
+    (sentence,) = notes_on(bad)
     assert sentence.startswith("output 'level' has its largest value 0.3")
-    (sentence,) = findings([replace(bad, y=lag(u)), bad, replace(bad, name="c"), bad])
+    (sentence,) = notes_on([replace(bad, y=lag(u)), bad, replace(bad, name="c"), bad])
     assert sentence.startswith("record 'a' and 2 more: output 'level' has")
-    assert findings(replace(bad, y=lag(u))) == []
+    assert notes_on(replace(bad, y=lag(u))) == []
 
 
 def test_skipped_samples_are_not_looked_at(u):
     record = Record(u, lag(u) + 5 * (np.arange(T) < 2000), skip=2000)
-    assert findings(record) == []
+    assert notes_on(record) == []
     rest = np.where(np.arange(T) < 2000, 0, u)
-    assert findings(Record(rest, lag(rest), skip=2000)) == []
-    assert findings(Record(rest, lag(rest))) != []
+    assert notes_on(Record(rest, lag(rest), skip=2000)) == []
+    assert notes_on(Record(rest, lag(rest))) != []
 
 
 @pytest.mark.slow
 def test_simulated_benchmarks():
     for dataset in (boucwen.load(), parwh.load(source="stand-in")):
         for record in (*dataset.train[:3], *dataset.validation[:1], *dataset.tests):
-            assert findings(record) == []
+            assert notes_on(record) == []
             assert "swapped" in found(record.y, record.u)
 
 
@@ -286,7 +288,7 @@ def test_official_benchmarks(benchmark_root: Path):
     for module in (silverbox, wiener_hammerstein, boucwen):
         dataset = module.load(root=benchmark_root)
         for record in (*dataset.train, *dataset.tests):
-            assert findings(record) == []
+            assert notes_on(record) == []
             assert "swapped" in found(record.y, record.u)
 
 

@@ -10,99 +10,112 @@ import scipy
 
 from lfrtorch._types import Array
 from lfrtorch.records import Record, as_records
-from lfrtorch.survey.causality import Lags, lags
-from lfrtorch.survey.measurement import Survey, survey
+from lfrtorch.survey.causality import TwoSidedResponse, two_sided_response
+from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.signal import SignalSurvey, longest_run
 
 SHORT = 300
-"""Samples below which a record is short: a small NL-LFR model has 50 to 100 parameters."""
+"""A record of fewer samples is short: a small NL-LFR model has 50 to 100 parameters."""
 
 ENOUGH = 100
-"""Samples from which on it can be said what a record excites."""
+"""Least samples of a record for notes on what it excites."""
 
 MOST = 2**21
-"""Samples of a record that are looked at by ``findings``, its first ones after ``skip``."""
+"""``notes_on`` looks at this many samples of a record at most, the first ones after ``skip``."""
 
 STILL, STRETCHES, REST = 0.2, 200, 0.05
-"""Inputs stand still where all of them stay within REST of their rms for this share of the record,
-as seen in so many stretches."""
+"""Inputs stand still if all of them stay within REST of their rms for the share STILL of the
+record, which is looked at in STRETCHES parts."""
 
 STUCK = 0.1
 """Share of the record in which an output does not change at all, while an input does."""
 
 OVERSAMPLED, WANTED = 50, 10
-"""All power lies below fs over the first; decimation leaves it below fs over the second."""
+"""A record is oversampled if all power lies below fs / OVERSAMPLED; decimation leaves it below
+fs / WANTED."""
 
 COARSE, FEW = 0.05, 200
-"""An output is coarse where its steps are more than this of its rms, in records of more samples."""
+"""An output is coarse if its steps exceed COARSE of its rms, in a record of more than FEW
+samples."""
 
 FEW_FREQUENCIES, LINE = 5, 1e-4
-"""An input of fewer frequencies is narrow; one counts where it has this share of the power of the
-strongest."""
+"""An input of fewer frequencies is narrow; a frequency counts if it has the share LINE of the power
+of the strongest."""
 
 LOBE = 6
-"""Lines, in a row, that one sine has in the spectrum of a record, windowed."""
+"""Neighbouring lines that one sine has in the windowed spectrum of a record."""
 
 NARROW = 0.1
-"""Or an input whose band is narrower than this times its centre."""
+"""An input is narrow, too, if its band is narrower than this times its centre."""
 
 SAME = 0.999
 """Correlation of two inputs that carry the same signal."""
 
 DRIFT, ALIKE, OTHERS = 0.2, 3.0, 0.05
-"""An output drifts where a straight line explains this share of its variance, with slopes in each
-third of the record within this factor, and no more than the last of an input or its magnitude."""
+"""An output drifts if a straight line explains DRIFT of its variance, with slopes in all thirds of
+the record within the factor ALIKE, and at most OTHERS of that of any input or its magnitude."""
 
 BEFORE, AFTER, CERTAIN = -0.15, 0.5, -0.4
-"""The output comes first where the causality is below the first and in reverse above the second.
-A reverse gain that rises with frequency speaks against it: an integrator, fed through, has it."""
+"""The output comes first if the causality is below BEFORE and the reverse one above AFTER. A
+reverse gain that rises with frequency speaks against it, as an integrator with feedthrough has it;
+then the causality must be below CERTAIN."""
 
 COHERENT, UNRELATED = 0.1, 0.05
-"""Coherence beyond chance from which on lags mean something, and below which nothing follows."""
+"""Coherence beyond chance above which the causality test means something, and below which the
+output does not follow the inputs."""
 
 DELAY, SHARP = 8, 0.5
-"""Least samples of a delay that is worth a shift, and its share of the lag of the peak."""
+"""Least samples of a delay that is worth a shift, and its least share of the lag of the peak."""
 
 
-class Finding(NamedTuple):
-    """A sentence, and its kind: what it would be called in all records."""
+class Note(NamedTuple):
+    """A sentence, and its kind, which is the same in all records."""
 
     kind: str
     text: str
 
 
-def examine(found: Survey, u: Array, y: Array) -> list[Finding]:
-    """What is found in a measurement; nothing in one that was made well.
+def examine(found: Survey, u: Array, y: Array) -> list[Note]:
+    """Notes on a measurement; none on one that was made well.
 
     Args:
         found: its survey.
-        u, y: its signals, NaN where a sample is missing. Without inputs it is not known which
-            signals are outputs, and nothing is said of what lies between them.
+        u, y: its signals (T, nu) and (T, ny), NaN for a missing sample. Without inputs all signals
+            count as outputs, and there are no notes on how these follow from inputs.
 
-    Shape:
-        u: (T, nu), y: (T, ny).
+    Example:
+        >>> from lfrtorch.survey.measurement import survey_measurement
+        >>> u, y = np.zeros((400, 1)), np.random.default_rng(0).standard_normal((400, 1))
+        >>> examine(survey_measurement(u, y), u, y)[0].kind
+        'constant u1'
     """
-    findings = [*_levels(found, u, y)]
+    notes = [*_levels(found, u, y)]
     u, y = u[found.whole], y[found.whole]
     if len(y) >= ENOUGH:
-        findings += _excitation(found, u)
-        findings += _relations(found, u, y)
-    return findings
+        notes += _excitation(found, u)
+        notes += _relations(found, u, y)
+    return notes
 
 
-def findings(records: Record | Sequence[Record]) -> list[str]:
+def notes_on(records: Record | Sequence[Record]) -> list[str]:
     """What will hurt a model of the records, and what to do about it, a sentence each.
 
-    A sentence names a record where there are several.
+    If there are several records, a sentence names the one it is about.
 
     Raises:
         ValueError: no records, or records of different channels.
+
+    Example:
+        >>> short = lfrtorch.Record(np.random.default_rng(0).standard_normal(50), np.arange(50.0))
+        >>> for note in notes_on(short):
+        ...     print(note)
+        the record has 50 samples, which is short: ...
     """
     data = as_records(records)
     by_kind: dict[str, list[tuple[str, str]]] = {}
     for r in data:
         scored = slice(r.skip, r.skip + MOST)
-        found = survey(
+        found = survey_measurement(
             r.u[scored], r.y[scored], r.fs, inputs=r.inputs, outputs=r.outputs, period=r.period
         )
         for kind, text in examine(found, r.u[scored], r.y[scored]):
@@ -114,16 +127,16 @@ def findings(records: Record | Sequence[Record]) -> list[str]:
     return sentences
 
 
-def _levels(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
+def _levels(found: Survey, u: Array, y: Array) -> Iterator[Note]:
     """Missing samples, constant, stuck, clipped and coarse signals, a short record."""
     roles = bool(found.inputs)
     T = len(y)
     for one in found.signals:
         name = one.channel.name
         if one.missing == T:
-            yield Finding(f"missing {name}", f"'{name}' has no values at all; leave it out.")
+            yield Note(f"missing {name}", f"'{name}' has no values at all; leave it out.")
         elif one.missing:
-            yield Finding(
+            yield Note(
                 f"missing {name}",
                 f"'{name}' misses {one.missing} of {T} samples, up to {one.gap} in a row; "
                 "fill short gaps by interpolation; gaps='split' cuts the record at them.",
@@ -138,10 +151,10 @@ def _levels(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
                 )
             else:
                 text = f"output {told}: it does not respond; check the sensor and the column."
-            yield Finding(f"constant {name}", text)
+            yield Note(f"constant {name}", text)
     still = _still(found.inputs, u)
     if still[1] >= STILL * max(T, ENOUGH):
-        yield Finding(
+        yield Note(
             "still",
             f"{_listed(found.inputs)} {'is' if len(found.inputs) == 1 else 'are'} constant in "
             f"{100 * still[1] / T:.0f} % of the record (samples {still[0]} to {sum(still)}): "
@@ -151,7 +164,7 @@ def _levels(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
         name, kind = one.channel.name, "output " if roles else ""
         for end in one.clipped:
             what = "largest" if end is one.maximum else "smallest"
-            yield Finding(
+            yield Note(
                 f"clipped {name} {what}",
                 f"{kind}'{name}' has its {what} value {end.value:.6g} in {end.samples} samples "
                 f"({100 * end.samples / T:.2g} %), {end.run} in a row: it is clipped. Where the "
@@ -162,28 +175,28 @@ def _levels(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
         length += 1
         stuck = length >= STUCK * T and one.values > 2 and not one.clipped
         if stuck and not (roles and _rests(found.inputs, u[first : first + length])):
-            yield Finding(
+            yield Note(
                 f"stuck {name}",
                 f"{kind}'{name}' stays at {signal[first]:.6g} for {length} samples "
                 f"({100 * length / T:.0f} % of the record)"
                 f"{' while the input moves' if roles else ''}: check the sensor.",
             )
         if T > FEW and one.values > 2 and one.step > COARSE * one.rms:
-            yield Finding(
+            yield Note(
                 f"coarse {name}",
                 f"{kind}'{name}' has {one.values} different values, in steps of {one.step:.3g} "
                 f"({100 * one.step / one.rms:.0f} % of its rms): no model comes below an rms error "
                 f"of about {one.step / np.sqrt(12):.2g}; use more of the converter's range.",
             )
     if T < SHORT:
-        yield Finding(
+        yield Note(
             "short",
             f"the record has {T} samples, which is short: a small nonlinear model has 50 to 100 "
             "parameters; measure longer.",
         )
 
 
-def _excitation(found: Survey, u: Array) -> Iterator[Finding]:
+def _excitation(found: Survey, u: Array) -> Iterator[Note]:
     """What inputs in a stretch (T, nu) without gaps excite, and how fast it was sampled."""
     T, fs, unit = len(u), found.fs or 1.0, _unit(found)
     for one, signal in zip(found.inputs, u.T, strict=True):
@@ -191,21 +204,21 @@ def _excitation(found: Survey, u: Array) -> Iterator[Finding]:
             continue
         name, (low, high) = one.channel.name, one.band
         if one.values == 2:
-            yield Finding(
+            yield Note(
                 f"binary {name}",
                 f"input '{name}' has two values only: of a nonlinearity at the input nothing shows "
                 "between them; use a signal of many levels, as a multisine.",
             )
         count = _frequencies(signal)
         if count < FEW_FREQUENCIES:
-            yield Finding(
+            yield Note(
                 f"narrow {name}",
                 f"input '{name}' excites {count} frequenc{'y' if count == 1 else 'ies'} or so, "
                 f"{low:.4g} to {high:.4g} {unit}: enough for a linear model of order {count} and "
                 "no more; excite the band where the model is used.",
             )
         elif high - low < NARROW * (high + low) / 2:
-            yield Finding(
+            yield Note(
                 f"narrow {name}",
                 f"input '{name}' excites {low:.4g} to {high:.4g} {unit} only: elsewhere a model is "
                 "a guess; excite the band where it is used.",
@@ -214,7 +227,7 @@ def _excitation(found: Survey, u: Array) -> Iterator[Finding]:
     if bands and all(b is not None and b[1] < fs / OVERSAMPLED for b in bands):
         highest = max(b[1] for b in bands if b is not None)
         factor = int(fs / (WANTED * highest)) if highest > 0 else 1
-        yield Finding(
+        yield Note(
             "oversampled",
             f"all power lies below {highest:.3g} {unit}, fs / {fs / highest:.0f}: the record is "
             f"oversampled; decimate by {factor} (scipy.signal.decimate) for a fit that is "
@@ -222,7 +235,7 @@ def _excitation(found: Survey, u: Array) -> Iterator[Finding]:
         )
     period = found.inputs[0].period if found.inputs else None
     if period is not None and period < T < 2 * period:
-        yield Finding(
+        yield Note(
             "periods",
             f"the record has {T / period:.2f} periods of {period} samples: less than two tell no "
             "noise from distortion; measure more, or cut it to one in steady state.",
@@ -234,26 +247,26 @@ def _excitation(found: Survey, u: Array) -> Iterator[Finding]:
             correlation = float(np.corrcoef(u[:, i], u[:, j])[0, 1])
             if abs(correlation) > SAME:
                 names = found.inputs[j].channel.name, found.inputs[i].channel.name
-                yield Finding(
+                yield Note(
                     f"same {names}",
                     f"inputs '{names[0]}' and '{names[1]}' carry the same signal (correlation "
                     f"{correlation:.4f}): what each does cannot be told; leave one out.",
                 )
 
 
-def _relations(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
-    """What lies between inputs (T, nu) and outputs (T, ny) without gaps: order, delay, drift."""
+def _relations(found: Survey, u: Array, y: Array) -> Iterator[Note]:
+    """How outputs (T, ny) without gaps follow inputs (T, nu): order, delay, drift."""
     between = {
         (i, j): pair
         for i in range(y.shape[1])
         for j in range(u.shape[1])
-        if (pair := lags(u[:, j], y[:, i])) is not None
+        if (pair := two_sided_response(u[:, j], y[:, i])) is not None
     }
     if between:
         (i, j), pair = max(between.items(), key=lambda item: item[1].coherence)
         if _first(pair):
             names = found.outputs[i].channel.name, found.inputs[j].channel.name
-            yield Finding(
+            yield Note(
                 "swapped",
                 f"output '{names[0]}' comes before input '{names[1]}': are inputs and outputs "
                 "swapped? (Or a controller makes the input from the output.)",
@@ -263,7 +276,7 @@ def _relations(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
         pairs = {j: pair for (k, j), pair in between.items() if k == i}
         name = output.channel.name
         if pairs and sum(p.coherence - p.chance for p in pairs.values()) < UNRELATED:
-            yield Finding(
+            yield Note(
                 f"unrelated {name}",
                 f"hardly anything of output '{name}' follows from the inputs linearly: other "
                 "columns, times that do not fit, noise, or a purely even nonlinearity, where there "
@@ -276,7 +289,7 @@ def _relations(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
                 and pair.delay >= max(DELAY, SHARP * pair.peak)
             ):
                 lasting = "" if found.fs is None else f" ({pair.delay / found.fs:.3g} s)"
-                yield Finding(
+                yield Note(
                     f"delay {name} {j}",
                     f"a delay of about {pair.delay} samples{lasting} from input "
                     f"'{found.inputs[j].channel.name}' to output '{name}': shift the output by it, "
@@ -285,7 +298,7 @@ def _relations(found: Survey, u: Array, y: Array) -> Iterator[Finding]:
         yield from _drift(output, y[:, i], u)
 
 
-def _first(pair: Lags) -> bool:
+def _first(pair: TwoSidedResponse) -> bool:
     """Whether the output comes before the input."""
     return (
         pair.coherence - pair.chance > COHERENT
@@ -295,7 +308,7 @@ def _first(pair: Lags) -> bool:
     )
 
 
-def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Finding]:
+def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Note]:
     """Whether an output (T,) drifts, and the inputs (T, nu) and their magnitudes do not."""
     share, slope = _trend(y)
     thirds = [_trend(part)[1] for part in np.array_split(y, 3)] if len(y) >= SHORT else [0.0]
@@ -303,7 +316,7 @@ def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Finding]:
     centred = u - u.mean(axis=0)
     others = [_trend(v)[0] for v in (*centred.T, *np.abs(centred).T)]
     if share > DRIFT and steady and max(others, default=1.0) < OTHERS:
-        yield Finding(
+        yield Note(
             f"drift {output.channel.name}",
             f"output '{output.channel.name}' drifts by {slope * len(y):.3g} over the record, "
             f"{abs(slope) * len(y) / output.rms:.1f} times its rms, and no input does: take the "
