@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 
 import lfrtorch
-from lfrtorch import reporting
 from lfrtorch.survey.notes import notes_on
 
 
@@ -54,7 +53,7 @@ def main() -> None:
         error = lfrtorch.rmse(test, model.simulate(test))
         print(f"{name:13} {1e3 * error:6.2f} mm rms on the test, of which noise 5 mm")
 
-    reporting.write(run, "runs/tank")
+    lfrtorch.reporting.write(run, "runs/tank")
     tank = lfrtorch.load("runs/tank")
     level = tank.simulate(np.full(600, 2.0))  # from rest at the mean level, at 2 V
     print(
