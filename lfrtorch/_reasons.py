@@ -9,6 +9,11 @@ class Reason(StrEnum):
     """Why a search or a fit ended; a member equals its text, which files hold and people read.
 
     A trainer of one's own may give other texts.
+
+    Example:
+        >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=2))
+        >>> result.reason is lfrtorch.Reason.ALL_ITERATIONS, str(result.reason)
+        (True, 'maximum number of iterations')
     """
 
     RESIDUAL_VANISHES = "converged: the residual vanishes"

@@ -14,7 +14,7 @@ import pytest
 
 import lfrtorch
 from lfrtorch import FRF, LinearModel, Model, analysis, datasets, distributed
-from lfrtorch.reporting import linear_plots, monitor, plots, scores, survey_plots
+from lfrtorch.reporting import linear_plots, plots, survey_plots
 
 REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "api" / "lfrtorch.md"
 
@@ -43,8 +43,6 @@ def public() -> Iterator[tuple[str, Any]]:
             own = hasattr(module, "__all__") or getattr(thing, "__module__", "") == module.__name__
             if own and not name.startswith("_"):
                 yield f"{module.__name__.removeprefix('lfrtorch.')}.{name}", thing
-    for thing in (scores.score, *(getattr(monitor, name) for name in MONITORS)):
-        yield f"{thing.__module__.removeprefix('lfrtorch.')}.{thing.__qualname__}", thing
     for kind in (Model, LinearModel, FRF):
         for name, thing in vars(kind).items():
             method = inspect.isfunction(thing) or isinstance(thing, classmethod | staticmethod)
@@ -57,8 +55,17 @@ def is_shown(thing: Any) -> bool:
     return callable(thing) and not (inspect.isclass(thing) and issubclass(thing, Exception))
 
 
-MONITORS = ("ProgressLine", "StartsLine", "TensorBoard", "Checkpoint")
-SHOWN = {name: thing for name, thing in public() if is_shown(thing) and name not in WITHOUT}
+def elsewhere() -> Iterator[tuple[str, Any]]:
+    """What else in the package shows an example, by name."""
+    for info in pkgutil.walk_packages(lfrtorch.__path__, "lfrtorch."):
+        for name, thing in vars(importlib.import_module(info.name)).items():
+            own = getattr(thing, "__module__", "") == info.name
+            if own and ">>>" in (thing.__doc__ or ""):
+                yield f"{info.name.removeprefix('lfrtorch.')}.{name}", thing
+
+
+PUBLIC = {name: thing for name, thing in public() if is_shown(thing) and name not in WITHOUT}
+SHOWN = PUBLIC | {name: thing for name, thing in elsewhere() if thing not in PUBLIC.values()}
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,8 @@ from lfrtorch.reporting.monitor import ProgressLine, StartsLine
 class Console(Observer):
     """Prints what :func:`lfrtorch.identify` finds, step by step.
 
-    Examples:
+    Example:
+        >>> from lfrtorch.reporting.console import Console
         >>> Console().say("note: the input is constant")
         note: the input is constant
     """

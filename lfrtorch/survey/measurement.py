@@ -62,6 +62,7 @@ def survey_measurement(
         ValueError: different lengths, or other numbers of names than of channels.
 
     Example:
+        >>> from lfrtorch.survey.measurement import survey_measurement
         >>> found = survey_measurement(u, y, fs=100.0)
         >>> found.outputs[0].samples, found.outputs[0].missing, found.whole
         (400, 0, slice(0, 400, None))

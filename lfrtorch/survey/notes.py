@@ -85,6 +85,7 @@ def examine(found: Survey, u: Array, y: Array) -> list[Note]:
 
     Example:
         >>> from lfrtorch.survey.measurement import survey_measurement
+        >>> from lfrtorch.survey.notes import examine
         >>> u, y = np.zeros((400, 1)), np.random.default_rng(0).standard_normal((400, 1))
         >>> examine(survey_measurement(u, y), u, y)[0].kind
         'constant u1'
@@ -106,6 +107,7 @@ def notes_on(records: Record | Sequence[Record]) -> list[str]:
         ValueError: no records, or records of different channels.
 
     Example:
+        >>> from lfrtorch.survey.notes import notes_on
         >>> short = lfrtorch.Record(np.random.default_rng(0).standard_normal(50), np.arange(50.0))
         >>> for note in notes_on(short):
         ...     print(note)
