@@ -30,9 +30,14 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     fresh = Path(name)
     try:
         yield fresh
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(fresh, 0o666 & ~mask)  # a temporary file is its owner's alone
+        os.chmod(fresh, 0o666 & ~umask())  # a temporary file is its owner's alone
         os.replace(fresh, path)
     finally:
         fresh.unlink(missing_ok=True)
+
+
+def umask() -> int:
+    """The permissions that new files do not get."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

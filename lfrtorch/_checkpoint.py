@@ -14,6 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from lfrtorch._atomic import umask
 from lfrtorch._errors import InputError
 
 FORMAT = "lfrtorch"
@@ -41,7 +42,7 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
         text = json.dumps({"format": FORMAT, "version": VERSION, **description}, indent=2) + "\n"
         (fresh / DESCRIPTION).write_text(text)
         save_file({k: t.detach().contiguous().cpu() for k, t in weights.items()}, fresh / WEIGHTS)
-        os.chmod(fresh, 0o777 & ~_umask())
+        os.chmod(fresh, 0o777 & ~umask())
         if _holds(folder, text):  # other weights of the same model: at no moment is there neither
             os.replace(fresh / WEIGHTS, folder / WEIGHTS)
         elif folder.exists():
@@ -136,9 +137,3 @@ def _holds(folder: Path, description: str) -> bool:
 def _occupied(folder: Path) -> bool:
     """Whether ``folder`` is a file or a folder that is not empty."""
     return not folder.is_dir() or any(folder.iterdir())
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

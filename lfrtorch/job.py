@@ -12,6 +12,7 @@ from typing import Any, cast
 import torch
 
 from lfrtorch._errors import InputError
+from lfrtorch._tables import number, quantity
 from lfrtorch._threads import each_alone
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
@@ -166,8 +167,8 @@ def linear_model(
     found = linear.fit
     assert found is not None
     observer.say(
-        f"BLA: order {linear.nx}, {found.criterion} error {found.rmse:.3g} (normalised), "
-        f"{found.iterations} iterations, {found.reason}, {found.seconds:.1f} s"
+        f"BLA: order {linear.nx}, {found.criterion} error {number(found.rmse)} (normalised), "
+        f"{found.iterations} iterations, {found.reason}, {quantity(found.seconds, 's')}"
     )
     for note in found.notes:
         observer.say(f"note: {note}")

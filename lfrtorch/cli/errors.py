@@ -34,12 +34,12 @@ def user_errors(rank: str = "0") -> Iterator[None]:
     except TerminatedError as end:
         if rank == "0":
             print(end, file=sys.stderr)
-        sys.exit(128 + signal.SIGTERM)
+        sys.exit(128 + end.number)
     except (LfrtorchError, OSError) as failed:
         print(f"{error}: {failed}", file=sys.stderr)
-    except KeyboardInterrupt as stop:
-        print(f"interrupted {str(stop) or 'outside the fit'}: nothing to keep", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt:
+        print("interrupted outside the fit: nothing to keep", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)
     sys.exit(1)
 
 

@@ -81,12 +81,9 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             found = identify(
                 dataset, settings, observer=files, snapshots=snapshots, ranks=ranks, stop=stop
             )
-        except StoppedError:
-            if stop.asked == signal.SIGTERM:
-                raise TerminatedError(
-                    "terminated while sizes were searched: nothing to keep"
-                ) from None
-            raise KeyboardInterrupt("while sizes were searched") from None
+        except StoppedError as stopped:
+            number = stop.asked or signal.SIGINT
+            raise TerminatedError(f"{stopped}: nothing to keep", number) from None
         if files is not None:
             print(found)
             config = OmegaConf.to_yaml(files.cfg, resolve=True)

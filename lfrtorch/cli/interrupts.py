@@ -10,7 +10,11 @@ from lfrtorch._errors import LfrtorchError
 
 
 class TerminatedError(LfrtorchError):
-    """SIGTERM ended the program."""
+    """A signal ended the program, SIGTERM or another ``number``."""
+
+    def __init__(self, message: str, number: int = signal.SIGTERM) -> None:
+        super().__init__(message)
+        self.number = number
 
 
 class Termination:

@@ -64,7 +64,9 @@ def simulate(cfg: DictConfig) -> None:
                 print(f"note: '{path}' has no column {missing}, so nothing is scored")
             x0 = start_state(cfg, model, stream)
             result = written(model, stream, x0, out, cfg.skip)
-        print(f"{out}: {result.samples} samples, {time.perf_counter() - clock:.1f} s")
+        print(
+            f"{out}: {result.samples} samples, {_tables.quantity(time.perf_counter() - clock, 's')}"
+        )
         for note in noted(result, model, cfg):
             print(f"note: {note}")
         rows += scored(path, model, result.scores, cfg.skip) if stream.y else []
@@ -128,8 +130,8 @@ def written(
 def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
     """What a user should know before the outputs are used."""
     notes = [
-        f"the input {channel.name} goes {peak:.3g} standard deviations of the training input away "
-        "from its mean: the model extrapolates there"
+        f"the input {channel.name} goes {_tables.number(peak)} standard deviations of the training "
+        "input away from its mean: the model extrapolates there"
         for channel, peak in zip(model.inputs, result.peaks, strict=True)
         if peak > FAR
     ]
@@ -141,9 +143,9 @@ def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
     if cfg.start != "estimated" and transient.any():
         ratio = (beginning / settled.rmse)[transient].max()
         notes.append(
-            f"the error over the first {BEGINNING} scored samples is {ratio:.3g} times that of the "
-            "rest: start=estimated finds the state that the file starts from, skip=N leaves out "
-            "the transient"
+            f"the error over the first {BEGINNING} scored samples is {_tables.number(ratio)} "
+            "times that of the rest: start=estimated finds the state that the file starts from, "
+            "skip=N leaves out the transient"
         )
     return notes
 
@@ -198,9 +200,10 @@ def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> A
     record = lfrtorch.Record(u, y, fs=model.fs, start="estimated", name=stream.table.path.name)
     trajectory = model.signals(record)
     fitted = lfrtorch.rmse(record, model.scaler.restore_y(trajectory.y[0].double().numpy()))
+    there, at_rest = map(_tables.number, (fitted, lfrtorch.rmse(record, model.simulate(u))))
     print(
         f"start: the state is estimated from the first {len(u)} samples of '{record.name}'; RMSE "
-        f"there {fitted:.3g}, from zero state {lfrtorch.rmse(record, model.simulate(u)):.3g}"
+        f"there {there}, from zero state {at_rest}"
         + (f" (skip={len(u)} leaves them out of the scores)" if cfg.skip < len(u) else "")
     )
     return trajectory.x[0, 0].numpy()

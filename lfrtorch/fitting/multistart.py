@@ -144,7 +144,7 @@ def fit(
         ValueError: no model, one that diverges on the training records at the start, fewer records
             than processes, another number of lists of monitors, or models to average that have no
             network.
-        ProcessLostError: before there was an iterate to keep.
+        ProcessLostError, StoppedError: before there was an iterate to keep.
 
     Example:
         >>> before = lfrtorch.rmse(record, model.simulate(record))
@@ -199,7 +199,7 @@ def fit(
         together.advance(field, until)
         field = judge.ranked(field)
         if not field:
-            raise StoppedError("the fit was stopped before its first iterate")
+            raise StoppedError("stopped before the first iterate of the fit")
         watch(Round(number, len(ends), judge.summaries(field), time.perf_counter() - clock))
         cut = next((fit for fit in field if fit.reason in CUT_SHORT), None)
         if cut is not None:

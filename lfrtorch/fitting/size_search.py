@@ -276,7 +276,7 @@ def search_sizes(
                 squares = np.full(len(judge.counts), inf)
             else:
                 if result.reason == Reason.INTERRUPTED:
-                    raise StoppedError("the search for sizes was stopped")
+                    raise StoppedError("stopped while sizes were searched")
                 if result.reason == Reason.PROCESS_LOST:
                     raise ProcessLostError(result.detail)
                 squares = judge.squares(result.model)

@@ -1,4 +1,8 @@
-"""A search on disk, in one file: its numbers as JSON, its tensors beside them, no pickle."""
+"""A search on disk: its numbers as JSON and its tensors in one safetensors file, no pickle.
+
+It is no checkpoint, which is a folder that people read and keep: a fit replaces this file every few
+seconds, whole or not at all, and only the same fit reads it again.
+"""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from lfrtorch._tables import quantity
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings
@@ -68,7 +69,8 @@ class Run:
         fit, parts = self.fit, []
         parts.append(
             f"{fit.outcome}; kept iteration {fit.chosen_iteration} of {fit.iterations}, "
-            f"{fit.seconds:.1f} s, {1e3 * fit.seconds_per_iteration:.0f} ms an iteration\n"
+            f"{quantity(fit.seconds, 's')}, "
+            f"{quantity(1e3 * fit.seconds_per_iteration, 'ms')} an iteration\n"
         )
         if len(fit.starts) > 1:
             parts.append(scores.starts_table(self.metrics) + "\n")

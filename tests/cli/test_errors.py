@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,12 +26,17 @@ def printed(capsys: pytest.CaptureFixture[str], call: Callable[[], object]) -> s
     return capsys.readouterr().err
 
 
-@pytest.mark.parametrize("kind", [InputError, ProcessLostError, FileNotFoundError, LfrtorchError])
+@pytest.mark.parametrize("kind", [InputError, FileNotFoundError, LfrtorchError])
 def test_errors_of_users_are_one_line(kind: Callable[[str], Exception], capsys):
     assert printed(capsys, lambda: fails(kind, "nx is 0")) == "error: nx is 0\n"
     target = {"_target_": fails, "kind": kind, "message": "nx is 0"}
     assert printed(capsys, lambda: instantiate(target)) == "error: nx is 0\n"
     assert printed(capsys, lambda: instantiate({"a": target})["a"]) == "error: a: nx is 0\n"
+
+
+def test_a_lost_process_is_one_line(capsys):
+    err = printed(capsys, lambda: fails(ProcessLostError, "rank 1"))
+    assert err == "error: a process was lost: rank 1\n"
 
 
 @pytest.mark.parametrize("kind", [ValueError, TypeError, KeyError])
@@ -63,6 +69,9 @@ def test_termination_has_the_exit_code_of_its_signal(capsys):
         raise TerminatedError("ended")
     assert stop.value.code == 143
     assert capsys.readouterr().err == "ended\n"
+    with pytest.raises(SystemExit) as stop, user_errors():
+        raise TerminatedError("ended", signal.SIGINT)
+    assert stop.value.code == 130
 
 
 def test_bad_input_is_a_value_error_as_well():

@@ -476,8 +476,8 @@ class AtOnce(lfrtorch.LevenbergMarquardt):
 @pytest.mark.parametrize(
     ("trainer", "code", "message"),
     [
-        ("AtOnce", 130, "interrupted while sizes were searched: nothing to keep"),
-        ("Terminated", 143, "terminated while sizes were searched: nothing to keep"),
+        ("AtOnce", 130, "stopped while sizes were searched: nothing to keep"),
+        ("Terminated", 143, "stopped while sizes were searched: nothing to keep"),
     ],
 )
 def test_a_search_for_sizes_that_is_ended_says_so(

@@ -156,7 +156,9 @@ def test_inputs_beyond_those_of_training_are_said(folder: Path, monkeypatch, cap
     run(monkeypatch, folder, "data.path=loud.csv", "data.fs=50", "out=x.csv")
     said = [line for line in capsys.readouterr().out.splitlines() if "extrapolates" in line]
     assert len(said) == 1
-    assert said[0].startswith("note: the input u2 goes 8 standard deviations of the training input")
+    assert said[0].startswith(
+        "note: the input u2 goes 8.00 standard deviations of the training input"
+    )
 
 
 @pytest.mark.numeric
