@@ -14,6 +14,7 @@ from torch.nn import Module
 import lfrtorch
 from lfrtorch._checks import integer
 from lfrtorch._errors import InputError
+from lfrtorch.cli.words import translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings, SizesSearch
 from lfrtorch.survey.notes import notes_on
@@ -84,7 +85,7 @@ def loaded(cfg: DictConfig) -> Dataset:
     dataset: Dataset = instantiate(cfg.data)
     measured = [record for record in dataset.train if record.source == "file"]
     for note in (*dataset.notes, *(notes_on(measured) if measured else ())):
-        print(f"note: {note}")
+        print(f"note: {translated(note, cfg)}")
     return dataset
 
 

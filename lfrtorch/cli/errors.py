@@ -9,19 +9,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hydra.errors import InstantiationException
+from omegaconf import DictConfig
 
 from lfrtorch._errors import LfrtorchError
 from lfrtorch.cli.interrupts import TerminatedError
+from lfrtorch.cli.words import translated
 
 
 @contextmanager
-def user_errors(rank: str = "0") -> Iterator[None]:
+def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None]:
     """Errors of users end the program with one message and exit code 1; bugs keep their traceback.
 
     A message names the group of the configuration, which a function's argument belongs to:
-    ``data: seed is -1``.
+    ``data: seed is -1``. With ``cfg`` it speaks in words of the command line.
     """
     error = "error" if rank == "0" else f"error on rank {rank}"
+
+    def show(message: str) -> None:
+        text = message if cfg is None else translated(message, cfg)
+        print(f"{error}: {text}", file=sys.stderr)
+
     try:
         yield
         return
@@ -30,13 +37,13 @@ def user_errors(rank: str = "0") -> Iterator[None]:
             raise failed.__cause__ from None
         group = re.search(r"^full_key: (.+)$", str(failed), re.MULTILINE)
         where = f"{group[1]}: " if group and failed.__cause__ else ""
-        print(f"{error}: {where}{failed.__cause__ or failed}", file=sys.stderr)
+        show(f"{where}{failed.__cause__ or failed}")
     except TerminatedError as end:
         if rank == "0":
             print(end, file=sys.stderr)
         sys.exit(128 + end.number)
     except (LfrtorchError, OSError) as failed:
-        print(f"{error}: {failed}", file=sys.stderr)
+        show(str(failed))
     except KeyboardInterrupt:
         print("interrupted outside the fit: nothing to keep", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)

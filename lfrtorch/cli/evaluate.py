@@ -66,7 +66,7 @@ def linear_beside(checkpoint: str) -> lfrtorch.LinearModel | None:
 def main(cfg: DictConfig) -> None:
     """The command line."""
     command = shlex.join([*program("scripts/evaluate.py"), *HydraConfig.get().overrides.task])
-    with user_errors():
+    with user_errors(cfg=cfg):
         evaluate(cfg, command)
 
 

@@ -15,6 +15,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -39,6 +40,7 @@ from lfrtorch.cli.run_folder import (
     no_empty_folder,
     program,
 )
+from lfrtorch.cli.words import Terminal, translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.observer import Watching
@@ -48,7 +50,7 @@ from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
-from lfrtorch.reporting.console import Console
+from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
 from lfrtorch.reporting.run_files import write
 
@@ -85,6 +87,8 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             number = stop.asked or signal.SIGINT
             raise TerminatedError(f"{stopped}: nothing to keep", number) from None
         if files is not None:
+            advice = [Advice(translated(a.text, cfg), a.evidence) for a in found.advice]
+            found = replace(found, advice=advice)
             print(found)
             config = OmegaConf.to_yaml(files.cfg, resolve=True)
             write(
@@ -106,11 +110,12 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
     return found.fit.history[found.fit.chosen_iteration].train if judged is None else judged
 
 
-class _Folder(Console):
+class _Folder(Terminal):
     """The first process: prints, and keeps the folder of the run up to date during the fit."""
 
     def __init__(self, cfg: DictConfig, folder: Path, *, least: float) -> None:
-        self.cfg, self.folder, self._least = cfg, folder, least
+        super().__init__(cfg)
+        self.folder, self._least = folder, least
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
@@ -146,7 +151,7 @@ def main(cfg: DictConfig) -> float:
     command = shlex.join([*program("train.py"), *job.overrides.task])
     folder = Path(job.runtime.output_dir)
     with ExitStack() as stack:
-        stack.enter_context(user_errors(rank))
+        stack.enter_context(user_errors(rank, cfg))
         if rank == "0":
             stack.enter_context(no_empty_folder(folder))
         ranks = stack.enter_context(connect(cfg.device, cfg.timeout))

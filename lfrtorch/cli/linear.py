@@ -30,12 +30,12 @@ from lfrtorch.analysis.poles import frequency_and_damping
 from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
+from lfrtorch.cli.words import Terminal
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.job import linear_model
 from lfrtorch.metrics import rms
 from lfrtorch.reporting import linear_plots, plots
-from lfrtorch.reporting.console import Console
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
@@ -49,7 +49,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     # A fit to the response takes the one that the figures show.
     data = frf if frf and cfg.bla.refine == "frequency" else dataset.train
     model, scan = linear_model(
-        data, settings, dataset.validation, observer=Console(), ranks=Ranks()
+        data, settings, dataset.validation, observer=Terminal(cfg), ranks=Ranks()
     )
     cfg.nx = model.nx
     assert model.fit is not None
@@ -240,7 +240,7 @@ def main(cfg: DictConfig) -> None:
     run = HydraConfig.get()
     command = shlex.join([*program("scripts/bla.py"), *run.overrides.task])
     folder = Path(run.runtime.output_dir)
-    with user_errors(), no_empty_folder(folder):
+    with user_errors(cfg=cfg), no_empty_folder(folder):
         identify(cfg, folder, command)
 
 

@@ -15,6 +15,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from lfrtorch._errors import InputError
+from lfrtorch.cli.words import now
 from lfrtorch.distributed import Ranks
 
 WORLD = int(os.environ.get("WORLD_SIZE", "1"))
@@ -22,12 +23,6 @@ WORLD = int(os.environ.get("WORLD_SIZE", "1"))
 
 CONFIG, SNAPSHOTS = "config.yaml", "resume"
 """In the folder of a run: its settings, and its starts as far as they came."""
-
-OLD_WORDS = {
-    "init=polynomial": "static=polynomial",
-    "trainer.epochs": "trainer.max_iter",
-}
-"""Words of the command line that have other names now; saved runs may have them."""
 
 
 def arguments(given: Sequence[str]) -> list[str]:
@@ -61,14 +56,6 @@ def arguments(given: Sequence[str]) -> list[str]:
                 "to go on with that run, or overwrite=true to replace it."
             )
     return list(given)
-
-
-def now(word: str) -> str:
-    """The word of the command line by its present name."""
-    for old, new in OLD_WORDS.items():
-        if word == old or word.startswith(f"{old}="):
-            return new + word.removeprefix(old)
-    return word
 
 
 def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:

@@ -28,10 +28,11 @@ def printed(capsys: pytest.CaptureFixture[str], call: Callable[[], object]) -> s
 
 @pytest.mark.parametrize("kind", [InputError, FileNotFoundError, LfrtorchError])
 def test_errors_of_users_are_one_line(kind: Callable[[str], Exception], capsys):
-    assert printed(capsys, lambda: fails(kind, "nx is 0")) == "error: nx is 0\n"
+    message = str(kind("nx is 0"))
+    assert printed(capsys, lambda: fails(kind, "nx is 0")) == f"error: {message}\n"
     target = {"_target_": fails, "kind": kind, "message": "nx is 0"}
-    assert printed(capsys, lambda: instantiate(target)) == "error: nx is 0\n"
-    assert printed(capsys, lambda: instantiate({"a": target})["a"]) == "error: a: nx is 0\n"
+    assert printed(capsys, lambda: instantiate(target)) == f"error: {message}\n"
+    assert printed(capsys, lambda: instantiate({"a": target})["a"]) == f"error: a: {message}\n"
 
 
 def test_a_lost_process_is_one_line(capsys):

@@ -34,7 +34,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 import lfrtorch
-from lfrtorch.cli import config, errors, fit, interrupts, run_folder
+from lfrtorch.cli import config, errors, fit, interrupts, run_folder, words
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
 
@@ -122,9 +122,10 @@ def test_notes_on_the_data_are_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(official, "cache", lambda: tmp_path)  # without files
-    data = config.loaded(configuration("+bench=parwh", "data.levels=[100]"))
+    cfg = configuration("+bench=parwh", "data.levels=[100]")
+    data = config.loaded(cfg)
     assert data.tests[0].source == "stand-in"
-    assert capsys.readouterr().out == f"note: {data.notes[0]}\n"
+    assert capsys.readouterr().out == f"note: {words.translated(data.notes[0], cfg)}\n"
 
 
 @pytest.mark.parametrize("group", ["bla", "data", "trainer"])
@@ -363,6 +364,19 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
     assert ends[0]["ranking"] == ends[1]["ranking"]
     weights = [(f / "model" / "weights.safetensors").read_bytes() for f in (cut, whole)]
     assert weights[0] == weights[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "spoken"),
+    [
+        ("Still falling: max_iter=240.", "Still falling: trainer.max_iter=240."),
+        ("start='estimated' or skip=N", "data.start=estimated or data.skip=N"),
+        ("try offset=False", "try bla.offset=false"),
+        ("nx=auto, data.fs=3 and starts=8", "nx=auto, data.fs=3 and starts=8"),
+    ],
+)
+def test_messages_speak_the_command_line(text: str, spoken: str, csv: Path):
+    assert words.translated(text, configuration(*file_overrides(csv))) == spoken
 
 
 @pytest.mark.numeric

@@ -1,0 +1,59 @@
+"""Words of the command line: those that have other names now, and those for Python's arguments."""
+
+from __future__ import annotations
+
+import re
+
+from omegaconf import DictConfig
+
+from lfrtorch.reporting.console import Console
+
+OLD_WORDS = {
+    "init=polynomial": "static=polynomial",
+    "trainer.epochs": "trainer.max_iter",
+}
+"""Words that have other names now; saved runs may have them."""
+
+GROUPS = ("bla", "data", "trainer")
+"""Groups whose words are arguments of functions. Of a name in several, the last one is meant."""
+
+
+def now(word: str) -> str:
+    """The word of the command line by its present name."""
+    for old, new in OLD_WORDS.items():
+        if word == old or word.startswith(f"{old}="):
+            return new + word.removeprefix(old)
+    return word
+
+
+def translated(text: str, cfg: DictConfig) -> str:
+    """A message with Python's arguments as words of the command line.
+
+    Examples:
+        >>> from omegaconf import OmegaConf
+        >>> cfg = OmegaConf.create({"data": {"start": "zero"}, "trainer": {"max_iter": 5}})
+        >>> translated("estimate their starts (start='estimated'), or give max_iter=20.", cfg)
+        'estimate their starts (data.start=estimated), or give trainer.max_iter=20.'
+    """
+    words = {name: f"{group}.{name}" for group in GROUPS for name in cfg.get(group) or {}}
+    words = {name: word for name, word in words.items() if name not in cfg}
+
+    def translate(found: re.Match[str]) -> str:
+        name, value = found[1], found[2]
+        if name not in words:
+            return found[0]
+        value = value.strip("'\"") if value[:1] in ("'", '"') else value
+        return f"{words[name]}={value.lower() if value in ('True', 'False') else value}"
+
+    return re.sub(r"(?<![\w.])(\w+)=('\w+'|\"\w+\"|True\b|False\b|)", translate, text)
+
+
+class Terminal(Console):
+    """Prints in words of the command line."""
+
+    def __init__(self, cfg: DictConfig) -> None:
+        self.cfg = cfg
+
+    def say(self, text: str) -> None:
+        """Print it."""
+        super().say(translated(text, self.cfg))
