@@ -49,7 +49,7 @@ class Model:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """nx, nz, nw, and the degree of a polynomial or else the neurons nn (0 for an own map)."""
+        """nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a map of the user's own."""
         cell = self.lfr.cell
         sizes = {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw}
         if isinstance(cell.static, Polynomial):
@@ -101,9 +101,9 @@ class Model:
             start: ``"zero"`` (x = 0: at rest at the input's offset, exactly so for the linear model
                 and the start of a fit, later up to the network's bias), ``"given"`` (x0),
                 ``"periodic"``, or ``"estimated"``: from the most probable state, given the record's
-                output in the samples it skips, or in all if it skips none. Where left out, the
-                record's own, and ``"zero"`` for a bare input.
-            x0: start state in the model's coordinates, for ``start="given"``.
+                output in the samples it skips, or in all if it skips none. Default: the record's
+                own, and ``"zero"`` for a bare input.
+            x0: initial state in the model's coordinates, for ``start="given"``.
 
         Shape:
             data: (T, nu) or (T,), x0: (nx,) -> (T, ny).
@@ -221,14 +221,14 @@ def simulate_blocks(
 ) -> Iterator[Array]:
     """Simulated output of an input that comes in blocks, as if it were simulated in one go.
 
-    The state at the end of a block is that at the start of the next: the numbers are the same to
-    the bit where the model is linear or a ``Network`` on the CPU, and to rounding elsewhere. No
-    more than a block is in memory.
+    Each block begins with the state at the end of the one before. The numbers are the same to the
+    bit if the model is linear or a ``Network`` on the CPU, otherwise to rounding. Only one block is
+    in memory.
 
     Args:
         model: what is simulated; ``LinearModel.to_model`` gives that of a linear one.
         blocks: the input, physical units, one block after another, of any lengths.
-        x0: start state in the model's coordinates; 0 where left out. That of a measurement is
+        x0: initial state in the model's coordinates. Default: 0. That of a measurement is
             ``model.signals(record, start="estimated").x[0, 0]``.
 
     Shape:
@@ -265,8 +265,8 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
 
     Args:
         folder: where it was saved.
-        static: the module of the static nonlinearity, where it was the user's own class (a
-            checkpoint holds weights, never code).
+        static: the module of the static nonlinearity, if it is of the user's own class: a
+            checkpoint holds weights, never code.
 
     Raises:
         ValueError: no checkpoint, a damaged one, one of another program or a newer version, one

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from lfrtorch._checks import integer
@@ -21,8 +22,8 @@ class LFRCell(nn.Module):
 
     Args:
         nu, ny, nx, nz, nw: sizes; ``nz = nw = 0`` without ``static`` is a linear model.
-        static: the map z -> w, any module from (..., nz) to (..., nw).
-        device, dtype: as everywhere in torch.
+        static: the map z -> w: any module from (..., nz) to (..., nw).
+        device, dtype: of the matrices, as in any torch module.
 
     Shape:
         A: (nx, nx), Bu: (nx, nu), Bw: (nx, nw), Cz: (nz, nx), Dzu: (nz, nu), Cy: (ny, nx),
@@ -69,18 +70,18 @@ class LFRCell(nn.Module):
         self.Cy, self.Dyu, self.Dyw = matrix(ny, nx), matrix(ny, nu), matrix(ny, nw)
         self.static = static
 
-    def forward(self, u: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Output and next state.
-
-        Shape:
-            u: (..., nu), x: (..., nx) -> y: (..., ny), x+: (..., nx).
-        """
+    def forward(
+        self, u: Float[Tensor, "*axes nu"], x: Float[Tensor, "*axes nx"]
+    ) -> tuple[Float[Tensor, "*axes ny"], Float[Tensor, "*axes nx"]]:
+        """Output and next state."""
         w = self.internal(u, x)[1]
         y = x @ self.Cy.mT + u @ self.Dyu.mT + w @ self.Dyw.mT
         return y, x @ self.A.mT + u @ self.Bu.mT + w @ self.Bw.mT
 
-    def internal(self, u: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Input z (..., nz) and output w (..., nw) of the static nonlinearity."""
+    def internal(
+        self, u: Float[Tensor, "*axes nu"], x: Float[Tensor, "*axes nx"]
+    ) -> tuple[Float[Tensor, "*axes nz"], Float[Tensor, "*axes nw"]]:
+        """Input z and output w of the static nonlinearity."""
         z = x @ self.Cz.mT + u @ self.Dzu.mT
         return z, (z if self.static is None else self.static(z))
 

@@ -1,7 +1,9 @@
-"""Rows of the Jacobian in machine code: all sensitivities at once, never stored over time.
+"""Rows of the Jacobian in machine code.
 
-S(k+1) = F(k) S(k) + G(k) and dy(k)/dθ = H(k) S(k) + E(k), a job for each record and part of the
-columns; ``sensitivity`` has the same in torch.
+The sensitivities S(k+1) = F(k) S(k) + G(k) go from sample to sample, and the rows
+dy(k)/dθ = H(k) S(k) + E(k) are written on the way; no S is stored over time. Each job has one
+record and some of the columns.
+``sensitivity`` has the equations, and the same computation in torch.
 """
 
 from __future__ import annotations
@@ -17,14 +19,15 @@ def jacobian_rows(
     job, A, Bw, Cz, Cy, Dyw, J, v, by_weight, slope, h, Ww, z, x_entries, z_entries, y_entries,
     first, chunks, S, rows,
 ):  # fmt: skip
-    """Rows of one record and one part of the columns, and S (R, nx, C) on to the block's end.
+    """Write the rows of one record and one chunk of the columns; S goes on to the block's end.
 
-    Job r * chunks + c is chunk c of the columns of record r; weights have a leading axis for one
-    model or one a record. Of ``by_weight`` and the four of a network one kind is empty; entries are
-    those of ``layout.Columns``.
+    Job r * chunks + c is chunk c of the columns of record r. The weights have a leading axis: one
+    model for all records, or one a record. The derivatives of the static map are ``by_weight``, or
+    come from slope, h, Ww and z of a network; the others are empty. Entries are those of
+    ``parameter_layout.Columns``.
 
     Shape:
-        J: (R, B, nw, nz), v: (R, B, nx + nu + nw), by_weight: (R, B, nw, columns),
+        S: (R, nx, C), J: (R, B, nw, nz), v: (R, B, nx + nu + nw), by_weight: (R, B, nw, columns),
         slope, h: (R, B, nn), z: (R, B, nz), rows: (R, B, ny, at least C).
     """
     r, chunk = job // chunks, job % chunks

@@ -42,7 +42,7 @@ class LFR(nn.Module):
         x0: Float[Tensor, "R nx"] | None = None,
         start: Start = "zero",
         *,
-        guess: Float[Tensor, "R T+1 nx"] | Float[Tensor, "R 1 nx"] | None = None,
+        guess: Float[Tensor, "R _ nx"] | None = None,
     ) -> Trajectory:
         """All signals of a simulation, without gradients.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
@@ -12,33 +13,31 @@ from lfrtorch.engine.recurrence import linear_recurrence
 from lfrtorch.engine.static_jacobian import linearise_static
 
 PASS = 1 << 14
-"""Samples of a long record that are linearised together."""
+"""Most samples, of all records together, that are linearised in one pass."""
 
 
 class Linearised(NamedTuple):
-    """The model linearised along a trajectory: x+ = F x, y = H x.
+    """F = ∂x(k+1)/∂x(k) and H = ∂y(k)/∂x(k) at every sample."""
 
-    Shape:
-        F: (R, T, nx, nx), H: (R, T, ny, nx).
-    """
-
-    F: Tensor
-    H: Tensor
+    F: Float[Tensor, "R T nx nx"]
+    H: Float[Tensor, "R T ny nx"]
 
 
 @torch.no_grad()
-def linearise(cell: LFRCell, z: Tensor) -> Linearised:
-    """The linearised model at the inputs z (R, T, nz) of its static nonlinearity."""
+def linearise(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Linearised:
+    """F and H of a trajectory, of which only the input z of the static nonlinearity matters."""
     weights = {name: p.detach() for name, p in cell.named_parameters()}
     return linearise_at(weights, linearise_static(cell.static, z, of_static(weights)).J)
 
 
-def linearise_at(weights: dict[str, Tensor], J: Tensor) -> Linearised:
-    """F = A + Bw J Cz and H = Cy + Dyw J Cz for J (R, T, nw, nz), by one product with a matrix.
+def linearise_at(weights: dict[str, Tensor], J: Float[Tensor, "R T nw nz"]) -> Linearised:
+    """F = A + Bw J Cz and H = Cy + Dyw J Cz, with J = ∂w/∂z.
 
-    The product is twenty times faster than as many products of small matrices.
+    Both are linear in J: its entries times one constant matrix give [F; H]. That is one large
+    product, twenty times faster than small ones at every sample.
     """
     A, Cz = weights["A"], weights["Cz"]
+    # products[(q, j), (i, l)] = [Bw; Dyw][i, q] Cz[j, l]
     left = torch.cat([weights["Bw"], weights["Dyw"]], dim=-2)
     products = torch.einsum("...iq,...jl->...qjil", left, Cz).flatten(-2).flatten(-3, -2)
     constant = torch.cat([A, weights["Cy"]], dim=-2).flatten(-2).unsqueeze(-2)
@@ -49,22 +48,22 @@ def linearise_at(weights: dict[str, Tensor], J: Tensor) -> Linearised:
 
 def of_static(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     """The weights of the static nonlinearity among those of the cell, by their own names."""
-    start = "static."
-    return {name.removeprefix(start): p for name, p in weights.items() if name.startswith(start)}
+    prefix = "static."
+    return {name.removeprefix(prefix): p for name, p in weights.items() if name.startswith(prefix)}
 
 
-def spectral_radius(matrices: Tensor) -> Tensor:
-    """Largest magnitude of an eigenvalue of each of (..., n, n); NaN where an entry is not finite.
+def spectral_radius(matrices: Float[Tensor, "*axes n n"]) -> Float[Tensor, "*axes"]:
+    """Largest magnitude of the eigenvalues of each matrix; NaN if an entry is not finite.
 
-    LAPACK is not asked then: some builds crash the process.
+    Some builds of LAPACK crash the process on such a matrix, so they never see it.
     """
     finite = torch.isfinite(matrices).all(dim=-1).all(dim=-1)
     radii = torch.linalg.eigvals(torch.where(finite[..., None, None], matrices, 0.0)).abs().amax(-1)
     return torch.where(finite, radii, torch.nan)
 
 
-def monodromy(cell: LFRCell, z: Tensor) -> Tensor:
-    """Transition matrix (R, nx, nx) over a record along z (R, T, nz): the product of all F(k)."""
+def monodromy(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx nx"]:
+    """Transition matrix over a whole record: the product of all F(k)."""
     Phi = torch.eye(cell.nx).to(z).expand(len(z), cell.nx, cell.nx)
     for part in z.split(max(1, PASS // len(z)), dim=1):
         F = linearise(cell, part).F

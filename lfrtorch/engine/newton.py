@@ -9,6 +9,7 @@ model linearised along the latest trajectory: a linear recurrence, which is para
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -20,37 +21,34 @@ MAX_NEWTON = 20
 """Iterations after which Newton's method is given up; from a nearby trajectory it needs 3 or 4."""
 
 UPDATE_ROUNDING = 1.0
-"""Largest update relative to 1 + max |x| after which the states count as found, in units of √eps.
+"""The states count as found after an update below this many √eps, relative to 1 + max |x|.
 
-Convergence is quadratic: what is then left is about eps, the rounding of the loop over time.
+Convergence is quadratic, so the error left is about eps: the rounding of the loop over time.
 """
 
 
 @torch.no_grad()
 def newton_states(
     cell: LFRCell,
-    u: Tensor,
-    x0: Tensor,
+    u: Float[Tensor, "R T nu"],
+    x0: Float[Tensor, "R nx"],
     *,
-    guess: Tensor | None = None,
+    guess: Float[Tensor, "R T+1 nx"] | None = None,
     periodic: bool = False,
-) -> Tensor:
+) -> Float[Tensor, "R T+1 nx"]:
     """States of x(k+1) = f(x(k), u(k)), those of the loop over time to rounding.
 
     Args:
         cell: the model. Its matrices may have a leading axis R, one model a record.
         u: input.
-        x0: initial state; in periodic steady state the start of the search where ``guess`` is not.
-        guess: states of a nearby trajectory, whatever their start; x0 at all times where left out.
+        x0: initial state.
+        guess: states of a nearby trajectory from any initial state. Default: x0 at all times.
         periodic: close the boundary by x(T) = x(0) instead of x(0) = x0.
 
-    Shape:
-        u: (R, T, nu), x0: (R, nx), guess: (R, T + 1, nx) -> (R, T + 1, nx). Normalised units.
-
     Returns:
-        The states; NaN for a record where the iteration does not converge or overflows (a model
-        that diverges or is chaotic), or where the periodic solution is not stable, so that no
-        simulation would settle to it.
+        The states. A record is NaN if the iteration does not converge or overflows (a model that
+        diverges or is chaotic), or if the periodic solution is not stable: no simulation would
+        settle to it.
 
     References:
         Lim, Zhu, Selfridge and Kasim, "Parallelizing non-linear sequential models over the sequence
@@ -64,6 +62,7 @@ def newton_states(
         z, w = cell.internal(u, x[:, :-1])
         defect = x[:, :-1] @ cell.A.mT + driven + w @ cell.Bw.mT - x[:, 1:]
         gap = (x[:, -1] if periodic else x0) - x[:, 0]
+        # `defect` is f(x(k), u(k)) - x(k+1), and `gap` that of the boundary: both 0 when found.
         update, transition = (_closed if periodic else _open)(linearise(cell, z).F, defect, gap)
         x = x + update
         change, size = (signal.abs().amax(dim=(1, 2)) for signal in (update, x))
@@ -75,29 +74,27 @@ def newton_states(
     return torch.where(found[:, None, None], x, torch.nan)
 
 
-def _open(F: Tensor, defect: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
-    """d(k+1) = F(k) d(k) + defect(k) from d(0) = gap: all d and the last.
-
-    Shape:
-        F: (R, T, nx, nx), defect: (R, T, nx), gap: (R, nx) -> (R, T + 1, nx), (R, nx).
-    """
+def _open(
+    F: Float[Tensor, "R T nx nx"], defect: Float[Tensor, "R T nx"], gap: Float[Tensor, "R nx"]
+) -> tuple[Float[Tensor, "R T+1 nx"], Float[Tensor, "R nx"]]:
+    """d(k+1) = F(k) d(k) + defect(k) from d(0) = gap: all d and the last."""
     d = linear_recurrence(F, defect.unsqueeze(-1), gap.unsqueeze(-1)).squeeze(-1)
     return d, d[:, -1]
 
 
-def _closed(F: Tensor, defect: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
+def _closed(
+    F: Float[Tensor, "R T nx nx"], defect: Float[Tensor, "R T nx"], gap: Float[Tensor, "R nx"]
+) -> tuple[Float[Tensor, "R T+1 nx"], Float[Tensor, "R nx nx"]]:
     """The same from d(0) = d(T) + gap: all d and the transition matrix Φ over the whole record.
 
-    d(k) = Φ(k) d(0) + p(k), all columns of which are one recurrence; (I - Φ) d(0) = p(T) + gap.
-
-    Shape:
-        F: (R, T, nx, nx), defect: (R, T, nx), gap: (R, nx) -> (R, T + 1, nx), (R, nx, nx).
+    d(k) = Φ(k) d(0) + p(k). One recurrence computes the columns of [Φ(k) p(k)], and the boundary
+    gives (I - Φ) d(0) = p(T) + gap.
     """
     R, _, nx = defect.shape
     identity = torch.eye(nx, dtype=F.dtype, device=F.device).expand(R, nx, nx)
     columns = torch.cat([torch.zeros_like(F), defect.unsqueeze(-1)], dim=-1)
     states = linear_recurrence(F, columns, pad(identity, (0, 1)))
     transition, p = states[:, -1].split([nx, 1], dim=-1)
-    start = torch.linalg.solve_ex(identity - transition, p + gap.unsqueeze(-1)).result
-    d = states.flatten(1, 2) @ pad(start, (0, 0, 0, 1), value=1.0)
+    d0 = torch.linalg.solve_ex(identity - transition, p + gap.unsqueeze(-1)).result
+    d = states.flatten(1, 2) @ pad(d0, (0, 0, 0, 1), value=1.0)  # [Φ(k) p(k)] [d0; 1]
     return d.unflatten(1, (-1, nx)).squeeze(-1), transition

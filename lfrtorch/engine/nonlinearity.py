@@ -9,6 +9,7 @@ from operator import mul
 from typing import TypeGuard
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call, vmap
 from torch.nn import Module, Parameter, ParameterList
@@ -35,10 +36,10 @@ class Network(Module):
         nn: neurons.
         activation: σ: ``"tanh"``, ``"sigmoid"``, ``"relu"``, ``"rbf"`` (exp(-v²)) or ``"softplus"``
             (ln(1 + exp(v)), a hinge without its corner).
-        device, dtype: as everywhere in torch.
+        device, dtype: of the weights, as in any torch module.
 
     Shape:
-        Wz: (nn, nz), bz: (nn,), Ww: (nw, nn), bw: (nw,); z: (..., nz) -> w: (..., nw).
+        Wz: (nn, nz), bz: (nn,), Ww: (nw, nn), bw: (nw,).
 
     Example:
         >>> static = lfrtorch.Network(nz=2, nw=1, nn=15)
@@ -77,8 +78,8 @@ class Network(Module):
                 weight.uniform_(-1.0, 1.0, generator=generator)
             self.bw.zero_()
 
-    def forward(self, z: Tensor) -> Tensor:
-        """w (..., nw) of z (..., nz)."""
+    def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
+        """w of z."""
         hidden = ACTIVATIONS[self.activation](z @ self.Wz.mT + self.bz)
         return hidden @ self.Ww.mT + self.bw
 
@@ -89,7 +90,7 @@ class Network(Module):
 
 
 def is_network(static: Module | None) -> TypeGuard[Network]:
-    """Whether a map is a ``Network`` itself: a class of one's own may have another forward pass."""
+    """Whether a map is a ``Network`` itself: a subclass may have another forward pass."""
     return type(static) is Network
 
 
@@ -102,11 +103,11 @@ class Polynomial(Module):
         nz: inputs.
         nw: outputs.
         degree: highest total degree.
-        device, dtype: as everywhere in torch.
+        device, dtype: of the weights, as in any torch module.
 
     Shape:
-        C: (nw, monomials), (nz + degree)! / (nz! degree!) of them by rising degree, the constant in
-        column 0; z: (..., nz) -> w: (..., nw).
+        C: (nw, monomials). There are (nz + degree)! / (nz! degree!) monomials by rising degree; the
+        constant is column 0.
 
     Raises:
         ValueError: a degree below 1.
@@ -131,20 +132,20 @@ class Polynomial(Module):
         super().__init__()
         integer("degree", degree, 1)
         self.nz, self.degree = nz, degree
-        # Each product of that many factors out of (1, z1, z2, ..) once; the ones lower its degree.
+        # A monomial is a product of `degree` factors out of (1, z1, z2, ..); ones lower its degree.
         factors = list(combinations_with_replacement(range(nz + 1), degree))
         self.register_buffer("_factors", torch.tensor(factors, device=device), persistent=False)
         self.C = Parameter(torch.empty(nw, len(factors), device=device, dtype=dtype))
         self.reset_parameters()
 
     def reset_parameters(self, generator: torch.Generator | None = None) -> None:
-        """C ~ U(-1, 1) / monomials, so that |w| <= 1 where all |z| <= 1, and the constant 0."""
+        """C ~ U(-1, 1) / monomials, so that |w| <= 1 if all |z| <= 1, and the constant is 0."""
         with torch.no_grad():
             self.C.uniform_(-1.0, 1.0, generator=generator).div_(self.C.shape[-1])
             self.C[:, 0] = 0.0
 
-    def forward(self, z: Tensor) -> Tensor:
-        """w (..., nw) of z (..., nz)."""
+    def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
+        """w of z."""
         factors = pad(z, (1, 0), value=1.0)[..., self._factors]  # (..., monomials, degree)
         return reduce(mul, factors.unbind(-1)) @ self.C.mT
 
@@ -171,8 +172,8 @@ class Stacked(Module):
         """The map."""
         return self._base[0]
 
-    def forward(self, z: Tensor) -> Tensor:
-        """w (R, T, nw) of z (R, T, nz)."""
+    def forward(self, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R T nw"]:
+        """w of z."""
 
         def one(weights: dict[str, Tensor], z: Tensor) -> Tensor:
             return functional_call(self.base, weights, (z,))

@@ -4,7 +4,7 @@ With v = [x; u; w] the model is linear in its matrices::
 
     x+ = [A Bu Bw] v      z = [Cz Dzu 0] v      y = [Cy Dyu Dyw] v      w = f(z; φ)
 
-so the direct term of a parameter is an entry of v, but for those of the static map.
+so the direct term of a parameter is an entry of v, unless it belongs to the static map.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
@@ -22,29 +23,26 @@ _EQUATIONS = {
     "z": {"Cz": "x", "Dzu": "u"},
     "y": {"Cy": "x", "Dyu": "u", "Dyw": "w"},
 }
-"""What each matrix multiplies, by the equation it stands in, in the order of the parameters."""
+"""For each equation its matrices, in the order of the parameters, and what each multiplies."""
 
 
 class Columns(NamedTuple):
     """Direct terms of some columns.
 
-    Each row (column, row, regressor) of ``x``, ``z``, ``y`` says that the column's parameter
-    multiplies ``v[regressor]`` in that row of the equation. Those of the static map begin at the
-    column ``first``.
-
-    Shape:
-        x, z, y: (entries, 3), static: (kept,), positions among all weights of the map.
+    A triple (column, row, regressor) in ``x``, ``z`` or ``y`` says that the column's parameter
+    multiplies ``v[regressor]`` in that row of the equation. The columns of the static map begin at
+    ``first``; ``static`` holds their positions among all weights of the map.
     """
 
-    x: Tensor
-    z: Tensor
-    y: Tensor
-    static: Tensor
+    x: Int[Tensor, "n_x 3"]
+    z: Int[Tensor, "n_z 3"]
+    y: Int[Tensor, "n_y 3"]
+    static: Int[Tensor, " n_static"]
     first: int
 
 
 def layout(cell: LFRCell, *, every: bool = False) -> Layout:
-    """Layout of the free parameters, or of all: the same object for cells that are alike."""
+    """Layout of the free parameters, or of every one; cells of one structure share the object."""
     models = cell.A.numel() // cell.nx**2
     parameters = tuple(
         (name, p.numel() // models, every or p.requires_grad) for name, p in cell.named_parameters()
@@ -66,13 +64,14 @@ class Layout:
     ) -> None:
         self.rows = {"x": nx, "z": nz, "y": ny}
         self.width = nx + nu + nw
-        start, size = {"x": 0, "u": nx, "w": nx + nu}, {"x": nx, "u": nu, "w": nw}
+        first_in_v, size = {"x": 0, "u": nx, "w": nx + nu}, {"x": nx, "u": nu, "w": nw}
         places = {
-            name: (e, self.rows[left], start[right], size[right])
+            name: (e, self.rows[left], first_in_v[right], size[right])
             for e, (left, matrices) in enumerate(_EQUATIONS.items())
             for name, right in matrices.items()
         }
-        # For every element of θ: equation (3: static map), row (its position), regressor.
+        # For every element of θ: equation, row, regressor. Those of the static map have equation 3,
+        # and their position in the map for the other two.
         table = []
         self.weights = 0
         for name, count, free in parameters:
@@ -90,8 +89,8 @@ class Layout:
                 table.append(entries)
         self.table = torch.cat([torch.zeros(3, 0, dtype=torch.int64), *table], dim=1)
 
-    def columns(self, kept: Tensor) -> Columns:
-        """The direct terms of the kept parameters (K,), positions in θ, ascending."""
+    def columns(self, kept: Int[Tensor, " K"]) -> Columns:
+        """The direct terms of the kept parameters, given by ascending positions in θ."""
         equation, row, regressor = self.table[:, kept.cpu()]
         column = torch.arange(len(equation))
         entries = torch.stack([column, row, regressor], dim=1)
@@ -99,8 +98,8 @@ class Layout:
         static = row[equation == 3]
         return Columns(x, z, y, static, len(column) - len(static))
 
-    def matrices(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Changes of [A Bu Bw], [Cz Dzu 0], [Cy Dyu Dyw] and the static map for θ (..., P)."""
+    def matrices(self, theta: Float[Tensor, "*axes P"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """[A Bu Bw], [Cz Dzu 0], [Cy Dyu Dyw] and the weights of the static map in θ."""
         equation, row, regressor = self.table.to(theta.device)
         parts = []
         for e, rows in enumerate(self.rows.values()):
@@ -112,8 +111,14 @@ class Layout:
         static[..., row[equation == 3]] = theta[..., equation == 3]
         return *parts, static
 
-    def vector(self, x: Tensor, z: Tensor, y: Tensor, static: Tensor) -> Tensor:
-        """The entries of such matrices (R, rows, width) that belong to θ: (R, P)."""
+    def vector(
+        self,
+        x: Float[Tensor, "R nx v"],
+        z: Float[Tensor, "R nz v"],
+        y: Float[Tensor, "R ny v"],
+        static: Float[Tensor, "R weights"],
+    ) -> Float[Tensor, "R P"]:
+        """θ from such matrices: the inverse of ``matrices``."""
         equation, row, regressor = self.table.to(x.device)
         theta = x.new_empty(len(x), len(equation))
         for e, matrix in enumerate((x, z, y)):

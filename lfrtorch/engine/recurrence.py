@@ -1,4 +1,4 @@
-"""The one sequential primitive: s(k+1) = F(k) s(k) + g(k), many columns at once.
+"""The one sequential primitive: s(k+1) = F(k) s(k) + g(k), for many columns at once.
 
 Sensitivities, adjoints, Newton steps over a trajectory and periodic boundaries are all this
 recurrence. ``loop`` says what it computes; ``compiled`` (numba) serves the CPU and ``scan`` (torch,
@@ -36,7 +36,7 @@ def linear_recurrence(
 def adjoint_recurrence(
     F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], end: Float[Tensor, "R n m"]
 ) -> Float[Tensor, "R T+1 n m"]:
-    """All states of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end: the same back in time."""
+    """All states of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end: the transposed one, back in time."""
     if has_kernels(F):
         return compiled(F, g, end, backwards=True)
     return scan(F.mT.flip(1), g.flip(1), end).flip(1)
@@ -118,8 +118,8 @@ def scan(
 ) -> Float[Tensor, "R T+1 n m"]:
     """The recurrence in about 3 √T batched products: chunks of √T steps side by side.
 
-    Each chunk is run from a zero state together with its transition matrices, the chunks' end
-    states are linked, and the links are propagated back into the chunks.
+    First, every chunk runs from a zero state, together with its transition matrices. Then one loop
+    over the chunks finds their initial states. Last, the response to these is added in each chunk.
     """
     R, T, n, m = g.shape
     steps = max(1, math.isqrt(T))
@@ -137,8 +137,8 @@ def scan(
         inside.append(local)
     particular, transition = torch.stack(inside, dim=2).split([m, n], dim=-1)
 
-    starts = [s0]
+    initial = [s0]
     for c in range(chunks - 1):
-        starts.append(transition[:, c, -1] @ starts[-1] + particular[:, c, -1])
-    s = particular + transition @ torch.stack(starts, dim=1).unsqueeze(2)
+        initial.append(transition[:, c, -1] @ initial[-1] + particular[:, c, -1])
+    s = particular + transition @ torch.stack(initial, dim=1).unsqueeze(2)
     return torch.cat([s0.unsqueeze(1), s.reshape(R, chunks * steps, n, m)[:, :T]], dim=1)

@@ -180,7 +180,7 @@ class Linearisation:
 
     @torch.no_grad()
     def tangent(
-        self, d_theta: Float[Tensor, "*R P"], d_x0: Float[Tensor, "R nx"] | None = None
+        self, d_theta: Float[Tensor, "*records P"], d_x0: Float[Tensor, "R nx"] | None = None
     ) -> Float[Tensor, "R T ny"]:
         """dy of a change dθ and of the initial state."""
         d_x, d_z, d_y, d_static = self.layout.matrices(d_theta)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._threads import spread
@@ -19,29 +20,25 @@ PERIODIC_TOLERANCE = 1e-10
 """Largest |x(T) - x(0)| relative to 1 + max |x| that counts as periodic (states have unit rms)."""
 
 PERIODIC_ROUNDING = 100.0
-"""The same in multiples of the rounding error, for dtypes that cannot reach the tolerance."""
+"""The same in multiples of the rounding error, which decides for dtypes of fewer digits."""
 
 MET_ROUNDING = 4.0
-"""Distance of two states, in rounding errors, at which their trajectories are taken as one."""
+"""Two trajectories have met if their states differ by at most this many rounding errors."""
 
 SETTLING_PERIODS = 3
 """Periods simulated forward before Newton's method takes over; a well damped model needs one."""
 
 MAX_PERIODS = 30
-"""Passes over the record after which the periodic steady state is given up."""
+"""Most passes over the record in search of the periodic steady state."""
 
 
 class Trajectory(NamedTuple):
-    """Signals of a simulation.
+    """Signals of a simulation, in normalised units."""
 
-    Shape:
-        x: (R, T + 1, nx), z: (R, T, nz), w: (R, T, nw), y: (R, T, ny), normalised units.
-    """
-
-    x: Tensor
-    z: Tensor
-    w: Tensor
-    y: Tensor
+    x: Float[Tensor, "R T+1 nx"]
+    z: Float[Tensor, "R T nz"]
+    w: Float[Tensor, "R T nw"]
+    y: Float[Tensor, "R T ny"]
 
     @property
     def finite(self) -> bool:
@@ -50,20 +47,25 @@ class Trajectory(NamedTuple):
 
 
 @torch.no_grad()
-def simulate(cell: LFRCell, u: Tensor, x0: Tensor, *, guess: Tensor | None = None) -> Trajectory:
+def simulate(
+    cell: LFRCell,
+    u: Float[Tensor, "R T nu"],
+    x0: Float[Tensor, "R nx"],
+    *,
+    guess: Float[Tensor, "R _ nx"] | None = None,
+) -> Trajectory:
     """Trajectory from the state ``x0``. A model that diverges gives infinite or NaN samples.
 
-    On the CPU a linear model and a ``Network`` are simulated in machine code; any other map, and
-    any other device, by Newton's method over all of time and, where that fails, step by step.
+    On the CPU a linear model and a ``Network`` are simulated in machine code. Any other map, and
+    any other device, goes through Newton's method over all of time. If that fails for a record, it
+    is simulated step by step.
 
     Args:
         cell: the model. Its weights may have a leading axis of length R: one model a record.
         u: input.
         x0: initial state.
-        guess: states of a nearby trajectory, for Newton's method.
-
-    Shape:
-        u: (R, T, nu), x0: (R, nx), guess: (R, T + 1, nx).
+        guess: states of a nearby trajectory, T + 1 of them, for Newton's method. Machine code
+            needs none.
     """
     if is_compiled(cell, u):
         return _compiled(cell, u, x0, None)
@@ -71,25 +73,30 @@ def simulate(cell: LFRCell, u: Tensor, x0: Tensor, *, guess: Tensor | None = Non
     return _with_loop_where_lost(cell, u, x0, x)
 
 
-def signals(cell: LFRCell, u: Tensor, x: Tensor) -> Trajectory:
-    """The trajectory of given states x (R, T + 1, nx)."""
+def signals(cell: LFRCell, u: Float[Tensor, "R T nu"], x: Float[Tensor, "R T+1 nx"]) -> Trajectory:
+    """The trajectory of given states."""
     z, w = cell.internal(u, x[:, :-1])
     return Trajectory(x, z, w, x[:, :-1] @ cell.Cy.mT + u @ cell.Dyu.mT + w @ cell.Dyw.mT)
 
 
 @torch.no_grad()
-def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Trajectory:
+def steady_state(
+    cell: LFRCell,
+    u: Float[Tensor, "R T nu"],
+    guess: Float[Tensor, "R nx"] | Float[Tensor, "R _ nx"] | None = None,
+) -> Trajectory:
     """Trajectory with x(T) = x(0): the response to the periodic repetition of ``u``.
 
-    In machine code the record is passed until its end state meets its initial state; where that
-    takes more than a few passes, Newton's method on x(T) - x(0) takes over. Elsewhere Newton's
-    method over all of time closes the period, too, and passes follow where it fails. A periodic
-    solution that is not stable, so that no simulation would settle to it, counts as diverged (its
-    record has NaN samples), unless the search starts right on it.
+    In machine code the record is simulated again and again, each time from its end state, until the
+    end state is the initial state. After a few passes Newton's method on x(T) - x(0) takes over.
+    Other cells try Newton's method over all of time first. A periodic solution that is not stable
+    counts as diverged (its record has NaN samples), unless the search begins right on it: no
+    simulation would settle to it.
 
-    Shape:
-        u: (R, T, nu), one or more whole periods; guess: (R, nx), start of the search, or
-        (R, T + 1, nx), states of a nearby solution.
+    Args:
+        cell: the model.
+        u: input, one or more whole periods.
+        guess: initial state of the search, or the states of a nearby solution. Default: zero.
     """
     x0 = u.new_zeros(len(u), cell.nx) if guess is None else guess
     compiled = is_compiled(cell, u)
@@ -99,6 +106,7 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
         if torch.isfinite(x).all():
             return signals(cell, u, x)
     x0 = x0[:, 0] if x0.ndim == 3 else x0
+    # `settled` and `lost` tell for each record whether it is periodic, or will never be.
     identity = torch.eye(cell.nx, dtype=u.dtype, device=u.device)
     tolerance = max(PERIODIC_TOLERANCE, PERIODIC_ROUNDING * torch.finfo(u.dtype).eps)
     trajectory = simulate(cell, u, x0)
@@ -117,6 +125,7 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
         else:
             transition = monodromy(cell, trajectory.z)
             lost |= ~settled & ~(spectral_radius(transition) < 1.0)  # False for NaN
+            # x(T) = end + Φ d for the initial state x0 + d, and x(T) = x0 + d is wanted.
             gap = (end - x0).unsqueeze(-1)
             closer = x0 + torch.linalg.solve_ex(identity - transition, gap).result.squeeze(-1)
         x0 = torch.where((settled | lost).unsqueeze(1), x0, closer)
@@ -131,31 +140,43 @@ def steady_state(cell: LFRCell, u: Tensor, guess: Tensor | None = None) -> Traje
 
 
 def is_compiled(cell: LFRCell, u: Tensor) -> bool:
-    """Whether the cell is simulated in machine code, on signals like ``u``."""
+    """Whether the cell is simulated in machine code on the device of ``u``."""
     return has_kernels(u) and (cell.static is None or is_network(cell.static))
 
 
-def _with_loop_where_lost(cell: LFRCell, u: Tensor, x0: Tensor, x: Tensor) -> Trajectory:
-    """The trajectory of the states x (R, T + 1, nx), NaN ones found step by step."""
+def _with_loop_where_lost(
+    cell: LFRCell,
+    u: Float[Tensor, "R T nu"],
+    x0: Float[Tensor, "R nx"],
+    x: Float[Tensor, "R T+1 nx"],
+) -> Trajectory:
+    """The trajectory of the states x; records that are not finite are simulated step by step."""
     lost = ~torch.isfinite(x).all(dim=(1, 2))
     if lost.any():
         x = torch.where(lost[:, None, None], _loop(cell, u, x0), x)
     return signals(cell, u, x)
 
 
-def _loop(cell: LFRCell, u: Tensor, x0: Tensor) -> Tensor:
-    """States (R, T + 1, nx), one step after another, any static map and device: the oracle."""
+def _loop(
+    cell: LFRCell, u: Float[Tensor, "R T nu"], x0: Float[Tensor, "R nx"]
+) -> Float[Tensor, "R T+1 nx"]:
+    """States, one step after another, of any static map on any device."""
     states = [x0.unsqueeze(1)]
     for u_k in u.split(1, dim=1):
         states.append(cell(u_k, states[-1])[1])
     return torch.cat(states, dim=1)
 
 
-def _compiled(cell: LFRCell, u: Tensor, x0: Tensor, near: Trajectory | None) -> Trajectory:
+def _compiled(
+    cell: LFRCell,
+    u: Float[Tensor, "R T nu"],
+    x0: Float[Tensor, "R nx"],
+    near: Trajectory | None,
+) -> Trajectory:
     """Trajectory of a linear cell or one hidden layer, in machine code on the CPU.
 
-    ``near`` is that of the same model and input from another start; once the two have met to
-    rounding, the rest is taken from there. It is overwritten.
+    ``near`` is the trajectory of the same model and input from another initial state; it is
+    overwritten. Once the two have met, the rest of it is taken over.
     """
     R, T = u.shape[:2]
     if near is None:

@@ -1,4 +1,4 @@
-"""The static nonlinearity linearised at every sample, by each of its inputs and weights."""
+"""Jacobian of the static nonlinearity at every sample, with respect to its inputs and weights."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vjp, vmap
 
@@ -16,14 +17,13 @@ Weights = dict[str, Tensor]
 
 
 class StaticJacobian(Protocol):
-    """dw = J dz + (∂w/∂φ) dφ, φ all weights of the map in the order of its parameters.
+    """dw = J dz + (∂w/∂φ) dφ; φ are all weights of the map in the order of its parameters.
 
-    Shape:
-        J: (R, T, nw, nz); dφ: (nφ,), or (R, nφ) where every record has its own weights.
+    dφ has an axis R if every record has weights of its own.
     """
 
     @property
-    def J(self) -> Tensor:
+    def J(self) -> Float[Tensor, "R T nw nz"]:
         """∂w/∂z."""
         ...
 
@@ -31,27 +31,29 @@ class StaticJacobian(Protocol):
         """The same for some of the records and samples."""
         ...
 
-    def by_weight(self) -> Tensor:
-        """∂w/∂φ (R, T, nw, nφ)."""
+    def by_weight(self) -> Float[Tensor, "R T nw weights"]:
+        """∂w/∂φ."""
         ...
 
-    def tangent(self, d_weights: Tensor) -> Tensor:
-        """(∂w/∂φ) dφ (R, T, nw)."""
+    def tangent(self, d_weights: Float[Tensor, "*records weights"]) -> Float[Tensor, "R T nw"]:
+        """(∂w/∂φ) dφ."""
         ...
 
-    def adjoint(self, d_w: Tensor) -> Tensor:
-        """Σ_k (∂w/∂φ)ᵀ d_w(k) (R, nφ) of d_w (R, T, nw)."""
+    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R weights"]:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
         ...
 
 
-def linearise_static(static: nn.Module | None, z: Tensor, weights: Weights) -> StaticJacobian:
-    """The map linearised at z (R, T, nz), with the given weights in place of its own."""
+def linearise_static(
+    static: nn.Module | None, z: Float[Tensor, "R T nz"], weights: Weights
+) -> StaticJacobian:
+    """The map linearised at z, with the given weights instead of its own."""
     if is_network(static):
         return NetworkJacobian(static, z, weights)
     return ModuleJacobian(static, z, weights)
 
 
-_SLOPES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+_DERIVATIVES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "tanh": lambda v, h: torch.addcmul(h.new_ones(()), h, h, value=-1.0),
     "sigmoid": lambda v, h: h * (1.0 - h),
     "relu": lambda v, h: (v > 0).to(v.dtype),
@@ -64,15 +66,15 @@ _SLOPES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 class NetworkJacobian:
     """One hidden layer, in closed form: six times faster than ``torch.func``."""
 
-    def __init__(self, network: Network, z: Tensor, weights: Weights) -> None:
+    def __init__(self, network: Network, z: Float[Tensor, "R T nz"], weights: Weights) -> None:
         self.z = z
         self.Wz, self.Ww = weights["Wz"], weights["Ww"]
         v = (z @ self.Wz.mT).add_(weights["bz"])
         self.h = ACTIVATIONS[network.activation](v)
-        self.slope = _SLOPES[network.activation](v, self.h)  # (R, T, nn)
+        self.slope = _DERIVATIVES[network.activation](v, self.h)  # (R, T, nn)
         nw, (nn, nz) = self.Ww.shape[-2], self.Wz.shape[-2:]
         self.sizes = [nn * nz, nn, nw * nn, nw]
-        # J = Σ_n slope_n Ww[:, n] Wz[n, :]: one product with a matrix (nn, nw nz).
+        # J = Σ_n slope_n Ww[:, n] Wz[n, :] at every sample: one product with a matrix (nn, nw nz).
         rank_ones = self.Ww.mT.unsqueeze(-1) * self.Wz.unsqueeze(-2)
         self.J = (self.slope @ rank_ones.flatten(-2)).unflatten(-1, (nw, nz))
 
@@ -86,10 +88,12 @@ class NetworkJacobian:
             part.Wz, part.Ww = self.Wz[records], self.Ww[records]
         return part
 
-    def by_weight(self) -> Tensor:
-        """∂w/∂φ (R, T, nw, nφ)."""
+    def by_weight(self) -> Float[Tensor, "R T nw weights"]:
+        """∂w/∂φ."""
         R, T, nn = self.h.shape
         nw, nz = self.J.shape[-2:]
+        # With s = slope: ∂w_q/∂Wz[n, j] = Ww[q, n] s_n z_j, ∂w_q/∂bz[n] = Ww[q, n] s_n,
+        # ∂w_q/∂Ww[q, n] = h_n, ∂w_q/∂bw[q] = 1; the last two are 0 in the rows of other outputs.
         out = self.h.new_zeros(R, T, nw, sum(self.sizes))
         Wz, bz, Ww, bw = out.split(self.sizes, dim=-1)
         torch.mul(self.slope.unsqueeze(2), self.Ww.unsqueeze(-3), out=bz)
@@ -99,27 +103,29 @@ class NetworkJacobian:
         bw.diagonal(dim1=2, dim2=3).fill_(1.0)
         return out
 
-    def tangent(self, d_weights: Tensor) -> Tensor:
-        """(∂w/∂φ) dφ (R, T, nw)."""
+    def tangent(self, d_weights: Float[Tensor, "*records weights"]) -> Float[Tensor, "R T nw"]:
+        """(∂w/∂φ) dφ."""
         (nn, nz), nw = self.Wz.shape[-2:], self.Ww.shape[-2]
         Wz, bz, Ww, bw = d_weights.split(self.sizes, dim=-1)
         Wz, Ww = Wz.unflatten(-1, (nn, nz)), Ww.unflatten(-1, (nw, nn))
         d_h = self.slope * (self.z @ Wz.mT + bz.unsqueeze(-2))
         return d_h @ self.Ww.mT + self.h @ Ww.mT + bw.unsqueeze(-2)
 
-    def adjoint(self, d_w: Tensor) -> Tensor:
-        """Σ_k (∂w/∂φ)ᵀ d_w(k) (R, nφ)."""
+    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R weights"]:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
         d_v = (d_w @ self.Ww) * self.slope
         parts = (d_v.mT @ self.z, d_v.sum(-2), d_w.mT @ self.h, d_w.sum(-2))
         return torch.cat([part.flatten(1) for part in parts], dim=-1)
 
 
 class ModuleJacobian:
-    """Any module, by ``torch.func``; none at all is a map without inputs, outputs and weights."""
+    """Any module, by ``torch.func``; ``None`` is a map without inputs, outputs and weights."""
 
-    def __init__(self, static: nn.Module | None, z: Tensor, weights: Weights) -> None:
+    def __init__(
+        self, static: nn.Module | None, z: Float[Tensor, "R T nz"], weights: Weights
+    ) -> None:
         self.z, self.static, self.weights = z, static, weights
-        self.by_record = None  # the axis of the weights that counts the records
+        self.by_record = None  # axis of the weights that counts the records, for vmap
         if isinstance(static, Stacked):
             self.static, self.by_record = static.base, 0
             self.weights = dict(zip(static.names, weights.values(), strict=True))
@@ -140,20 +146,20 @@ class ModuleJacobian:
             part.weights = {name: p[records] for name, p in self.weights.items()}
         return part
 
-    def by_weight(self) -> Tensor:
-        """∂w/∂φ (R, T, nw, nφ)."""
+    def by_weight(self) -> Float[Tensor, "R T nw weights"]:
+        """∂w/∂φ."""
         parts = self._at_every_sample(jacrev(self._map)) if self.weights else {}
         return torch.cat(
             [self.J[..., :0], *(part.reshape(*self.J.shape[:3], -1) for part in parts.values())],
             dim=-1,
         )
 
-    def tangent(self, d_weights: Tensor) -> Tensor:
-        """(∂w/∂φ) dφ (R, T, nw)."""
+    def tangent(self, d_weights: Float[Tensor, "*records weights"]) -> Float[Tensor, "R T nw"]:
+        """(∂w/∂φ) dφ."""
         return (self.by_weight() @ d_weights[..., None, :, None]).squeeze(-1)
 
-    def adjoint(self, d_w: Tensor) -> Tensor:
-        """Σ_k (∂w/∂φ)ᵀ d_w(k) (R, nφ)."""
+    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R weights"]:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
 
         def one(weights: Weights, z: Tensor, d_w: Tensor) -> Weights:
             return vjp(lambda weights: self._map(weights, z), weights)[1](d_w)[0]

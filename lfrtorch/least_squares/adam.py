@@ -1,4 +1,4 @@
-"""Adam on the full batch, the baseline beside Levenberg-Marquardt."""
+"""Adam on the full batch, a baseline for Levenberg-Marquardt."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._checks import integer, number, renamed
@@ -15,18 +16,20 @@ from lfrtorch._reasons import Reason
 class Differentiable(Protocol):
     """A residual with the gradient of its mean square."""
 
-    def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """r (M,) and the gradient (P,) of its mean square at θ (P,)."""
+    def gradient(
+        self, theta: Float[Tensor, " P"]
+    ) -> tuple[Float[Tensor, " M"], Float[Tensor, " P"]]:
+        """r and the gradient of its mean square at θ."""
         ...
 
 
 @dataclass
 class AdamState:
-    """Where the search stands: θ (P,), r(θ) (M,), the optimiser's moments, and why it ended."""
+    """Where the search stands: θ, r(θ), the optimiser's moments, and why it ended."""
 
-    theta: Tensor
-    residual: Tensor
-    gradient: Tensor
+    theta: Float[Tensor, " P"]
+    residual: Float[Tensor, " M"]
+    gradient: Float[Tensor, " P"]
     iteration: int = 0
     reason: str = ""
     moments: dict[str, Tensor] = field(default_factory=dict)
@@ -66,7 +69,7 @@ class Adam:
         return self.max_iter
 
     def init(self, problem: Differentiable, theta: Tensor) -> AdamState:
-        """State at the start θ."""
+        """State at the first θ."""
         return AdamState(theta, *problem.gradient(theta))
 
     def step(self, problem: Differentiable, state: AdamState) -> AdamState:
@@ -87,10 +90,10 @@ class Adam:
         return AdamState(theta, residual, gradient, iteration, reason, moments)
 
     def prolonged(self, state: AdamState) -> AdamState:
-        """State to go on from where all epochs were spent and there are more now."""
+        """State to go on from if all epochs were spent and there are more now."""
         spent = state.reason == Reason.ALL_EPOCHS and state.iteration < self.max_iter
         return replace(state, reason="") if spent else state
 
     def refused(self, before: AdamState, after: AdamState) -> AdamState:
-        """State to go on from where a step might be taken back: its small steps lead out again."""
+        """State to go on from after a poor step: it stays, since small steps lead out again."""
         return after

@@ -1,7 +1,9 @@
-"""Several models of one structure through the engine at once: the starts of a multi-start search.
+"""Several models of one structure, simulated and linearised together.
 
-Simulations and rows of all models are computed together, records of all models side by side; each
-model then has its own least-squares system.
+A search from several restarts has many small models. One model a time would leave a GPU idle. So
+their weights are stacked along the axis of the records: every record then has a model of its own,
+and the engine treats all records of all models alike. Each model keeps its own least-squares
+system.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import copy
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -24,14 +27,11 @@ from lfrtorch.least_squares.simulation_problem import SimulationProblem
 
 
 def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
-    """One cell with the weights of all along a leading axis, each repeated for so many records.
+    """One cell whose weights have a leading axis: the weights of each cell, ``repeat`` times.
 
     Args:
-        cells: of one structure.
+        cells: models of one structure.
         repeat: records of each cell; those of the first come first.
-
-    Shape:
-        each weight (n, m): (len(cells) * repeat, n, m).
     """
     first = cells[0]
     weights = {
@@ -44,7 +44,7 @@ def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
         static = None
     elif is_network(first.static):
         static = copy.deepcopy(first.static)
-        for name, w in own.items():  # vectors are broadcast over time
+        for name, w in own.items():  # vectors get an axis for time
             setattr(static, name, Parameter(w if w.ndim == 3 else w.unsqueeze(1)))
     else:
         static = Stacked(first.static, own)
@@ -58,10 +58,10 @@ def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
 
 
 class JointProblem:
-    """Simulation errors of several models of one structure over the same records.
+    """Simulation problems of several models of one structure over the same records.
 
     Args:
-        problems: one a model, all of the same records.
+        problems: one for each model.
 
     Raises:
         ValueError: problems that share a model, or differ in records, scaling or parameters.
@@ -83,8 +83,10 @@ class JointProblem:
                     "a stack is of models of one structure over the same records."
                 )
 
-    def residuals(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[Tensor]:
-        """r (M,) of some of the models (by their numbers), each at its own θ (P,)."""
+    def residuals(
+        self, models: Sequence[int], thetas: Sequence[Float[Tensor, " P"]]
+    ) -> list[Float[Tensor, " M"]]:
+        """r of some of the models (by their numbers), each at its own θ."""
         problems = [self.problems[i] for i in models]
         for problem, theta in zip(problems, thetas, strict=True):
             problem.write(theta)
@@ -93,8 +95,8 @@ class JointProblem:
             R = len(group.u)
             lfr = LFR(stacked([p.model.lfr.cell for p in problems], R))
             u = group.u.repeat(len(problems), 1, 1)
-            starts = [p.initial_state(i) for p in problems]
-            x0 = None if starts[0] is None else torch.cat([x for x in starts if x is not None])
+            states = [x for p in problems if (x := p.initial_state(i)) is not None]
+            x0 = torch.cat(states) if states else None
             near = [x for p in problems if (x := p.guesses[i]) is not None]
             trajectory = lfr.trajectory(
                 u,
@@ -110,10 +112,12 @@ class JointProblem:
             problem.remember(theta, trajectories)
         return [problem.residual(theta) for problem, theta in zip(problems, thetas, strict=True)]
 
-    def linearise(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[Jacobian]:
+    def linearise(
+        self, models: Sequence[int], thetas: Sequence[Float[Tensor, " P"]]
+    ) -> list[Jacobian]:
         """dr/dθ of some of the models, their rows computed together."""
         problems = [self.problems[i] for i in models]
-        # The same columns for all: none is left out.
+        # Rows are computed together, so all models need the same columns: none is left out.
         jacobians = [
             p.linearise(theta, reduce=False) for p, theta in zip(problems, thetas, strict=True)
         ]

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._checks import integer, number
@@ -28,47 +29,47 @@ from lfrtorch._reasons import Reason
 from lfrtorch.least_squares.linear_systems import SVDSystem, System
 
 FASTEST_DECREASE = 0.2
-"""Smallest factor on λ after a good step; Nielsen has 1/3."""
+"""Smallest factor on λ after an accepted step; Nielsen has 1/3."""
 
 TAKEN_BACK = 10.0
-"""Factor on λ after a step that is taken back; what it decreased at the most, and twice more."""
+"""Factor on λ after an undone step: reverts the largest decrease (1/0.2 = 5) and doubles."""
 
 
 class Jacobian(Protocol):
-    """The Jacobian J (M, P) of a residual as far as the search needs it: never the whole of it."""
+    """The Jacobian J of a residual r, as far as the search needs it: never the whole matrix."""
 
-    def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
-        """The system (JᵀJ + λI) δ = -gradient, and the gradient Jᵀr (P,) where J was taken.
+    def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
+        """The system (JᵀJ + λI) δ = -gradient, and the gradient Jᵀr.
 
         Args:
-            damping: that of the next trial relative to the largest eigenvalue of JᵀJ, as far as it
-                is known: the system may have errors that are small against it.
-            truncation: relative size of singular values that are left out.
+            damping: λ of the next trial relative to the largest eigenvalue of JᵀJ, roughly. Errors
+                of the system may be as large as a small part of it.
+            truncation: singular values below this part of the largest are left out.
         """
         ...
 
-    def tangent(self, d_theta: Tensor) -> Tensor:
-        """J d_theta (M,)."""
+    def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
+        """J dθ."""
         ...
 
-    def adjoint(self, residual: Tensor) -> Tensor:
-        """Jᵀ residual (P,)."""
+    def adjoint(self, residual: Float[Tensor, " M"]) -> Float[Tensor, " P"]:
+        """Jᵀ residual."""
         ...
 
 
 class LeastSquares(Protocol):
-    """A residual and its slope; where the residual is undefined it is infinite or NaN."""
+    """A residual and its Jacobian. A residual that is undefined is infinite or NaN."""
 
-    def residual(self, theta: Tensor) -> Tensor:
-        """r (M,) at θ (P,)."""
+    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
+        """r at θ."""
         ...
 
-    def linearise(self, theta: Tensor) -> Jacobian:
-        """dr/dθ at θ (P,)."""
+    def linearise(self, theta: Float[Tensor, " P"]) -> Jacobian:
+        """dr/dθ at θ."""
         ...
 
-    def cost(self, residual: Tensor) -> float:
-        """|r|²: of all parts of r, where processes share it."""
+    def cost(self, residual: Float[Tensor, " M"]) -> float:
+        """|r|², summed over the processes that share r."""
         ...
 
 
@@ -93,9 +94,9 @@ JACOBIAN, RESIDUAL = "jacobian", "residual"
 
 
 class DenseJacobian:
-    """A Jacobian (M, P) that is held whole, and the residual (M,) there."""
+    """A Jacobian that is held as one matrix, and the residual there."""
 
-    def __init__(self, jacobian: Tensor, residual: Tensor) -> None:
+    def __init__(self, jacobian: Float[Tensor, "M P"], residual: Float[Tensor, " M"]) -> None:
         self.jacobian, self.residual = jacobian, residual
 
     def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
@@ -103,12 +104,12 @@ class DenseJacobian:
         R = torch.linalg.qr(self.jacobian, mode="r").R
         return SVDSystem(R, truncation), self.jacobian.mT @ self.residual
 
-    def tangent(self, d_theta: Tensor) -> Tensor:
-        """J d_theta (M,)."""
+    def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
+        """J dθ."""
         return self.jacobian @ d_theta
 
-    def adjoint(self, residual: Tensor) -> Tensor:
-        """Jᵀ residual (P,)."""
+    def adjoint(self, residual: Float[Tensor, " M"]) -> Float[Tensor, " P"]:
+        """Jᵀ residual."""
         return self.jacobian.mT @ residual
 
 
@@ -117,8 +118,8 @@ class LMState:
     """Where the search stands.
 
     Args:
-        theta: parameters (P,).
-        residual: r(θ), (M,).
+        theta: parameters θ.
+        residual: r(θ).
         cost: |r|².
         damping: λ of the next trial; ``None`` before the first step.
         scale: largest squared singular value of the Jacobian in the last step.
@@ -131,8 +132,8 @@ class LMState:
         reason: why the search is over, a ``Reason``; empty while it is not.
     """
 
-    theta: Tensor
-    residual: Tensor
+    theta: Float[Tensor, " P"]
+    residual: Float[Tensor, " M"]
     cost: float
     damping: float | None = None
     scale: float = 1.0
@@ -168,8 +169,8 @@ class LevenbergMarquardt:
         tolerance: relative decrease of the cost that counts as no progress ...
         patience: ... and the number of such steps in a row that ends the search.
         floor: root mean square of the residual that counts as zero.
-        truncation: singular values below this part of the largest are left out as gauge, where
-            they are computed: not while the damping is far above rounding errors.
+        truncation: singular values below this part of the largest are left out as gauge. They are
+            computed only if the damping is not far above rounding errors.
         finite_step: h of the directional second derivative (Transtrum et al. use 0.1).
         acceleration_limit: largest 2|a| / |δ| at which the acceleration is trusted.
         max_damping: λ relative to the largest squared singular value that ends the search.
@@ -206,7 +207,7 @@ class LevenbergMarquardt:
         return self.max_iter
 
     def init(self, problem: LeastSquares, theta: Tensor) -> LMState:
-        """State at the start θ.
+        """State at the first θ.
 
         Raises:
             ValueError: the residual at the start is not finite.
@@ -231,7 +232,7 @@ class LevenbergMarquardt:
             answer = problem.linearise(theta) if wanted is JACOBIAN else problem.residual(theta)
 
     def refused(self, before: LMState, after: LMState) -> LMState:
-        """State to go on from where a step is taken back: it was too long."""
+        """State to go on from after a step that is undone: it was too long."""
         assert after.damping is not None
         return replace(
             before,
@@ -244,19 +245,19 @@ class LevenbergMarquardt:
         )
 
     def prolonged(self, state: LMState) -> LMState:
-        """State to go on from where all iterations were spent and there are more now."""
+        """State to go on from if all iterations were spent and there are more now."""
         spent = state.reason == Reason.ALL_ITERATIONS and state.iteration < self.max_iter
         return replace(state, reason="") if spent else state
 
-    def steps(self, stack: ManyLeastSquares, states: Sequence[LMState]) -> list[LMState]:
+    def steps(self, joint: ManyLeastSquares, states: Sequence[LMState]) -> list[LMState]:
         """One iteration of each of several searches, evaluated together.
 
-        The searches go in step: each round answers what all of them ask for. A search that is over
-        stays as it is.
+        Each round collects what the searches ask for and answers all of it at once. A search that
+        is over keeps its state.
         """
         after = list(states)
         searches = {
-            i: self._search(stack.problems[i].cost, state)
+            i: self._search(joint.problems[i].cost, state)
             for i, state in enumerate(states)
             if not state.reason
         }
@@ -270,7 +271,7 @@ class LevenbergMarquardt:
                 except StopIteration as end:
                     after[i] = end.value
             answers = {}
-            for wanted, evaluate in ((JACOBIAN, stack.linearise), (RESIDUAL, stack.residuals)):
+            for wanted, evaluate in ((JACOBIAN, joint.linearise), (RESIDUAL, joint.residuals)):
                 if asked[wanted]:
                     models, thetas = zip(*asked[wanted], strict=True)
                     answers |= dict(zip(models, evaluate(models, thetas), strict=True))
@@ -279,7 +280,7 @@ class LevenbergMarquardt:
     def _search(
         self, cost_of: Callable[[Tensor], float], state: LMState
     ) -> Generator[tuple[str, Tensor], Any, LMState]:
-        """One iteration that asks for the residuals and Jacobians it needs."""
+        """One iteration, which yields (what, θ) for each residual or Jacobian that it needs."""
         jacobian: Jacobian = yield JACOBIAN, state.theta
         relative = self.damping if state.damping is None else state.damping / state.scale
         system, gradient = jacobian.system(relative, self.truncation)
@@ -293,12 +294,14 @@ class LevenbergMarquardt:
         while damping <= self.max_damping * scale:
             trials += 1
             delta = system.solve(gradient, damping)
+            # Decrease of |r + J δ|² by the δ with (JᵀJ + λI) δ = -gradient.
             predicted = float(damping * delta.square().sum() - gradient @ delta)
             theta = state.theta + delta
             if self.acceleration:
                 h = self.finite_step
                 ahead = yield RESIDUAL, state.theta + h * delta
                 if math.isfinite(cost_of(ahead)):
+                    # r'' along δ, from r(θ + hδ) = r + h J δ + h² r'' / 2 + O(h³).
                     second = 2.0 / h * ((ahead - state.residual) / h - jacobian.tangent(delta))
                     theta = theta + self._acceleration(second, delta, jacobian, system, damping)
             residual = yield RESIDUAL, theta
@@ -341,9 +344,14 @@ class LevenbergMarquardt:
         )
 
     def _acceleration(
-        self, second: Tensor, delta: Tensor, jacobian: Jacobian, system: System, damping: float
-    ) -> Tensor:
-        """Second-order correction a = ½ argmin |J a + r''|² + λ|a|², or 0 where it is too long."""
+        self,
+        second: Float[Tensor, " M"],
+        delta: Float[Tensor, " P"],
+        jacobian: Jacobian,
+        system: System,
+        damping: float,
+    ) -> Float[Tensor, " P"]:
+        """Second-order correction a = ½ argmin |J a + r''|² + λ|a|², or 0 if it is too long."""
         a = 0.5 * system.solve(jacobian.adjoint(second), damping)
         trusted = 2.0 * a.norm() <= self.acceleration_limit * delta.norm()  # False for NaN
         return a if trusted else torch.zeros_like(delta)

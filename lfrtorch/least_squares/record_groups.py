@@ -9,9 +9,11 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lfrtorch._types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start
@@ -23,29 +25,37 @@ EVERY = slice(None)
 class RecordGroup:
     """Records of one length and start, normalised, and how their errors are weighted.
 
-    Shape:
-        u: (R, T, nu), y: (R, T, ny), x0: (R, nx) of given starts; estimated: (R,), which of the
-        estimated initial states is each record's.
-        scored: (R, T), 1 where a sample counts in the score.
-        weight: (R, T, ny), or by spectral line (R, F, ny), F = T // 2 + 1: the factors of the
-            errors, 0 where a sample or a line does not count.
-        start_weight: (R, T, ny), the same where the initial state of a given model is estimated.
+    Args:
+        u, y: input and output.
+        x0: the initial states, if they are given.
+        estimated: which of the estimated initial states is each record's, if they are estimated.
+        scored: 1 if a sample counts in the score, else 0.
+        weight: factors of the errors by sample, or by spectral line with m = T // 2 + 1; 0 if a
+            sample or a line does not count.
+        start_weight: the factors with which the initial state of a given model is estimated.
+        spectral: whether the weight is by spectral line.
+        start: how the records begin.
     """
 
-    u: Tensor
-    y: Tensor
-    x0: Tensor | None
-    estimated: Tensor | None
-    scored: Tensor
-    weight: Tensor
-    start_weight: Tensor | None
+    u: Float[Tensor, "R T nu"]
+    y: Float[Tensor, "R T ny"]
+    x0: Float[Tensor, "R nx"] | None
+    estimated: Int[Tensor, " R"] | None
+    scored: Float[Tensor, "R T"]
+    weight: Float[Tensor, "R m ny"]
+    start_weight: Float[Tensor, "R T ny"] | None
     spectral: bool
     start: Start
 
-    def weigh(self, errors: Tensor, records: slice = EVERY, time: slice = EVERY) -> Tensor:
-        """Weighted errors (R, m, ny) of errors (R, T, ny), or rows (..., P) of them.
+    def weigh(
+        self,
+        errors: Float[Tensor, "R T ny *columns"],
+        records: slice = EVERY,
+        time: slice = EVERY,
+    ) -> Float[Tensor, "R m ny *columns"]:
+        """Weighted errors, or weighted rows of their Jacobian.
 
-        A part of the samples will do where the weights are not spectral.
+        A spectrum needs all samples. Its real and imaginary parts follow each other in m.
         """
         weight = self.weight[records]
         if not self.spectral:
@@ -66,8 +76,8 @@ class RecordGroup:
         R, m, ny = self.weight.shape
         return torch.Size((R, 2 * m if self.spectral else m, ny))
 
-    def unweigh(self, r: Tensor) -> Tensor:
-        """The adjoint of ``weigh``: (R, m, ny) to (R, T, ny)."""
+    def unweigh(self, r: Float[Tensor, "R m ny"]) -> Float[Tensor, "R T ny"]:
+        """The adjoint of ``weigh``."""
         if not self.spectral:
             return self.weight * r
         T = self.u.shape[1]
@@ -113,8 +123,8 @@ def group_records(model: Model, records: list[Record], ranks: Ranks) -> list[Rec
     return groups
 
 
-def _factors(record: Record) -> NDArray:
-    """What multiplies the errors, (T, ny), or their spectrum by ``rfft``, (F, ny)."""
+def _factors(record: Record) -> Float[Array, "m ny"]:
+    """What multiplies the errors, or their spectrum by ``rfft``."""
     T, ny = record.y.shape
     if record.line_weight is None:
         return record.factors
@@ -128,6 +138,6 @@ def _factors(record: Record) -> NDArray:
     )
 
 
-def _columns(weight: Tensor, like: Tensor) -> Tensor:
-    """The weight (R, m, ny) with as many axes as what it multiplies."""
+def _columns(weight: Float[Tensor, "R m ny"], like: Tensor) -> Tensor:
+    """The weight with as many axes as what it multiplies."""
     return weight.reshape(*weight.shape, *[1] * (like.ndim - weight.ndim))

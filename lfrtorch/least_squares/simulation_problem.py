@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lfrtorch._checks import number
@@ -24,23 +25,23 @@ Ridge = float | Mapping[str, float]
 
 
 class SimulationProblem:
-    """Residual, slope and gradient of a model's mean squared simulation error.
+    """Residual, Jacobian and gradient of a model's squared simulation error.
 
-    r = weighted y_hat - y in normalised units, over all samples of all records (0 where a sample
-    does not count), followed by √ridge (θ - θ_0). θ is the vector of all parameters of
-    ``model.lfr`` that require a gradient, then the initial state of each record whose start is
-    ``"estimated"``; the module holds the θ that was evaluated or written last.
+    r = weighted y_hat - y in normalised units, over all samples of all records (0 if a sample does
+    not count), followed by √ridge (θ - θ_0). θ is the vector of all parameters of ``model.lfr``
+    that require a gradient, then the initial state of each record whose start is ``"estimated"``.
+    The model holds the θ that was evaluated or written last.
 
     Args:
         model: the model whose parameters are θ; θ_0 is what they are now.
         records: the data, of the model's channels and rate.
-        ridge: weight of |θ - θ_0|² beside |y_hat - y|²: the noise variance over that of a
-            prior on each parameter, both normalised. One number, or one for each group of
+        ridge: weight of |θ - θ_0|²; that of |y_hat - y|² is 1. As a prior on each parameter: noise
+            variance over prior variance, both normalised. One number, or one for each group of
             parameters by the beginning of their names: ``{"static": 1e-3, "A": 1e-2, "x0": 0}``;
-            those without get none.
+            other groups get 0.
         solve_initial_states: estimated initial states are no part of θ, but solved for at every θ.
-        ranks: the processes that share the records; θ, cost and gradient are the same on all, a
-            residual is each one's own.
+        ranks: the processes that share the records. All have the same θ, cost and gradient; each
+            has the residual of its own records.
 
     Raises:
         ValueError: records that are not the model's, fewer records than processes, a negative ridge
@@ -77,26 +78,27 @@ class SimulationProblem:
         )
         self._theta_0 = self.theta
         self._ridge = self._ridge_of(ridge)
-        self.fixed: Tensor | None = None
-        """Which entries of the module's free parameters stay as they are: columns of zeros in J."""
+        self.fixed: Bool[Tensor, " free"] | None = None
+        """Which entries of the module's free parameters are constants: columns of zeros in J."""
         self._reduced: Reduction | None = None
         self._memory = Memory()
         self.guesses: list[Tensor | None] = [None] * len(self.groups)
-        """States of each group near those to come."""
+        """States of each group at a θ close to the next one."""
+        # A search evaluates r at a θ and, if it accepts it, J there: one simulation serves both.
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
 
     @property
-    def theta(self) -> Tensor:
-        """Parameters (P,) as they stand in the module, then the estimated initial states."""
+    def theta(self) -> Float[Tensor, " P"]:
+        """Parameters as they stand in the module, then the estimated initial states."""
         own = [p.detach().flatten() for p in self._parameters]
         return torch.cat([*own, self._initial_states.flatten()])
 
-    def initial_states(self, theta: Tensor) -> Tensor:
-        """The estimated initial states (records, nx) in θ."""
+    def initial_states(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "estimated nx"]:
+        """The estimated initial states in θ."""
         return theta[len(theta) - self._initial_states.numel() :].view(self._initial_states.shape)
 
-    def rmse(self, theta: Tensor) -> float:
-        """Root mean squared error at θ over scored samples and outputs, output unit, unweighted."""
+    def rmse(self, theta: Float[Tensor, " P"]) -> float:
+        """Root mean squared error at θ over scored samples and outputs, unweighted, output unit."""
         total = torch.zeros((), dtype=torch.float64, device=self._theta_0.device)
         scale = torch.as_tensor(self.model.scaler.y_scale).to(self._theta_0)
         for group, trajectory in zip(self.groups, self.trajectories(theta), strict=True):
@@ -104,35 +106,35 @@ class SimulationProblem:
             total = total + errors.double().square().sum()
         return math.sqrt(self.ranks.sum(total) / self.size)
 
-    def write(self, theta: Tensor) -> None:
-        """Put θ (P,) into the module."""
+    def write(self, theta: Float[Tensor, " P"]) -> None:
+        """Put θ into the module."""
         theta = theta.detach().to(
             self._initial_states, copy=True
         )  # the module's weights are its own
         sizes = [p.numel() for p in self._parameters]
-        *own, starts = theta.split([*sizes, self._initial_states.numel()])
+        *own, states = theta.split([*sizes, self._initial_states.numel()])
         for parameter, part in zip(self._parameters, own, strict=True):
             parameter.data = part.view(parameter.shape)
-        self._initial_states = starts.view(self._initial_states.shape)
+        self._initial_states = states.view(self._initial_states.shape)
 
-    def cost(self, residual: Tensor) -> float:
+    def cost(self, residual: Float[Tensor, " M"]) -> float:
         """|r|² of all processes."""
         return float(self.ranks.sum(residual.square().sum()))
 
-    def residual(self, theta: Tensor) -> Tensor:
-        """r (M,); infinite or NaN where the model diverges."""
+    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
+        """r at θ; infinite or NaN if the model diverges."""
         pairs = zip(self.groups, self.trajectories(theta), strict=True)
         errors = [group.weigh(t.y - group.y).flatten() for group, t in pairs]
         if self._ridge.any() and self.ranks.rank == 0:
             errors.append(self._ridge.sqrt() * (theta - self._theta_0))
         return torch.cat(errors)
 
-    def linearise(self, theta: Tensor, *, reduce: bool = True) -> Jacobian:
-        """dr/dθ at θ, held as a whole only where it is small.
+    def linearise(self, theta: Float[Tensor, " P"], *, reduce: bool = True) -> Jacobian:
+        """dr/dθ at θ.
 
         Args:
-            theta: θ (P,).
-            reduce: leave the columns of gauge directions out of its rows.
+            theta: θ.
+            reduce: whether columns that gauge directions make dependent are left out of the rows.
         """
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
@@ -160,39 +162,41 @@ class SimulationProblem:
                 before=self._reduced,
                 fixed=self.fixed,
             )
-            # A tie between columns is broken by rounding errors, on each process by its own.
+            # Rounding errors decide between columns that are as good; processes must agree.
             reduced = self._reduced = Reduction(*map(self.ranks.first, reduced))
         else:
             reduced = everything(theta)
         penalty = theta - self._theta_0
         return Jacobian(parts, reduced, self._ridge.sqrt(), penalty, self.ranks, fixed)
 
-    def jacobian(self, theta: Tensor) -> Tensor:
-        """dr/dθ (M, P) as a whole: for a look at it, and for small problems."""
+    def jacobian(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "M P"]:
+        """dr/dθ as one matrix, for small problems."""
         return SimulationProblem.linearise(self, theta).whole()
 
-    def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """r (M,) and the gradient (P,) of |r|² / samples, by the adjoint recurrence."""
+    def gradient(
+        self, theta: Float[Tensor, " P"]
+    ) -> tuple[Float[Tensor, " M"], Float[Tensor, " P"]]:
+        """r and the gradient of |r|² / samples, by the adjoint recurrence."""
         r = self.residual(theta)
         return r, 2.0 / self.size * self.linearise(theta, reduce=False).adjoint(r)
 
-    def trajectories(self, theta: Tensor) -> list[Trajectory]:
-        """Trajectories at θ, those of the latest θ kept; periodic ones start from a good guess."""
+    def trajectories(self, theta: Float[Tensor, " P"]) -> list[Trajectory]:
+        """Trajectories of each group at θ; those of the latest θ are cached."""
         if self._latest is None or not torch.equal(self._latest[0], theta):
             self.write(theta)
             self._latest = theta.clone(), [self._trajectory(i) for i in range(len(self.groups))]
         return self._latest[1]
 
-    def remember(self, theta: Tensor, trajectories: list[Trajectory]) -> None:
-        """Take trajectories at θ, one a group, from elsewhere."""
+    def remember(self, theta: Float[Tensor, " P"], trajectories: list[Trajectory]) -> None:
+        """Cache trajectories at θ, one for each group, that someone else has simulated."""
         self._latest = theta.clone(), trajectories
 
     def release(self) -> None:
-        """Let go of what would only speed up the next evaluation."""
+        """Free the memory of what only speeds up the next evaluation."""
         self._latest, self._memory = None, Memory()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What the next evaluations depend on beside θ, the last bit of them included."""
+        """What the next evaluations depend on in addition to θ, to the last bit."""
         tensors = {"start": self._theta_0}
         cell = self.model.lfr.cell
         for i, (group, guess) in enumerate(zip(self.groups, self.guesses, strict=True)):
@@ -208,23 +212,23 @@ class SimulationProblem:
         Raises:
             ValueError: it is of another problem.
         """
-        start = tensors["start"]
-        if start.shape != self._theta_0.shape or not torch.allclose(
-            start, self._theta_0, 1e-6, 1e-6
+        theta_0 = tensors["start"]
+        if theta_0.shape != self._theta_0.shape or not torch.allclose(
+            theta_0, self._theta_0, 1e-6, 1e-6
         ):
             raise InputError(
                 "the fit that is to go on began elsewhere: the data, the settings or the package "
                 "have changed since. Start a new one, from its best model: init_from=DIR."
             )
-        self._theta_0 = start
+        self._theta_0 = theta_0
         self.guesses = [tensors.get(f"guess.{i}") for i in range(len(self.groups))]
         if "kept" in tensors:
             kept = tensors["kept"]
-            self._reduced = Reduction(kept, start.new_zeros(0, len(start)))
+            self._reduced = Reduction(kept, theta_0.new_zeros(0, len(theta_0)))
         self._latest = None
 
-    def initial_state(self, i: int) -> Tensor | None:
-        """Initial state (R, nx) of a group where it is given or a parameter."""
+    def initial_state(self, i: int) -> Float[Tensor, "R nx"] | None:
+        """Initial states of group i, unless they are zero or periodic."""
         group = self.groups[i]
         if group.estimated is None:
             return group.x0
@@ -236,20 +240,20 @@ class SimulationProblem:
 
     def _trajectory(self, i: int) -> Trajectory:
         group, lfr = self.groups[i], self.model.lfr
-        start = "periodic" if group.start == "periodic" else "zero"
+        start = "periodic" if group.start == "periodic" else "zero"  # from x0
         return lfr.trajectory(group.u, self.initial_state(i), start, guess=self.guesses[i])
 
-    def _first_initial_states(self, count: int) -> Tensor:
-        """Initial states (count, nx) of the records where they are parameters."""
+    def _first_initial_states(self, count: int) -> Float[Tensor, "estimated nx"]:
+        """First values of the initial states that are parameters."""
         cell = self.model.lfr.cell
-        starts = cell.A.new_zeros(0 if self._solved else count, cell.nx)
-        for group in self.groups if len(starts) else ():
+        states = cell.A.new_zeros(0 if self._solved else count, cell.nx)
+        for group in self.groups if len(states) else ():
             if group.estimated is not None:
                 found = simulate_estimated(cell, group.u, group.y, group.weight)
-                starts[group.estimated] = found.x[:, 0]
-        return self.ranks.sum(starts)
+                states[group.estimated] = found.x[:, 0]
+        return self.ranks.sum(states)
 
-    def _ridge_of(self, ridge: Ridge) -> Tensor:
+    def _ridge_of(self, ridge: Ridge) -> Float[Tensor, " P"]:
         """The weight of every entry of θ."""
         groups = ridge if isinstance(ridge, Mapping) else {"": ridge}
         names = [n for n, p in self.model.lfr.cell.named_parameters() if p.requires_grad]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Module
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
@@ -18,33 +19,30 @@ class StaticProblem:
     Args:
         static: the map.
         z, w: samples of its input and output.
-
-    Shape:
-        z: (T, nz), w: (T, nw).
     """
 
-    def __init__(self, static: Module, z: Tensor, w: Tensor) -> None:
+    def __init__(self, static: Module, z: Float[Tensor, "T nz"], w: Float[Tensor, "T nw"]) -> None:
         self.static, self.z, self.w = static, z.unsqueeze(0), w.unsqueeze(0)
 
     @property
-    def theta(self) -> Tensor:
-        """Parameters (P,) as they stand in the module."""
+    def theta(self) -> Float[Tensor, " P"]:
+        """Parameters as they stand in the module."""
         return parameters_to_vector(self.static.parameters()).detach()
 
-    def write(self, theta: Tensor) -> None:
-        """Put θ (P,) into the module."""
+    def write(self, theta: Float[Tensor, " P"]) -> None:
+        """Put θ into the module."""
         vector_to_parameters(theta.clone(), self.static.parameters())
 
     def cost(self, residual: Tensor) -> float:
         """|r|²."""
         return float(residual.square().sum())
 
-    def residual(self, theta: Tensor) -> Tensor:
-        """r (M,) at θ."""
+    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
+        """r at θ."""
         self.write(theta)
         return (self.static(self.z) - self.w).detach().flatten()
 
-    def linearise(self, theta: Tensor) -> DenseJacobian:
+    def linearise(self, theta: Float[Tensor, " P"]) -> DenseJacobian:
         """dr/dθ at θ."""
         r = self.residual(theta)
         weights = {name: p.detach() for name, p in self.static.named_parameters()}

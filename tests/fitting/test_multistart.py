@@ -123,9 +123,9 @@ class Slow(LevenbergMarquardt):
         Slow.now += 8.0
         return super().step(problem, state)
 
-    def steps(self, stack, states):
+    def steps(self, joint, states):
         Slow.now += 8.0
-        return super().steps(stack, states)
+        return super().steps(joint, states)
 
 
 def test_starts_in_step_share_the_time_of_an_iteration(monkeypatch):
