@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
 import lfrtorch
-from lfrtorch.reporting.plots import LTI, NL_LFR, OUTPUT
+from lfrtorch.reporting.plots import LINEAR as LINEAR_COLOUR
+from lfrtorch.reporting.plots import NL_LFR, OUTPUT
 
 OUT = Path(__file__).with_suffix(".png")
 
@@ -58,7 +59,10 @@ def errors(ax: Axes) -> None:
     part = slice(0, 180)
     t = np.arange(180) / record.fs
     ax.plot(t, 1e3 * record.y[part, 0], color=OUTPUT, lw=1.2, label="displacement")
-    for name, model, colour in (("linear", run.linear, LTI), ("NL-LFR", run.model, NL_LFR)):
+    for name, model, colour in (
+        ("linear", run.linear, LINEAR_COLOUR),
+        ("NL-LFR", run.model, NL_LFR),
+    ):
         y_hat = model.simulate(record)
         rmse = 1e6 * lfrtorch.rmse(record, y_hat)
         error = 1e3 * (record.y - y_hat)[part, 0]

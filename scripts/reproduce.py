@@ -189,15 +189,16 @@ def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: boo
         "Simulation RMSE on the test records, written by `python scripts/reproduce.py "
         "data.root=DIR`. *chosen* is the run that is best on validation (of the tanks, all of "
         "whose samples train, on training), then the median and the range of all runs (seeds 0, "
-        "1, ...); LTI is the best linear approximation (of parwh one a level). *seconds* are those "
-        "of the whole command, the linear model, all starts, scores and figures included (median). "
-        "Sizes of a mean are those of each start; its parameters count the zeros between them.",
+        "1, ...); *linear* is the best linear approximation (of parwh one a level). *seconds* are "
+        "those of the whole command, the linear model, all starts, scores and figures included "
+        "(median). Sizes of a mean are those of each start; its parameters count the zeros "
+        "between them.",
         "",
     ]
     if quick:
         lines += [f"**A quick try ({' '.join(QUICK)}, one run): no result to quote.**", ""]
     lines += [
-        "| benchmark | test | source | unit | LTI | **chosen** | median | best .. worst | runs "
+        "| benchmark | test | source | unit | linear | **chosen** | median | best .. worst | runs "
         "| best published | samples - skip |",
         "|---" * 11 + "|",
     ]

@@ -59,7 +59,7 @@ _LOADER = "not_splitted_benchmarks.BoucWen"
 
 _PAPER = "Schoukens and Tóth (2020), table 1"
 _PUBLISHED = (
-    Published("LTI (paper)", {"multisine": 15.8e-5, "sweep": 17.7e-5}, _PAPER),
+    Published("linear (paper)", {"multisine": 15.8e-5, "sweep": 17.7e-5}, _PAPER),
     Published("NL-LFR (paper)", {"multisine": 5.31e-5, "sweep": 4.19e-5}, _PAPER, (1, 1)),
     Published("NL-LFR (paper)", {"multisine": 0.72e-5, "sweep": 0.32e-5}, _PAPER, (2, 1)),
     Published("NL-LFR (paper)", {"multisine": 0.74e-5, "sweep": 0.56e-5}, _PAPER, (2, 2)),

@@ -66,7 +66,7 @@ def _published(label: str, millivolts: Sequence[float], reference: str = _PAPER)
 
 _PUBLISHED = (
     _published(
-        "LTI (paper)",
+        "linear (paper)",
         (0.83, 9.46, 19.9, 30.7, 37.7, 45.5),
         f"{_PAPER}; a model for each level, that of 1000 mV for the arrow",
     ),

@@ -184,7 +184,7 @@ def size_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[li
         + ["chosen" if e["chosen"] else "" if _known(e["error"]) else "diverges"]
         for e in sorted(entries, key=lambda e: e["parameters_net"])
     ]
-    head = ["parameters", "net", "seconds", "validation", "±", "/ LTI", "above best", ""]
+    head = ["parameters", "net", "seconds", "validation", "±", "/ linear", "above best", ""]
     return [*sizes, *head], rows
 
 

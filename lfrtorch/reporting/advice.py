@@ -63,8 +63,8 @@ class Evidence:
     """Numbers of a fit; None where one is not known.
 
     Args:
-        train, lti_train: errors of the NL-LFR and of the linear model on the training records.
-        validation, lti_validation: on those that chose the iterate.
+        train, linear_train: errors of the NL-LFR and of the linear model on the training records.
+        validation, linear_validation: on those that chose the iterate.
         outputs: the NL-LFR's error over the linear model's by output, where there are several.
         noise: of the outputs, known or from the differences between periods.
         linear: part of the training error's power that a linear filter of the inputs explains.
@@ -84,9 +84,9 @@ class Evidence:
     """
 
     train: float | None
-    lti_train: float | None
+    linear_train: float | None
     validation: float | None = None
-    lti_validation: float | None = None
+    linear_validation: float | None = None
     outputs: Mapping[str, float] = field(default_factory=dict)
     noise: float | None = None
     linear: float | None = None
@@ -107,18 +107,18 @@ class Evidence:
     def judged(self) -> tuple[float | None, float | None, str]:
         """Errors of the NL-LFR and the linear model on validation, else on training; and which."""
         if self.validation is None:
-            return self.train, self.lti_train, "training"
-        return self.validation, self.lti_validation, "validation"
+            return self.train, self.linear_train, "training"
+        return self.validation, self.linear_validation, "validation"
 
     @property
     def overfit(self) -> float | None:
         """Growth of the error from training to validation over that of the linear model."""
-        errors = self.train, self.lti_train, self.validation, self.lti_validation
+        errors = self.train, self.linear_train, self.validation, self.linear_validation
         if not all(errors):
             return None
-        train, lti_train, validation, lti_validation = (error or 0.0 for error in errors)
+        train, linear_train, validation, linear_validation = (error or 0.0 for error in errors)
         # What grows for the linear model as well lies in the records.
-        return validation / train / max(1.0, lti_validation / lti_train)
+        return validation / train / max(1.0, linear_validation / linear_train)
 
     @property
     def noise_limited(self) -> bool:
@@ -214,13 +214,13 @@ def linear_part_incomplete(e: Evidence) -> Advice | None:
 
 def hardly_better(e: Evidence) -> Advice | None:
     """No gain over the linear model, of which no states are missing."""
-    error, lti, which = e.judged
+    error, linear_error, which = e.judged
     if e.linear is not None and e.linear > LINEAR:
         return None
-    if error is None or not lti or error <= USELESS * lti:
+    if error is None or not linear_error or error <= USELESS * linear_error:
         return None
-    gain = f"{which} error {percent(error)}, of the linear model {percent(lti)}"
-    if e.lti_train and e.noise and e.lti_train <= NOISE_LIMITED * e.noise:
+    gain = f"{which} error {percent(error)}, of the linear model {percent(linear_error)}"
+    if e.linear_train and e.noise and e.linear_train <= NOISE_LIMITED * e.noise:
         return Advice("The system is linear at this level: the linear model is enough.", gain)
     if e.searched:
         return Advice(
@@ -237,9 +237,9 @@ def hardly_better(e: Evidence) -> Advice | None:
 
 def outputs_left_out(e: Evidence) -> Advice | None:
     """Outputs without gain beside others that have one: the static map has too few outputs."""
-    error, lti, which = e.judged
+    error, linear_error, which = e.judged
     behind = {name: ratio for name, ratio in e.outputs.items() if ratio > USELESS}
-    if not behind or error is None or not lti or error > USELESS * lti:
+    if not behind or error is None or not linear_error or error > USELESS * linear_error:
         return None
     ratios = ", ".join(f"{number(ratio)} times on '{name}'" for name, ratio in behind.items())
     return Advice(
@@ -251,10 +251,10 @@ def outputs_left_out(e: Evidence) -> Advice | None:
 
 def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
     """An error that is neither noise nor linear: the static map is too small."""
-    error, lti, _ = e.judged
+    error, linear_error, _ = e.judged
     if e.linear is not None and e.linear > LINEAR:
         return None
-    if error is None or (lti and error > USELESS * lti):
+    if error is None or (linear_error and error > USELESS * linear_error):
         return None
     if e.noise and e.train is not None:
         if e.train <= BEYOND_NOISE * e.noise:
@@ -285,8 +285,8 @@ def best_start_alone(e: Evidence) -> Advice | None:
 
 def one_start(e: Evidence) -> Advice | None:
     """Nothing to compare the minimum with."""
-    error, lti, _ = e.judged
-    useless = error is not None and lti and error > USELESS * lti  # said there
+    error, linear_error, _ = e.judged
+    useless = error is not None and linear_error and error > USELESS * linear_error  # said there
     if e.started > 1 or e.continued or useless:
         return None
     return Advice("Try several starts: starts=8.", "one start; fits end in one of several minima")

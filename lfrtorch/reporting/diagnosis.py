@@ -60,9 +60,9 @@ def evidence(
     peak = _peak(train, result.model.scaler.u_offset)
     return Evidence(
         train=_error([r.error for r in train], scale),
-        lti_train=_error([r.lti_error for r in train], scale),
+        linear_train=_error([r.linear_error for r in train], scale),
         validation=_error([r.error for r in validation], scale),
-        lti_validation=_error([r.lti_error for r in validation], scale),
+        linear_validation=_error([r.linear_error for r in validation], scale),
         outputs=_by_output(validation or train),
         noise=None if noise is None else float(rms(noise / scale)),
         linear=linear,
@@ -196,13 +196,13 @@ def _error(errors: Sequence[Array], scale: Array) -> float | None:
 def _by_output(responses: Sequence[Response]) -> dict[str, float]:
     """The NL-LFR's error over the linear model's by output, where there are several."""
     outputs = responses[0].record.outputs
-    lti, error = (
+    linear, error = (
         rms(np.concatenate(errors), axis=0)
-        for errors in ([r.lti_error for r in responses], [r.error for r in responses])
+        for errors in ([r.linear_error for r in responses], [r.error for r in responses])
     )
     if len(outputs) == 1 or not np.isfinite(error).all():
         return {}
-    return {c.name: float(e / b) for c, e, b in zip(outputs, error, lti, strict=True) if b > 0}
+    return {c.name: float(e / b) for c, e, b in zip(outputs, error, linear, strict=True) if b > 0}
 
 
 def _transient(train: Sequence[Response], scale: Array) -> float | None:

@@ -29,7 +29,7 @@ def of_run(
     drawn: dict[str, Figure] = {}
     for shown in simulated:
         if shown.use == "test":
-            record, signals = shown.record, (shown.record, shown.y_lti, shown.y_hat)
+            record, signals = shown.record, (shown.record, shown.y_linear, shown.y_hat)
             drawn[record.name] = plots.errors(*signals)
             if not plots.is_whole(record):
                 drawn[f"{record.name}_density"] = plots.density(*signals)
@@ -50,7 +50,7 @@ def of_tests(simulated: Sequence[Response]) -> tuple[dict[str, Figure], dict[str
     for shown in simulated:
         if shown.use != "test":
             continue
-        record, signals = shown.record, (shown.record, shown.y_lti, shown.y_hat)
+        record, signals = shown.record, (shown.record, shown.y_linear, shown.y_hat)
         name, near = record.name, f"{record.name}_near"
         drawn[near] = plots.close_up(*signals)
         if plots.is_whole(record):

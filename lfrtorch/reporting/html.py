@@ -40,12 +40,12 @@ Rows = list[Sequence[Cell]]
 
 
 class Errors(NamedTuple):
-    """RMSE of the linear model and of the NL-LFR, lti / error, and both over the deviation."""
+    """RMSE of the linear model and of the NL-LFR, linear / error, and both over the deviation."""
 
-    lti: float
+    linear: float
     error: float
     ratio: float
-    lti_relative: float
+    linear_relative: float
     relative: float
 
 
@@ -142,9 +142,9 @@ def _line(name: str, unit: str, errors: Errors) -> str:
         return f"{name}: the NL-LFR diverges"
     lower = errors.ratio >= 1.005  # in three digits more than 1.00
     below = f"error {number(errors.ratio)} × below" if lower else "no error below"
-    error, lti = quantity(errors.error, unit), quantity(errors.lti, unit)
+    error, linear = quantity(errors.error, unit), quantity(errors.linear, unit)
     relative = percent(errors.relative)
-    return f"{name}: {below} the linear model's ({error} beside {lti}), NRMSE {relative}"
+    return f"{name}: {below} the linear model's ({error} beside {linear}), NRMSE {relative}"
 
 
 def _sizes(metrics: Mapping[str, Any]) -> str:
@@ -164,7 +164,7 @@ def _scores(
     outputs = responses[0].record.outputs
     several, units = len(outputs) > 1, any(channel.unit for channel in outputs)
     what = [*["output"] * several, *["unit"] * (several and units)]
-    errors = ["LTI", "NL-LFR", "ratio", "LTI NRMSE", "NRMSE"]
+    errors = ["linear", "NL-LFR", "ratio", "linear NRMSE", "NRMSE"]
     tests, others = [], []
     for response in responses:
         name, use = response.record.name, response.use
@@ -178,7 +178,7 @@ def _scores(
     references = [f"{p.label}: {p.reference}" for p in published if tests]
     if metrics["linear"]:
         own = ", ".join(f"{test} of {'+'.join(used)}" for test, used in metrics["linear"].items())
-        references.insert(0, f"LTI: a model for each of these: {own}")
+        references.insert(0, f"linear: a model for each of these: {own}")
     return {
         "unit": "" if several else outputs[0].unit,
         "words": 1 + len(what),
@@ -202,16 +202,18 @@ def _channels(response: Response) -> list[tuple[str, str, slice]]:
 
 def _errors(response: Response, of: slice) -> Errors:
     """Of some outputs."""
-    lti, error = (float(rms(signal[:, of])) for signal in (response.lti_error, response.error))
+    linear, error = (
+        float(rms(signal[:, of])) for signal in (response.linear_error, response.error)
+    )
     deviation = float(np.sqrt(np.mean(np.var(response.scored[:, of], axis=0)))) or math.nan
-    ratio = lti / error if error > 0 else math.nan
-    return Errors(lti, error, ratio, lti / deviation, error / deviation)
+    ratio = linear / error if error > 0 else math.nan
+    return Errors(linear, error, ratio, linear / deviation, error / deviation)
 
 
 def _cells(errors: Errors) -> list[Cell]:
     shown = errors.error if math.isfinite(errors.error) else "diverges"
-    relative = percent(errors.lti_relative), percent(errors.relative)
-    return [errors.lti, shown, errors.ratio, *relative]
+    relative = percent(errors.linear_relative), percent(errors.relative)
+    return [errors.linear, shown, errors.ratio, *relative]
 
 
 def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
@@ -260,7 +262,7 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
     if bla.covariance is not None:
         caption += "; band: ± 2 standard deviations"
     poles: Rows = []
-    for model, values in (("LTI", bla.poles), ("NL-LFR", poles_at_rest(result.model))):
+    for model, values in (("linear", bla.poles), ("NL-LFR", poles_at_rest(result.model))):
         poles += [
             [
                 model,

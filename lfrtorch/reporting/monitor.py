@@ -133,7 +133,7 @@ class TensorBoard:
         folder: of the event file.
         record: record whose spectrum and static map are drawn, usually the validation record; left
             out for scalars alone.
-        y_lti: output of the linear model on it, (T, ny), for the error beside ours.
+        y_linear: output of the linear model on it, (T, ny), for the error beside ours.
         every: iterations between figures; they cost about half a second.
 
     Example:
@@ -147,11 +147,11 @@ class TensorBoard:
         self,
         folder: str | Path,
         record: Record | None = None,
-        y_lti: plots.Array | None = None,
+        y_linear: plots.Array | None = None,
         every: int = 50,
     ) -> None:
         self.writer = SummaryWriter(str(folder))
-        self.record, self.y_lti, self.every = record, y_lti, every
+        self.record, self.y_linear, self.every = record, y_linear, every
 
     def history(self, history: Sequence[Progress]) -> None:
         """Log iterations of the past."""
@@ -169,9 +169,11 @@ class TensorBoard:
         self.history([progress])
         radius = spectral_radius(model.lfr.cell.A.detach())
         self.writer.add_scalar("model/spectral_radius_A", radius, step)
-        if self.record is not None and self.y_lti is not None and step % self.every == 0:
+        if self.record is not None and self.y_linear is not None and step % self.every == 0:
             y_hat, signals = model.simulate(self.record), model.signals(self.record)
-            self.figure("validation/spectrum", plots.spectrum(self.record, self.y_lti, y_hat), step)
+            self.figure(
+                "validation/spectrum", plots.spectrum(self.record, self.y_linear, y_hat), step
+            )
             drawn = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
             self.figure("validation/static_map", drawn, step)
 

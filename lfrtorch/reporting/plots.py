@@ -14,7 +14,7 @@ from lfrtorch._types import Array
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.records import Record
 
-OUTPUT, LTI, NL_LFR = "tab:blue", "tab:red", "tab:green"
+OUTPUT, LINEAR, NL_LFR = "tab:blue", "tab:red", "tab:green"
 """Colours of the measured output, the linear model's error and the NL-LFR's, as in the paper."""
 
 DPI = 150
@@ -30,7 +30,7 @@ SEGMENT, SHORTEST = 4096, 16
 """Most and fewest samples of a segment that a power spectral density is averaged over."""
 
 
-def errors(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
+def errors(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figure:
     """The spectrum of whole periods in steady state, and else the response against time.
 
     Example:
@@ -39,7 +39,7 @@ def errors(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
         >>> figure.axes[0].get_xlabel()  # the record is a whole period: its spectrum
         'frequency (Hz)'
     """
-    return (spectrum if is_whole(record) else response)(record, y_lti, y_hat)
+    return (spectrum if is_whole(record) else response)(record, y_linear, y_hat)
 
 
 def is_whole(record: Record) -> bool:
@@ -55,24 +55,24 @@ def is_whole(record: Record) -> bool:
     return record.start == "periodic" and not record.skip
 
 
-def spectrum(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
+def spectrum(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figure:
     """Magnitude of the measured output and of the errors against frequency, one panel an output.
 
     Shape:
-        y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
+        y_linear, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
             is no NL-LFR.
 
     Example:
         >>> from lfrtorch.reporting import plots
         >>> figure = plots.spectrum(record, bla.simulate(record), model.simulate(record))
         >>> [line.get_label() for line in figure.axes[0].lines]
-        ['output', 'LTI error', 'NL-LFR error']
+        ['output', 'linear error', 'NL-LFR error']
     """
     figure, axes = _panels(record)
     y = record.y[record.skip :]
     f = np.fft.rfftfreq(len(y), 1.0 / record.fs)
     for i, ax in enumerate(axes):
-        for signal, label, colour in _signals(record, y_lti, y_hat, i):
+        for signal, label, colour in _signals(record, y_linear, y_hat, i):
             ax.plot(f[1:-1], _decibel(signal)[1:-1], ".", ms=2, color=colour, label=label)
         unit = record.outputs[i].unit or "1"
         ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {unit})", xlim=(0, f[-1]))
@@ -82,13 +82,13 @@ def spectrum(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure
     return figure
 
 
-def density(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
+def density(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figure:
     """Power spectral density of the measured output and of the errors, one panel an output.
 
     By Welch's method: for records that are no whole periods.
 
     Shape:
-        y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
+        y_linear, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
             is no NL-LFR.
 
     Example:
@@ -100,7 +100,7 @@ def density(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
     scored = record.samples - record.skip
     segment = min(SEGMENT, scored, max(SHORTEST, scored // 8))
     for i, ax in enumerate(axes):
-        for signal, label, colour in _signals(record, y_lti, y_hat, i):
+        for signal, label, colour in _signals(record, y_linear, y_hat, i):
             f, power = scipy.signal.welch(signal, record.fs, nperseg=segment)
             level = 10.0 * np.log10(np.maximum(power, np.finfo(float).tiny))
             ax.plot(f[1:], level[1:], lw=0.8, color=colour, label=label)
@@ -113,11 +113,11 @@ def density(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
     return figure
 
 
-def response(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure:
+def response(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figure:
     """Measured output and errors against time in the record, one panel an output.
 
     Shape:
-        y_lti, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
+        y_linear, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
             is no NL-LFR.
 
     Example:
@@ -129,7 +129,7 @@ def response(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure
     figure, axes = _panels(record)
     t = np.arange(record.skip, record.samples) / record.fs
     for i, ax in enumerate(axes):
-        for signal, label, colour in _signals(record, y_lti, y_hat, i):
+        for signal, label, colour in _signals(record, y_linear, y_hat, i):
             ax.plot(*envelope(t, signal), lw=0.5, color=colour, label=label)
         ax.set(ylabel=str(record.outputs[i]), xlim=(t[0], t[-1]))
         _legend(ax)
@@ -138,14 +138,14 @@ def response(record: Record, y_lti: Array, y_hat: Array | None = None) -> Figure
     return figure
 
 
-def close_up(record: Record, y_lti: Array, y_hat: Array) -> Figure:
+def close_up(record: Record, y_linear: Array, y_hat: Array) -> Figure:
     """The response about the largest error of the NL-LFR, and below it this error alone.
 
     Errors of several outputs are compared relative to the deviation of each. Where the model
     diverges it is where it does so first.
 
     Shape:
-        y_lti, y_hat: (T, ny), simulated outputs in physical units.
+        y_linear, y_hat: (T, ny), simulated outputs in physical units.
 
     Example:
         >>> from lfrtorch.reporting import plots
@@ -164,7 +164,7 @@ def close_up(record: Record, y_lti: Array, y_hat: Array) -> Figure:
     figure = Figure(figsize=(8, 1.5 + 4.5 * ny), layout="constrained")
     axes = list(figure.subplots(2 * ny, 1, sharex=True, height_ratios=[2, 1] * ny))
     for i, output in enumerate(record.outputs):
-        signals = _signals(record, y_lti, y_hat, i)
+        signals = _signals(record, y_linear, y_hat, i)
         for ax, drawn in ((axes[2 * i], signals), (axes[2 * i + 1], signals[-1:])):
             for signal, label, colour in drawn:
                 ax.plot(t, signal[window], lw=1.0, color=colour, label=label)
@@ -262,10 +262,10 @@ def _panels(record: Record) -> tuple[Figure, list[Axes]]:
 
 
 def _signals(
-    record: Record, y_lti: Array, y_hat: Array | None, i: int
+    record: Record, y_linear: Array, y_hat: Array | None, i: int
 ) -> list[tuple[Array, str, str]]:
     y = record.y[record.skip :, i]
-    signals = [(y, "output", OUTPUT), (y - y_lti[record.skip :, i], "LTI error", LTI)]
+    signals = [(y, "output", OUTPUT), (y - y_linear[record.skip :, i], "linear error", LINEAR)]
     if y_hat is not None:
         signals.append((y - y_hat[record.skip :, i], "NL-LFR error", NL_LFR))
     return signals

@@ -160,7 +160,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     sizes = result["sizes"]
     mine = (sizes["nz"], sizes["nw"])
     others = [p for p in published if p.sizes in (None, mine)]
-    head = ["record", "source", "samples", "skip", "LTI", "NL-LFR", *(p.label for p in others)]
+    head = ["record", "source", "samples", "skip", "linear", "NL-LFR", *(p.label for p in others)]
     rows = [
         [name, s["source"], s["samples"], s["skip"], s["lti_rmse"], s["rmse"]]
         + [p.scores.get(name) for p in others]
@@ -181,7 +181,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     references = [f"{p.label}: {p.reference}" for p in others]
     if result["linear"]:
         models = ", ".join(f"{n} of {'+'.join(r)}" for n, r in result["linear"].items())
-        references.insert(0, f"LTI: a model for each of these: {models}")
+        references.insert(0, f"linear: a model for each of these: {models}")
     return "\n".join([title, "", _tables.table(head, rows), *[""] * bool(references), *references])
 
 

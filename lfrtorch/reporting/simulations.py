@@ -21,15 +21,15 @@ class Response:
     Args:
         record: the measurement.
         use: ``"train"``, ``"validation"`` or ``"test"``.
-        y_lti, y_hat: simulated outputs.
+        y_linear, y_hat: simulated outputs.
 
     Shape:
-        y_lti, y_hat: (T, ny).
+        y_linear, y_hat: (T, ny).
     """
 
     record: Record
     use: str
-    y_lti: Array
+    y_linear: Array
     y_hat: Array
 
     @property
@@ -43,9 +43,9 @@ class Response:
         return self.scored - self.y_hat[self.record.skip :]
 
     @property
-    def lti_error(self) -> Array:
+    def linear_error(self) -> Array:
         """Of the linear model, after the skip window (scored samples, ny)."""
-        return self.scored - self.y_lti[self.record.skip :]
+        return self.scored - self.y_linear[self.record.skip :]
 
     @property
     def diverged(self) -> bool:
@@ -69,6 +69,6 @@ def respond(
     found = []
     for use, records in used.items():
         for record in records:
-            lti = own.get(record.name, bla) if use == "test" else bla
-            found.append(Response(record, use, lti.simulate(record), model.simulate(record)))
+            linear = own.get(record.name, bla) if use == "test" else bla
+            found.append(Response(record, use, linear.simulate(record), model.simulate(record)))
     return found

@@ -301,7 +301,7 @@ def test_steady_state(samples, short_sweep):
 def test_published(simulated):
     numbers = {(p.label, p.sizes): p.scores for p in simulated.published}
     assert numbers["NL-LFR (paper)", (2, 1)] == {"multisine": 0.72e-5, "sweep": 0.32e-5}
-    assert numbers["LTI (paper)", None]["sweep"] == 17.7e-5
+    assert numbers["linear (paper)", None]["sweep"] == 17.7e-5
     assert numbers["decoupled PNLSS", None]["multisine"] == 1.34e-5
     assert len(numbers) == 5
 

@@ -246,7 +246,7 @@ def test_published(data):
     scores = {p.label: p.scores for p in data.published}
     assert scores["NL-LFR (paper)"]["level_1000"] == pytest.approx(1.37e-3)
     assert scores["NL-LFR (paper)"]["arrow"] == pytest.approx(1.42e-3)
-    assert scores["LTI (paper)"]["level_100"] == pytest.approx(0.83e-3)
+    assert scores["linear (paper)"]["level_100"] == pytest.approx(0.83e-3)
     assert scores["parallel WH"]["level_550"] == pytest.approx(0.38e-3)
     assert all(list(s) == [r.name for r in data.tests] for s in scores.values())
 

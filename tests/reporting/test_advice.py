@@ -21,9 +21,9 @@ pytestmark = pytest.mark.numeric
 
 GOOD = Evidence(
     train=0.02,
-    lti_train=0.2,
+    linear_train=0.2,
     validation=0.021,
-    lti_validation=0.2,
+    linear_validation=0.2,
     outputs={"y1": 0.1, "y2": 0.1},
     noise=0.01,
     linear=0.01,
@@ -48,7 +48,11 @@ GOOD = Evidence(
         (advice.overfits, {"validation": 0.05}, "nn=5, ridge=1e-3, or more data"),
         (advice.linear_part_incomplete, {"linear": 0.5}, "nx=4, nx=5 or nx=auto"),
         (advice.hardly_better, {"validation": 0.19}, "nn=20, nz=2 or nw=2"),
-        (advice.hardly_better, {"validation": 0.19, "lti_train": 0.01}, "linear model is enough"),
+        (
+            advice.hardly_better,
+            {"validation": 0.19, "linear_train": 0.01},
+            "linear model is enough",
+        ),
         (advice.outputs_left_out, {"outputs": {"y1": 0.95, "y2": 0.1}}, "nw=2, nz=2"),
         (advice.best_start_alone, {"starts": (0.02, 0.03)}, "starts=16"),
         (advice.one_start, {"started": 1}, "starts=8"),
@@ -113,7 +117,7 @@ def test_missing_states_come_before_a_larger_map():
 
 
 def test_what_spoils_the_linear_model_as_much_is_no_overfit():
-    assert advice.overfits(replace(GOOD, validation=0.06, lti_validation=0.6)) is None
+    assert advice.overfits(replace(GOOD, validation=0.06, linear_validation=0.6)) is None
 
 
 def test_a_model_that_diverges_everywhere_has_advice():
@@ -188,7 +192,7 @@ def test_evidence_is_measured_on_the_records(fitted):
     assert found.noise == pytest.approx(np.sqrt(np.mean((0.1 / deviation) ** 2)))
     expected = np.sqrt(np.mean(np.mean(responses[0].error ** 2, axis=0) / deviation**2))
     assert found.train == pytest.approx(expected)
-    assert (found.validation, found.lti_validation) == (None, None)
+    assert (found.validation, found.linear_validation) == (None, None)
     assert found.transient is not None
     assert found.transient > 10.0
     assert found.falling == 0.5

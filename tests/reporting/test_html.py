@@ -128,10 +128,10 @@ def test_page_has_the_numbers_and_no_address_outside(single: Run):
     assert len(page.addresses) == 2
     assert "script" not in page.tags
     test = single.responses[-1]
-    lti, error = (number(lfrtorch.rmse(test.record, y)) for y in (test.y_lti, test.y_hat))
+    linear, error = (number(lfrtorch.rmse(test.record, y)) for y in (test.y_linear, test.y_hat))
     for words in (
-        f"test {lti} {error}",
-        f"({error} V beside {lti} V)",
+        f"test {linear} {error}",
+        f"({error} V beside {linear} V)",
         "Do this. as x is 3",
         "else: A <i>(2001)",
         "a note",
@@ -203,8 +203,8 @@ def test_several_outputs_have_scores_of_their_own():
     test = same.responses[-1]
     for i, name in ((0, "a"), (1, "b")):
         error = np.sqrt(np.mean(test.error[:, i] ** 2))
-        lti = np.sqrt(np.mean(test.lti_error[:, i] ** 2))
-        assert f"{name} V {number(lti)} {number(error)}" in page.text
+        linear = np.sqrt(np.mean(test.linear_error[:, i] ** 2))
+        assert f"{name} V {number(linear)} {number(error)}" in page.text
     assert "test all V" in page.text
     assert page.text.count("maximum number of iterations") == 2
     assert "The best of 2 starts" in page.text
@@ -219,9 +219,9 @@ def test_several_outputs_have_scores_of_their_own():
 
 def test_many_tests_have_one_verdict(single: Run):
     test = single.responses[-1]
-    error = test.record.y - test.y_lti
+    error = test.record.y - test.y_linear
     many = [
-        replace(test, record=replace(test.record, name=f"t{k}"), y_hat=test.y_lti + error * part)
+        replace(test, record=replace(test.record, name=f"t{k}"), y_hat=test.y_linear + error * part)
         for k, part in enumerate((0.5, 0.9, 0.75, math.nan, 0.0))
     ]
     line, lost = html_report.verdict(many)
@@ -232,7 +232,7 @@ def test_many_tests_have_one_verdict(single: Run):
 @pytest.mark.parametrize(("part", "below"), [(1 - 1e-15, False), (1 + 1e-15, False), (0.99, True)])
 def test_a_ratio_of_one_plus_rounding_is_no_gain(single: Run, part: float, below: bool):
     test = single.responses[-1]
-    error = test.record.y - test.y_lti
+    error = test.record.y - test.y_linear
     (line,) = html_report.verdict([replace(test, y_hat=test.record.y - part * error)])
     assert ("no error below" not in line) is below
     assert ("error 1.01 × below" in line) is below

@@ -24,7 +24,7 @@ def test_spectrum_shows_amplitudes_in_decibel():
     figure = plots.spectrum(RECORD, 0.9 * Y, Y - 1e-3 * Y)
     first, second = figure.axes
     for ax, frequency, amplitude in ((first, 10.0, 1.0), (second, 20.0, 3.0)):
-        for label, scale in (("output", 1.0), ("LTI error", 0.1), ("NL-LFR error", 1e-3)):
+        for label, scale in (("output", 1.0), ("linear error", 0.1), ("NL-LFR error", 1e-3)):
             line = drawn(ax, label)
             peak = line[np.argmax(line[:, 1])]
             assert peak == pytest.approx([frequency, 20 * np.log10(scale * amplitude)], abs=1e-6)
@@ -37,7 +37,10 @@ def test_figures_of_a_linear_model_have_its_error_alone():
     skipped = Record(T, Y, 100.0, start="periodic", skip=1)
     for record, unit in ((periodic, "Hz"), (skipped, "s"), (RECORD, "s")):
         figure = plots.errors(record, 0.9 * Y)
-        assert [line.get_label() for line in figure.axes[0].get_lines()] == ["output", "LTI error"]
+        assert [line.get_label() for line in figure.axes[0].get_lines()] == [
+            "output",
+            "linear error",
+        ]
         assert f"({unit})" in figure.axes[-1].get_xlabel()
 
 
@@ -46,7 +49,7 @@ def test_response_shows_the_scored_samples():
     ax = plots.response(record, 0.5 * Y, Y).axes[0]
     assert drawn(ax, "output")[0] == pytest.approx([1.0, Y[100, 0]])
     assert len(drawn(ax, "output")) == 300
-    assert np.allclose(drawn(ax, "LTI error")[:, 1], 0.5 * Y[100:, 0])
+    assert np.allclose(drawn(ax, "linear error")[:, 1], 0.5 * Y[100:, 0])
     assert not drawn(ax, "NL-LFR error")[:, 1].any()
 
 
@@ -55,7 +58,7 @@ def test_density_integrates_to_the_power():
     y = rng.standard_normal((20_000, 1))
     record = Record(y, y, 100.0, name="lab", outputs=(Channel("a", "m"),))
     ax = plots.density(record, 0.9 * y, 0.5 * y).axes[0]
-    for label, scale in (("output", 1.0), ("LTI error", 0.1), ("NL-LFR error", 0.5)):
+    for label, scale in (("output", 1.0), ("linear error", 0.1), ("NL-LFR error", 0.5)):
         line = drawn(ax, label)
         # White: one sided, 2 / fs; a standard deviation of 1.4 % over the band, 4 σ.
         level = 10 * np.log10(np.mean(10 ** (line[:, 1] / 10)))

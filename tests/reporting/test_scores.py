@@ -76,7 +76,7 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
     assert metrics["scores"]["test"]["lti_rmse"] == expected
     assert metrics["linear"] == {"test": ["train"]}
     text = report.table(metrics, data.published)
-    assert "LTI: a model for each of these: test of train\n" in text
+    assert "linear: a model for each of these: test of train\n" in text
 
 
 def test_metrics_are_what_the_model_scores(result):
@@ -117,7 +117,7 @@ def test_table_shows_published_results_of_these_sizes_only(result):
     lines = report.table(metrics, data.published).splitlines()
     assert lines[0] == "Simulation RMSE (V), nx 2, nz 1, nw 1, 3 neurons"
     head, row = lines[2].split(), lines[4].split()
-    assert head == ["record", "source", "samples", "skip", "LTI", "NL-LFR", "everybody", "small"]
+    assert head == ["record", "source", "samples", "skip", "linear", "NL-LFR", "everybody", "small"]
     assert row[:4] == ["test", "simulated", "300", "5"]
     assert float(row[5]) == pytest.approx(metrics["scores"]["test"]["rmse"], rel=5e-3)
     assert row[6:] == ["0.500", "0.250"]
