@@ -24,7 +24,7 @@ from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
-from lfrtorch.fitting.trainer import Stop
+from lfrtorch.fitting.trainer import FitResult, Stop
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
@@ -94,10 +94,7 @@ def identify(
     if sizes is not None:
         settings = replace(settings, **sizes.chosen.sizes)
     models = starting_models(dataset.train, settings, linear)
-    average = settings.average
-    if average > 1 and not all(is_network(model.lfr.cell.static) for model in models):
-        observer.say("note: average is for networks; the best start is kept")
-        average = 1
+    average = _networks(models, settings.average, observer)
     observer.say(
         f"{dataset.name}: {sum(record.samples for record in dataset.train)} training samples, "
         f"{models[0].parameter_count} parameters "
@@ -119,6 +116,27 @@ def identify(
         stop=stop,
     )
     observer.end(result)
+    return judged(dataset, settings, linear, result, order_scan=order_scan, size_search=sizes)
+
+
+def _networks(models: Sequence[Model], average: int, observer: Observer) -> int:
+    """Of how many starts to take the mean at most: of networks alone."""
+    if average == 1 or all(is_network(model.lfr.cell.static) for model in models):
+        return average
+    observer.say("note: average is for networks; the best start is kept")
+    return 1
+
+
+def judged(
+    dataset: Dataset,
+    settings: Settings,
+    linear: LinearModel,
+    result: FitResult,
+    *,
+    order_scan: OrderScan | None,
+    size_search: SizeSearch | None,
+) -> Run:
+    """All records simulated and scored, and advice."""
     test_linear = linear_models_of_tests(dataset, settings)
     simulations = respond(result.model, linear, dataset, test_linear)
     found = evidence(
@@ -127,7 +145,10 @@ def identify(
         noise_rms=dataset.noise_rms,
         continued=settings.init_from is not None,
         ridge=settings.ridge != 0.0,
-        searched=sizes is not None,
+        searched=size_search is not None,
+    )
+    numbers = metrics(
+        result, linear, dataset, own=test_linear, seeds=settings.seeds, search=size_search
     )
     return Run(
         dataset=dataset,
@@ -135,12 +156,10 @@ def identify(
         linear=linear,
         test_linear=test_linear,
         order_scan=order_scan,
-        size_search=sizes,
+        size_search=size_search,
         fit=result,
         simulations=simulations,
-        metrics=metrics(
-            result, linear, dataset, own=test_linear, seeds=settings.seeds, search=sizes
-        ),
+        metrics=numbers,
         advice=advise(found),
     )
 
