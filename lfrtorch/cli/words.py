@@ -31,6 +31,7 @@ def translated(text: str, cfg: DictConfig) -> str:
 
     Examples:
         >>> from omegaconf import OmegaConf
+        >>> from lfrtorch.cli.words import translated
         >>> cfg = OmegaConf.create({"data": {"start": "zero"}, "trainer": {"max_iter": 5}})
         >>> translated("estimate their starts (start='estimated'), or give max_iter=20.", cfg)
         'estimate their starts (data.start=estimated), or give trainer.max_iter=20.'
