@@ -29,7 +29,7 @@ def now(word: str) -> str:
 def translated(text: str, cfg: DictConfig) -> str:
     """A message with Python's arguments as words of the command line.
 
-    Examples:
+    Example:
         >>> from omegaconf import OmegaConf
         >>> from lfrtorch.cli.words import translated
         >>> cfg = OmegaConf.create({"data": {"start": "zero"}, "trainer": {"max_iter": 5}})
