@@ -26,7 +26,7 @@ from baseline_side import MEASURED
 from engine import HERE, available_cores, pinned
 from ratios import LEAST_PAIRS, PAIRS, show
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 
 SAME = 1e-6
 """Relative difference of two outcomes up to which both sides did the same work."""

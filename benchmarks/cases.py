@@ -22,7 +22,7 @@ import problems
 import torch
 
 import lfrtorch
-from lfrtorch._threads import spread_by_hand
+from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.least_squares.gauge import reduction
 from lfrtorch.least_squares.levenberg_marquardt import LMState
 from lfrtorch.least_squares.simulation_problem import SimulationProblem

@@ -23,7 +23,7 @@ import torch
 
 import lfrtorch
 from lfrtorch import Record
-from lfrtorch._types import Array, Complex
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.datasets import boucwen, parwh, silverbox, wiener_hammerstein
 from lfrtorch.linear.resolvent import frequency_response
 

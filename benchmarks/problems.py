@@ -15,7 +15,7 @@ from scipy import signal
 
 import lfrtorch
 from lfrtorch import LinearModel, Model, Record
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
 
 SIZES = {

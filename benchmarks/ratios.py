@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import binom
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 
 LIMIT = 1.03
 """Largest ratio: what is slower by more is a change that someone should have meant."""

@@ -36,7 +36,7 @@ from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import FitResult
-from lfrtorch._reasons import Reason
+from lfrtorch._support.reasons import Reason
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 
@@ -49,7 +49,7 @@ from lfrtorch.reporting.run import Run
 from lfrtorch.metrics import nrmse, rmse
 
 # errors
-from lfrtorch._errors import InputError, LfrtorchError
+from lfrtorch._support.errors import InputError, LfrtorchError
 
 __version__ = version("lfrtorch")
 

@@ -21,9 +21,9 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from lfrtorch._checks import number
-from lfrtorch._errors import LfrtorchError
-from lfrtorch._reasons import Reason, told
+from lfrtorch._support.checks import number
+from lfrtorch._support.errors import LfrtorchError
+from lfrtorch._support.reasons import Reason, told
 
 Shared = TypeVar("Shared")
 

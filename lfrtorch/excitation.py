@@ -8,10 +8,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lfrtorch import _checks
-from lfrtorch._checks import dft_lines, integer, number
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array, Integers
+from lfrtorch._support import checks
+from lfrtorch._support.checks import dft_lines, integer, number
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Integers
 
 Grid = Literal["full", "odd", "random_odd"]
 
@@ -119,7 +119,7 @@ def multisine(
     integer("group", group, 2)
     number("fs", fs, positive=True)
     if band is not None:
-        _checks.band(band)
+        checks.band(band)
     generator = np.random.default_rng(seed)
     excited = _on_grid(_candidates(samples, fs, band, lines), grid, group, generator)
     A = _amplitudes(amplitude, samples, nu, excited)

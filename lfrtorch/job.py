@@ -11,9 +11,9 @@ from typing import Any, cast
 
 import torch
 
-from lfrtorch._errors import InputError
-from lfrtorch._tables import number, quantity
-from lfrtorch._threads import each_alone
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import number, quantity
+from lfrtorch._support.threads import each_alone
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network

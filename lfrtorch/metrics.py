@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.records import Record
 
 

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch.nn import Module
 
-from lfrtorch import _checkpoint
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support import checkpoint
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.initial_state import simulate_estimated
 from lfrtorch.engine.lfr import LFR
@@ -213,7 +213,7 @@ class Model:
         weights = dict(self.lfr.cell.state_dict())
         scaling = ("u_offset", "u_scale", "y_offset", "y_scale")
         weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in scaling}
-        return _checkpoint.write(folder, description, weights)
+        return checkpoint.write(folder, description, weights)
 
 
 def simulate_blocks(
@@ -277,7 +277,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         >>> lfrtorch.load(folder).sizes
         {'nx': 1, 'nz': 1, 'nw': 1, 'nn': 4}
     """
-    description, weights = _checkpoint.read(folder)
+    description, weights = checkpoint.read(folder)
     if "linear" in description:
         raise InputError(
             f"'{folder}' holds a linear model, as estimate_bla makes it; "

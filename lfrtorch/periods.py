@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 
 _ALIKE = 0.02
 """Largest difference D(p) that counts as noise. Two parts of narrow-band noise reach 0.05 at

@@ -29,9 +29,9 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lfrtorch._checks import integer
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 
 Start = Literal["zero", "given", "estimated", "periodic"]
 

@@ -33,8 +33,8 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
 import lfrtorch
-from lfrtorch._atomic import whole_file
-from lfrtorch._tables import number
+from lfrtorch._support.atomic import whole_file
+from lfrtorch._support.tables import number
 from lfrtorch.cli.config import CONF
 from lfrtorch.dataset import Dataset
 from lfrtorch.reporting import leaderboard

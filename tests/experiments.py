@@ -3,7 +3,7 @@
 import numpy as np
 from reference import System, frf, periodic_response
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.linear.frf import FRF
 from lfrtorch.records import Record
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.func import functional_call, jacfwd
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from lfrtorch._types import Array, Complex
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network

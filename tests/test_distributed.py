@@ -26,7 +26,7 @@ from reference import measure, normal, random_cell, random_model
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from lfrtorch._reasons import Reason
+from lfrtorch._support.reasons import Reason
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.multistart import fit

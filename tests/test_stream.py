@@ -15,7 +15,7 @@ from reference import random_cell, random_model
 
 import lfrtorch
 from lfrtorch import simulate_blocks
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.metrics import BlockScores, nrmse, rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record

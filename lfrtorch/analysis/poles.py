@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from lfrtorch._types import Complex
+from lfrtorch._support.types import Complex
 from lfrtorch.engine.linearised import linearise
 from lfrtorch.model import Model
 

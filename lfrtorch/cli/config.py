@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from torch.nn import Module
 
 import lfrtorch
-from lfrtorch._checks import integer
-from lfrtorch._errors import InputError
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
 from lfrtorch.cli.words import translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings, SizesSearch

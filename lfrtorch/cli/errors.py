@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig
 
-from lfrtorch._errors import LfrtorchError
+from lfrtorch._support.errors import LfrtorchError
 from lfrtorch.cli.interrupts import TerminatedError
 from lfrtorch.cli.words import translated
 

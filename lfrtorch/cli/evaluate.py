@@ -15,8 +15,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 import lfrtorch
-from lfrtorch._atomic import refuse_existing, whole_file
-from lfrtorch._errors import InputError
+from lfrtorch._support.atomic import refuse_existing, whole_file
+from lfrtorch._support.errors import InputError
 from lfrtorch.cli.config import CONF, loaded, require_data
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import program

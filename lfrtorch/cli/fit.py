@@ -24,8 +24,8 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from lfrtorch._atomic import whole_file
-from lfrtorch._reasons import Reason
+from lfrtorch._support.atomic import whole_file
+from lfrtorch._support.reasons import Reason
 from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError, Termination

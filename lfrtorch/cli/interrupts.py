@@ -6,7 +6,7 @@ import signal
 import sys
 from typing import Any, Self
 
-from lfrtorch._errors import LfrtorchError
+from lfrtorch._support.errors import LfrtorchError
 
 
 class TerminatedError(LfrtorchError):

@@ -23,9 +23,9 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
-from lfrtorch import _tables
-from lfrtorch._atomic import whole_file
-from lfrtorch._tables import in_percent
+from lfrtorch._support import tables
+from lfrtorch._support.atomic import whole_file
+from lfrtorch._support.tables import in_percent
 from lfrtorch.analysis.poles import frequency_and_damping
 from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
@@ -209,23 +209,23 @@ def table(found: dict[str, Any]) -> str:
         for o in s["outputs"]
     ]
     head = ["use", "record", "source", "samples", "skip", "output", "RMSE", "unit", "% of std"]
-    parts.append(_tables.table(head, scores, digits=4))
+    parts.append(tables.table(head, scores, digits=4))
     listed = [["pole", p] for p in found["poles"]]
     listed += [[f"zero {n}".strip(), z] for n, zeros in found["zeros"].items() for z in zeros]
     rows = [
         [what, r["frequency"], r["damping"], r["radius"], "pair" if r["imag"] else ""]
         for what, r in listed
     ]
-    parts.append(_tables.table(["", "frequency (Hz)", "damping", "radius", ""], rows, digits=4))
+    parts.append(tables.table(["", "frequency (Hz)", "damping", "radius", ""], rows, digits=4))
     rows = [[o["channel"], o["offset"], o["unit"]] for o in found["offsets"]]
-    parts.append(_tables.table(["operating point", "offset", "unit"], rows, digits=4))
+    parts.append(tables.table(["operating point", "offset", "unit"], rows, digits=4))
     if found["response_std"]:
         rows = [
             [r["channel"], r["std"], in_percent(r["relative"]), r["frequency"]]
             for r in found["response_std"]
         ]
         head = ["response", "largest std", "% of response there", "at (Hz)"]
-        parts.append(_tables.table(head, rows, digits=4))
+        parts.append(tables.table(head, rows, digits=4))
     return "\n\n".join(parts)
 
 

@@ -19,11 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lfrtorch import _tables
-from lfrtorch._atomic import whole_file
-from lfrtorch._checks import number
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support import tables
+from lfrtorch._support.atomic import whole_file
+from lfrtorch._support.checks import number
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.files.formats import BLOCK, Table, open_table
 from lfrtorch.files.time_stamps import UnevenError, in_seconds, is_time, sampling
@@ -257,7 +257,7 @@ def numbers(found: Survey) -> str:
     head = ["signal", "use", "samples", "missing", "mean", "rms", "min", "max", "% at min"]
     head += ["% at max", "run", f"from {unit}", f"to {unit}", "period", "periods"]
     rows = [row(one, found) for one in found.signals]
-    text = _tables.table([*head, "noise"], rows, digits=4)
+    text = tables.table([*head, "noise"], rows, digits=4)
     methods = {one.method for one in found.signals}
     legend = [
         "rms: about the mean; run: longest at an extreme; from, to: the band of 99 % of the power."
@@ -273,7 +273,7 @@ def row(one: SignalSurvey, found: Survey) -> list[str | float | None]:
     """What the table says of a signal."""
     use = "" if not found.inputs else "input" if one in found.inputs else "output"
     ends = one.minimum, one.maximum
-    noise = None if one.noise is None else _tables.number(one.noise, 4)
+    noise = None if one.noise is None else tables.number(one.noise, 4)
     return [
         str(one.channel),
         use,

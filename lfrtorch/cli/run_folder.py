@@ -14,7 +14,7 @@ from typing import cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from lfrtorch._errors import InputError
+from lfrtorch._support.errors import InputError
 from lfrtorch.cli.words import now
 from lfrtorch.distributed import Ranks
 

@@ -16,11 +16,11 @@ import numpy as np
 from omegaconf import DictConfig, ListConfig
 
 import lfrtorch
-from lfrtorch import _checkpoint, _tables
-from lfrtorch._atomic import refuse_existing, whole_file
-from lfrtorch._checks import integer, number
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support import checkpoint, tables
+from lfrtorch._support.atomic import refuse_existing, whole_file
+from lfrtorch._support.checks import integer, number
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.cli.config import CONF
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.linear import finite
@@ -65,14 +65,14 @@ def simulate(cfg: DictConfig) -> None:
             x0 = start_state(cfg, model, stream)
             result = written(model, stream, x0, out, cfg.skip)
         print(
-            f"{out}: {result.samples} samples, {_tables.quantity(time.perf_counter() - clock, 's')}"
+            f"{out}: {result.samples} samples, {tables.quantity(time.perf_counter() - clock, 's')}"
         )
         for note in noted(result, model, cfg):
             print(f"note: {note}")
         rows += scored(path, model, result.scores, cfg.skip) if stream.y else []
     if rows:
         head = ["file", "output", "unit", "samples", "skip", "RMSE", "NRMSE (%)"]
-        print(f"\n{_tables.table(head, rows)}")
+        print(f"\n{tables.table(head, rows)}")
 
 
 class Written(NamedTuple):
@@ -130,7 +130,7 @@ def written(
 def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
     """What a user should know before the outputs are used."""
     notes = [
-        f"the input {channel.name} goes {_tables.number(peak)} standard deviations of the training "
+        f"the input {channel.name} goes {tables.number(peak)} standard deviations of the training "
         "input away from its mean: the model extrapolates there"
         for channel, peak in zip(model.inputs, result.peaks, strict=True)
         if peak > FAR
@@ -143,7 +143,7 @@ def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
     if cfg.start != "estimated" and transient.any():
         ratio = (beginning / settled.rmse)[transient].max()
         notes.append(
-            f"the error over the first {BEGINNING} scored samples is {_tables.number(ratio)} "
+            f"the error over the first {BEGINNING} scored samples is {tables.number(ratio)} "
             "times that of the rest: start=estimated finds the state that the file starts from, "
             "skip=N leaves out the transient"
         )
@@ -200,7 +200,7 @@ def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> A
     record = lfrtorch.Record(u, y, fs=model.fs, start="estimated", name=stream.table.path.name)
     trajectory = model.signals(record)
     fitted = lfrtorch.rmse(record, model.scaler.restore_y(trajectory.y[0].double().numpy()))
-    there, at_rest = map(_tables.number, (fitted, lfrtorch.rmse(record, model.simulate(u))))
+    there, at_rest = map(tables.number, (fitted, lfrtorch.rmse(record, model.simulate(u))))
     print(
         f"start: the state is estimated from the first {len(u)} samples of '{record.name}'; RMSE "
         f"there {there}, from zero state {at_rest}"
@@ -219,7 +219,7 @@ def scored(path: Path, model: lfrtorch.Model, scores: BlockScores, skip: int) ->
             int(scores.samples[i]),
             skip,
             finite(scores.rmse[i]),
-            _tables.in_percent(finite(scores.nrmse[i])),
+            tables.in_percent(finite(scores.nrmse[i])),
         ]
         for i, channel in enumerate(model.outputs)
     ]
@@ -227,7 +227,7 @@ def scored(path: Path, model: lfrtorch.Model, scores: BlockScores, skip: int) ->
 
 def opened(folder: str) -> lfrtorch.Model:
     """The model of a checkpoint, a linear one as an NL-LFR without static nonlinearity."""
-    description, _ = _checkpoint.read(folder)
+    description, _ = checkpoint.read(folder)
     if "linear" in description:
         return lfrtorch.LinearModel.load(folder).to_model()
     return lfrtorch.load(folder)

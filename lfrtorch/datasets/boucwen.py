@@ -26,9 +26,9 @@ import scipy
 from numba import njit
 from numpy.typing import ArrayLike
 
-from lfrtorch._checks import integer, number
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.checks import integer, number
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record

@@ -19,8 +19,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lfrtorch._checks import integer, number
-from lfrtorch._errors import InputError
+from lfrtorch._support.checks import integer, number
+from lfrtorch._support.errors import InputError
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record

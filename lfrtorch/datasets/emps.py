@@ -28,8 +28,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lfrtorch._checks import integer
-from lfrtorch._errors import InputError
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record

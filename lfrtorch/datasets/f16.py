@@ -34,8 +34,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.metrics import rms

@@ -17,9 +17,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from lfrtorch._checks import number
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.checks import number
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.records import Record, Start
 
 _AGAIN = "download the file again."

@@ -22,9 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lfrtorch._checks import integer, number
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.checks import integer, number
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.datasets.parwh_simulator import FS, PERIOD, Signals, StandIn, multisine, simulate

@@ -22,9 +22,9 @@ import scipy
 from numpy.typing import ArrayLike
 
 from lfrtorch import metrics
-from lfrtorch._checks import number
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.checks import number
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 
 FS = 78125.0
 """Sampling frequency of the records, Hz."""

@@ -39,9 +39,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lfrtorch._checks import integer
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lfrtorch._checks import integer
-from lfrtorch._errors import InputError
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
 
 
 class LFRCell(nn.Module):

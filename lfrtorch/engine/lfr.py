@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from lfrtorch._errors import InputError
+from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, simulate, steady_state

@@ -15,8 +15,8 @@ from torch.func import functional_call, vmap
 from torch.nn import Module, Parameter, ParameterList
 from torch.nn.functional import pad
 
-from lfrtorch._checks import integer
-from lfrtorch._errors import InputError
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "tanh": torch.tanh,

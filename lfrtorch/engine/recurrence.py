@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lfrtorch._threads import spread
+from lfrtorch._support.threads import spread
 
 COMPILED_ON = {"cpu"}
 """Devices that have compiled kernels; all else runs in torch, parallel in time."""

@@ -31,7 +31,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lfrtorch._threads import spread, workers
+from lfrtorch._support.threads import spread, workers
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
 from lfrtorch.engine.linearised import PASS, Linearised, linearise_at, of_static

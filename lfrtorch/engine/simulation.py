@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._threads import spread
+from lfrtorch._support.threads import spread
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import monodromy, spectral_radius
 from lfrtorch.engine.newton import newton_states

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable
 from pathlib import Path
 
-from lfrtorch._errors import InputError
+from lfrtorch._support.errors import InputError
 from lfrtorch.files import arrays as array_table
 from lfrtorch.files.parquet import ParquetTable
 from lfrtorch.files.table import BLOCK, Table

@@ -10,8 +10,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Literal, cast, get_args
 
-from lfrtorch._checks import integer, number
-from lfrtorch._errors import InputError
+from lfrtorch._support.checks import integer, number
+from lfrtorch._support.errors import InputError
 from lfrtorch.dataset import Dataset
 from lfrtorch.files.formats import similar
 from lfrtorch.files.measurement import (

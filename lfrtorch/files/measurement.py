@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch._checks import number
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array, Integers
+from lfrtorch._support.checks import number
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Integers
 from lfrtorch.files.formats import Table, open_table
 from lfrtorch.files.time_stamps import Sampling, UnevenError, in_seconds, is_time, sampling
 from lfrtorch.records import Channel

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.files.arrays import optional
 from lfrtorch.files.table import BLOCK, Clock, Table
 

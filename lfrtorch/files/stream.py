@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.files.formats import BLOCK, open_table
 from lfrtorch.files.table import NoColumnError
 from lfrtorch.files.time_stamps import UnevenError, in_seconds, sampling

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.records import Channel
 
 BLOCK = 65536

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array, Integers
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Integers
 from lfrtorch.records import Channel
 
 _JITTER = 0.1  # of a step: how far a stamp may be from its place in an even grid

@@ -8,7 +8,7 @@ from operator import mul
 
 import numpy as np
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 
 REACH = 3.0
 """z that is mapped to 1, in standard deviations: the polynomials grow beyond it."""

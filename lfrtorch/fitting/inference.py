@@ -40,9 +40,9 @@ import torch
 from torch import Tensor
 from torch.nn import Module
 
-from lfrtorch._checks import integer
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array, Complex, Integers
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Complex, Integers
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.chebyshev import chebyshev, chebyshev_slope
 from lfrtorch.fitting.starts import OUTPUT_WEIGHTS, initialise

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lfrtorch._errors import InputError
+from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, is_network

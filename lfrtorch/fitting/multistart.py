@@ -27,10 +27,10 @@ from typing import cast
 
 import torch
 
-from lfrtorch._checks import integer, renamed
-from lfrtorch._errors import InputError
-from lfrtorch._reasons import CUT_SHORT, Reason, told
-from lfrtorch._threads import each_alone, spread_by_hand
+from lfrtorch._support.checks import integer, renamed
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.reasons import CUT_SHORT, Reason, told
+from lfrtorch._support.threads import each_alone, spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import torch
 from torch.nn import Module
 
-from lfrtorch._checks import integer, number
-from lfrtorch._errors import InputError
+from lfrtorch._support.checks import integer, number
+from lfrtorch._support.errors import InputError
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.trainer import Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt

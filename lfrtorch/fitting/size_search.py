@@ -36,12 +36,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from lfrtorch import _tables
-from lfrtorch._checks import integer, renamed
-from lfrtorch._errors import InputError
-from lfrtorch._reasons import Reason
-from lfrtorch._tables import number
-from lfrtorch._types import Array, Integers
+from lfrtorch._support import tables
+from lfrtorch._support.checks import integer, renamed
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.reasons import Reason
+from lfrtorch._support.tables import number
+from lfrtorch._support.types import Array, Integers
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import StartDivergesError, Stop, StoppedError, Trainer
@@ -171,7 +171,7 @@ class SizeSearch:
 
     def table(self) -> str:
         """One line a model, by rising net parameters."""
-        return f"{_tables.table(*size_table(self.entries()))}\n{LEGEND}"
+        return f"{tables.table(*size_table(self.entries()))}\n{LEGEND}"
 
 
 def size_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:

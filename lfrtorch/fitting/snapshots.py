@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from time import monotonic
 
-from lfrtorch._atomic import whole_file
-from lfrtorch._errors import InputError
+from lfrtorch._support.atomic import whole_file
+from lfrtorch._support.errors import InputError
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.trainer import Fit, Keep, nothing
 

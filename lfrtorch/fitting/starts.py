@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import Module
 
-from lfrtorch._checks import integer, number
-from lfrtorch._errors import InputError
+from lfrtorch._support.checks import integer, number
+from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial

@@ -16,8 +16,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from lfrtorch._atomic import whole_file
-from lfrtorch._errors import InputError
+from lfrtorch._support.atomic import whole_file
+from lfrtorch._support.errors import InputError
 
 State = TypeVar("State")
 Tensors = dict[str, Tensor]

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from lfrtorch._errors import InputError, LfrtorchError
-from lfrtorch._reasons import Reason, told
-from lfrtorch._threads import spread_by_hand
+from lfrtorch._support.errors import InputError, LfrtorchError
+from lfrtorch._support.reasons import Reason, told
+from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt

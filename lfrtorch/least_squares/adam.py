@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._checks import integer, number, renamed
-from lfrtorch._reasons import Reason
+from lfrtorch._support.checks import integer, number, renamed
+from lfrtorch._support.reasons import Reason
 
 
 class Differentiable(Protocol):

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lfrtorch._types import Array, Integers
+from lfrtorch._support.types import Array, Integers
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import is_network
 

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lfrtorch._threads import spread
+from lfrtorch._support.threads import spread
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.sensitivity import Linearisation, Rows, fixed_point, output_jacobian
 from lfrtorch.least_squares.gauge import Reduction

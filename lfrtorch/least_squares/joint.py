@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter
 
-from lfrtorch._errors import InputError
+from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Stacked, is_network

@@ -23,9 +23,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._checks import integer, number
-from lfrtorch._errors import InputError
-from lfrtorch._reasons import Reason
+from lfrtorch._support.checks import integer, number
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.reasons import Reason
 from lfrtorch.least_squares.linear_systems import SVDSystem, System
 
 FASTEST_DECREASE = 0.2

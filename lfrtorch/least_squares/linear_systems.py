@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lfrtorch._threads import spread
+from lfrtorch._support.threads import spread
 from lfrtorch.distributed import Ranks
 
 MERGED = 16

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start

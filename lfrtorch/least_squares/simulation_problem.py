@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lfrtorch._checks import number
-from lfrtorch._errors import InputError
+from lfrtorch._support.checks import number
+from lfrtorch._support.errors import InputError
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.initial_state import simulate_estimated
 from lfrtorch.engine.sensitivity import Linearisation

@@ -15,10 +15,10 @@ from typing import Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
-from lfrtorch._checks import integer
-from lfrtorch._errors import InputError
-from lfrtorch._threads import spread_by_hand
-from lfrtorch._types import Array
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.threads import spread_by_hand
+from lfrtorch._support.types import Array
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel, balancing
 from lfrtorch.linear.refinement import Matrices, Refined, Search

@@ -18,11 +18,11 @@ import numpy as np
 from jaxtyping import Complex128, Float
 from numpy.typing import ArrayLike
 
-from lfrtorch import _checks
-from lfrtorch._checks import dft_lines, integer
-from lfrtorch._errors import InputError
-from lfrtorch._threads import spread_by_hand
-from lfrtorch._types import Array, Complex, Integers
+from lfrtorch._support import checks
+from lfrtorch._support.checks import dft_lines, integer
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.threads import spread_by_hand
+from lfrtorch._support.types import Array, Complex, Integers
 from lfrtorch.linear.local_polynomial import fit_local_polynomials, half_width
 from lfrtorch.linear.regression import Regression, covariance, outer, regress
 from lfrtorch.linear.spectra import (
@@ -269,7 +269,7 @@ def estimate_frf(
     if degrees_of_freedom is not None:
         integer("degrees_of_freedom", degrees_of_freedom, 1)
     if band is not None:
-        _checks.band(band)
+        checks.band(band)
     if band is not None and not 0 <= band[0] <= band[1]:
         raise InputError(
             f"the band is {band[0]} to {band[1]} Hz; give a lower and an upper frequency."

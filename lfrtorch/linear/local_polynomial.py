@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Complex128, Int64
 from numpy.typing import NDArray
 
-from lfrtorch._types import Complex, Integers
+from lfrtorch._support.types import Complex, Integers
 from lfrtorch.linear.regression import DEPENDENT, covariance, outer, regress
 
 CHUNK = 2**21

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from lfrtorch import _checkpoint
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array, Complex
+from lfrtorch._support import checkpoint
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.linear.resolvent import frequency_response, response_jacobian, solve_resolvents
@@ -325,7 +325,7 @@ class LinearModel:
         }
         arrays = {name: getattr(self, name) for name in (*_ARRAYS, *_OPTIONAL)}
         weights = {k: torch.tensor(v) for k, v in arrays.items() if v is not None}
-        return _checkpoint.write(folder, description, weights)
+        return checkpoint.write(folder, description, weights)
 
     @classmethod
     def load(cls, folder: str | Path) -> LinearModel:
@@ -339,7 +339,7 @@ class LinearModel:
             >>> lfrtorch.LinearModel.load("filter").nx
             1
         """
-        description, weights = _checkpoint.read(folder, ("linear", "model"))
+        description, weights = checkpoint.read(folder, ("linear", "model"))
         if "linear" not in description:
             raise InputError(f"'{folder}' holds no linear model; lfrtorch.load reads an NL-LFR.")
         try:

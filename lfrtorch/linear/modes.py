@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Complex128, Float
 
-from lfrtorch._types import Array, Complex
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.model import LinearModel, balancing
 from lfrtorch.records import Channel, Record, as_records, without_coordinates
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lfrtorch import _tables
-from lfrtorch._checks import integer
-from lfrtorch._errors import InputError
+from lfrtorch._support import tables
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
@@ -75,7 +75,7 @@ class OrderScan:
             chosen = "chosen" if model.nx == self.chosen else ""
             rows.append([model.nx, model.fit.rmse, score, value, radius, chosen])
         head = ["nx", "fitted", how, "singular value", "largest pole", ""]
-        return _tables.table(head, rows, digits=4)
+        return tables.table(head, rows, digits=4)
 
 
 def scan_orders(

@@ -8,8 +8,8 @@ from typing import Any, Self
 
 from torch import Tensor
 
-from lfrtorch._reasons import Reason
-from lfrtorch._types import Array
+from lfrtorch._support.reasons import Reason
+from lfrtorch._support.types import Array
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 
 Matrices = tuple[Array, Array, Array, Array]

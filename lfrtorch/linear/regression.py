@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Complex128
 from numpy.typing import NDArray
 
-from lfrtorch._types import Complex
+from lfrtorch._support.types import Complex
 
 DEPENDENT = 1e-10
 """A column depends on those before it if its part orthogonal to them is relatively below this."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lfrtorch._errors import InputError
+from lfrtorch._support.errors import InputError
 from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import shortest, suffice
 from lfrtorch.metrics import rms

@@ -15,7 +15,7 @@ import scipy
 from jaxtyping import Complex128, Float, Integer
 from numpy.typing import NDArray
 
-from lfrtorch._types import Array, Complex, Integers
+from lfrtorch._support.types import Array, Complex, Integers
 
 
 def solve_resolvent(

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Complex128, Float
 from torch import Tensor
 
-from lfrtorch._types import Array, Complex
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.least_squares.gauge import Reduction, reduction
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.linear.model import linear_cell

@@ -20,7 +20,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.least_squares.linear_systems import SVDSystem

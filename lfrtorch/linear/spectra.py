@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Complex128, Float, Int64
 from numpy.typing import ArrayLike
 
-from lfrtorch._checks import dft_lines
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array, Complex, Integers
+from lfrtorch._support.checks import dft_lines
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Complex, Integers
 from lfrtorch.linear.regression import outer
 from lfrtorch.records import Record
 

@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Complex128, Float
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array, Complex
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.frf import FRF
 from lfrtorch.records import Record, Scaler, rms_scale
 

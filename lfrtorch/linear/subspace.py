@@ -29,7 +29,7 @@ import numpy as np
 import scipy
 from jaxtyping import Complex128, Float
 
-from lfrtorch._types import Array, Complex
+from lfrtorch._support.types import Array, Complex
 
 LARGEST_POLE = 1.0 - 1e-6
 """Limit for the radius of poles: the margin keeps a model stable when its coordinates change."""

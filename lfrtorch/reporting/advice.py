@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from lfrtorch._tables import number, percent
+from lfrtorch._support.tables import number, percent
 
 NOISE_LIMITED = 1.1
 """Training error over the noise up to which the model's own share, √(1.1² - 1), is below half of

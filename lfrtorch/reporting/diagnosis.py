@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from lfrtorch._reasons import SPENT, Reason
-from lfrtorch._types import Array
+from lfrtorch._support.reasons import SPENT, Reason
+from lfrtorch._support.types import Array
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.spectra import spectra_of_periods
 from lfrtorch.metrics import rms

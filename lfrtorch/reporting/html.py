@@ -14,8 +14,8 @@ import jinja2
 import numpy as np
 import torch
 
-from lfrtorch._tables import UNKNOWN, Cell, cell, number, percent, quantity
-from lfrtorch._types import Array
+from lfrtorch._support.tables import UNKNOWN, Cell, cell, number, percent, quantity
+from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest
 from lfrtorch.dataset import Dataset

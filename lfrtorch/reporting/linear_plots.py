@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array, Complex
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan

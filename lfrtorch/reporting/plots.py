@@ -10,7 +10,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.records import Record
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lfrtorch._tables import quantity
+from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings

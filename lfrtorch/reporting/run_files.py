@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lfrtorch._atomic import whole_file
+from lfrtorch._support.atomic import whole_file
 from lfrtorch.reporting import figures, html, plots, scores
 from lfrtorch.reporting.monitor import TensorBoard
 from lfrtorch.reporting.run import Run

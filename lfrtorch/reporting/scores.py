@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
-from lfrtorch import _tables
+from lfrtorch._support import tables
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.fitting.size_search import SizeSearch
@@ -182,7 +182,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     if result["linear"]:
         models = ", ".join(f"{n} of {'+'.join(r)}" for n, r in result["linear"].items())
         references.insert(0, f"linear: a model for each of these: {models}")
-    return "\n".join([title, "", _tables.table(head, rows), *[""] * bool(references), *references])
+    return "\n".join([title, "", tables.table(head, rows), *[""] * bool(references), *references])
 
 
 def neurons(count: int) -> str:
@@ -197,7 +197,7 @@ def starts_table(result: Mapping[str, Any]) -> str:
         [s[k] for k in ("seed", "iterations", "train", "validation", "selection", "reason")]
         for s in result["ranking"]
     ]
-    return f"Starts, the best iterate of each\n\n{_tables.table(head, rows)}"
+    return f"Starts, the best iterate of each\n\n{tables.table(head, rows)}"
 
 
 def _pooled(values: list[float | None], scores: list[Score]) -> float | None:

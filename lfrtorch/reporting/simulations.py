@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from lfrtorch._types import Array, Complex
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.metrics import rms
 
 SEGMENTS = (4, 8)

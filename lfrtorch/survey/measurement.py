@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Array
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.periods import find_period
 from lfrtorch.records import Channel
 from lfrtorch.survey.signal import SignalSurvey, longest_run, survey_signal

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.records import Record, as_records
 from lfrtorch.survey.causality import TwoSidedResponse, two_sided_response
 from lfrtorch.survey.measurement import Survey, survey_measurement

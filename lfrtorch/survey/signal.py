@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from lfrtorch._types import Array, Integers
+from lfrtorch._support.types import Array, Integers
 from lfrtorch.periods import find_transient
 from lfrtorch.records import Channel
 

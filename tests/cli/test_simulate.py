@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from reference import random_cell, random_model
 
 import lfrtorch
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.cli import simulate
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.stream import Block, FileStream

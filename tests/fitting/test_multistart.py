@@ -11,7 +11,7 @@ from reference import measure, move, planted, random_cell, random_model, theta
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
-from lfrtorch._reasons import Reason
+from lfrtorch._support.reasons import Reason
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.means import mean_model

@@ -11,7 +11,7 @@ import torch
 from reference import random_cell
 from scipy.signal import lfilter
 
-from lfrtorch._tables import number
+from lfrtorch._support.tables import number
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Polynomial

@@ -13,7 +13,7 @@ from reference import measure, random_cell, random_model
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
-from lfrtorch._reasons import Reason
+from lfrtorch._support.reasons import Reason
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting import state_file, trainer
 from lfrtorch.fitting.multistart import fit

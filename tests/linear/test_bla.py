@@ -12,7 +12,7 @@ import reference
 import scipy.linalg
 from reference import System, random_system
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.linear import bla
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf

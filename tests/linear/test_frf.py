@@ -8,7 +8,7 @@ import pytest
 from experiments import FS, SEEDS, check_covariance, coloured, recorded, steady, true_frf, vec
 from reference import random_system
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.excitation import Multisine, multisine
 from lfrtorch.linear.frf import FRF, Method, estimate_frf
 from lfrtorch.records import Channel, Record

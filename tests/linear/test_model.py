@@ -15,7 +15,7 @@ import torch
 from reference import System, normal, random_cell, random_model, random_system
 
 import lfrtorch
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.linear.model import LinearFit, LinearModel, balancing
 from lfrtorch.linear.resolvent import frequency_response

@@ -8,7 +8,7 @@ import torch
 from reference import System, random_system
 from torch import Tensor
 
-from lfrtorch._types import Complex
+from lfrtorch._support.types import Complex
 from lfrtorch.linear.resolvent import frequency_response, response_jacobian, solve_resolvents
 
 pytestmark = pytest.mark.numeric

@@ -6,7 +6,7 @@ import reference
 import torch
 from reference import System, random_system, refined
 
-from lfrtorch._types import Array, Complex
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.resolvent import frequency_response

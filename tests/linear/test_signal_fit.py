@@ -8,7 +8,7 @@ import reference
 import scipy.linalg
 from reference import System, random_system, refined
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.linear.signal_fit import OBSERVERS, SignalFit
 from lfrtorch.records import Record
 

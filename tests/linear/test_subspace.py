@@ -7,7 +7,7 @@ import pytest
 import reference
 from reference import System, random_system
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.linear import subspace
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.linear.response_fit import ResponseFit, SpectralData

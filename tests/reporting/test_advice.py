@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 
 import lfrtorch
-from lfrtorch._reasons import Reason
+from lfrtorch._support.reasons import Reason
 from lfrtorch.fitting.trainer import FitResult, Progress, Start
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import advice

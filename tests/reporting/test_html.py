@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import lfrtorch
-from lfrtorch._tables import number
+from lfrtorch._support.tables import number
 from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.engine.lfr import LFR

@@ -9,7 +9,7 @@ import pytest
 from scipy.io import loadmat
 from scipy.signal import butter, lfilter, sosfilt
 
-from lfrtorch._types import Array
+from lfrtorch._support.types import Array
 from lfrtorch.datasets import boucwen, parwh, silverbox, wiener_hammerstein
 from lfrtorch.records import Channel, Record
 from lfrtorch.survey.measurement import survey_measurement

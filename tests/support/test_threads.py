@@ -11,7 +11,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from lfrtorch._threads import spread, spread_by_hand, workers
+from lfrtorch._support.threads import spread, spread_by_hand, workers
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])

@@ -3,7 +3,7 @@
 import json
 
 from lfrtorch import Reason
-from lfrtorch._reasons import CUT_SHORT, SPENT, told
+from lfrtorch._support.reasons import CUT_SHORT, SPENT, told
 
 
 def test_a_reason_equals_the_text_that_files_hold():

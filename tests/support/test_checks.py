@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lfrtorch
-from lfrtorch._checks import integer, number
+from lfrtorch._support.checks import integer, number
 
 
 @pytest.mark.parametrize("value", [3, np.int64(3), 4])

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from lfrtorch._tables import UNKNOWN, number, percent, quantity, table
+from lfrtorch._support.tables import UNKNOWN, number, percent, quantity, table
 
 
 @pytest.mark.parametrize(

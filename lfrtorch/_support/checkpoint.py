@@ -14,8 +14,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from lfrtorch._atomic import umask
-from lfrtorch._errors import InputError
+from lfrtorch._support.atomic import umask
+from lfrtorch._support.errors import InputError
 
 FORMAT = "lfrtorch"
 VERSION = 1

@@ -11,8 +11,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lfrtorch._errors import InputError
-from lfrtorch._types import Integers
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Integers
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

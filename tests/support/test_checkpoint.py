@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 import lfrtorch
-from lfrtorch import _checkpoint
+from lfrtorch._support import checkpoint
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.model import Model, load
 from lfrtorch.records import Channel
@@ -175,8 +175,8 @@ def test_description_of_another_program(saved: Path, text: str):
 
 
 def test_newer_version(saved: Path):
-    edit(saved, version=_checkpoint.VERSION + 1)
-    refused(saved, f"has checkpoint version {_checkpoint.VERSION + 1} and this program reads up to")
+    edit(saved, version=checkpoint.VERSION + 1)
+    refused(saved, f"has checkpoint version {checkpoint.VERSION + 1} and this program reads up to")
 
 
 def test_version_that_is_missing(saved: Path):
@@ -375,7 +375,7 @@ def test_save_that_fails_keeps_the_old_checkpoint(saved: Path, monkeypatch: pyte
     def full(*_):
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(_checkpoint, "save_file", full)
+    monkeypatch.setattr(checkpoint, "save_file", full)
     with pytest.raises(OSError, match="no space left"):
         small(seed=1).save(saved)
     assert np.array_equal(load(saved).simulate(U), small().simulate(U))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from lfrtorch._atomic import refuse_existing, whole_file
+from lfrtorch._support.atomic import refuse_existing, whole_file
 
 
 def test_replaces_the_file(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lfrtorch._errors import InputError
+from lfrtorch._support.errors import InputError
 
 
 def refuse_existing(path: str | Path, option: str) -> None:
