@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from hypothesis import settings
-from shapes import install
+from shapes import calls, install
 
 install()
 
@@ -23,6 +23,12 @@ torch.set_num_threads(THREADS)
 # Same examples in every run, none kept on disk; compilation may take its time.
 settings.register_profile("lfrtorch", deadline=None, derandomize=True, database=None)
 settings.load_profile("lfrtorch")
+
+
+@pytest.fixture(autouse=True)
+def shapes_are_checked() -> None:
+    """The first calls of each test."""
+    calls.clear()
 
 
 @pytest.fixture(scope="session")

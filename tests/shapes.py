@@ -1,4 +1,4 @@
-"""Checks the shapes that stand in the package's annotations, at every call.
+"""Checks the shapes that stand in the package's annotations, at the first calls in each test.
 
 jaxtyping's own import hook decorates every function. Numba cannot compile the decorated kernels,
 and types without a shape are basedpyright's business.
@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import ast
 import sys
+from collections import Counter
+from collections.abc import Callable
+from functools import wraps
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import CodeType
 from typing import Any
@@ -15,7 +18,23 @@ from typing import Any
 from beartype import beartype
 from jaxtyping import jaxtyped
 
-checked = jaxtyped(typechecker=beartype)
+FIRST = 5
+"""Calls of each function that are checked in a test: all of them would cost a third more time."""
+
+calls: Counter[str] = Counter()
+"""Of each function, in this test."""
+
+
+def checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Check the shapes of the first calls in each test."""
+    strict, name = jaxtyped(function, typechecker=beartype), function.__qualname__
+
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        calls[name] += 1
+        return (strict if calls[name] <= FIRST else function)(*args, **kwargs)
+
+    return call
 
 
 def install() -> None:
