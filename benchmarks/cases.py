@@ -179,7 +179,7 @@ def first_call(folder: Path) -> dict:
         stage("estimate_bla")
         model = lfrtorch.initialise(bla, data, nz=2, nw=1, nn=15)
         stage("initialise")
-        search(SimulationProblem(model, data, ridge=problems.RIDGE), 1)
+        search(SimulationProblem.of(model, data, ridge=problems.RIDGE), 1)
         stage("first iteration")
         runs.append(stages)
     return {"first_s": runs[0], "again_s": runs[1]}

@@ -78,7 +78,7 @@ def problem(
     """The residual that a fit of the problem minimises."""
     model = lfrtorch.load(folder / name)
     data = records(folder, name, start=start, periods=periods)
-    return SimulationProblem(model, data, ridge=ridge)
+    return SimulationProblem.of(model, data, ridge=ridge)
 
 
 def synthetic(
@@ -98,13 +98,13 @@ def synthetic(
     channels = data[0].inputs, data[0].outputs
     bla = LinearModel(A, B, C / np.sqrt(nx), D, 1.0, none, none, *channels)
     model = lfrtorch.initialise(bla, data, nz=nz, nw=nw, nn=nn)
-    return model, SimulationProblem(model, data)
+    return model, SimulationProblem.of(model, data)
 
 
 def plain_gradient(problem: SimulationProblem, theta: torch.Tensor) -> torch.Tensor:
     """The gradient (P,) of the mean square by autograd through a loop in Python, from rest."""
     problem.write(theta)
-    cell, (group,) = problem.model.lfr.cell, problem.groups
+    cell, (group,) = problem.lfr.cell, problem.groups
     x, outputs = group.u.new_zeros(len(group.u), cell.nx), []
     for u in group.u.unbind(1):
         y, x = cell(u, x)

@@ -21,7 +21,25 @@ from lfrtorch.engine.initial_state import simulate_estimated
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network
 from lfrtorch.engine.simulation import Trajectory
-from lfrtorch.records import Channel, Record, Scaler, Start, as_signal, check_start
+from lfrtorch.records import (
+    Channel,
+    NormalisedRecord,
+    Record,
+    Scaler,
+    Start,
+    as_signal,
+    check_start,
+)
+
+
+def simulate_record(lfr: LFR, normalised: NormalisedRecord, start: Start) -> Trajectory:
+    """All signals of a record from a start other than ``"given"``, with R = 1."""
+    like, record = lfr.cell.A, normalised.record
+    signals = normalised.u, normalised.y, record.start_factors
+    u, y, weight = (torch.tensor(signal).to(like).unsqueeze(0) for signal in signals)
+    if start == "estimated":
+        return simulate_estimated(lfr.cell, u, y, weight)
+    return lfr.trajectory(u, None, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +164,7 @@ class Model:
         if start == "estimated":
             if not isinstance(data, Record):
                 raise InputError("start='estimated' needs a record: the state is fitted to its y.")
-            y = torch.as_tensor(self.scaler.normalise_y(data.y)).to(like).unsqueeze(0)
-            weight = torch.as_tensor(np.array(data.start_factors)).to(like).unsqueeze(0)
-            trajectory = simulate_estimated(self.lfr.cell, v, y, weight)
+            trajectory = simulate_record(self.lfr, self.scaler.normalise(data), start)
         else:
             trajectory = self.lfr.trajectory(v, state, start)
         return Trajectory(*(signal.cpu() for signal in trajectory))

@@ -273,6 +273,20 @@ def without_coordinates(record: Record) -> Record:
 
 
 @dataclass(frozen=True, eq=False)
+class NormalisedRecord:
+    """The signals of a record in the units of a model.
+
+    Args:
+        u, y: normalised input (T, nu) and output (T, ny); a predictor's input has y as well.
+        record: how it starts, and how its errors count.
+    """
+
+    u: Array
+    y: Array
+    record: Record
+
+
+@dataclass(frozen=True, eq=False)
 class Scaler:
     """Offsets and scales between physical and normalised signals: (physical - offset) / scale.
 
@@ -303,6 +317,10 @@ class Scaler:
 
         u_offset, y_offset = centre(us), centre(ys)
         return cls(u_offset, rms_scale(us, u_offset), y_offset, rms_scale(ys, y_offset))
+
+    def normalise(self, record: Record) -> NormalisedRecord:
+        """The record from physical to normalised units."""
+        return NormalisedRecord(self.normalise_u(record.u), self.normalise_y(record.y), record)
 
     def normalise_u(self, u: Array) -> Array:
         """Input (T, nu) from physical to normalised units."""

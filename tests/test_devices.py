@@ -32,7 +32,7 @@ def some_problem(model: Model, made_by: Model | None = None) -> SimulationProble
         replace(measure(made_by, 40, seed=2), start="estimated"),
     ]
     noisy = [replace(r, y=r.y + 0.1 * noise.normal(size=r.y.shape)) for r in records]
-    return SimulationProblem(model, noisy, ridge=0.1)
+    return SimulationProblem.of(model, noisy, ridge=0.1)
 
 
 def searched(problem: SimulationProblem, steps: int = 4) -> LMState:

@@ -162,7 +162,7 @@ def fitted(name: str, ranks: Ranks) -> tuple[Tensor, FitResult]:
 def slope(ranks: Ranks) -> dict[str, Any]:
     """Cost, gradients and error of the start."""
     model, train, _ = case()
-    problem = SimulationProblem(model, train, ridge=1e-2, ranks=ranks)
+    problem = SimulationProblem.of(model, train, ridge=1e-2, ranks=ranks)
     at = problem.theta + 0.01
     r, gradient = problem.gradient(at)
     system, product = problem.linearise(at).system(0.0, 1e-12)

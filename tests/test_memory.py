@@ -40,7 +40,7 @@ def peak_of_an_iteration(T: int, start: Start, nn: int = 15) -> tuple[int, int]:
     """Bytes, and parameters of the model: Bouc-Wen's sizes."""
     model = random_model(random_cell(1, 1, 3, 2, 1, nn))
     noise = np.random.default_rng(0).normal(size=(2, T, 1))
-    problem = SimulationProblem(model, Record(noise[0], noise[1], model.fs, start))
+    problem = SimulationProblem.of(model, Record(noise[0], noise[1], model.fs, start))
     optimiser = LevenbergMarquardt()
     state = optimiser.init(problem, problem.theta)
     with Allocations() as allocations:

@@ -234,7 +234,7 @@ def test_scored_samples_have_no_part_in_the_start(model: Model):
     other = replace(part, y=np.concatenate([part.y[:100], -part.y[100:]]))
     for record in (part, other):
         np.testing.assert_allclose(model.simulate(record), part.y, rtol=0, atol=1e-8)
-    judge = SimulationProblem(model, other, solve_initial_states=True)
+    judge = SimulationProblem.judge(model, other)
     assert judge.rmse(judge.theta) == pytest.approx(rmse(other, part.y), rel=1e-8)
 
 

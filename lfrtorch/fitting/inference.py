@@ -123,9 +123,10 @@ def residual_of(model: Model, record: Record, generator: np.random.Generator) ->
         weight.detach().double().numpy() for weight in (cell.A, cell.Bu, cell.Cy, cell.Dyu)
     )
     T = record.period or record.samples
+    normalised = model.scaler.normalise(record)
     u, y = (
         signal.reshape(-1, T, signal.shape[1]).mean(axis=0)
-        for signal in (model.scaler.normalise_u(record.u), model.scaler.normalise_y(record.y))
+        for signal in (normalised.u, normalised.y)
     )
     U, Y = np.fft.rfft(u, axis=0), np.fft.rfft(y, axis=0)
     F = len(U)
@@ -476,7 +477,7 @@ def _safest(model: Model, plain: Model, records: list[Record]) -> Model:
                 weight.copy_(fraction * value)
 
     def cost(candidate: Model) -> float:
-        problem = SimulationProblem(candidate, records)
+        problem = SimulationProblem.of(candidate, records)
         return problem.cost(problem.residual(problem.theta))
 
     best, kept = cost(plain), 0.0

@@ -236,8 +236,7 @@ class _Judge:
     ) -> None:
         self.fits, self._unseen = fits, unseen
         self._errors = [
-            SimulationProblem(fit.model, records, solve_initial_states=True) if records else None
-            for fit in fits
+            SimulationProblem.judge(fit.model, records) if records else None for fit in fits
         ]
 
     def ranked(self, fits: Sequence[Fit]) -> list[Fit]:
@@ -285,7 +284,7 @@ class _Judge:
         means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]
         scores = [min(map(self._score, self.fits))]
         for mean in means:
-            error = SimulationProblem(mean, self._unseen, solve_initial_states=True)
+            error = SimulationProblem.judge(mean, self._unseen)
             scores.append(error.cost(error.residual(error.theta)))
         scores = self.fits[0].ranks.first(torch.tensor(scores, dtype=torch.float64))
         count = 1 + int((scores <= AS_GOOD**2 * scores.nan_to_num(math.inf).min()).nonzero().max())

@@ -235,10 +235,8 @@ class Fit:
         if ranks.world > 1:
             weights = parameters_to_vector(model.lfr.parameters())
             vector_to_parameters(ranks.first(weights), model.lfr.parameters())
-        self.problem = SimulationProblem(model, train, ridge=ridge, ranks=ranks)
-        self.judge = (
-            SimulationProblem(model, validation, solve_initial_states=True) if validation else None
-        )
+        self.problem = SimulationProblem.of(model, train, ridge=ridge, ranks=ranks)
+        self.judge = SimulationProblem.judge(model, validation) if validation else None
         if not math.isfinite(self.problem.cost(self.problem.residual(self.problem.theta))):
             raise StartDivergesError(
                 "the model diverges on the training records at the start; start from a stable "

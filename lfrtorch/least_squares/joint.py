@@ -70,7 +70,7 @@ class JointProblem:
     def __init__(self, problems: Sequence[SimulationProblem]) -> None:
         self.problems = list(problems)
         first = self.problems[0]
-        if len({id(problem.model) for problem in problems}) < len(self.problems):
+        if len({id(problem.lfr) for problem in problems}) < len(self.problems):
             raise InputError("two problems share one model; give each a model of its own.")
         for problem in self.problems:
             alike = len(problem.theta) == len(first.theta)
@@ -93,7 +93,7 @@ class JointProblem:
         found: list[list[Trajectory]] = [[] for _ in problems]
         for i, group in enumerate(problems[0].groups):
             R = len(group.u)
-            lfr = LFR(stacked([p.model.lfr.cell for p in problems], R))
+            lfr = LFR(stacked([p.lfr.cell for p in problems], R))
             u = group.u.repeat(len(problems), 1, 1)
             states = [x for p in problems if (x := p.initial_state(i)) is not None]
             x0 = torch.cat(states) if states else None
@@ -127,7 +127,7 @@ class JointProblem:
             each = [part.linearisation.trajectory for part in parts]
             trajectory = Trajectory(*(torch.cat(signals) for signals in zip(*each, strict=True)))
             linearisation = Linearisation(
-                stacked([p.model.lfr.cell for p in problems], R),
+                stacked([p.lfr.cell for p in problems], R),
                 group.u.repeat(len(problems), 1, 1),
                 trajectory,
                 periodic=group.start == "periodic",

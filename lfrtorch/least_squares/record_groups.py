@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,8 +16,7 @@ from torch import Tensor
 
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
-from lfrtorch.model import Model
-from lfrtorch.records import Record, Start
+from lfrtorch.records import NormalisedRecord, Record, Start
 
 EVERY = slice(None)
 
@@ -87,16 +87,17 @@ class RecordGroup:
         return T * torch.fft.irfft(spectrum, T, dim=1)
 
 
-def group_records(model: Model, records: list[Record], ranks: Ranks) -> list[RecordGroup]:
-    """A process's share of the records, grouped and normalised, in the model's dtype and device."""
-    like = model.lfr.cell.A
-    members: dict[tuple[int, Start, bool], list[Record]] = defaultdict(list)
+def group_records(
+    records: Sequence[NormalisedRecord], like: Tensor, ranks: Ranks
+) -> list[RecordGroup]:
+    """A process's share of the records, grouped, as tensors ``like`` another one."""
+    members: dict[tuple[int, Start, bool], list[NormalisedRecord]] = defaultdict(list)
     estimated: dict[tuple[int, Start, bool], list[int]] = defaultdict(list)
     count = itertools.count()
-    numbers = [next(count) if record.start == "estimated" else 0 for record in records]
-    for record, number in ranks.share(list(zip(records, numbers, strict=True))):
-        kind = record.samples, record.start, record.line_weight is not None
-        members[kind].append(record)
+    numbers = [next(count) if each.record.start == "estimated" else 0 for each in records]
+    for each, number in ranks.share(list(zip(records, numbers, strict=True))):
+        kind = each.record.samples, each.record.start, each.record.line_weight is not None
+        members[kind].append(each)
         estimated[kind].append(number)
     groups = []
 
@@ -105,15 +106,18 @@ def group_records(model: Model, records: list[Record], ranks: Ranks) -> list[Rec
 
     for kind, group in members.items():
         _, start, spectral = kind
+        physical = [each.record for each in group]
         groups.append(
             RecordGroup(
-                u=stacked([model.scaler.normalise_u(record.u) for record in group]),
-                y=stacked([model.scaler.normalise_y(record.y) for record in group]),
-                x0=stacked([r.x0 for r in group if r.x0 is not None]) if start == "given" else None,
+                u=stacked([each.u for each in group]),
+                y=stacked([each.y for each in group]),
+                x0=stacked([r.x0 for r in physical if r.x0 is not None])
+                if start == "given"
+                else None,
                 estimated=torch.tensor(estimated[kind]) if start == "estimated" else None,
-                scored=stacked([np.arange(record.samples) >= record.skip for record in group]),
-                weight=stacked([_factors(record) for record in group]),
-                start_weight=stacked([record.start_factors for record in group])
+                scored=stacked([np.arange(r.samples) >= r.skip for r in physical]),
+                weight=stacked([_factors(r) for r in physical]),
+                start_weight=stacked([r.start_factors for r in physical])
                 if start == "estimated"
                 else None,
                 spectral=spectral,

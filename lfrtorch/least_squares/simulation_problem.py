@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any, Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,15 +12,17 @@ from torch import Tensor
 
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.initial_state import simulate_estimated
+from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, is_compiled
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.jacobian import Jacobian, Memory, Part
 from lfrtorch.least_squares.record_groups import group_records
 from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.records import NormalisedRecord, Record, as_records
 
 Ridge = float | Mapping[str, float]
 
@@ -30,11 +33,12 @@ class SimulationProblem:
     r = weighted y_hat - y in normalised units, over all samples of all records (0 if a sample does
     not count), followed by √ridge (θ - θ_0). θ is the vector of all parameters of ``model.lfr``
     that require a gradient, then the initial state of each record whose start is ``"estimated"``.
-    The model holds the θ that was evaluated or written last.
+    The LFR holds the θ that was evaluated or written last.
 
     Args:
-        model: the model whose parameters are θ; θ_0 is what they are now.
-        records: the data, of the model's channels and rate.
+        lfr: the LFR whose parameters are θ; θ_0 is what they are now.
+        records: the data.
+        y_scale: (ny,), from normalised to physical outputs, for ``rmse``.
         ridge: weight of |θ - θ_0|²; that of |y_hat - y|² is 1. As a prior on each parameter: noise
             variance over prior variance, both normalised. One number, or one for each group of
             parameters by the beginning of their names: ``{"static": 1e-3, "A": 1e-2, "x0": 0}``;
@@ -50,28 +54,28 @@ class SimulationProblem:
 
     def __init__(
         self,
-        model: Model,
-        records: Record | Sequence[Record],
+        lfr: LFR,
+        records: Sequence[NormalisedRecord],
+        y_scale: Array | float = 1.0,
         *,
         ridge: Ridge = 0.0,
         solve_initial_states: bool = False,
         ranks: Ranks | None = None,
     ) -> None:
-        self.model, self.ranks = model, Ranks() if ranks is None else ranks
-        self._parameters = [p for p in model.lfr.parameters() if p.requires_grad]
-        data = as_records(records)
+        self.lfr, self.ranks = lfr, Ranks() if ranks is None else ranks
+        self._parameters = [p for p in lfr.parameters() if p.requires_grad]
+        self._y_scale = y_scale
+        data = [each.record for each in records]
         estimated = any(record.start == "estimated" for record in data)
         if not self._parameters and not estimated and not solve_initial_states:
             raise InputError("all parameters of the model are frozen; there is nothing to fit.")
-        for record in data:
-            model.check(record)
         if len(data) < self.ranks.world:
             raise InputError(
                 f"{self.ranks.world} processes share {len(data)} record(s); each needs one: start "
                 "fewer processes, or cut the data into more records."
             )
-        self.groups = group_records(model, data, self.ranks)
-        self.size = sum(record.samples - record.skip for record in data) * len(model.outputs)
+        self.groups = group_records(records, lfr.cell.A, self.ranks)
+        self.size = sum(record.samples - record.skip for record in data) * lfr.cell.ny
         self._solved = solve_initial_states
         self._initial_states = self._first_initial_states(
             sum(record.start == "estimated" for record in data)
@@ -87,6 +91,20 @@ class SimulationProblem:
         # A search evaluates r at a θ and, if it accepts it, J there: one simulation serves both.
         self._latest: tuple[Tensor, list[Trajectory]] | None = None
 
+    @classmethod
+    def of(cls, model: Model, records: Record | Sequence[Record], **options: Any) -> Self:
+        """The problem of a model and records of its channels and rate, in physical units."""
+        data = as_records(records)
+        for record in data:
+            model.check(record)
+        normalised = [model.scaler.normalise(record) for record in data]
+        return cls(model.lfr, normalised, model.scaler.y_scale, **options)
+
+    @classmethod
+    def judge(cls, model: Model, records: Record | Sequence[Record]) -> Self:
+        """The same for records that are not fitted, each from its most probable initial state."""
+        return cls.of(model, records, solve_initial_states=True)
+
     @property
     def theta(self) -> Float[Tensor, " P"]:
         """Parameters as they stand in the module, then the estimated initial states."""
@@ -100,7 +118,7 @@ class SimulationProblem:
     def rmse(self, theta: Float[Tensor, " P"]) -> float:
         """Root mean squared error at θ over scored samples and outputs, unweighted, output unit."""
         total = torch.zeros((), dtype=torch.float64, device=self._theta_0.device)
-        scale = torch.as_tensor(self.model.scaler.y_scale).to(self._theta_0)
+        scale = torch.as_tensor(self._y_scale).to(self._theta_0)
         for group, trajectory in zip(self.groups, self.trajectories(theta), strict=True):
             errors = (trajectory.y - group.y) * scale * group.scored.unsqueeze(-1)
             total = total + errors.double().square().sum()
@@ -139,7 +157,7 @@ class SimulationProblem:
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
         self.guesses = [t.x for t in trajectories]
-        cell = self.model.lfr.cell
+        cell = self.lfr.cell
         parts, P = [], len(theta) - self._initial_states.numel()
         for group, trajectory in zip(self.groups, trajectories, strict=True):
             x0 = group.estimated if self._initial_states.numel() else None
@@ -198,7 +216,7 @@ class SimulationProblem:
     def state_dict(self) -> dict[str, Tensor]:
         """What the next evaluations depend on in addition to θ, to the last bit."""
         tensors = {"start": self._theta_0}
-        cell = self.model.lfr.cell
+        cell = self.lfr.cell
         for i, (group, guess) in enumerate(zip(self.groups, self.guesses, strict=True)):
             if guess is not None:  # of machine code the initial state of a period is of use alone
                 tensors[f"guess.{i}"] = guess[:, :1] if is_compiled(cell, group.u) else guess
@@ -234,18 +252,18 @@ class SimulationProblem:
             return group.x0
         if self._solved:
             assert group.start_weight is not None
-            cell = self.model.lfr.cell
+            cell = self.lfr.cell
             return simulate_estimated(cell, group.u, group.y, group.start_weight).x[:, 0]
         return self._initial_states[group.estimated]
 
     def _trajectory(self, i: int) -> Trajectory:
-        group, lfr = self.groups[i], self.model.lfr
+        group, lfr = self.groups[i], self.lfr
         start = "periodic" if group.start == "periodic" else "zero"  # from x0
         return lfr.trajectory(group.u, self.initial_state(i), start, guess=self.guesses[i])
 
     def _first_initial_states(self, count: int) -> Float[Tensor, "estimated nx"]:
         """First values of the initial states that are parameters."""
-        cell = self.model.lfr.cell
+        cell = self.lfr.cell
         states = cell.A.new_zeros(0 if self._solved else count, cell.nx)
         for group in self.groups if len(states) else ():
             if group.estimated is not None:
@@ -256,7 +274,7 @@ class SimulationProblem:
     def _ridge_of(self, ridge: Ridge) -> Float[Tensor, " P"]:
         """The weight of every entry of θ."""
         groups = ridge if isinstance(ridge, Mapping) else {"": ridge}
-        names = [n for n, p in self.model.lfr.cell.named_parameters() if p.requires_grad]
+        names = [n for n, p in self.lfr.cell.named_parameters() if p.requires_grad]
         sizes = [p.numel() for p in self._parameters]
         if self._initial_states.numel():
             names.append("x0")

@@ -243,13 +243,12 @@ def _of_records(
     records: list[Record], scaler: Scaler, *, offset: bool, prediction: bool, feedthrough: bool
 ) -> ResponseFit | SignalFit:
     """The fit to the spectra of the records if that is the same, else to their signals."""
-    us = [scaler.normalise_u(r.u) for r in records]
-    ys = [scaler.normalise_y(r.y) for r in records]
+    normalised = [scaler.normalise(record) for record in records]
     if not prediction:
-        spectra = spectral_data_of_records(us, ys, records, offset=offset)
+        spectra = spectral_data_of_records(normalised, offset=offset)
         if spectra is not None:
             return ResponseFit(spectra, known=False, feedthrough=feedthrough)
-    return SignalFit(us, ys, records, offset=offset, prediction=prediction, feedthrough=feedthrough)
+    return SignalFit(normalised, offset=offset, prediction=prediction, feedthrough=feedthrough)
 
 
 class _Candidate(NamedTuple):

@@ -28,8 +28,8 @@ from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signals
-from lfrtorch.model import Model
-from lfrtorch.records import Record, Scaler
+from lfrtorch.model import simulate_record
+from lfrtorch.records import NormalisedRecord
 
 MOST_CANDIDATES, SHORT = 8, 200_000
 """Subspace estimates that are refined; only one if samples times squared states exceed SHORT."""
@@ -49,8 +49,7 @@ class SignalFit:
     """The least-squares problem between records and linear models of any order.
 
     Args:
-        us, ys: normalised signals (T, nu) and (T, ny) of each record.
-        records: their initial states, windows and weights.
+        records: signals with their initial states, windows and weights.
         offset: whether the output has a constant as a parameter.
         prediction: whether the error is that of the one-step-ahead prediction.
         feedthrough: whether D is a parameter; it is 0 otherwise.
@@ -58,20 +57,16 @@ class SignalFit:
 
     def __init__(
         self,
-        us: Sequence[Array],
-        ys: Sequence[Array],
-        records: Sequence[Record],
+        records: Sequence[NormalisedRecord],
         *,
         offset: bool,
         prediction: bool,
         feedthrough: bool = True,
     ) -> None:
-        self._us, self._ys = us, ys
-        self.nu, self.ny = us[0].shape[1], ys[0].shape[1]
+        self._us, self._ys = [each.u for each in records], [each.y for each in records]
+        self.nu, self.ny = self._us[0].shape[1], self._ys[0].shape[1]
         self._offset, self._prediction, self._feedthrough = offset, prediction, feedthrough
-        self._records = [self._driven(*signals) for signals in zip(us, ys, records, strict=True)]
-        nu, ny = self._records[0].u.shape[1], self.ny
-        self._unit = Scaler(np.zeros(nu), np.ones(nu), np.zeros(ny), np.ones(ny))
+        self._driven = [self._with_all_inputs(each) for each in records]
 
     def most_candidates(self, nx: int) -> int:
         """How many subspace estimates are refined: one of long records, where they are good."""
@@ -86,7 +81,7 @@ class SignalFit:
         nu, ny, nx = self.nu, self.ny, len(A)
         matrices = A, np.zeros((nx, nu)), C, np.zeros((ny, nu))
         problem = self._problem(matrices, np.zeros((nx, ny)), observed=False)
-        cell = problem.model.lfr.cell
+        cell = problem.lfr.cell
         cost = problem.cost(problem.residual(problem.theta))
         if np.isfinite(cost):
             system, gradient = problem.linearise(problem.theta).system(0.0, TRUNCATION)
@@ -98,16 +93,11 @@ class SignalFit:
 
     def state_deviation(self, matrices: Matrices) -> Array:
         """Standard deviation (nx,) of the states over the records."""
-        A, B, C, D = matrices
-        nu, ny = self.nu, self.ny
-        unit = Scaler(np.zeros(nu), np.ones(nu), np.zeros(ny), np.ones(ny))
-        first = self._records[0]
-        model = Model(LFR(linear_cell(A, B, C, D)), unit, first.fs, (), ())
-        states = []
-        for u, y, record in zip(self._us, self._ys, self._records, strict=True):
-            of_record = replace(record, u=u, y=y, inputs=(), outputs=())
-            model = replace(model, inputs=of_record.inputs, outputs=of_record.outputs)
-            states.append(model.signals(of_record).x[0, :-1].numpy())
+        lfr = LFR(linear_cell(*matrices))
+        states = [
+            simulate_record(lfr, replace(each, u=u), each.record.start).x[0, :-1].numpy()
+            for u, each in zip(self._us, self._driven, strict=True)
+        ]
         return np.concatenate(states).std(axis=0)
 
     def search(self, matrices: Matrices) -> Search:
@@ -132,7 +122,7 @@ class SignalFit:
             return state.cost
         problem.write(state.theta)
         driven = torch.cat(
-            [problem.model.lfr.trajectory(group.u).x.flatten(0, 1) for group in problem.groups]
+            [problem.lfr.trajectory(group.u).x.flatten(0, 1) for group in problem.groups]
         )
         spread, axes = torch.linalg.eigh(driven.mT @ driven / len(driven))
         variances = spread.clamp_min(ROUNDING * float(spread[-1]))
@@ -143,7 +133,7 @@ class SignalFit:
         """The present result of a search, with its covariance."""
         problem, state = search.problem, search.state
         problem.write(state.theta)
-        cell = problem.model.lfr.cell
+        cell = problem.lfr.cell
         A, Bu, C, Dyu = (m.detach().numpy() for m in (cell.A, cell.Bu, cell.Cy, cell.Dyu))
         nu, ny = self.nu, self.ny
         B, D, K = Bu[:, :nu].copy(), Dyu[:, :nu].copy(), np.zeros((len(A), ny))
@@ -209,26 +199,22 @@ class SignalFit:
             first = last
         return inverse @ meat @ inverse * (problem.size / spare)
 
-    def _driven(self, u: Array, y: Array, record: Record) -> Record:
-        """The record with all inputs of the cell: u, then y for a prediction, then the constant."""
-        inputs = [u]
+    def _with_all_inputs(self, each: NormalisedRecord) -> NormalisedRecord:
+        """The record with the inputs of the cell: u, then y for a prediction, then the constant."""
+        inputs, record = [each.u], each.record
         if self._prediction:
-            inputs.append(y)
+            inputs.append(each.y)
+            if record.start == "periodic":
+                record = replace(record, start="estimated", line_weight=None)
         if self._offset:
-            inputs.append(np.ones((len(u), 1)))
-        start = record.start
-        if self._prediction and start == "periodic":
-            start = "estimated"
-        weights = {"line_weight": None} if start != record.start else {}
-        return replace(
-            record, u=np.hstack(inputs), y=y, start=start, inputs=(), outputs=(), **weights
-        )
+            inputs.append(np.ones((len(each.u), 1)))
+        return NormalisedRecord(np.hstack(inputs), each.y, record)
 
     def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> SimulationProblem:
         """Least-squares problem of the cell; unless ``observed`` in B, D and the constant alone."""
         A, B, C, D = matrices
         nu, ny = self.nu, self.ny
-        width = self._records[0].u.shape[1]
+        width = self._driven[0].u.shape[1]
         Bu, Dyu = np.zeros((len(A), width)), np.zeros((ny, width))
         Bu[:, :nu], Dyu[:, :nu] = B - K @ D, D
         free_B, free_D = np.zeros_like(Bu, dtype=bool), np.zeros_like(Dyu, dtype=bool)
@@ -239,15 +225,13 @@ class SignalFit:
         if self._offset:
             free_D[:, -1] = True
             free_B[:, -1] = observed and self._prediction  # what y0 makes of the states by K
-        first = self._records[0]
         cell = linear_cell(A - K @ C, Bu, C, Dyu)
         for parameter in (cell.A, cell.Cy):
             parameter.requires_grad_(observed)
-        model = Model(LFR(cell), self._unit, first.fs, first.inputs, first.outputs)
-        problem = SimulationProblem(model, self._records)
+        problem = SimulationProblem(LFR(cell), self._driven)
         if observed:
             measured = slice(nu, nu + ny) if self._prediction else None
-            problem = _Stable(model, self._records, measured)
+            problem = _Stable(LFR(cell), self._driven, measured)
         free = {"Bu": free_B, "Dyu": free_D}
         problem.fixed = torch.cat(
             [
@@ -271,7 +255,7 @@ class SignalFit:
 
     def _of_system(self, covariance: Array, C: Array, D: Array, K: Array) -> Array:
         """Covariance of A, B, C, D from that of the cell's parameters and initial states."""
-        nx, nu, ny, width = len(K), self.nu, self.ny, self._records[0].u.shape[1]
+        nx, nu, ny, width = len(K), self.nu, self.ny, self._driven[0].u.shape[1]
         sizes = [nx * nx, nx * width, ny * nx, ny * width]
         ends = np.cumsum(sizes)
         cells = np.split(np.eye(ends[-1], len(covariance)), ends[:-1])
@@ -292,19 +276,21 @@ class _Stable(SimulationProblem):
     """Simulation error of a linear cell; infinite if a pole passes LARGEST_POLE.
 
     Args:
-        model, records: as for ``SimulationProblem``.
+        lfr, records: as for ``SimulationProblem``.
         outputs: which inputs are the measured outputs, if the cell is a predictor. Then the system
             that it predicts must be stable as well.
     """
 
-    def __init__(self, model: Model, records: Sequence[Record], outputs: slice | None) -> None:
-        super().__init__(model, records)
+    def __init__(
+        self, lfr: LFR, records: Sequence[NormalisedRecord], outputs: slice | None
+    ) -> None:
+        super().__init__(lfr, records)
         self._outputs = outputs
 
     def residual(self, theta: Tensor) -> Tensor:
         r = super().residual(theta)
         self.write(theta)
-        cell = self.model.lfr.cell
+        cell = self.lfr.cell
         matrices = [cell.A.detach()]
         if self._outputs is not None:
             matrices.append((cell.A + cell.Bu[:, self._outputs] @ cell.Cy).detach())

@@ -18,7 +18,7 @@ from jaxtyping import Complex128, Float
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.frf import FRF
-from lfrtorch.records import Record, Scaler, rms_scale
+from lfrtorch.records import NormalisedRecord, Scaler, rms_scale
 
 Weight = Literal["total", "noise", "none"]
 
@@ -67,7 +67,7 @@ class SpectralData:
 
 
 def spectral_data_of_records(
-    us: Sequence[Array], ys: Sequence[Array], records: Sequence[Record], *, offset: bool
+    normalised: Sequence[NormalisedRecord], *, offset: bool
 ) -> SpectralData | None:
     """Spectra of periodic records, or ``None`` if their simulation error is no sum over lines.
 
@@ -75,19 +75,19 @@ def spectral_data_of_records(
     outputs is a constant error, which no linear model changes.
 
     Args:
-        us, ys: normalised signals (T, nu) and (T, ny) of each record.
-        records: their weights and periods.
+        normalised: the records, with their weights and periods.
         offset: whether the model has a constant in its output. It is eliminated from line 0.
     """
-    ny = ys[0].shape[1]
+    records, ny = [each.record for each in normalised], normalised[0].y.shape[1]
     if any(r.start != "periodic" or r.skip for r in records):
         return None
     if ny > 1 and any(np.ptp(r.weight) > 0 or r.line_weight is not None for r in records):
         return None
     groups: dict[int, list[tuple[Complex, Complex]]] = {}
     means: list[tuple[Complex, Complex, float]] = []
-    total = sum(map(len, us))
-    for u, y, record in zip(us, ys, records, strict=True):
+    total = sum(record.samples for record in records)
+    for each in normalised:
+        u, y, record = each.u, each.y, each.record
         N = record.period or len(u)
         U, Y = (np.fft.rfft(s.reshape(-1, N, s.shape[1]).mean(0), axis=0) / N for s in (u, y))
         # A line stands for itself and its conjugate; lines 0 and N / 2 are their own.

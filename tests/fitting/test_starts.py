@@ -93,7 +93,7 @@ def test_signals_have_unit_deviation(bla: LinearModel, method):
     T = np.random.default_rng(1).normal(size=(3, 3))  # also from a model in any coordinates
     for start in (bla, bla.transformed(T)):
         model = initialise(start, RECORDS, **SIZES, method=method)
-        problem = SimulationProblem(model, RECORDS)
+        problem = SimulationProblem.of(model, RECORDS)
         trajectories = problem.trajectories(problem.theta)
         x = torch.cat([t.x[:, :-1].flatten(0, 1) for t in trajectories])
         z = torch.cat([t.z.flatten(0, 1) for t in trajectories])

@@ -333,7 +333,7 @@ def test_a_lost_process_keeps_the_best():
     assert result.outcome == "a process was lost: all of them"
     chosen = result.history[result.chosen_iteration]
     assert chosen.train < result.history[0].train
-    error = SimulationProblem(model, train)
+    error = SimulationProblem.of(model, train)
     # The periodic state is known to 1e-10.
     assert error.rmse(error.theta) == pytest.approx(chosen.train, rel=1e-9, abs=1e-9)
 

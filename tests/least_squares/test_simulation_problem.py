@@ -54,7 +54,7 @@ def all_kinds(model: Model, *, given: bool = True) -> list[Record]:
 
 def test_residual_is_the_error_of_all_scored_samples(model: Model):
     records = some_records(model)
-    problem = SimulationProblem(model, records)
+    problem = SimulationProblem.of(model, records)
     r = problem.residual(problem.theta)
     expected = [((model.simulate(x) - x.y) / model.scaler.y_scale)[x.skip :] for x in records]
     assert r.shape == (2 * (30 + 30 + 30 + 20),)
@@ -67,7 +67,7 @@ def test_residual_is_the_error_of_all_scored_samples(model: Model):
 def test_rmse_is_that_of_the_metrics(model: Model):
     records = some_records(model)
     for record in records:
-        problem = SimulationProblem(model, record)
+        problem = SimulationProblem.of(model, record)
         score = problem.rmse(problem.theta)
         assert score == pytest.approx(rmse(record, model.simulate(record)), rel=1e-9)
 
@@ -77,7 +77,7 @@ RIDGES = pytest.mark.parametrize("ridge", [0.0, 0.5, {"static": 0.1, "A": 0.3, "
 
 @RIDGES
 def test_gradient_and_jacobian_agree(model: Model, ridge):
-    problem = SimulationProblem(model, all_kinds(model), ridge=ridge)
+    problem = SimulationProblem.of(model, all_kinds(model), ridge=ridge)
     theta = problem.theta + 0.1
     r, gradient = problem.gradient(theta)
     J = problem.jacobian(theta)
@@ -87,7 +87,7 @@ def test_gradient_and_jacobian_agree(model: Model, ridge):
 
 @RIDGES
 def test_jacobian_is_the_slope_of_the_residual(model: Model, ridge):
-    problem = SimulationProblem(model, all_kinds(model), ridge=ridge)
+    problem = SimulationProblem.of(model, all_kinds(model), ridge=ridge)
     theta = problem.theta
     assert len(theta) == model.parameter_count + 3 * 2
     step = 1e-4 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
@@ -116,7 +116,7 @@ def test_system_and_products_are_those_of_the_whole_jacobian(
     """
     monkeypatch.setattr("lfrtorch.engine.sensitivity.BLOCK", 5)
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
-    problem = SimulationProblem(model, all_kinds(model, given=given), ridge=ridge)
+    problem = SimulationProblem.of(model, all_kinds(model, given=given), ridge=ridge)
     theta = problem.theta + 0.1
     r, J = problem.residual(theta), problem.jacobian(theta)
     jacobian = problem.linearise(theta)
@@ -133,10 +133,10 @@ def test_system_and_products_are_those_of_the_whole_jacobian(
 
 def test_weights_multiply_the_squared_errors(model: Model):
     (record,) = some_records(model)[:1]
-    plain = SimulationProblem(model, record)
+    plain = SimulationProblem.of(model, record)
     theta = plain.theta + 0.1
     squares = plain.residual(theta).reshape(-1, 2).square().sum(0)
-    weighted = SimulationProblem(model, replace(record, weight=[0.5, 3.0]))
+    weighted = SimulationProblem.of(model, replace(record, weight=[0.5, 3.0]))
     assert weighted.cost(weighted.residual(theta)) == pytest.approx(
         float(0.5 * squares[0] + 3.0 * squares[1]), rel=1e-9
     )
@@ -149,7 +149,7 @@ def test_unit_line_weights_are_plain_least_squares(model: Model, T: int):
     record = measure(model, T, start="periodic")
     record = replace(record, y=record.y + noise)
     lines = replace(record, line_weight=np.ones(T // 2 + 1))
-    plain, weighted = SimulationProblem(model, record), SimulationProblem(model, lines)
+    plain, weighted = SimulationProblem.of(model, record), SimulationProblem.of(model, lines)
     theta = plain.theta + 0.1
     cost = plain.cost(plain.residual(theta))
     assert weighted.cost(weighted.residual(theta)) == pytest.approx(cost, rel=1e-9)
@@ -162,7 +162,7 @@ def test_line_weights_weigh_the_spectrum_of_the_error(model: Model, T: int):
     y = record.y + model.scaler.y_scale * (np.cos(3 * t) + 2.0 * np.sin(5 * t))
     weight = np.zeros(T // 2 + 1)
     weight[[3, 5, 6]] = 4.0, 0.25, 9.0
-    problem = SimulationProblem(model, replace(record, y=y, line_weight=weight))
+    problem = SimulationProblem.of(model, replace(record, y=y, line_weight=weight))
     # Σ cos² = Σ sin² = T / 2 over whole periods, in each of two outputs.
     expected = 2 * (4.0 * 1.0 + 0.25 * 4.0) * T / 2
     assert problem.cost(problem.residual(problem.theta)) == pytest.approx(expected, rel=1e-7)
@@ -175,7 +175,7 @@ def test_adjoint_of_the_weights_is_that_of_their_product(model: Model, T: int, b
     rng, record = np.random.default_rng(0), measure(model, T, start="periodic")
     F = T // 2 + 1
     weights = {"line_weight": rng.uniform(0.5, 2.0, (F, 2))} if by_line else {"weight": [0.5, 3.0]}
-    problem = SimulationProblem(model, [replace(record, **weights)] * 2)
+    problem = SimulationProblem.of(model, [replace(record, **weights)] * 2)
     (group,) = problem.groups
     e, r = normal(2, T, 2), normal(*group.residual_shape, seed=1)
     assert group.residual_shape == (2, 2 * F if by_line else T, 2)
@@ -189,11 +189,11 @@ def test_start_state_is_fitted_with_the_parameters(model: Model):
     """A record cut from the middle of another, and the first of its samples thrown away."""
     whole = measure(model, 200)
     later = replace(whole[50:], start="estimated")
-    problem = SimulationProblem(model, [whole, later])
+    problem = SimulationProblem.of(model, [whole, later])
     states = model.signals(whole).x[0]
     assert_close(problem.theta[-2:], states[50], rtol=0, atol=1e-7)
     assert problem.rmse(problem.theta) < 1e-8
-    solved = SimulationProblem(model, [whole, later], solve_initial_states=True)
+    solved = SimulationProblem.of(model, [whole, later], solve_initial_states=True)
     assert len(solved.theta) == model.parameter_count
     assert solved.rmse(solved.theta) < 1e-8
 
@@ -201,12 +201,12 @@ def test_start_state_is_fitted_with_the_parameters(model: Model):
 def test_given_start_state(model: Model):
     whole = measure(model, 200)
     state = model.signals(whole).x[0, 50].numpy()
-    problem = SimulationProblem(model, replace(whole[50:], start="given", x0=state))
+    problem = SimulationProblem.of(model, replace(whole[50:], start="given", x0=state))
     assert problem.rmse(problem.theta) < 1e-9
 
 
 def test_ridge_by_group_is_of_its_parameters_only(model: Model):
-    problem = SimulationProblem(model, some_records(model), ridge={"A": 0.25, "static.bz": 4.0})
+    problem = SimulationProblem.of(model, some_records(model), ridge={"A": 0.25, "static.bz": 4.0})
     theta = problem.theta
     longer = problem.residual(theta + 1.0)[-len(theta) :]
     names = [name for name, p in model.lfr.cell.named_parameters() for _ in range(p.numel())]
@@ -216,14 +216,17 @@ def test_ridge_by_group_is_of_its_parameters_only(model: Model):
 
 def test_ridge_of_an_unknown_group(model: Model):
     with pytest.raises(ValueError, match=r"ridge has a group 'B',.*parameters are A, Bu, .*bw"):
-        SimulationProblem(model, some_records(model), ridge={"B": 1.0})
+        SimulationProblem.of(model, some_records(model), ridge={"B": 1.0})
     with pytest.raises(ValueError, match=r"ridge of 'A' is -1; give"):
-        SimulationProblem(model, some_records(model), ridge={"A": -1})
+        SimulationProblem.of(model, some_records(model), ridge={"A": -1})
 
 
 def test_penalty_is_no_part_of_the_score(model: Model):
     records = some_records(model)
-    plain, ridged = SimulationProblem(model, records), SimulationProblem(model, records, ridge=4.0)
+    plain, ridged = (
+        SimulationProblem.of(model, records),
+        SimulationProblem.of(model, records, ridge=4.0),
+    )
     theta = plain.theta + 0.1
     r, longer = plain.residual(theta), ridged.residual(theta)
     assert_close(longer[: len(r)], r, rtol=0, atol=1e-9)
@@ -233,9 +236,9 @@ def test_penalty_is_no_part_of_the_score(model: Model):
 
 def test_jacobian_is_that_of_its_argument_whatever_the_module_holds(model: Model):
     records = some_records(model)
-    theta = SimulationProblem(model, records).theta
-    expected = SimulationProblem(model, records).jacobian(theta)
-    problem, other = SimulationProblem(model, records), SimulationProblem(model, records)
+    theta = SimulationProblem.of(model, records).theta
+    expected = SimulationProblem.of(model, records).jacobian(theta)
+    problem, other = SimulationProblem.of(model, records), SimulationProblem.of(model, records)
     problem.residual(theta)
     other.residual(theta + 0.1)
     assert_close(problem.jacobian(theta), expected, rtol=0, atol=1e-8)
@@ -244,7 +247,7 @@ def test_jacobian_is_that_of_its_argument_whatever_the_module_holds(model: Model
 def test_frozen_parameters_are_no_part_of_theta(model: Model):
     model.lfr.cell.A.requires_grad_(False)
     before = model.lfr.cell.A.clone()
-    problem = SimulationProblem(model, some_records(model))
+    problem = SimulationProblem.of(model, some_records(model))
     assert len(problem.theta) == model.parameter_count - 4
     problem.residual(problem.theta + 0.1)
     assert torch.equal(model.lfr.cell.A, before)
@@ -252,7 +255,7 @@ def test_frozen_parameters_are_no_part_of_theta(model: Model):
 
 
 def test_divergence_is_a_residual_that_is_not_finite(model: Model):
-    problem = SimulationProblem(model, measure(model, 2000))
+    problem = SimulationProblem.of(model, measure(model, 2000))
     theta = problem.theta
     assert not torch.isfinite(problem.residual(theta + 3.0)).all()
     assert torch.isfinite(problem.residual(theta)).all()
@@ -261,7 +264,7 @@ def test_divergence_is_a_residual_that_is_not_finite(model: Model):
 @pytest.mark.parametrize("ridge", [-1.0, float("nan")])
 def test_negative_ridge(model: Model, ridge: float):
     with pytest.raises(ValueError, match=r"ridge is .*; give a number of at least 0"):
-        SimulationProblem(model, some_records(model), ridge=ridge)
+        SimulationProblem.of(model, some_records(model), ridge=ridge)
 
 
 @pytest.mark.parametrize(
@@ -271,7 +274,7 @@ def test_negative_ridge(model: Model, ridge: float):
 def test_records_that_are_not_the_model_s(model: Model, nu: int, ny: int, fs: float, message: str):
     record = Record(np.ones((20, nu)), np.ones((20, ny)), fs, name="lab")
     with pytest.raises(ValueError, match=f"(?s)lab.*{message}"):
-        SimulationProblem(model, record)
+        SimulationProblem.of(model, record)
 
 
 def test_integrator_in_steady_state_ends_the_search_with_a_reason():
@@ -283,7 +286,7 @@ def test_integrator_in_steady_state_ends_the_search_with_a_reason():
     model = random_model(cell)
     u = np.tile([1.0, -1.0], 10) * model.scaler.u_scale + model.scaler.u_offset
     record = Record(u, np.ones(20), model.fs, "periodic")
-    problem = SimulationProblem(model, record)
+    problem = SimulationProblem.of(model, record)
     optimiser = LevenbergMarquardt()
     state = optimiser.step(problem, optimiser.init(problem, problem.theta))
     assert state.reason == "the Jacobian vanishes or is not finite"
@@ -291,7 +294,7 @@ def test_integrator_in_steady_state_ends_the_search_with_a_reason():
 
 def test_one_record_twice_has_two_start_states(model: Model):
     record = replace(some_records(model)[0], start="estimated")
-    problem = SimulationProblem(model, [record, record])
+    problem = SimulationProblem.of(model, [record, record])
     theta = problem.theta + 0.1
     r, gradient = problem.gradient(theta)
     J = problem.jacobian(theta)
@@ -300,7 +303,7 @@ def test_one_record_twice_has_two_start_states(model: Model):
 
 
 def test_theta_changed_in_place_is_another_theta(model: Model):
-    problem = SimulationProblem(model, some_records(model))
+    problem = SimulationProblem.of(model, some_records(model))
     theta = problem.theta
     before = problem.residual(theta)
     theta += 0.1
@@ -308,7 +311,7 @@ def test_theta_changed_in_place_is_another_theta(model: Model):
 
 
 def test_weights_of_the_module_are_not_those_of_theta(model: Model):
-    problem = SimulationProblem(model, some_records(model))
+    problem = SimulationProblem.of(model, some_records(model))
     theta = problem.theta
     problem.residual(theta)
     kept = theta.clone()
@@ -322,7 +325,7 @@ def test_weights_of_the_module_are_not_those_of_theta(model: Model):
 def test_an_output_without_weight_is_scored_all_the_same(model: Model):
     record = measure(model, 30)
     off = replace(record, y=record.y + model.scaler.y_scale, weight=[0.0, 1.0])
-    problem = SimulationProblem(model, off)
+    problem = SimulationProblem.of(model, off)
     expected = np.sqrt(np.mean(model.scaler.y_scale**2))
     assert problem.rmse(problem.theta) == pytest.approx(expected, rel=1e-9)
 
@@ -330,22 +333,22 @@ def test_an_output_without_weight_is_scored_all_the_same(model: Model):
 def test_start_state_of_the_wrong_length(model: Model):
     record = replace(some_records(model)[0], start="given", x0=[1.0])
     with pytest.raises(ValueError, match=r"x0 of 1 entries and the model 2 states"):
-        SimulationProblem(model, record)
+        SimulationProblem.of(model, record)
 
 
 def test_nothing_to_fit(model: Model):
     model.lfr.requires_grad_(False)
     with pytest.raises(ValueError, match="all parameters of the model are frozen"):
-        SimulationProblem(model, some_records(model))
+        SimulationProblem.of(model, some_records(model))
     start = replace(some_records(model)[0], start="estimated")
-    assert len(SimulationProblem(model, start).theta) == 2
+    assert len(SimulationProblem.of(model, start).theta) == 2
 
 
 @pytest.mark.parametrize("spare", [0, -1])
 def test_rows_of_all_groups_share_the_room_for_them(model: Model, spare: int, monkeypatch):
     """Two of three groups fit exactly; a byte less, and the last does not."""
     records = some_records(model)
-    problem = SimulationProblem(model, records)
+    problem = SimulationProblem.of(model, records)
     columns = len(problem.linearise(problem.theta)._reduced.kept) + 1
     room = 8 * 2 * (2 * 30 + 20) * columns + spare  # of two outputs
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", room)
@@ -358,7 +361,7 @@ def test_rows_of_all_groups_share_the_room_for_them(model: Model, spare: int, mo
 
 
 def test_two_jacobians_keep_their_own_rows_and_a_third_takes_over_the_room(model: Model):
-    problem = SimulationProblem(model, some_records(model))
+    problem = SimulationProblem.of(model, some_records(model))
     first_theta, second_theta = problem.theta, problem.theta + 0.1
     first, second = problem.linearise(first_theta), problem.linearise(second_theta)
     for jacobian in (first, second):
@@ -377,7 +380,7 @@ def test_two_jacobians_keep_their_own_rows_and_a_third_takes_over_the_room(model
 
 
 def test_a_jacobian_asks_for_room_once(model: Model, monkeypatch):
-    problem = SimulationProblem(model, some_records(model))
+    problem = SimulationProblem.of(model, some_records(model))
     jacobian = problem.linearise(problem.theta)
     jacobian.system(1e-2, 1e-12)
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.Memory.take", None)
@@ -404,9 +407,9 @@ def test_fixed_entries_have_columns_of_zeros(
     """The other columns are the plain Jacobian's, whichever way a product or a system takes."""
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     records = all_kinds(model, given=False)
-    theta = SimulationProblem(model, records).theta + 0.1
-    plain = SimulationProblem(model, records, ridge=ridge).jacobian(theta)
-    problem = SimulationProblem(model, records, ridge=ridge)
+    theta = SimulationProblem.of(model, records).theta + 0.1
+    plain = SimulationProblem.of(model, records, ridge=ridge).jacobian(theta)
+    problem = SimulationProblem.of(model, records, ridge=ridge)
     problem.fixed = some_fixed(model)
     held = torch.cat([problem.fixed, torch.zeros(3 * 2, dtype=torch.bool)])  # start states follow
     r, J = problem.residual(theta), problem.jacobian(theta)
@@ -441,8 +444,8 @@ def test_search_leaves_fixed_entries_and_brings_the_rest_home(
     """With geodesic acceleration, whose right side is a product with J by itself."""
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     records = [measure(model, 60, seed=i) for i in range(2)]
-    theta = SimulationProblem(model, records).theta
-    problem = SimulationProblem(model, records, ridge=1e-8 * ridge)
+    theta = SimulationProblem.of(model, records).theta
+    problem = SimulationProblem.of(model, records, ridge=1e-8 * ridge)
     problem.fixed = some_fixed(model)
     away = 0.02 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
     away[problem.fixed] = 0.0
@@ -461,7 +464,7 @@ def test_stack_leaves_fixed_entries(kept: bool, monkeypatch):
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     models = [random_model(random_cell(2, 2, 2, 2, 1, 3, seed=i)) for i in range(2)]
     record = measure(models[0], 60)
-    problems = [SimulationProblem(m, replace(record, y=record.y + 0.1)) for m in models]
+    problems = [SimulationProblem.of(m, replace(record, y=record.y + 0.1)) for m in models]
     for problem, m in zip(problems, models, strict=True):
         problem.fixed = some_fixed(m)
     starts = [p.theta for p in problems]

@@ -16,7 +16,7 @@ from lfrtorch.linear.spectral_data import (
     spectral_data_of_records,
     spectral_data_of_response,
 )
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Channel, NormalisedRecord, Record
 
 pytestmark = pytest.mark.numeric
 
@@ -39,7 +39,7 @@ def records_of(
 
 def lines(records: list[Record], *, offset: bool) -> SpectralData:
     found = spectral_data_of_records(
-        [r.u for r in records], [r.y for r in records], records, offset=offset
+        [NormalisedRecord(r.u, r.y, r) for r in records], offset=offset
     )
     assert found is not None
     return found
@@ -118,13 +118,13 @@ def test_offset_is_the_mean_by_the_weights_of_line_0():
 
 def test_other_records_are_no_lines():
     record = records_of(1, 1, 2)[0]
-    signals = [record.u], [record.y]
     for other in (
         Record(record.u, record.y),
         Record(record.u, record.y, start="periodic", skip=1),
         Record(record.u, record.y, start="periodic", weight=np.array([1.0, 2.0])),
     ):
-        assert spectral_data_of_records(*signals, [other], offset=True) is None
+        signals = NormalisedRecord(record.u, record.y, other)
+        assert spectral_data_of_records([signals], offset=True) is None
 
 
 def test_lines_without_input_are_left_out():

@@ -10,7 +10,7 @@ from reference import System, random_system, refined
 
 from lfrtorch._support.types import Array
 from lfrtorch.linear.signal_fit import OBSERVERS, SignalFit
-from lfrtorch.records import Record
+from lfrtorch.records import NormalisedRecord, Record
 
 pytestmark = pytest.mark.numeric
 
@@ -19,7 +19,7 @@ OMEGA = np.linspace(0.05, 3.0, 40)
 
 def fit_of(records: list[Record], **options: bool) -> SignalFit:
     options = {"offset": False, "prediction": False} | options
-    return SignalFit([r.u for r in records], [r.y for r in records], records, **options)
+    return SignalFit([NormalisedRecord(r.u, r.y, r) for r in records], **options)
 
 
 def innovations(
@@ -324,7 +324,7 @@ def test_start_states_that_no_input_leads_to_are_improbable():
     search = both.search(matrices).advance(1)
     (x0,) = search.problem.initial_states(search.state.theta).numpy()
     search.problem.write(search.state.theta)
-    cell = search.problem.model.lfr.cell
+    cell = search.problem.lfr.cell
     A, B = (m.detach().numpy() for m in (cell.A, cell.Bu))
     # The state after the last sample counts, too.
     states = [reference.dlsim((A, B, C, 0 * B), np.vstack([r.u, [[0.0]]])) for r in records]
@@ -347,9 +347,9 @@ def test_start_states_that_no_input_leads_to_are_improbable():
 )
 def test_prediction_estimates_the_start_of_what_repeats_but_for_its_noise(start, predicted_from):
     u = np.random.default_rng(0).normal(size=(60, 1))
-    record = Record(u, u, 10.0, start)
+    record = NormalisedRecord(u, u, Record(u, u, 10.0, start))
     options = {"offset": False, "feedthrough": True}
-    (driven,) = SignalFit([u], [u], [record], prediction=True, **options)._records
-    assert driven.start == predicted_from
-    (driven,) = SignalFit([u], [u], [record], prediction=False, **options)._records
-    assert driven.start == start
+    (driven,) = SignalFit([record], prediction=True, **options)._driven
+    assert driven.record.start == predicted_from
+    (driven,) = SignalFit([record], prediction=False, **options)._driven
+    assert driven.record.start == start
