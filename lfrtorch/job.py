@@ -94,7 +94,7 @@ def identify(
     if sizes is not None:
         settings = replace(settings, **sizes.chosen.sizes)
     models = starting_models(dataset.train, settings, linear)
-    average = _networks(models, settings.average, observer)
+    average = _most_averaged(models, settings.average, observer)
     observer.say(
         f"{dataset.name}: {sum(record.samples for record in dataset.train)} training samples, "
         f"{models[0].parameter_count} parameters "
@@ -116,18 +116,18 @@ def identify(
         stop=stop,
     )
     observer.end(result)
-    return judged(dataset, settings, linear, result, order_scan=order_scan, size_search=sizes)
+    return scored_run(dataset, settings, linear, result, order_scan=order_scan, size_search=sizes)
 
 
-def _networks(models: Sequence[Model], average: int, observer: Observer) -> int:
-    """Of how many starts to take the mean at most: of networks alone."""
+def _most_averaged(models: Sequence[Model], average: int, observer: Observer) -> int:
+    """How many starts the mean may have: ``average``, and 1 if the models are not networks."""
     if average == 1 or all(is_network(model.lfr.cell.static) for model in models):
         return average
     observer.say("note: average is for networks; the best start is kept")
     return 1
 
 
-def judged(
+def scored_run(
     dataset: Dataset,
     settings: Settings,
     linear: LinearModel,

@@ -100,6 +100,14 @@ def output_jacobian(cell: LFRCell, u: Tensor, x0: Tensor, periods: int = 1) -> T
         return torch.stack([one(u_r, x_r) for u_r, x_r in zip(u, x0, strict=True)])
 
 
+def linear_loop(F: Tensor, g: Tensor, s0: Tensor) -> Tensor:
+    """All states (R, T + 1, n, m) of s(k+1) = F(k) s(k) + g(k), one sample after another."""
+    states = [s0]
+    for k in range(F.shape[1]):
+        states.append(F[:, k] @ states[-1] + g[:, k])
+    return torch.stack(states, dim=1)
+
+
 # --- small random models --------------------------------------------------------------------
 
 SIZES = st.fixed_dictionaries(

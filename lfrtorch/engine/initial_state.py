@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import linearise
-from lfrtorch.engine.recurrence import linear_recurrence
 from lfrtorch.engine.simulation import Trajectory, simulate
 
 ITERATIONS, HALVINGS, TOLERANCE = 20, 6, 1e-10

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.recurrence import linear_recurrence
+from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.static_jacobian import linearise_static
 
 PASS = 1 << 14

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import linearise, spectral_radius
-from lfrtorch.engine.recurrence import linear_recurrence
 
 MAX_NEWTON = 20
 """Iterations after which Newton's method is given up; from a nearby trajectory it needs 3 or 4."""

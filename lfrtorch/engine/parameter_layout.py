@@ -26,7 +26,7 @@ _EQUATIONS = {
 """For each equation its matrices, in the order of the parameters, and what each multiplies."""
 
 
-class Columns(NamedTuple):
+class DirectTerms(NamedTuple):
     """Direct terms of some columns.
 
     A triple (column, row, regressor) in ``x``, ``z`` or ``y`` says that the column's parameter
@@ -89,14 +89,14 @@ class Layout:
                 table.append(entries)
         self.table = torch.cat([torch.zeros(3, 0, dtype=torch.int64), *table], dim=1)
 
-    def columns(self, kept: Int[Tensor, " K"]) -> Columns:
+    def columns(self, kept: Int[Tensor, " K"]) -> DirectTerms:
         """The direct terms of the kept parameters, given by ascending positions in θ."""
         equation, row, regressor = self.table[:, kept.cpu()]
         column = torch.arange(len(equation))
         entries = torch.stack([column, row, regressor], dim=1)
         x, z, y = (entries[equation == e] for e in range(3))
         static = row[equation == 3]
-        return Columns(x, z, y, static, len(column) - len(static))
+        return DirectTerms(x, z, y, static, len(column) - len(static))
 
     def matrices(self, theta: Float[Tensor, "*axes P"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """[A Bu Bw], [Cz Dzu 0], [Cy Dyu Dyw] and the weights of the static map in θ."""

@@ -34,14 +34,14 @@ from torch import Tensor
 from lfrtorch._support.threads import spread, workers
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
-from lfrtorch.engine.linearised import PASS, Linearised, linearise_at, of_static
-from lfrtorch.engine.parameter_layout import Columns, layout
-from lfrtorch.engine.recurrence import (
+from lfrtorch.engine.linear_recurrence import (
     adjoint_recurrence,
     has_kernels,
     linear_recurrence,
     to_numpy,
 )
+from lfrtorch.engine.linearised import PASS, Linearised, linearise_at, of_static
+from lfrtorch.engine.parameter_layout import DirectTerms, layout
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.engine.static_jacobian import NetworkJacobian, StaticJacobian, linearise_static
 
@@ -280,13 +280,13 @@ class Linearisation:
         one = self.weights["A"].ndim == 2
         return self.weights if one else {name: p[records] for name, p in self.weights.items()}
 
-    def _by_weight(self, block: _Block, columns: Columns) -> Tensor:
+    def _by_weight(self, block: _Block, columns: DirectTerms) -> Tensor:
         by_weight = block.static.by_weight()
         if len(columns.static) == self.layout.weights:
             return by_weight
         return by_weight[..., columns.static.to(by_weight.device)]
 
-    def _rows_generic(self, block: _Block, columns: Columns, S: Tensor, rows: Tensor) -> Tensor:
+    def _rows_generic(self, block: _Block, columns: DirectTerms, S: Tensor, rows: Tensor) -> Tensor:
         """Write the rows of a block and return the next S: in torch, on any device.
 
         ``d_w`` holds the direct terms of w. G and E are what they and the entries of v make of x+
@@ -306,7 +306,9 @@ class Linearisation:
         rows[..., :C] = block.linearised.H @ states[:, :-1] + E
         return states[:, -1]
 
-    def _rows_compiled(self, block: _Block, columns: Columns, S: Tensor, rows: Tensor) -> Tensor:
+    def _rows_compiled(
+        self, block: _Block, columns: DirectTerms, S: Tensor, rows: Tensor
+    ) -> Tensor:
         """The same in machine code; S is never stored over time, and is changed in place."""
         R = len(S)
         W = [block.weights[name] for name in ("A", "Bw", "Cz", "Cy", "Dyw")]

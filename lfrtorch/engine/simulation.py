@@ -10,10 +10,10 @@ from torch import Tensor
 
 from lfrtorch._support.threads import spread
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linear_recurrence import has_kernels, to_numpy
 from lfrtorch.engine.linearised import monodromy, spectral_radius
 from lfrtorch.engine.newton import newton_states
 from lfrtorch.engine.nonlinearity import is_network
-from lfrtorch.engine.recurrence import has_kernels, to_numpy
 from lfrtorch.engine.simulation_kernel import ACTIVATION_CODES, simulate_record
 
 PERIODIC_TOLERANCE = 1e-10

@@ -15,7 +15,6 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.dataset import Dataset
 from lfrtorch.files.formats import similar
 from lfrtorch.files.measurement import (
-    Columns,
     Gaps,
     Measurement,
     Stretch,
@@ -23,7 +22,7 @@ from lfrtorch.files.measurement import (
     read_measurement,
 )
 from lfrtorch.files.split import SHORTEST, TooShortError, cut
-from lfrtorch.files.table import NoColumnError
+from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.periods import find_period, find_transient
 from lfrtorch.records import Record
 

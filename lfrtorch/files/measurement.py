@@ -15,10 +15,10 @@ from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.files.formats import Table, open_table
+from lfrtorch.files.table import Columns
 from lfrtorch.files.time_stamps import Sampling, UnevenError, in_seconds, is_time, sampling
 from lfrtorch.records import Channel
 
-Columns = str | int | Sequence[str | int]
 Gaps = Literal["error", "split"]
 
 _SAME = 1e-3  # relative: sampling frequencies that do not contradict one another

@@ -11,11 +11,9 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.files.formats import BLOCK, open_table
-from lfrtorch.files.table import NoColumnError
+from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.files.time_stamps import UnevenError, in_seconds, sampling
 from lfrtorch.records import Channel
-
-Columns = str | int | Sequence[str | int]
 
 SAME = 1e-3
 """Relative difference of sampling frequencies that counts as none: clocks differ."""

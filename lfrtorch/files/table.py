@@ -15,6 +15,9 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.records import Channel
 
+Columns = str | int | Sequence[str | int]
+"""Columns of a table by their names or numbers: one or several."""
+
 BLOCK = 65536
 """Samples that are in memory at once."""
 

@@ -41,7 +41,7 @@ from lfrtorch.fitting.trainer import (
     FitResult,
     Monitor,
     Progress,
-    Start,
+    RestartSummary,
     Stop,
     StoppedError,
     Trainer,
@@ -76,7 +76,7 @@ class Round:
 
     number: int
     count: int
-    starts: tuple[Start, ...]
+    starts: tuple[RestartSummary, ...]
     seconds: float
 
 
@@ -194,7 +194,7 @@ def fit(
     ends = sorted({ceil(part * limit) for part in rounds} | {limit})
     for number, until in enumerate(ends, start=1):
         if number <= len(snapshots.rounds):
-            field = _gone_on(field, [fits[i] for i in snapshots.rounds[number - 1]])
+            field = _drop_others(field, [fits[i] for i in snapshots.rounds[number - 1]])
             continue
         together.advance(field, until)
         field = judge.ranked(field)
@@ -205,12 +205,12 @@ def fit(
         if cut is not None:
             for fit in field:
                 if not fit.reason:  # it had come to the end of the round
-                    fit.end(cut.reason, cut.detail)
+                    fit.note_end(cut.reason, cut.detail)
             break
         if until < limit:
             kept = max(FINALISTS, average, ceil(len(field) / 2))
             snapshots.decided([judge.number(fit) for fit in field[:kept]])
-            field = _gone_on(field, field[:kept])
+            field = _drop_others(field, field[:kept])
     ranked = judge.ranked(fits)
     result = ranked[0].result()
     if not alone:
@@ -243,14 +243,14 @@ class _Judge:
         """Those that have begun, the best first."""
         return sorted((fit for fit in fits if fit.history), key=self._score)
 
-    def summaries(self, fits: Sequence[Fit]) -> tuple[Start, ...]:
+    def summaries(self, fits: Sequence[Fit]) -> tuple[RestartSummary, ...]:
         """How far each came."""
         found = []
         for fit in fits:
             number = self.number(fit)
             error = self._errors[number]
             found.append(
-                Start(
+                RestartSummary(
                     number,
                     fit.history[-1].iteration,
                     fit.kept.train,
@@ -329,17 +329,17 @@ class _Together:
             if len(fits) > 1 and in_step and first.problem.theta.device.type != "cpu":
                 advance_in_step(fits, until, [self._monitors[id(fit)] for fit in fits])
             elif len(fits) > 1 and first.ranks.world == 1:
-                each_alone(lambda fit: self._go_on(fit, until), fits, self._halt.set)
+                each_alone(lambda fit: self._advance_one(fit, until), fits, self._halt.set)
             else:
                 for fit in fits:
-                    self._go_on(fit, until)
+                    self._advance_one(fit, until)
         except KeyboardInterrupt:
             if not any(fit.history for fit in fits):
                 raise
             for fit in fits:
-                fit.end(Reason.INTERRUPTED)
+                fit.note_end(Reason.INTERRUPTED)
 
-    def _go_on(self, fit: Fit, until: int) -> None:
+    def _advance_one(self, fit: Fit, until: int) -> None:
         if fit.history or not fit.stopped():
             fit.advance(until, self._monitors[id(fit)])
 
@@ -367,7 +367,7 @@ def advance_in_step(
         if not fit.history:
             fit.begin(watching[id(fit)])
     try:
-        while live := [f for f in fits if _goes_on(f, until)]:
+        while live := [f for f in fits if _unfinished(f, until)]:
             clock = time.perf_counter()
             after = trainer.steps(JointProblem([f.problem for f in live]), [f.state for f in live])
             each = (time.perf_counter() - clock) / len(live)
@@ -378,13 +378,13 @@ def advance_in_step(
             fit.pause()
 
 
-def _gone_on(field: list[Fit], kept: list[Fit]) -> list[Fit]:
+def _drop_others(field: list[Fit], kept: list[Fit]) -> list[Fit]:
     """Those that are kept; the others are left."""
     for fit in field:
         if not any(fit is other for other in kept):
-            fit.end(Reason.OTHERS_BETTER)
+            fit.note_end(Reason.OTHERS_BETTER)
     return kept
 
 
-def _goes_on(fit: Fit, until: int) -> bool:
+def _unfinished(fit: Fit, until: int) -> bool:
     return not fit.over and fit.state.iteration < until and not fit.stopped()

@@ -130,7 +130,7 @@ Keep = Callable[["Fit", bool], None]
 
 
 @dataclass(frozen=True)
-class Start:
+class RestartSummary:
     """How far one of several starts came.
 
     Args:
@@ -180,7 +180,7 @@ class FitResult:
     seconds: float
     seconds_per_iteration: float
     reason: str
-    starts: tuple[Start, ...] = ()
+    starts: tuple[RestartSummary, ...] = ()
     averaged: int = 1
     detail: str = ""
 
@@ -245,7 +245,7 @@ class Fit:
         self.state: Any = None
         """The trainer's; None before the first call of ``advance``."""
         self.history: list[Progress] = []
-        self.end(Reason.NO_ITERATIONS)
+        self.note_end(Reason.NO_ITERATIONS)
         self.best = math.inf
         """Normalised squared error of the best iterate, on validation where there is one."""
         self._theta_best, self._chosen = self.problem.theta, 0
@@ -265,7 +265,7 @@ class Fit:
             return False
         return bool(self.state.reason) or self.state.iteration >= self.trainer.limit
 
-    def end(self, reason: str, detail: str = "") -> None:
+    def note_end(self, reason: str, detail: str = "") -> None:
         """Note why the fit is over."""
         self.reason, self.detail = reason, detail
 
@@ -273,7 +273,7 @@ class Fit:
         """Whether the fit is asked to end here, which then is its reason."""
         asked = self._stop is not None and bool(self.ranks.sum(torch.tensor(int(self._stop()))))
         if asked:
-            self.end(Reason.INTERRUPTED)
+            self.note_end(Reason.INTERRUPTED)
         return asked
 
     @spread_by_hand()
@@ -294,11 +294,11 @@ class Fit:
         except KeyboardInterrupt:
             if not self.history:
                 raise
-            self.end(Reason.INTERRUPTED)
+            self.note_end(Reason.INTERRUPTED)
         except ProcessLostError as lost:
             if not self.history:
                 raise
-            self.end(Reason.PROCESS_LOST, lost.detail)
+            self.note_end(Reason.PROCESS_LOST, lost.detail)
         finally:
             self.pause()
         return self
@@ -361,7 +361,7 @@ class Fit:
         """Judge the start."""
         clock = time.perf_counter()
         start = self.trainer.init(self.problem, self.problem.theta)
-        progress = self._judged(start, time.perf_counter() - clock)
+        progress = self._progress(start, time.perf_counter() - clock)
         self._first = progress.score
         self._enter(start, progress)
         self._show(progress, monitors)
@@ -372,7 +372,7 @@ class Fit:
         Not where the model there explodes on validation: the search goes back, and treads softly.
         """
         before, last = self.state, self._score
-        progress = self._judged(after, seconds)
+        progress = self._progress(after, seconds)
         if after.theta is not before.theta:
             self._durations.append(seconds)
         self._enter(after, progress)
@@ -395,7 +395,7 @@ class Fit:
             detail=self.detail,
         )
 
-    def _judged(self, state: TrainerState, seconds: float) -> Progress:
+    def _progress(self, state: TrainerState, seconds: float) -> Progress:
         """The progress that an iterate is, which took so many seconds to find."""
         clock, problem = time.perf_counter(), self.problem
         train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")

@@ -56,7 +56,7 @@ def evidence(
     noise = noise_of_periods([response.record for response in train])
     if noise is None and noise_rms is not None:
         noise = np.full(len(scale), noise_rms)
-    linear, nonlinear = unexplained(train)
+    linear, nonlinear = explained_parts(train)
     peak = _peak(train, result.model.scaler.u_offset)
     return Evidence(
         train=_error([r.error for r in train], scale),
@@ -101,7 +101,7 @@ def noise_of_periods(records: Sequence[Record]) -> Array | None:
     return np.sqrt(power[1:, : records[0].y.shape[1]].sum(axis=0))
 
 
-def unexplained(train: Sequence[Response]) -> tuple[float | None, float | None]:
+def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | None]:
     """Parts of the errors' power that linear filters would explain.
 
     Returns:

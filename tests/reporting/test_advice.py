@@ -10,7 +10,7 @@ import scipy.signal
 
 import lfrtorch
 from lfrtorch._support.reasons import Reason
-from lfrtorch.fitting.trainer import FitResult, Progress, Start
+from lfrtorch.fitting.trainer import FitResult, Progress, RestartSummary
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import advice
 from lfrtorch.reporting.advice import Evidence, advise
@@ -171,9 +171,9 @@ def fitted() -> tuple[FitResult, list[Response]]:
     bla = lfrtorch.estimate_bla(Record(u[100:800], y[100:800], outputs=outputs), nx=1)
     model = lfrtorch.initialise(bla, train, nz=1, nw=1, nn=2)
     starts = (
-        Start(0, 20, 1.0, np.nan, np.nan, "converged"),
-        Start(1, 20, 1.5, np.nan, np.nan, "converged"),
-        Start(2, 2, 1.2, np.nan, np.nan, Reason.OTHERS_BETTER),
+        RestartSummary(0, 20, 1.0, np.nan, np.nan, "converged"),
+        RestartSummary(1, 20, 1.5, np.nan, np.nan, "converged"),
+        RestartSummary(2, 2, 1.2, np.nan, np.nan, Reason.OTHERS_BETTER),
     )
     result = FitResult(
         model, history([4.0, 2.0, 1.0]), 2, 1.0, 1.0, "maximum number of iterations", starts

@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import lfrtorch
 from lfrtorch.fitting.multistart import Round
-from lfrtorch.fitting.trainer import Progress, Start
+from lfrtorch.fitting.trainer import Progress, RestartSummary
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting.monitor import (
     Checkpoint,
@@ -72,7 +72,9 @@ def test_a_terminal_gets_one_live_line(model: lfrtorch.Model):
 
 
 def test_a_round_of_starts_is_a_line(model: lfrtorch.Model):
-    starts = tuple(Start(i, 25, 1.0, e, math.nan, "") for i, e in ((3, 1e-3), (0, 2e-3), (1, 5e-3)))
+    starts = tuple(
+        RestartSummary(i, 25, 1.0, e, math.nan, "") for i, e in ((3, 1e-3), (0, 2e-3), (1, 5e-3))
+    )
     for stream, live in ((io.StringIO(), False), (Terminal(), True)):
         line = StartsLine(3, "m", stream)
         line(model, step(1))

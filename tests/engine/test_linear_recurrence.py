@@ -1,19 +1,18 @@
-"""The three ways of the one recurrence agree."""
+"""Both ways of the linear recurrence agree with the plain loop."""
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import normal
+from reference import linear_loop, normal
 from torch import Tensor
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from lfrtorch.engine.recurrence import (
+from lfrtorch.engine.linear_recurrence import (
     adjoint_recurrence,
     compiled,
     linear_recurrence,
-    loop,
     scan,
 )
 
@@ -36,9 +35,9 @@ def assert_same(s: Tensor, expected: Tensor, eps: float):
 
 @given(R=st.integers(1, 3), T=LENGTHS, n=SIZES, m=SIZES)
 @settings(max_examples=40)
-def test_loop_compiled_and_scan_agree(R: int, T: int, n: int, m: int):
+def test_compiled_and_scan_agree_with_the_loop(R: int, T: int, n: int, m: int):
     F, g, s0 = problem(R, T, n, m)
-    expected = loop(F, g, s0)
+    expected = linear_loop(F, g, s0)
     assert expected.shape == (R, T + 1, n, m)
     assert_same(compiled(F, g, s0), expected, 1e-12)
     assert_same(scan(F, g, s0), expected, 1e-12)
@@ -47,7 +46,7 @@ def test_loop_compiled_and_scan_agree(R: int, T: int, n: int, m: int):
 def test_loop_is_the_recurrence():
     F = torch.tensor([[[[2.0]], [[3.0]]]])
     g = torch.tensor([[[[1.0]], [[5.0]]]])
-    assert loop(F, g, torch.tensor([[[7.0]]])).flatten().tolist() == [7.0, 15.0, 50.0]
+    assert linear_loop(F, g, torch.tensor([[[7.0]]])).flatten().tolist() == [7.0, 15.0, 50.0]
 
 
 class Products(TorchDispatchMode):
@@ -67,7 +66,7 @@ def test_scan_takes_3_root_of_T_products_at_most(T: int):
     F, g, s0 = problem(2, T, 3, 2)
     with Products() as products:
         s = scan(F, g, s0)
-    assert_same(s, loop(F, g, s0), 1e-12)
+    assert_same(s, linear_loop(F, g, s0), 1e-12)
     assert 0 < products.count <= 3 * T**0.5
 
 
@@ -76,7 +75,7 @@ def test_single_precision_stays_single(way):
     F, g, s0 = problem(2, 30, 3, 2, torch.float32)
     s = way(F, g, s0)
     assert s.dtype == torch.float32
-    assert_same(s, loop(F, g, s0), 1e-5)
+    assert_same(s, linear_loop(F, g, s0), 1e-5)
 
 
 @pytest.mark.parametrize("way", [compiled, scan])
@@ -90,7 +89,7 @@ def test_no_states_or_no_columns(way, shape):
 def test_views_are_read_as_they_stand(way):
     F, g, s0 = problem(2, 12, 3, 3)
     F, g, s0 = F.mT.flip(1), g.mT, s0.mT  # what the adjoint passes
-    assert_same(way(F, g, s0), loop(F, g, s0), 1e-12)
+    assert_same(way(F, g, s0), linear_loop(F, g, s0), 1e-12)
 
 
 @pytest.mark.parametrize("backwards", [False, True])
@@ -100,9 +99,9 @@ def test_faded_states_are_zero_and_never_denormal(backwards: bool):
     g, s0 = torch.zeros_like(F), torch.ones(2, 1, 1, dtype=torch.float64)
     g[:, 1300] = 1.0
     s = (adjoint_recurrence if backwards else linear_recurrence)(F, g, s0)
-    expected = loop(F, g, s0)
+    expected = linear_loop(F, g, s0)
     if backwards:
-        expected = loop(F.flip(1), g.flip(1), s0).flip(1)
+        expected = linear_loop(F.flip(1), g.flip(1), s0).flip(1)
     assert_close(s, expected, rtol=0, atol=1e-30)
     size = s.abs()
     assert not ((size > 0) & (size < torch.finfo(s.dtype).tiny)).any()

@@ -1,8 +1,8 @@
-"""The one sequential primitive: s(k+1) = F(k) s(k) + g(k), for many columns at once.
+"""Linear recurrences s(k+1) = F(k) s(k) + g(k), for many columns at once.
 
-Sensitivities, adjoints, Newton steps over a trajectory and periodic boundaries are all this
-recurrence. ``loop`` says what it computes; ``compiled`` (numba) serves the CPU and ``scan`` (torch,
-parallel in time) any other device.
+Sensitivities, adjoints, Newton steps over a trajectory and periodic boundaries are such
+recurrences; the simulation itself is in ``simulation_kernel``. ``compiled`` (numba) serves the CPU,
+and ``scan`` (torch, parallel in time) any other device.
 """
 
 from __future__ import annotations
@@ -40,16 +40,6 @@ def adjoint_recurrence(
     if has_kernels(F):
         return compiled(F, g, end, backwards=True)
     return scan(F.mT.flip(1), g.flip(1), end).flip(1)
-
-
-def loop(
-    F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], s0: Float[Tensor, "R n m"]
-) -> Float[Tensor, "R T+1 n m"]:
-    """The recurrence written out: the oracle of the two others."""
-    states = [s0]
-    for k in range(F.shape[1]):
-        states.append(F[:, k] @ states[-1] + g[:, k])
-    return torch.stack(states, dim=1)
 
 
 def compiled(
