@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import sys
 from pathlib import Path
 
 import hydra
@@ -17,6 +18,7 @@ from omegaconf import DictConfig
 import lfrtorch
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
+from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import CONF, loaded, require_data
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import program
@@ -72,4 +74,6 @@ def main(cfg: DictConfig) -> None:
 
 def launch() -> None:
     """The command."""
+    with user_errors():
+        check_words("evaluate", sys.argv[1:])
     main()

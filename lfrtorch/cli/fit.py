@@ -26,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.reasons import Reason
+from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError, Termination
@@ -166,7 +167,9 @@ def launch() -> None:
     if WORLD > 1 and {"-m", "--multirun"} & set(sys.argv):
         sys.exit("error: torchrun shares one fit; start several runs one after another.")
     with user_errors(os.environ.get("RANK", "0")):
-        sys.argv[1:] = arguments(sys.argv[1:])
+        given = sys.argv[1:]
+        sys.argv[1:] = arguments(given)
+        check_words("config", given, sys.argv[1:])
     if WORLD > 1 and os.environ["RANK"] != "0":
         sys.argv += WITHOUT_FILES
     main()

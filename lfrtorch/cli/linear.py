@@ -27,6 +27,7 @@ from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.tables import in_percent
 from lfrtorch.analysis.poles import frequency_and_damping
+from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
@@ -247,5 +248,7 @@ def main(cfg: DictConfig) -> None:
 def launch() -> None:
     """The command, with the settings of the run in ``resume=DIR`` before its words."""
     with user_errors():
-        sys.argv[1:] = arguments(sys.argv[1:])
+        given = sys.argv[1:]
+        sys.argv[1:] = arguments(given)
+        check_words("linear", given, sys.argv[1:])
     main()

@@ -5,6 +5,7 @@ lfrtorch simulate checkpoint=runs/run/DATE data.path=new.csv out=predicted.csv
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import CONF
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.linear import finite
@@ -310,4 +312,6 @@ def main(cfg: DictConfig) -> None:
 
 def launch() -> None:
     """The command."""
+    with user_errors():
+        check_words("simulate", sys.argv[1:])
     main()

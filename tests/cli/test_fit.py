@@ -530,6 +530,8 @@ def test_old_words_name_the_new_ones(
     [
         ([], "no data chosen"),
         (["+bench=nonsense"], "nonsense"),
+        (["+bench=boucwen", "max_iter=5"], "did you mean trainer.max_iter=5?\n"),
+        (["+bench=boucwen", "+max_iter=5"], "did you mean trainer.max_iter=5?\n"),
         (["+bench=boucwen", "nz=0"], "nz is 0"),
         (["+bench=boucwen", "trainer.speed=3"], "speed"),
         (["+bench=boucwen", "data.root=/nowhere"], "no Bouc-Wen test files in '/nowhere'"),

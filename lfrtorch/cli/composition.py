@@ -1,0 +1,146 @@
+"""The words of a command line: those that no configuration takes end in one line of our own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
+
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Glob, Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from lfrtorch._support.errors import InputError
+from lfrtorch.cli.config import CONF
+from lfrtorch.cli.words import GROUPS
+
+SWEEPS = {"-m", "--multirun"}
+"""Options that make several runs of several values."""
+
+
+def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> None:
+    """Refuse words that Hydra would not take, or would add where nothing reads them.
+
+    Args:
+        command: the configuration's name.
+        given: the command line.
+        used: the command line with the words of an earlier run, which were taken then. Default:
+            the command line alone.
+
+    Raises:
+        InputError: with what was meant, as far as that can be told.
+    """
+    if {word for word in given if word.startswith("-")} - SWEEPS:
+        return  # an option of Hydra, as --help
+    several = not SWEEPS.isdisjoint(given)
+    words, every = (
+        [parsed(word) for word in line if word not in SWEEPS] for line in (given, used or given)
+    )
+    for word in words:
+        if word.is_sweep_override() and not several:
+            raise InputError(several_values(command, word))
+        if word.key_or_group == "bench" and not adds(word):
+            raise InputError(f"a benchmark is added to the settings: +{word.input_line}.")
+        folder = CONF / word.key_or_group
+        choices = sorted(path.stem for path in folder.glob("*.yaml"))
+        if choices and isinstance(word.value(), str) and word.value() not in choices:
+            raise InputError(
+                f"there is no {word.key_or_group}={word.value()}; give {', '.join(choices)}."
+            )
+    if any(isinstance(word.value(), Glob) or word.is_interval_sweep() for word in words):
+        return
+    cfg = composed(command, [first_run(word) for word in every if is_choice(word)])
+    for word in words:
+        if not (is_choice(word) or word.is_delete() or taken(word, cfg)):
+            raise InputError(unknown(word, cfg))
+    composed(command, [first_run(word) for word in every])
+
+
+def parsed(word: str) -> Override:
+    """The word as Hydra reads it."""
+    try:
+        return OverridesParser.create().parse_override(word)
+    except HydraException:
+        raise InputError(
+            f"'{word}' is not understood; write NAME=VALUE, and quotes around the word if a space, "
+            "a comma or a bracket stands in its value: \"NAME='VALUE'\"."
+        ) from None
+
+
+def several_values(command: str, word: Override) -> str:
+    """What is wrong with values that are neither a list nor several runs."""
+    name, values = word.get_key_element(), word.get_value_string()
+    listed = name.startswith("data.") or isinstance(
+        OmegaConf.select(composed(command), name), ListConfig
+    )
+    meant = f"for a list write {name}=[{values}], " if listed else ""
+    return f"{name}={values} has several values: {meant}for a run of each of them add -m."
+
+
+def is_choice(word: Override) -> bool:
+    """Whether it chooses an option of a group, of ours or of Hydra."""
+    return (CONF / word.key_or_group).is_dir() or word.is_hydra_override()
+
+
+def first_run(word: Override) -> str:
+    """The word of the first of several runs."""
+    if not word.is_sweep_override():
+        return str(word.input_line)
+    return f"{word.get_key_element()}={next(word.sweep_string_iterator())}"
+
+
+def composed(command: str, words: Sequence[str] = ()) -> DictConfig:
+    """The configuration; where Hydra cannot make one, the first line of its reason."""
+    try:
+        with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+            return compose(command, list(words))
+    except (HydraException, OmegaConfBaseException) as failed:
+        raise InputError(str(failed).splitlines()[0]) from None
+
+
+def adds(word: Override) -> bool:
+    """Whether it is +NAME or ++NAME."""
+    return word.is_add() or word.is_force_add()
+
+
+def taken(word: Override, cfg: DictConfig) -> bool:
+    """Whether something reads the setting: one that is there, or an argument that is added."""
+    group, _, name = word.key_or_group.rpartition(".")
+    top = group.split(".")[0]
+    if adds(word) and group and (top in cfg or (CONF / top).is_dir()):
+        return True
+    node = OmegaConf.select(cfg, group) if group else cfg
+    if not isinstance(node, DictConfig):
+        return isinstance(node, ListConfig)
+    return name in node.keys()  # noqa: SIM118, a DictConfig contains no key that is yet to be given
+
+
+def unknown(word: Override, cfg: DictConfig) -> str:
+    """What to write for a setting that there is not."""
+    key = word.key_or_group
+    _, value = str(word.input_line).split("=", 1)
+    if key.startswith("data.") and cfg.get("data") is None:
+        return f"{key} is of no use before data are chosen: add data=file, or +bench=NAME."
+    names = dict(spelt(cfg))
+    close = get_close_matches(key, names, n=1, cutoff=0.75)
+    meant = f"; did you mean {names[close[0]]}={value}?" if close else "; --help lists them all."
+    return f"there is no setting '{key}'{meant}"
+
+
+def spelt(cfg: DictConfig) -> Iterator[tuple[str, str]]:
+    """What a user may write for a setting, and the word of the command line.
+
+    Of a name in several groups the last of ``GROUPS`` is meant, and above all groups that without.
+    """
+    if cfg.get("data") is None:
+        file = OmegaConf.load(CONF / "data" / "file.yaml")
+        cfg = DictConfig({**cfg, "data": file})
+    groups = [name for name, node in cfg.items() if isinstance(node, DictConfig)]
+    for group in sorted(map(str, groups), key=lambda name: (name in GROUPS, name)):
+        for name in cfg[group]:
+            yield f"{group}.{name}", f"{group}.{name}"
+            yield str(name), f"{group}.{name}"
+    for name in cfg:
+        yield str(name), str(name)

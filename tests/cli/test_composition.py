@@ -1,0 +1,74 @@
+"""Words of the command line that no configuration takes end in one line."""
+
+from __future__ import annotations
+
+import pytest
+
+from lfrtorch import InputError
+from lfrtorch.cli.composition import check_words
+
+FILE = ["data=file", "data.path=x.csv"]
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "message"),
+    [
+        ("config", [*FILE, "max_iter=5"], "'max_iter'; did you mean trainer.max_iter=5?"),
+        ("config", [*FILE, "+max_iter=5"], "'max_iter'; did you mean trainer.max_iter=5?"),
+        ("config", ["+start=estimated"], "'start'; did you mean data.start=estimated?"),
+        ("config", [*FILE, "++seeds=1"], "'seeds'; did you mean seed=1?"),
+        ("config", ["inputs=[u]"], "'inputs'; did you mean data.inputs=[u]?"),
+        ("config", [*FILE, "data.input=[u]"], "'data.input'; did you mean data.inputs=[u]?"),
+        ("config", ["bench=boucwen"], "a benchmark is added to the settings: +bench=boucwen."),
+        ("config", [*FILE, "zzzz=1"], "no setting 'zzzz'; --help lists them all."),
+        ("config", ["data.path=x.csv"], "add data=file, or +bench=NAME"),
+        ("config", [*FILE, "data.inputs=a,b"], "for a list write data.inputs=[a,b], for a run"),
+        (
+            "config",
+            [*FILE, "nx=1,2"],
+            "nx=1,2 has several values: for a run of each of them add -m",
+        ),
+        ("config", ["static=poly"], "no static=poly; give network, own, polynomial."),
+        ("config", ["+bench=tanks"], "no bench=tanks; give boucwen, "),
+        ("config", ["x.csv"], "'x.csv' is not understood; write NAME=VALUE"),
+        ("config", ["data.inputs=[u,"], "write NAME=VALUE, and quotes"),
+        ("config", ["hydra/launcher=nowhere"], "Could not find 'hydra/launcher/nowhere'"),
+        ("linear", [*FILE, "frf.metod=fast"], "'frf.metod'; did you mean frf.method=fast?"),
+        ("simulate", ["path=x.csv"], "'path'; did you mean data.path=x.csv?"),
+        ("evaluate", ["checkpiont=x"], "'checkpiont'; did you mean checkpoint=x?"),
+    ],
+)
+def test_an_unknown_word_is_refused_in_one_line(command: str, words: list[str], message: str):
+    with pytest.raises(InputError) as refused:
+        check_words(command, words)
+    text = str(refused.value)
+    assert message in text
+    assert "\n" not in text
+    assert "HYDRA_FULL_ERROR" not in text
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("config", ["+bench=boucwen", "seed=1", "bla.offset=true", "sizes_search.nz=[1,2]"]),
+        ("config", [*FILE, "+data.x=1", "+trainer.x=1", "+bla.weight=x", "++trainer.max_iter=5"]),
+        ("config", ["+data._target_=my.loader", "+data.path=x", "trainer._target_=my.Trainer"]),
+        ("config", [*FILE, "static=own", "static._target_=my.Map", "+static.width=3"]),
+        ("config", [*FILE, "ridge={static: 1e-3}", "hydra.run.dir='x y'", "~static"]),
+        ("config", ["-m", "+bench=boucwen,parwh", "nx=1,2", "seed=range(3)"]),
+        ("config", ["--cfg", "job"]),
+        ("config", []),
+        ("linear", [*FILE, "frf.method=fast", "nx=auto"]),
+        ("evaluate", ["checkpoint=x", "+bench=boucwen", "starts=3"]),
+        ("simulate", ["data=file", "data.path=x.csv", "start=given", "x0=[1,2]"]),
+    ],
+)
+def test_known_words_pass(command: str, words: list[str]):
+    check_words(command, words)
+
+
+def test_words_of_an_earlier_run_are_taken_as_they_are():
+    saved = ["+bench=boucwen", "+old_word=3"]
+    check_words("config", ["resume=x", "data.seed=2"], [*saved, "resume=x", "data.seed=2"])
+    with pytest.raises(InputError, match=r"no setting 'data\.seeed'"):
+        check_words("config", ["resume=x", "data.seeed=2"], [*saved, "resume=x", "data.seeed=2"])
