@@ -35,7 +35,7 @@ RUNS, SHARED = 4, 0.05
 Seconds on one core are those that the process had the core. What threads wait for each other cannot
 be taken off: a case is repeated until it hardly waited, and the one that waited least counts."""
 PERIODS = 128
-"""Of 8192 samples: the long record has 1,048,576."""
+"""Periods of 8192 samples in the long record: 1,048,576 samples."""
 
 
 class Row(NamedTuple):

@@ -76,8 +76,8 @@ class Record:
         name: what tables and messages call it.
         source: where it comes from: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
         inputs, outputs: channel names and units, one a column of ``u`` and ``y``.
-        period: samples of one period of the input, where it repeats; a ``"periodic"`` record holds
-            a whole number of them, one where left out.
+        period: samples of one period of the input, if it repeats; a ``"periodic"`` record holds
+            a whole number of them. Default: one.
 
     Shape:
         u: (T, nu), y: (T, ny), x0: (nx,), weight: () or (ny,),

@@ -4,8 +4,8 @@ python scripts/reproduce.py [NAME ...] [data.root=DIR]
 python scripts/reproduce.py silverbox --seeds 2 --out runs/try --results runs/try/RESULTS.md
 python scripts/reproduce.py --quick data.root=DIR
 
-Each run is ``python train.py +bench=NAME seed=S`` (and data.seed=S where data are simulated), S = 0
-.. SEEDS - 1, in a folder of its own below --out, and is not repeated where one of the same command
+Each run is ``python train.py +bench=NAME seed=S`` (and data.seed=S if data are simulated), S = 0
+.. SEEDS - 1, in a folder of its own below --out, and is not repeated if one of the same command
 came to its end there (remove the folder after a change of the package). Words with an equals sign
 are settings passed on to train.py. RESULTS.md has all that is in --out.
 """
@@ -229,7 +229,7 @@ def written(cases: Sequence[Case], figures: dict[str, list[Path]], *, quick: boo
 
 
 def rows(each: Case) -> list[str]:
-    """Of the table of errors, one a test record."""
+    """Rows of the table of errors, one a test record."""
     if not each.runs or each.dataset is None:
         return [f"| {each.name} | {each.missing} |" + " |" * 9]
     scores = each.runs[each.chosen]["scores"]
@@ -307,7 +307,7 @@ def references(cases: Sequence[Case]) -> list[str]:
 
 
 def entries(cases: Sequence[Case]) -> list[leaderboard.Entry]:
-    """Of the leaderboard: the chosen models on the records as the benchmarks' package cuts them."""
+    """Entries of the leaderboard: the chosen models on the records that the package cuts."""
     return [
         leaderboard.entry(
             each.name,
@@ -370,7 +370,7 @@ def prefixed(unit: str, least: float, largest: float) -> tuple[str, float]:
 
 
 def three_digits(value: float | None, scale: float = 1.0) -> str:
-    """Of a value that may be none where a simulation diverges."""
+    """A value in three digits; None or infinite if a simulation diverges."""
     if value is None or not np.isfinite(value):
         return "diverges"
     return number(scale * value)

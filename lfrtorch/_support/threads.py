@@ -49,8 +49,8 @@ def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:
     """Call ``kernel(job, *arguments)`` for every job, on ``workers()`` threads.
 
     The kernel must release the interpreter's lock (``njit(nogil=True)``, or torch's operations).
-    numba's own parallel loops bring a second OpenMP beside torch's; where another process shares
-    the cores an iteration of 0.03 s took 0.8 s with them.
+    numba's own parallel loops bring a second OpenMP in addition to torch's: if another process
+    shares the cores, an iteration of 0.03 s took 0.8 s with them.
     """
     threads = min(jobs, workers())
     if threads == 1:
@@ -79,7 +79,7 @@ def each_alone(
     Args:
         work: finds its own work spread over one thread.
         items: what it is called with.
-        stop: called where one fails, or at Ctrl-C: it should make the others end soon.
+        stop: called if one fails, or at Ctrl-C: it should make the others end soon.
     """
 
     def alone(item: Item) -> Result:

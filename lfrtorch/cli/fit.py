@@ -59,7 +59,7 @@ PRINTED = 3
 """Most lines of advice that are printed; the report has all."""
 
 WITHOUT_FILES = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
-"""Of Hydra, for the processes beside the first."""
+"""Settings of Hydra for all processes but the first."""
 
 
 def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = None) -> float:

@@ -62,7 +62,7 @@ def launch(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--outputs", nargs="+", default=[], metavar="NAME", type=column)
     parser.add_argument("--fs", type=float, metavar="HZ", help="sampling frequency")
     parser.add_argument(
-        "--time", type=column, metavar="COLUMN", help="of times; looked for where left out"
+        "--time", type=column, metavar="COLUMN", help="of times; found if not given"
     )
     parser.add_argument("--out", type=Path, metavar="FIGURE.png", help="default: FILE_preview.png")
     options = parser.parse_args(words)

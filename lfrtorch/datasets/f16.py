@@ -133,7 +133,7 @@ def load(
 
 
 def _mean(signal: Array) -> Array:
-    """Of the periods but the first: (8192, channels)."""
+    """Mean of all periods but the first: (8192, channels)."""
     return signal.reshape(_PERIODS, _PERIOD, -1)[1:].mean(axis=0)
 
 

@@ -37,7 +37,7 @@ def cache() -> Path:
 
 
 def folder(root: str | Path | None) -> Path:
-    """The benchmarks' folder: ``root``, or the cache folder where it is left out."""
+    """The benchmarks' folder: ``root``, or the cache folder if it is None."""
     return cache() if root is None else Path(root).expanduser()
 
 
@@ -52,10 +52,10 @@ def find(
     """The path of a benchmark's file.
 
     Args:
-        root: folder of the benchmarks; the cache folder of nonlinear_benchmarks where left out.
+        root: folder of the benchmarks. Default: the cache folder of nonlinear_benchmarks.
         file: below ``root``, with the benchmark's folder first.
         loader: function of nonlinear_benchmarks that downloads it, after its submodule and a dot
-            where it is in one.
+            if it is in one.
         others: files that do as well, the zip archive for example; in order of preference. An empty
             archive is a placeholder and counts as missing.
         download: whether a missing file is downloaded, by ``loader``.
@@ -75,7 +75,7 @@ def find(
         if path is None:
             raise FileNotFoundError(
                 f"nonlinear_benchmarks.{loader}() left no '{file}' in '{below}'; it downloads "
-                "nothing where an archive is there already, even an empty one: remove that from "
+                "nothing if an archive is there already, even an empty one: remove that from "
                 f"'{below / file.partition('/')[0]}' and try again."
             )
     if path is None:
@@ -271,7 +271,7 @@ def _numbers(
     shapes: Sequence[tuple[int, ...]],
     advice: str,
 ) -> Array:
-    """What was found of a name, where it has one of the shapes and is real and finite."""
+    """What was found of a name, if it has one of the shapes and is real and finite."""
     if found.dtype.kind not in "iuf" or found.shape not in shapes or not np.isfinite(found).all():
         raise InputError(
             f"'{path}': '{name}' has shape {found.shape} and type {found.dtype}; expected "

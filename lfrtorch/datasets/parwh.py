@@ -100,8 +100,8 @@ def load(
     are noise free, its training and validation are not.
 
     Args:
-        source: ``"official"``, downloaded by the package nonlinear_benchmarks where it is missing;
-            ``"stand-in"``; or ``"auto"``, the official file where it is at hand, else the stand-in.
+        source: ``"official"``, downloaded by the package nonlinear_benchmarks if it is missing;
+            ``"stand-in"``; or ``"auto"``, the official file if it is at hand, else the stand-in.
         root: folder that holds ``ParWH/ParWHFiles/ParWHData.mat`` (or ``ParWH/ParWHData.mat``, or
             ``ParWH/ParWHFiles.zip`` with the file in it); by default the cache folder of
             nonlinear_benchmarks. Where it is given, ``"auto"`` requires the file.
@@ -181,7 +181,7 @@ def load(
 
 
 def _names(level: int, realisations: int) -> tuple[str, ...]:
-    """Of the training records of a level."""
+    """Names of the training records of a level."""
     several = realisations > 1
     return tuple(f"train_{level}" + f"_{r + 1}" * several for r in range(realisations))
 

@@ -14,7 +14,10 @@ ACTIVATION_CODES = {"tanh": 0, "sigmoid": 1, "relu": 2, "rbf": 3, "softplus": 4}
 def simulate_record(
     r, u, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, met_within, x, z, w, y
 ):  # fmt: skip
-    """Write the signals x, z, w, y of record r, until they meet those that stand there.
+    """Simulate record r: write its signals over those in x, z, w and y.
+
+    It stops once a state agrees, within ``met_within``, with the one that it would overwrite: the
+    rest of the earlier trajectory then holds for this one, too.
 
     The weights have a leading axis: one model for all records, or one a record.
 

@@ -180,12 +180,12 @@ class _Reader:
         self._notes: dict[str, list[str]] = {}
 
     def note(self, name: str, text: str) -> None:
-        """Keep what is to be known of a record, or of all where the name is empty."""
+        """Keep what is to be known of a record, or of all if the name is empty."""
         self._notes.setdefault(text, []).append(name)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """A sentence each, with the records it is about where that is not clear."""
+        """A sentence each, with the records it is about if that is not clear."""
         return tuple(
             text if len(self.all) == 1 or names == [""] else f"{_some(names)}: {text}"
             for text, names in self._notes.items()
@@ -352,7 +352,7 @@ def _stems(paths: Sequence[Path], taken: Container[str]) -> list[str]:
 
 
 def _name(paths: Sequence[Path]) -> str:
-    """Of a data set: its file's, or what its files' names begin with."""
+    """Name of a data set: its file's, or what its files' names begin with."""
     if len(paths) == 1:
         return _stem(paths[0])
     letters = zip(*map(_stem, paths), strict=False)

@@ -31,7 +31,7 @@ class Block(NamedTuple):
 
 
 class FileStream:
-    """Inputs of a model in a file, and outputs where it has them.
+    """Inputs of a model in a file, and outputs if it has them.
 
     Args:
         path: the file, of any format that ``open_table`` reads.
@@ -69,10 +69,10 @@ class FileStream:
         if len(self.times) > 1:
             raise InputError(f"time is {time!r}, {len(self.times)} columns; name one.")
         self.clock = self.table.columns[self.times[0]] if self.times else Channel("sample")
-        """Of the time stamps, or of sample numbers where there are none."""
+        """Name and unit of the time stamps; without them, of the sample numbers."""
 
     def blocks(self, samples: int = BLOCK) -> Iterator[Block]:
-        """At most so many samples at a time; an output that is missing in one is NaN.
+        """At most ``samples`` samples at a time; an output that is missing in one is NaN.
 
         Raises:
             ValueError: a sample without an input or a time, or times that do not run at ``fs``.

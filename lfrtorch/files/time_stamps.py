@@ -13,7 +13,7 @@ from lfrtorch.records import Channel
 
 _JITTER = 0.1  # of a step: how far a stamp may be from its place in an even grid
 _GAP = 1.5  # steps: from here on samples are missing
-_OFTEN = 0.1  # of the samples: so many steps that seem to be gaps are those of rounded stamps
+_OFTEN = 0.1  # of the samples: if more steps seem to be gaps, the stamps are rounded
 _SHOWS = 5  # steps that the last digit makes unlike the others, before it is taken to round
 _NAMES = re.compile(
     r"(t|time|zeit|uhrzeit|timestamps?|time[ _-]?stamps?|date[ _-]?time|date|sec|seconds?|x_value)",
@@ -39,7 +39,7 @@ class Sampling(NamedTuple):
 
 
 class UnevenError(InputError):
-    """Stamps that are no even grid; ``sample`` is one where that shows."""
+    """Stamps that are no even grid; ``sample`` is one at which that shows."""
 
     def __init__(self, message: str, sample: int) -> None:
         super().__init__(message)
@@ -52,7 +52,7 @@ def is_time(channel: Channel) -> bool:
 
 
 def in_seconds(t: Array, channel: Channel) -> Array:
-    """Time stamps by the unit of their column; seconds where it has none."""
+    """Time stamps by the unit of their column; seconds if it has none."""
     return t * _SECONDS.get(channel.unit, 1.0)
 
 

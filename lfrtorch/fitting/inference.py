@@ -63,7 +63,7 @@ REGULARISATION = 1e-2
 """λ relative to the mean square of G_yw over the lines; 1e-3 and 1e-1 do as well."""
 
 FEEDBACK = 0.3
-"""μ: weight of what w does to z, beside errors of y; both have unit deviation. On the parallel
+"""μ: weight of what w does to z, relative to errors of y; both have unit deviation. On the parallel
 Wiener-Hammerstein stand-in, nz = nw = 2, two starts were at 1.2 and 1.0 mV after 15 iterations with
 0.3, at 1.8 and 5.4 with 0, and at 3.3 and 19 with an inferred w, of which half is a guess there."""
 
@@ -82,7 +82,7 @@ OUTPUT_SIZE = 0.05
 Wiener-Hammerstein stand-in was at 1.9 .. 4.4 mV after 15 iterations, with 0.05 at 0.9 .. 2.9."""
 
 FRACTIONS = (1.0, 0.5, 0.25, 0.125)
-"""Of the learnt w, tried from the first one on."""
+"""Factors of the learnt w, tried in this order."""
 
 CONDITION, VANISHING = 1e-8, 1e-12
 """Added to the unit diagonal of the normal equations of β, and the least size of a column of theirs
@@ -157,7 +157,7 @@ class Inferred:
         z: z*.
         phi: spectra of φ(z*) at the chosen lines, weighted.
         H, GH: [L; μ Cz (zI - A)⁻¹ 0] at the chosen lines, and H B: from w to the errors.
-        G, W, V: G_yw, W* = G_ywᴴ V and V = (G_yw G_ywᴴ + λI)⁻¹ E, all lines, where w is inferred.
+        G, W, V: G_yw, W* = G_ywᴴ V and V = (G_yw G_ywᴴ + λI)⁻¹ E, at all lines.
 
     Shape:
         xu: (T, nx + nu), z: (T, nz), phi: (K, nf), H: (K, nh, n), GH: (K, nh, nw), nh = ny or
@@ -335,7 +335,7 @@ def infer(
     what the linear model leaves of periodic records, and a polynomial map from z to w is learnt
     with B and N (see the head of this module). The static map of the model is fitted to the
     samples of z and w. At last, w is scaled by the fraction that simulates the records best, which
-    is the one place where their weights count; where none does better than the linear model, the
+    is the one place where their weights count; if none does better than the linear model, the
     start is that of ``initialise``: the linear model itself.
 
     Args:
@@ -416,8 +416,9 @@ def _search(
         theta = _minimised(problem, STEPS, tolerance=TOLERANCE, patience=2)
         B, N = problem.matrices(theta)
         xu, w = problem.learnt(theta)
-    # From z that had drifted from unit covariance the fit was at 2.6 and 3.5 mV after 15 iterations
-    # where it is at 0.9 and 2.8 (parallel Wiener-Hammerstein stand-in, two starts).
+    # Whitened once more, as z has drifted from unit covariance: without this the fit was at 2.6 and
+    # 3.5 mV after 15 iterations, with it at 0.9 and 2.8 (parallel Wiener-Hammerstein stand-in, two
+    # starts).
     N, size = _whitened(N, xu), OUTPUT_SIZE / rms(B, axis=0)
     return B * size, N, xu @ N.T, w / size
 

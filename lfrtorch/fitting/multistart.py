@@ -69,7 +69,7 @@ class Round:
     """A round that has ended.
 
     Args:
-        number, count: 1 is the first, of so many.
+        number, count: its number, from 1, and the number of all rounds.
         starts: that took part in it, the best first.
         seconds: since the beginning.
     """
@@ -112,18 +112,20 @@ def fit(
             changed in place.
         train: records that are fitted.
         validation: records that choose among the iterates.
-        selection: more records to judge starts on, and not the iterates of one: at amplitudes
-            that are not fitted, where those that fit alike differ. (On the Bouc-Wen benchmark the
-            sweep's error has a rank correlation of 0.45 with that at the training's level, of 0.7
-            and 0.8 with those at a half and a fifth of it. Iterates that are chosen there are among
-            the first where the model is too small, and worse at the training's level by up to 6 %.)
+        selection: more records to judge starts on, and not the iterates of one. They should have
+            amplitudes that are not fitted: starts that fit alike differ there. (On the Bouc-Wen
+            benchmark the sweep's error has a rank correlation of 0.45 with that at the training's
+            level, of 0.7 and 0.8 with those at a half and a fifth of it. Iterates that are chosen
+            there are among the first if the model is too small, and worse at the training's level
+            by up to 6 %.)
             Starts are judged on validation and selection, and without both on training.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge: weight of |θ - θ_start|², see ``SimulationProblem``.
-        average: so many starts go to the end at least, and the model of the result is the mean of
-            so many of the best at most (:func:`lfrtorch.mean_model`): of as many as come within
-            1 % of the best error on validation and selection, which may be one, and without both
-            of all. Starts that diverge when the training input is doubled are left out.
+        average: most starts that the model of the result is the mean of
+            (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
+            averaged as bring the mean within 1 % of the least error on validation and selection,
+            which may be one; without such records all are. Starts that diverge when the training
+            input is doubled take no part.
         monitors: called with the model and its progress after every iteration; of several models a
             list for each, called one at a time. Each process calls its own: give those that print
             or write files to the first alone.
@@ -227,7 +229,7 @@ class _Judge:
 
     Args:
         fits: of all starts.
-        records: that they are judged on; what the fits themselves are judged on where empty.
+        records: that they are judged on. If empty, the fits' own validation or training records.
         unseen: the records that none of them is fitted to.
     """
 
@@ -276,8 +278,8 @@ class _Judge:
     def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
         """The mean of as many of the models as do about as well as the best, and of how many.
 
-        None where a single start is better than all means. Where there is nothing to judge on, the
-        mean of all.
+        None if a single start is better than all means. Without records to judge on, the mean of
+        all.
         """
         if not self._unseen:
             return (mean_model(best), len(best)) if len(best) > 1 else (None, 1)
@@ -379,7 +381,7 @@ def advance_in_step(
 
 
 def _drop_others(field: list[Fit], kept: list[Fit]) -> list[Fit]:
-    """Those that are kept; the others are left."""
+    """The starts that are kept; the others end."""
     for fit in field:
         if not any(fit is other for other in kept):
             fit.note_end(Reason.OTHERS_BETTER)

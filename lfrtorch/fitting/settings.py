@@ -26,7 +26,7 @@ LAST_SIZE = {"network": "nn", "polynomial": "degree"}
 """The third size of a static nonlinearity, after nz and nw."""
 
 SEED_STEP = 1000
-"""Between the seeds of several starts."""
+"""Distance of the seeds of several starts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +179,7 @@ class Settings:
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Of the starts; neighbouring seeds have none in common."""
+        """Seeds of the starts; neighbouring values of ``seed`` have none in common."""
         return tuple(self.seed + SEED_STEP * number for number in range(self.starts))
 
     def static_map(self) -> dict[str, Any]:

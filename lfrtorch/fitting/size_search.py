@@ -7,8 +7,8 @@ The choice is the one-standard-error rule: the fewest parameters whose error is 
 error of the best. All models are scored on the same samples and share their noise, which says
 nothing of one against another; what tells two apart is the difference of their squared errors, and
 the standard error is that of its mean. That difference is correlated in time, so its means over ten
-blocks are what is taken as independent: they are where a block is long against the system's memory.
-The usual form, with the standard error of the best model's own error, is blind where noise is
+blocks are taken as independent: they are if a block is long against the system's memory.
+The usual form, with the standard error of the best model's own error, is blind if noise is
 large: a mean square above it by 1.4 %, three standard errors of the difference over 2600 samples,
 is half of one of its own. Of two models that are equally good the smaller is taken in 83 % of
 cases. What chance does to starts, and what more iterations would do, is in neither.
@@ -58,10 +58,10 @@ NZ, NW, NN = (1, 2), (1, 2), (5, 10, 15, 25)
 """What is tried."""
 
 SEEDS = (0, 1000, 2000, 3000)
-"""Of the starts of each model."""
+"""Seeds of the starts of each model."""
 
 ITERATIONS = 50
-"""Of each start: a quarter of those of a fit."""
+"""Iterations of each start: a quarter of those of a fit."""
 
 BLOCKS = 10
 """Least number of blocks of time, over all records."""
@@ -80,8 +80,8 @@ class Candidate:
         parameters, parameters_net: all, and without the gauge directions.
         seconds: the search took for it.
         error, error_std: rms of the simulation error over the validation records, each output
-            relative to its rms, and its standard error; infinite where the model diverges.
-        ratio: of this error to the linear model's; NaN where there is none to compare with.
+            relative to its rms, and its standard error; infinite if the model diverges.
+        ratio: of this error to the linear model's; NaN if there is none to compare with.
         squares: the sum of the squared errors in each block of time, (B,).
     """
 
@@ -221,7 +221,7 @@ def search_sizes(
         degree: of a polynomial, in the place of nn.
         linear: the model that errors are compared with.
         seeds: of the starts.
-        trainer: Levenberg-Marquardt with 50 iterations where left out.
+        trainer: the search. Default: Levenberg-Marquardt with 50 iterations.
         ridge, ranks, stop: see :func:`lfrtorch.fit`.
         watch: called after each model.
 

@@ -53,7 +53,7 @@ def initialise(
 
     - ``"paper"``: Bw = Dyw = 0 and Ww ~ U(-1, 1) (Schoukens and Tóth 2020);
     - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021), for a polynomial
-      C = 0. The more reliable one. A module of another class starts so where its output vanishes on
+      C = 0. The more reliable one. A module of another class starts so if its output vanishes on
       the data, with the weights that it has, and else as with ``"paper"``.
 
     Args:
@@ -66,7 +66,7 @@ def initialise(
         method: which of the two starts.
         seed: of the random weights.
         minor: what counts as next to nothing: the part of a mode in the output over the model's
-            error; 0 leaves the linear model as it is. Where left out 0 for ``"paper"``, else 1/3.
+            error; 0 leaves the linear model as it is. Default: 0 for ``"paper"``, else 1/3.
         dtype: of the weights.
 
     Raises:

@@ -81,11 +81,11 @@ class Trainer(Protocol):
         ...
 
     def refused(self, before: Any, after: Any) -> Any:
-        """State to go on from where a step led to a model that explodes on validation."""
+        """State to go on from after a step to a model that explodes on validation."""
         ...
 
     def prolonged(self, state: Any) -> Any:
-        """State to go on from where all iterations were spent and there are more now."""
+        """State to go on from if all iterations were spent and more are allowed now."""
         ...
 
 
@@ -97,9 +97,9 @@ class Progress:
         iteration: 0 is the start.
         limit: most iterations.
         train, validation: root mean squared simulation errors, output unit; validation is NaN
-            where there is no validation record or the model diverges on it.
+            if there is no validation record or the model diverges on it.
         seconds: since the start of the fit.
-        best: whether this iterate is the best so far, on validation where there is one.
+        best: whether this iterate is the best so far, on validation if there is one.
         report: scalars of the trainer.
         score: normalised squared error that chooses: on validation, or on training without it.
     """
@@ -126,7 +126,7 @@ Stop = Callable[[], bool]
 """Asked before each iteration; True ends the fit there, and the best iterate is kept."""
 
 Keep = Callable[["Fit", bool], None]
-"""Called with a fit after each iteration, and where it pauses (then with True)."""
+"""Called with a fit after each iteration, and when it pauses (then with True)."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class RestartSummary:
         number: its place in the order given, from 0.
         iterations: it had.
         train, validation: errors of its best iterate, output unit.
-        selection: its error on all records that choose among starts; NaN where there are none.
+        selection: its error on all records that choose among starts; NaN if there are none.
         reason: why it ended, a :class:`lfrtorch.Reason` or, if a process was lost, a text with the
             detail.
     """
@@ -208,7 +208,7 @@ class Fit:
 
     Args:
         model, train, validation, trainer, ridge, ranks: see :func:`lfrtorch.fit`.
-        keep: called with the fit after every iteration, when it may be saved, and with True where
+        keep: called with the fit after every iteration, when it may be saved, and with True when
             it pauses.
         stop: asked before each iteration whether to end there; of several processes each has one,
             and one that says so ends all.
@@ -247,7 +247,7 @@ class Fit:
         self.history: list[Progress] = []
         self.note_end(Reason.NO_ITERATIONS)
         self.best = math.inf
-        """Normalised squared error of the best iterate, on validation where there is one."""
+        """Normalised squared error of the best iterate, on validation if there is one."""
         self._theta_best, self._chosen = self.problem.theta, 0
         self._first = self._score = math.inf
         self._seconds = 0.0
@@ -278,7 +278,7 @@ class Fit:
 
     @spread_by_hand()
     def advance(self, until: int | None = None, monitors: Sequence[Monitor] = ()) -> Self:
-        """Go on to an iteration, the trainer's last where left out; the best is in the model.
+        """Go on to an iteration (default: the trainer's last); the best is in the model.
 
         Raises:
             ProcessLostError: before there was an iterate to keep.
@@ -310,7 +310,7 @@ class Fit:
         self.keep(self, True)
 
     def save(self, path: Path) -> None:
-        """Write where the fit stands to a file, from which ``restore`` goes on to the same bits."""
+        """Write the state of the fit to a file, from which ``restore`` goes on to the same bits."""
         state, tensors = state_file.packed(self.state)
         problem = self.problem.state_dict()
         tensors = {f"state.{name}": tensor for name, tensor in tensors.items()}
@@ -323,7 +323,7 @@ class Fit:
         state_file.write(path, numbers, tensors | {"best": self._theta_best})
 
     def restore(self, path: Path) -> None:
-        """Take over where a fit of the same model, records and trainer stood.
+        """Take over the state of a fit of the same model, records and trainer.
 
         Raises:
             ValueError: a damaged file, or another fit.
@@ -367,9 +367,9 @@ class Fit:
         self._show(progress, monitors)
 
     def take(self, after: Any, seconds: float, monitors: Sequence[Monitor] = ()) -> None:
-        """Go on from the trainer's next state, which took so many seconds to find.
+        """Go on from the trainer's next state, which took ``seconds`` to find.
 
-        Not where the model there explodes on validation: the search goes back, and treads softly.
+        If the model there explodes on validation, the search goes back and takes smaller steps.
         """
         before, last = self.state, self._score
         progress = self._progress(after, seconds)
@@ -396,7 +396,7 @@ class Fit:
         )
 
     def _progress(self, state: TrainerState, seconds: float) -> Progress:
-        """The progress that an iterate is, which took so many seconds to find."""
+        """The errors of an iterate, as a line of the history; it took ``seconds`` to find."""
         clock, problem = time.perf_counter(), self.problem
         train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")
         score = problem.cost(state.residual)
@@ -416,7 +416,7 @@ class Fit:
         )  # fmt: skip
 
     def _enter(self, state: TrainerState, progress: Progress) -> None:
-        """Note an iterate, and keep it where it is the best."""
+        """Note an iterate, and keep it if it is the best."""
         if progress.best:
             self._theta_best, self.best, self._chosen = (
                 state.theta,

@@ -218,7 +218,7 @@ class SimulationProblem:
         tensors = {"start": self._theta_0}
         cell = self.lfr.cell
         for i, (group, guess) in enumerate(zip(self.groups, self.guesses, strict=True)):
-            if guess is not None:  # of machine code the initial state of a period is of use alone
+            if guess is not None:  # machine code needs the initial state of a period alone
                 tensors[f"guess.{i}"] = guess[:, :1] if is_compiled(cell, group.u) else guess
         if self._reduced is not None:
             tensors["kept"] = self._reduced.kept

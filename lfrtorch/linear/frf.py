@@ -314,7 +314,7 @@ def _robust(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
             cov_total = covariance(outer(fitted.residual) / spare, fitted.weights)
     else:
         notes.append(
-            f"total: not available, as {R} experiment(s) of {nu} input(s) leave no freedom beside "
+            f"total: not available, as {R} experiment(s) of {nu} input(s) leave no freedom after "
             "G; more realisations give it, or a random odd multisine and method='fast'."
         )
     return FRF(

@@ -1,4 +1,4 @@
-"""What to try next after a fit, from numbers alone: each rule looks at one, and says which.
+"""What to try next after a fit, from numbers alone. Each rule names the numbers that it rests on.
 
 Errors are root mean squares relative to the standard deviation of the training outputs, so that
 outputs of any unit count alike.
@@ -60,17 +60,17 @@ class Advice(NamedTuple):
 
 @dataclass(frozen=True)
 class Evidence:
-    """Numbers of a fit; None where one is not known.
+    """Numbers of a fit; None if one is not known.
 
     Args:
         train, linear_train: errors of the NL-LFR and of the linear model on the training records.
         validation, linear_validation: on those that chose the iterate.
-        outputs: the NL-LFR's error over the linear model's by output, where there are several.
+        outputs: the NL-LFR's error over the linear model's by output, if there are several.
         noise: of the outputs, known or from the differences between periods.
         linear: part of the training error's power that a linear filter of the inputs explains.
         nonlinear: part that squares and cubes of the outputs explain beyond that.
         transient: error at the beginning of the training records over that in the rest.
-        falling: part by which the error fell over the last tenth of the iterations, 0 where the
+        falling: part by which the error fell over the last tenth of the iterations, 0 if the
             search ended for another reason than its limit.
         iterations: of the fit.
         starts: errors of all starts that went to the end, the best first.
@@ -236,7 +236,7 @@ def hardly_better(e: Evidence) -> Advice | None:
 
 
 def outputs_left_out(e: Evidence) -> Advice | None:
-    """Outputs without gain beside others that have one: the static map has too few outputs."""
+    """Outputs without gain, while others have one: the static map has too few outputs."""
     error, linear_error, which = e.judged
     behind = {name: ratio for name, ratio in e.outputs.items() if ratio > USELESS}
     if not behind or error is None or not linear_error or error > USELESS * linear_error:

@@ -44,7 +44,7 @@ def of_run(
 
 
 def of_tests(simulated: Sequence[Response]) -> tuple[dict[str, Figure], dict[str, dict[str, str]]]:
-    """What the report shows of tests beside those, and of each test all with captions."""
+    """Further figures of the tests, and of each test all its figures with captions."""
     drawn: dict[str, Figure] = {}
     views: dict[str, dict[str, str]] = {}
     for shown in simulated:
@@ -67,7 +67,7 @@ def of_tests(simulated: Sequence[Response]) -> tuple[dict[str, Figure], dict[str
 
 
 def measured(records: Sequence[Record]) -> FRF | None:
-    """The nonparametric frequency response, where the records give one in seconds."""
+    """The nonparametric frequency response, if the records give one in seconds."""
     if sum(record.samples for record in records) > MOST_MEASURED:
         return None
     try:

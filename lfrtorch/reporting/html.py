@@ -144,7 +144,7 @@ def _line(name: str, unit: str, errors: Errors) -> str:
     below = f"error {number(errors.ratio)} × below" if lower else "no error below"
     error, linear = quantity(errors.error, unit), quantity(errors.linear, unit)
     relative = percent(errors.relative)
-    return f"{name}: {below} the linear model's ({error} beside {linear}), NRMSE {relative}"
+    return f"{name}: {below} the linear model's ({error} against {linear}), NRMSE {relative}"
 
 
 def _sizes(metrics: Mapping[str, Any]) -> str:
@@ -201,7 +201,7 @@ def _channels(response: Response) -> list[tuple[str, str, slice]]:
 
 
 def _errors(response: Response, of: slice) -> Errors:
-    """Of some outputs."""
+    """The errors of some outputs."""
     linear, error = (
         float(rms(signal[:, of])) for signal in (response.linear_error, response.error)
     )

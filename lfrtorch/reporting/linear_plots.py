@@ -33,8 +33,8 @@ RANGE = 120.0
 """Most dB that an axis shows: a zero on a grid point is no information."""
 
 STRETCHES = 200
-"""Of the frequency axis: a variance is drawn as its mean over each. Line by line it hid the dots of
-a record of 50000 samples."""
+"""Parts of the frequency axis: a variance is drawn as its mean over each. Line by line it hid the
+dots of a record of 50000 samples."""
 
 FAR = 2.0
 """Half width of the z plane that is drawn: sampling puts zeros far out that say little."""
@@ -50,7 +50,7 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
     """Magnitude and phase of the model, and the nonparametric response with its uncertainty.
 
     Two panels a channel. The model's band is ± 2 standard deviations from the covariance of its
-    parameters, where that is known. Without ``frf`` the model is drawn alone.
+    parameters, if that is known. Without ``frf`` the model is drawn alone.
 
     Example:
         >>> from lfrtorch.reporting import linear_plots

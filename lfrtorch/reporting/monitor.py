@@ -29,8 +29,8 @@ class ProgressLine:
     """One live line on a terminal; elsewhere a line now and then.
 
     Args:
-        every: iterations between lines where the output is not a terminal.
-        stream: where to write; standard output where left out.
+        every: iterations between lines if the output is not a terminal.
+        stream: where to write; Default: standard output.
 
     Example:
         >>> from lfrtorch.reporting.monitor import ProgressLine
@@ -86,7 +86,7 @@ class StartsLine:
     Args:
         starts: how many there are.
         unit: of the errors.
-        stream: where to write; standard output where left out.
+        stream: where to write; Default: standard output.
 
     Example:
         >>> from lfrtorch.reporting.monitor import StartsLine
@@ -219,7 +219,7 @@ class Checkpoint:
         self._unwritten: Model | None = None
 
     def __call__(self, model: Model, progress: Progress) -> None:
-        """Keep the iterate where it is the best; write the best one where it is time."""
+        """Keep the iterate if it is the best; write the best one when it is time."""
         if progress.best and progress.score < self._least:
             self._unwritten, self._least = copy.deepcopy(model), progress.score
         if self._unwritten is not None and monotonic() >= self._due:

@@ -18,7 +18,7 @@ OUTPUT, LINEAR, NL_LFR = "tab:blue", "tab:red", "tab:green"
 """Colours of the measured output, the linear model's error and the NL-LFR's, as in the paper."""
 
 DPI = 150
-"""Of a figure that is written."""
+"""Dots per inch of a figure that is written."""
 
 MOST_POINTS = 20_000
 """Samples drawn of a long signal as a cloud."""
@@ -59,8 +59,8 @@ def spectrum(record: Record, y_linear: Array, y_hat: Array | None = None) -> Fig
     """Magnitude of the measured output and of the errors against frequency, one panel an output.
 
     Shape:
-        y_linear, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
-            is no NL-LFR.
+        y_linear, y_hat: (T, ny), simulated outputs in physical units; without an NL-LFR
+            there is no y_hat.
 
     Example:
         >>> from lfrtorch.reporting import plots
@@ -88,8 +88,8 @@ def density(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figu
     By Welch's method: for records that are no whole periods.
 
     Shape:
-        y_linear, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
-            is no NL-LFR.
+        y_linear, y_hat: (T, ny), simulated outputs in physical units; without an NL-LFR
+            there is no y_hat.
 
     Example:
         >>> from lfrtorch.reporting import plots
@@ -117,8 +117,8 @@ def response(record: Record, y_linear: Array, y_hat: Array | None = None) -> Fig
     """Measured output and errors against time in the record, one panel an output.
 
     Shape:
-        y_linear, y_hat: (T, ny), simulated outputs in physical units; y_hat is left out where there
-            is no NL-LFR.
+        y_linear, y_hat: (T, ny), simulated outputs in physical units; without an NL-LFR
+            there is no y_hat.
 
     Example:
         >>> from lfrtorch.reporting import plots
@@ -141,8 +141,8 @@ def response(record: Record, y_linear: Array, y_hat: Array | None = None) -> Fig
 def close_up(record: Record, y_linear: Array, y_hat: Array) -> Figure:
     """The response about the largest error of the NL-LFR, and below it this error alone.
 
-    Errors of several outputs are compared relative to the deviation of each. Where the model
-    diverges it is where it does so first.
+    Errors of several outputs are compared relative to the deviation of each. If the
+    model diverges, the largest error is where it first does so.
 
     Shape:
         y_linear, y_hat: (T, ny), simulated outputs in physical units.

@@ -42,7 +42,7 @@ class Score:
 
 
 def score(model: Model, bla: LinearModel | None, record: Record) -> Score:
-    """Scores of the model and of the linear model, where there is one, on one record.
+    """Scores of the model, and of the linear model if there is one, on one record.
 
     Example:
         >>> from lfrtorch.reporting.scores import score
@@ -72,7 +72,7 @@ def metrics(
     command: str = "",
     search: SizeSearch | None = None,
 ) -> dict:
-    """What ``metrics.json`` holds, scores by test record; None where a number is not finite.
+    """What ``metrics.json`` holds, scores by test record; None if a number is not finite.
 
     Args:
         result: the fit.
@@ -81,7 +81,7 @@ def metrics(
         own: linear models of single tests, by name (see ``Dataset.linear``).
         seeds: of the random starts.
         command: that made it.
-        search: for the sizes, where they were not given.
+        search: for the sizes, if they were not given.
     """
     model = result.model
     entries = evaluation(model, bla, dataset, own=own, command=command)
@@ -114,7 +114,7 @@ def evaluation(
     own: Mapping[str, LinearModel] | None = None,
     command: str,
 ) -> dict:
-    """What ``metrics`` has without a fit: a model, beside a linear one where there is one, on data.
+    """What ``metrics`` has without a fit: scores of a model, and of a linear one if given, on data.
 
     Args:
         model, bla: what is scored.
@@ -186,7 +186,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
 
 
 def neurons(count: int) -> str:
-    """Of a network, in words; other maps have none."""
+    """The number of neurons in words; maps that are not networks have none."""
     return f"{count} neurons" if count else "a map of one's own"
 
 

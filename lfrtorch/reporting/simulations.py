@@ -39,12 +39,12 @@ class Response:
 
     @property
     def error(self) -> Array:
-        """Of the NL-LFR, after the skip window (scored samples, ny)."""
+        """Error of the NL-LFR after the skip window (scored samples, ny)."""
         return self.scored - self.y_hat[self.record.skip :]
 
     @property
     def linear_error(self) -> Array:
-        """Of the linear model, after the skip window (scored samples, ny)."""
+        """Error of the linear model after the skip window (scored samples, ny)."""
         return self.scored - self.y_linear[self.record.skip :]
 
     @property

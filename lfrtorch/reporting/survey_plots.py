@@ -18,7 +18,7 @@ RANGE = 120.0
 """Most dB that a spectrum shows."""
 
 STRETCHES = 3000
-"""Of the frequency axis: the largest line of each is drawn."""
+"""Parts of the frequency axis: the largest line of each is drawn."""
 
 BELOW = 3.0
 """The frequency axis begins at the lowest end of a band divided by this."""

@@ -131,7 +131,7 @@ def test_page_has_the_numbers_and_no_address_outside(single: Run):
     linear, error = (number(lfrtorch.rmse(test.record, y)) for y in (test.y_linear, test.y_hat))
     for words in (
         f"test {linear} {error}",
-        f"({error} V beside {linear} V)",
+        f"({error} V against {linear} V)",
         "Do this. as x is 3",
         "else: A <i>(2001)",
         "a note",
