@@ -28,7 +28,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LMState
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
 
 NEARBY = (1.0 + 1e-12 * i for i in itertools.count())
-"""Factors of what is kept from one call to the next where it is the same."""
+"""Factors of what is kept from one call to the next if it is the same."""
 ENDLESS = lfrtorch.LevenbergMarquardt(max_iter=10**9, tolerance=0.0)
 REPETITIONS = 15
 RESTART = 4
@@ -188,7 +188,7 @@ def first_call(folder: Path) -> dict:
 def search(
     problem: SimulationProblem, count: int, theta: torch.Tensor | None = None
 ) -> tuple[LMState, list[tuple[float, int]]]:
-    """Where the search stands after so many iterations, and seconds and trials of each."""
+    """State of the search after ``count`` iterations, and seconds and trials of each."""
     state = ENDLESS.init(problem, problem.theta if theta is None else theta.clone())
     steps = []
     for _ in range(count):
@@ -220,7 +220,7 @@ def clock() -> float:
 
 
 def waited(threads: str = "") -> float:
-    """Seconds that threads of this process could run and had no core; 0 where not known."""
+    """Seconds that threads of this process could run and had no core; 0 if not known."""
     files = Path("/proc/self").glob(f"{threads}/schedstat" if threads else "schedstat")
     with suppress(OSError):
         return sum(int(file.read_text().split()[1]) for file in files) / 1e9
@@ -235,7 +235,7 @@ def start_of_peak() -> float | None:
 
 
 def status(entry: str) -> float | None:
-    """MB of an entry of /proc/self/status; None where there is no such file."""
+    """MB of an entry of /proc/self/status; None if there is no such file."""
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith(f"{entry}:"):

@@ -49,7 +49,7 @@ class Row(NamedTuple):
 
     @property
     def met(self) -> bool | None:
-        """Whether the limit is kept; None where there is none, or no value."""
+        """Whether the limit is kept; None if there is none, or no value."""
         if self.value is None or self.limit is None:
             return None
         return self.value >= self.limit if self.at_least else self.value <= self.limit
@@ -248,7 +248,7 @@ def show(rows: list[Row]) -> None:
         met = {True: "met", False: "**not met**", None: ""}[row.met]
         print(f"| {row.what} | {value} | {limit} | {met} |")
     if any(row.unit == "MB" and row.value is None for row in rows):
-        print("\nMemory is measured where there is /proc.")
+        print("\nMemory is measured if there is /proc.")
 
 
 def available_cores() -> list[int]:
@@ -260,7 +260,7 @@ def available_cores() -> list[int]:
 
 @contextmanager
 def pinned(cores: list[int]) -> Iterator[None]:
-    """Processes that are started inside run on these cores, where the system can do that."""
+    """Processes that are started inside run on these cores, if the system can do that."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return

@@ -20,7 +20,7 @@ LONGEST = 300.0
 
 
 def prepared(folder: Path) -> str:
-    """Make the records that are missing; why the peers cannot run, empty where they can."""
+    """Make the records that are missing; why the peers cannot run, empty if they can."""
     python = _python(folder)
     for needed in (python, folder / SCRIPT):
         if not needed.is_file():

@@ -3,7 +3,7 @@
     python benchmarks/starts.py --out runs/starts.jsonl --jobs 2
     python benchmarks/starts.py --out runs/starts.jsonl --bench parwh --variants paper zero_output
 
-Every fit is one line of the file, and is not repeated where it is there (remove the file after a
+Every fit is one line of the file, and is not repeated if it is there (remove the file after a
 change of the package). One start each, seed = data.seed, data with their official noise. The table
 has the median and the worst over the seeds, of the iterate that is best on validation; defaults are
 chosen by its first column. The tests are noise free, and simulated (parwh: the stand-in) but for

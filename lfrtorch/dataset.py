@@ -16,7 +16,7 @@ class Published:
         label: column head, for example ``"NL-LFR (paper)"``.
         scores: RMSE in the output's unit, by the name of the test record.
         reference: where it was published.
-        sizes: (nz, nw) where the number belongs to one model size only.
+        sizes: (nz, nw) if the number belongs to one model size only.
 
     Example:
         >>> paper = lfrtorch.Published("NL-LFR (paper)", {"multisine": 1.9e-5}, "a paper")

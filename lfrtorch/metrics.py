@@ -86,7 +86,7 @@ class BlockScores:
 
     @property
     def rmse(self) -> Array:
-        """Root mean squared errors, NaN where no sample counts."""
+        """Root mean squared errors, NaN if no sample counts."""
         return np.sqrt(self._mean_of(self._errors))
 
     @property

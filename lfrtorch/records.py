@@ -63,10 +63,10 @@ class Record:
         y: output, physical units. A one-dimensional array is one channel.
         fs: sampling frequency in Hz.
         start: ``"zero"`` simulates from x = 0 (at rest at the input's offset), ``"given"`` from
-            ``x0``; ``"estimated"`` fits the start state to the record, too: with the parameters in
-            a fit, and where a model is simulated or judged to the skipped samples, so that no
-            scored sample has a part in it (to all where none is skipped); ``"periodic"`` says that
-            the record is a whole number of periods in steady state.
+            ``x0``; ``"estimated"`` fits the start state to the record, too: in a fit together with
+            the parameters; in a simulation or a score to the skipped samples alone, or to all if
+            none is skipped; ``"periodic"`` says that the record is a whole number of periods in
+            steady state.
         skip: samples at the beginning that are left out of cost and score.
         x0: the given start state, in the coordinates of the model.
         weight: of the squared normalised errors in a fit, one number or one for each output.
@@ -214,7 +214,7 @@ class Record:
     def __getitem__(self, window: slice) -> Record:
         """The part of the record in ``window``: a record from zero state with nothing skipped.
 
-        It keeps its period where it is as long as that.
+        It keeps its period if it is as long as that.
 
         Raises:
             ValueError: not a slice, or one with a step (it would change the rate).
@@ -344,7 +344,7 @@ def check_start(start: str, what: str) -> None:
 
 
 def rms_scale(signals: Sequence[Array], offset: Array) -> NDArray:
-    """Root mean square (n,) of signals (T, n) about ``offset``; 1 where a channel is constant."""
+    """Root mean square (n,) of signals (T, n) about ``offset``; 1 if a channel is constant."""
     scale = np.sqrt(np.mean((np.concatenate(signals) - offset) ** 2, axis=0))
     return np.where(scale > 0, scale, 1.0)
 

@@ -12,7 +12,7 @@ from lfrtorch._support.errors import InputError
 
 
 def refuse_existing(path: str | Path, option: str) -> None:
-    """Refuse a path where something is with a ValueError that names the option to replace it."""
+    """Refuse a path that exists with a ValueError that names the option to replace it."""
     if Path(path).exists():
         raise InputError(f"'{path}' exists; give another name, or {option} to replace it.")
 
@@ -21,7 +21,7 @@ def refuse_existing(path: str | Path, option: str) -> None:
 def whole_file(path: str | Path) -> Iterator[Path]:
     """A path beside ``path`` to write to, of the same extension; it takes the place of ``path``.
 
-    Not where the block raises: then nothing is left, and what was at ``path`` stays as it was.
+    If the block raises, nothing is left, and what was at ``path`` stays as it was.
     """
     path = Path(path).resolve()  # a link's target is replaced, not the link
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -90,7 +90,7 @@ def loaded(cfg: DictConfig) -> Dataset:
 
 
 def require_data(cfg: DictConfig) -> None:
-    """Say how data are chosen where none are."""
+    """Say how data are chosen if none are."""
     if cfg.get("data") is None:
         raise InputError(
             "no data chosen: add +bench=boucwen, or data=file data.path=FILE "

@@ -27,7 +27,7 @@ from lfrtorch.reporting import scores as report
 
 
 def evaluate(cfg: DictConfig, command: str = "") -> None:
-    """Print the scores of the checkpoint's model, and write them where that is asked for."""
+    """Print the scores of the checkpoint's model, and write them if that is asked for."""
     if cfg.checkpoint is None:
         raise InputError(
             "no model chosen: add checkpoint=DIR, the folder of a run or of a saved model."
@@ -57,7 +57,7 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
 
 
 def linear_beside(checkpoint: str) -> lfrtorch.LinearModel | None:
-    """The linear model of a run, whose folder or ``model/`` folder is given, where it has one."""
+    """The linear model of a run, whose folder or ``model/`` folder is given, if it has one."""
     folder = Path(checkpoint)
     places = [folder / "linear", *([folder.parent / "linear"] if folder.name == "model" else [])]
     found = next((place for place in places if place.is_dir()), None)

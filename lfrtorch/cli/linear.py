@@ -78,7 +78,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
 def response(
     cfg: DictConfig, records: Sequence[lfrtorch.Record]
 ) -> tuple[lfrtorch.FRF | None, list[str]]:
-    """The measured frequency response, where the records give one, and notes."""
+    """The measured frequency response, if the records give one, and notes."""
     asked_for = cfg.frf.method != "auto" or cfg.bla.refine == "frequency"
     try:
         frf: lfrtorch.FRF = instantiate(cfg.frf, records)
@@ -112,7 +112,7 @@ def numbers(
     frf: lfrtorch.FRF | None,
     scan: lfrtorch.OrderScan | None,
 ) -> dict[str, Any]:
-    """What linear.json holds; None where a number is not finite or not known."""
+    """What linear.json holds; None if a number is not finite or not known."""
     fit = model.fit
     assert fit is not None
     used = {"train": dataset.train, "validation": dataset.validation, "test": dataset.tests}
@@ -231,7 +231,7 @@ def table(found: dict[str, Any]) -> str:
 
 
 def finite(value: float) -> float | None:
-    """The number, None where JSON cannot hold it."""
+    """The number, None if JSON cannot hold it."""
     return float(value) if math.isfinite(value) else None
 
 

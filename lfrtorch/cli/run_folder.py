@@ -90,14 +90,14 @@ def common(folder: Path, ranks: Ranks) -> Path:
 
 
 def made(folder: Path) -> Path:
-    """The folder, made where it is missing."""
+    """The folder, made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
 @contextmanager
 def no_empty_folder(folder: Path) -> Iterator[None]:
-    """A run that fails before it has a model leaves no folder, where nothing else is in it."""
+    """A run that fails before it has a model leaves no folder, if nothing else is in it."""
     try:
         yield
     except BaseException:

@@ -162,7 +162,7 @@ def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
 
 
 def time_column(cfg: DictConfig, model: lfrtorch.Model, path: Path) -> str | int | None:
-    """The column of the time: where nothing says how the file is sampled, the one named like it."""
+    """The column of the time: if nothing says how the file is sampled, the one named like it."""
     if cfg.data.time is not None or cfg.data.fs is not None:
         return cfg.data.time
     named = [column.name for column in open_table(path).columns if is_time(column)]

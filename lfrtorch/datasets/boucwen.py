@@ -82,7 +82,7 @@ def load(
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """Simulated estimation data, and the official tests where their files are at hand.
+    """Simulated estimation data, and the official tests if their files are at hand.
 
     Training, validation and selection are steady-state periods of multisine realisations, with
     measurement noise: validation at the level of the first training record, selection at levels of

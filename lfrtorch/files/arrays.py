@@ -33,9 +33,9 @@ class Signal:
     Args:
         shape: as it is in the file.
         dtype: of its numbers.
-        unit: where the file says it.
+        unit: empty if the file does not say it.
         transposed: time runs along the last axis.
-        values: the array, where it is in memory.
+        values: the array, if it is in memory.
     """
 
     shape: tuple[int, ...]
@@ -51,7 +51,7 @@ class Signal:
         return (columns, rows) if self.transposed else (rows, columns)
 
     def refusal(self) -> str:
-        """Why it is no signal; nothing where it is one."""
+        """Why it is no signal; nothing if it is one."""
         kind = self.dtype.kind
         if kind == "c":
             return f"is complex ({self.dtype}); store real and imaginary part apart"

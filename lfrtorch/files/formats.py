@@ -59,7 +59,7 @@ def open_table(path: str | Path) -> Table:
     if kind not in FORMATS:
         instead = _INSTEAD.get(path.suffix.lower(), "convert it")
         raise InputError(
-            f"'{path}' has the unknown extension '{path.suffix}'; {instead}, or rename it where it "
+            f"'{path}' has the unknown extension '{path.suffix}'; {instead}, or rename it if it "
             f"is one of these: {', '.join(FORMATS)}."
         )
     if path.stat().st_size == 0:

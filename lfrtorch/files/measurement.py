@@ -229,9 +229,9 @@ def _suggested(table: Table, columns: Sequence[int]) -> str:
 
 
 def _doubts(table: Table, columns: Sequence[int], fs: float) -> list[str]:
-    """A note where a column is named as time is and contradicts ``fs``."""
+    """A note if a column is named as time is and contradicts ``fs``."""
     return [
-        f"fs is {fs:g} Hz and the column {table.headers[column]!r} says {grid.fs:g} Hz; where "
+        f"fs is {fs:g} Hz and the column {table.headers[column]!r} says {grid.fs:g} Hz; if "
         f"that is right, give time={table.columns[column].name!r} in place of fs"
         for column, grid in _beside(table, columns)
         if is_time(table.columns[column]) and abs(fs / grid.fs - 1) > max(_SAME, grid.uncertainty)

@@ -41,7 +41,7 @@ class Table(ABC):
     Args:
         path: the file.
         headers: the columns as the file names them; units stand in them in brackets or behind "/".
-        units: of columns by header, where the file has them apart.
+        units: of columns by header, if the file has them apart.
         arrays: column numbers by the name of an array of several channels.
         refused: why something in the file is not a channel, by its name.
     """
@@ -80,7 +80,7 @@ class Table(ABC):
 
     def read(self, columns: Sequence[int]) -> Array:
         """All samples of some columns, (T, len(columns))."""
-        grown = bytearray()  # grows in place, where a list of blocks is twice in memory at its end
+        grown = bytearray()  # grows in place: a list of blocks would be twice in memory at its end
         for block in self.blocks(columns):
             grown += block.tobytes()
         return np.frombuffer(grown, np.float64).reshape(-1, len(columns))
@@ -159,7 +159,7 @@ def is_unit(text: str) -> bool:
 
 
 def bracketed(text: str) -> str | None:
-    """What stands in brackets, where that is all."""
+    """What stands in brackets, if that is all."""
     found = _BRACKETS.fullmatch(text)
     return found[3] if found and not found[1] else None
 
@@ -167,7 +167,7 @@ def bracketed(text: str) -> str | None:
 def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel, ...]:
     """Names and units from headers as "force (N)", "force [N]" or "force/N".
 
-    What is in the brackets stays in the name where names would be equal without, and where it
+    What is in the brackets stays in the name if names would be equal without, and if it
     follows the name at once and is no unit, as in "y(t)".
     """
     found = [
@@ -192,7 +192,7 @@ def _channel(header: str) -> Channel:
 
 
 class Clock:
-    """Seconds since the first of date-times that come in blocks; NaN where there is none."""
+    """Seconds since the first of date-times that come in blocks; NaN for one that is missing."""
 
     def __init__(self) -> None:
         self._first: np.datetime64 | None = None

@@ -57,7 +57,7 @@ class TextTable(Table):
     """A text file (.csv, .tsv, .txt, .dat, .lvm, also as .gz), read by pandas in blocks.
 
     The delimiter is a tab, ";", ",", "|" or blanks, whichever makes the most cells numbers; the
-    decimal comma is known where the delimiter is another. Lines that begin with # or % are
+    decimal comma is known if the delimiter is another. Lines that begin with # or % are
     comments. The samples begin where lines of numbers do; the line above names the columns, one of
     units may stand between, and what is further above is not read.
     """

@@ -12,7 +12,7 @@ weights β are linear in the output and follow from B and N, which alone are sea
     minimise |E - G_yw W_hat|²
 
 More signals w than outputs cannot be inferred. Then x* = x_u, and what w would do to z is to be
-small, so that the model behaves the same where w acts back on z::
+small, so that the model behaves the same if w acts back on z::
 
     minimise |E - G_yw W_hat|² + μ² |G_zw W_hat|²        G_zw = Cz (zI - A)⁻¹ Bw
 

@@ -19,9 +19,9 @@ from lfrtorch.model import Model
 def mean_model(models: Sequence[Model]) -> Model:
     """The model whose output is the mean of the outputs of several models.
 
-    Models that fit alike from different random starts differ where the data do not tell, and their
-    mean has at most their mean squared error there. It has the states, z, w and neurons of all:
-    A, Bw, Cz, Wz and Ww are block diagonal.
+    Models that fit alike from different random starts differ in what the data do not tell. There
+    the squared error of their mean is at most the mean of theirs. It has the states, z, w and
+    neurons of all: A, Bw, Cz, Wz and Ww are block diagonal.
 
     Args:
         models: of the same data, each with a network of the same activation; they are copied.

@@ -300,7 +300,7 @@ def standard_errors_above(squares: Sequence[Array] | Array, counts: Integers) ->
     """How far the mean squares of several models are above the least of them.
 
     Args:
-        squares: sums of squared errors of each model in each block of time; infinite where one
+        squares: sums of squared errors of each model in each block of time; infinite if one
             diverges.
         counts: samples of each block.
 

@@ -63,12 +63,12 @@ class Snapshots:
 
     @property
     def least(self) -> float:
-        """Normalised squared error of the best iterate of all; infinite where there is none."""
+        """Normalised squared error of the best iterate of all; infinite if there is none."""
         files = [] if self.folder is None else sorted(self.folder.glob("*.safetensors"))
         return min((state_file.read(file)[0]["best"] for file in files), default=math.inf)
 
     def restore(self, fits: Sequence[Fit]) -> None:
-        """Bring fits to where they stood, those of them that had begun.
+        """Restore the fits that had begun.
 
         Raises:
             ValueError: another number of starts, or other fits.
@@ -88,7 +88,7 @@ class Snapshots:
                 fit.restore(self._file(number))
 
     def keeper(self, number: int) -> Keep:
-        """What writes the file of a start, where it is time."""
+        """What writes the file of a start when it is due."""
         if not self._writes:
             return nothing
         due = monotonic() + self.every

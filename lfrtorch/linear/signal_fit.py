@@ -69,7 +69,7 @@ class SignalFit:
         self._driven = [self._with_all_inputs(each) for each in records]
 
     def most_candidates(self, nx: int) -> int:
-        """How many subspace estimates are refined: one of long records, where they are good."""
+        """How many subspace estimates are refined: one of long records, as it is good."""
         return MOST_CANDIDATES if sum(map(len, self._us)) * nx**2 <= SHORT else 1
 
     def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:

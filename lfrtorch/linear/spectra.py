@@ -215,7 +215,7 @@ def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
 
 
 def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | None) -> Integers:
-    """The lines between 0 and fs / 2 where all inputs are excited, or the given ones.
+    """The lines between 0 and fs / 2 at which all inputs are excited, or the given ones.
 
     Raises:
         ValueError: there is none, or a given one has no power in an input.
@@ -230,7 +230,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
             line, channel = weak[0]
             raise InputError(
                 f"input '{inputs[channel].name}' has no power at line {lines[line]}; give lines "
-                "where all inputs are excited."
+                "at which all inputs are excited."
             )
         return lines
     noise = np.diagonal(spectra.C, axis1=1, axis2=2).real[1 : last + 1, -len(inputs) :]

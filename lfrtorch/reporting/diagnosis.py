@@ -40,8 +40,8 @@ def evidence(
 
     Args:
         result: the fit.
-        responses: of the training records and, where there are some, of validation and tests.
-        noise_rms: of the training outputs in their unit, where it is known.
+        responses: of the training records, and of validation and tests if there are any.
+        noise_rms: of the training outputs in their unit, if it is known.
         continued: whether the fit went on from a model.
         ridge: whether it had one.
         searched: whether validation chose the sizes.
@@ -89,7 +89,7 @@ def evidence(
 def noise_of_periods(records: Sequence[Record]) -> Array | None:
     """Standard deviation (ny,) of the noise in the outputs, from the differences between periods.
 
-    None where no record has two periods, or they do not have one period and input that repeats.
+    None if no record has two periods, if an input does not repeat, or if the periods differ.
     """
     try:
         spectra = spectra_of_periods(records)
@@ -107,7 +107,7 @@ def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | No
     Returns:
         What filters of the inputs explain, and what those of the squares and cubes of the simulated
         outputs explain beyond: the first says that states are missing, the second that the static
-        map is too small. None where the records are too short, or a simulation diverges.
+        map is too small. None if the records are too short, or a simulation diverges.
     """
     errors = [response.error for response in train]
     inputs = [response.record.u[response.record.skip :] for response in train]
@@ -140,7 +140,7 @@ def coherent_part(signals: Sequence[Array], errors: Sequence[Array]) -> float | 
         signals: (T, n), errors: (T, ny) each.
 
     Returns:
-        0 to 1, or None where the records are too short.
+        0 to 1, or None if the records are too short.
     """
     n = signals[0].shape[1]
     T, shortest = sum(map(len, errors)), min(map(len, errors))
@@ -172,7 +172,7 @@ def coherent_part(signals: Sequence[Array], errors: Sequence[Array]) -> float | 
 def falling(result: FitResult) -> float:
     """Part by which the error that chooses fell over the last tenth of the iterations.
 
-    0 where the search ended for another reason than its limit.
+    0 if the search ended for another reason than its limit.
     """
     history = result.history
     if result.reason not in SPENT or len(history) < 2:
@@ -186,7 +186,7 @@ def falling(result: FitResult) -> float:
 
 
 def _error(errors: Sequence[Array], scale: Array) -> float | None:
-    """RMS of errors in units of the scale; None without records or where one diverges."""
+    """RMS of errors in units of the scale; None without records or if one diverges."""
     if not errors:
         return None
     error = float(rms(rms(np.concatenate(errors), axis=0) / scale))
@@ -194,7 +194,7 @@ def _error(errors: Sequence[Array], scale: Array) -> float | None:
 
 
 def _by_output(responses: Sequence[Response]) -> dict[str, float]:
-    """The NL-LFR's error over the linear model's by output, where there are several."""
+    """The NL-LFR's error over the linear model's by output, if there are several."""
     outputs = responses[0].record.outputs
     linear, error = (
         rms(np.concatenate(errors), axis=0)
@@ -206,7 +206,7 @@ def _by_output(responses: Sequence[Response]) -> dict[str, float]:
 
 
 def _transient(train: Sequence[Response], scale: Array) -> float | None:
-    """Error at the beginning of the records over the rest; None where their start is known."""
+    """Error at the beginning of the records over the rest; None if their start is known."""
     first, rest = [], []
     for response in train:
         if response.record.start not in ("periodic", "estimated"):
@@ -226,7 +226,7 @@ def _peak(responses: Sequence[Response], offset: Array) -> Array:
 
 
 def _finished(result: FitResult) -> list[float]:
-    """Errors of the starts that went to the end, on validation where there is one."""
+    """Errors of the starts that went to the end, on validation if there is one."""
     found = [
         start.train if math.isnan(start.validation) else start.validation
         for start in result.starts

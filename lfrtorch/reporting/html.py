@@ -258,7 +258,7 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
             f"Order {bla.nx}, {bla.fit.criterion} error {number(bla.fit.rmse)} (normalised), "
             f"{_count(bla.fit.iterations, 'iteration')}, {bla.fit.reason}."
         )
-    caption = "Frequency response of the model, over the measured one where the records give one"
+    caption = "Frequency response of the model, over the measured one if the records give one"
     if bla.covariance is not None:
         caption += "; band: ± 2 standard deviations"
     poles: Rows = []

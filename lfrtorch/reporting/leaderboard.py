@@ -18,7 +18,7 @@ from lfrtorch.model import Model
 from lfrtorch.records import Record
 
 UNITS = {"V": ("mV", 1e3), "m": ("mm", 1e3)}
-"""That the site reports in, where it is not that of the record; volts of the tanks stay volts."""
+"""Units of the site by those of the records, if they differ; volts of the tanks stay volts."""
 
 
 @dataclass(frozen=True)

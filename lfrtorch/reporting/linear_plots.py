@@ -291,7 +291,7 @@ def _limit(ax: Axes) -> tuple[float, float]:
 
 
 def _decibel(amplitude: ArrayLike) -> Array:
-    """Amplitude in dB; gaps where it is 0."""
+    """Amplitude in dB; an amplitude of 0 leaves a gap."""
     amplitude = np.abs(np.asarray(amplitude))
     return 20.0 * np.log10(np.where(amplitude > 0, amplitude, np.nan))
 

@@ -169,8 +169,8 @@ def _levels(found: Survey, u: Array, y: Array) -> Iterator[Note]:
             yield Note(
                 f"clipped {name} {what}",
                 f"{kind}'{name}' has its {what} value {end.value:.6g} in {end.samples} samples "
-                f"({100 * end.samples / T:.2g} %), {end.run} in a row: it is clipped. Where the "
-                "sensor does it, measure again with more range; where the system does, a model "
+                f"({100 * end.samples / T:.2g} %), {end.run} in a row: it is clipped. If the "
+                "sensor does it, measure again with more range; if the system does, a model "
                 "can learn it.",
             )
         first, length = longest_run(np.diff(signal) == 0)
@@ -281,8 +281,8 @@ def _relations(found: Survey, u: Array, y: Array) -> Iterator[Note]:
             yield Note(
                 f"unrelated {name}",
                 f"hardly anything of output '{name}' follows from the inputs linearly: other "
-                "columns, times that do not fit, noise, or a purely even nonlinearity, where there "
-                "is no linear model to start from.",
+                "columns, times that do not fit, noise, or a purely even nonlinearity, for which "
+                "there is no linear model to start from.",
             )
         for j, pair in pairs.items():
             if (
@@ -322,7 +322,7 @@ def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Note]:
             f"drift {output.channel.name}",
             f"output '{output.channel.name}' drifts by {slope * len(y):.3g} over the record, "
             f"{abs(slope) * len(y) / output.rms:.1f} times its rms, and no input does: take the "
-            "line off (scipy.signal.detrend) where the sensor drifts; leave it where the system "
+            "line off (scipy.signal.detrend) if the sensor drifts; leave it if the system "
             "integrates.",
         )
 

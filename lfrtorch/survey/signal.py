@@ -47,7 +47,7 @@ class Extreme(NamedTuple):
 
 
 class SignalSurvey(NamedTuple):
-    """What a signal of T samples is like; numbers are NaN where it has no values.
+    """What a signal of T samples is like; numbers are NaN if it has no values.
 
     Args:
         channel: its name and unit.
@@ -63,7 +63,7 @@ class SignalSurvey(NamedTuple):
         noise: its estimated rms, ``None`` if it cannot be told from the signal.
         method: of the noise. ``"periods"``: the scatter of whole periods in steady state;
             ``"spectrum"``: a guess, the level of the quietest part of the spectrum as if of white
-            noise; more where signal is everywhere, less where a filter took noise away.
+            noise: too much if signal is everywhere, too little if a filter took noise away.
     """
 
     channel: Channel
@@ -97,7 +97,7 @@ def survey_signal(
         whole: a part of it without gaps, for the spectrum.
         channel: its name and unit.
         fs: sampling frequency in Hz.
-        period: samples of a period, where it repeats.
+        period: samples of a period, if it repeats.
 
     Shape:
         signal: (T,), whole: (up to T,).
