@@ -31,7 +31,7 @@ from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import CONF, configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
-from lfrtorch.cli.words import Terminal
+from lfrtorch.cli.words import Terminal, translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.job import linear_model
@@ -56,7 +56,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     assert model.fit is not None
     for note in notes:
         if note not in model.fit.notes:
-            print(f"note: {note}")
+            print(f"note: {translated(note, cfg)}")
 
     found = numbers(model, dataset, frf, scan)
     found |= {

@@ -180,8 +180,9 @@ def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]
         names = ", ".join(table.columns[i].name for i in others)
         remarks.append(f"{side}: {names}, all other columns")
         inputs, outputs = inputs or others, outputs or others
-    if not outputs or (options.inputs and not inputs):
-        raise InputError(f"'{table.path}' has no columns left to show; it has {table.listed}.")
+    if not outputs:
+        lacking = "no column is left for the outputs" if inputs else "there is no column to show"
+        raise InputError(f"'{table.path}': {lacking}; it has {table.listed}.")
     return Roles(inputs, outputs, time[0] if time else None), remarks
 
 

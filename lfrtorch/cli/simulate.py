@@ -126,6 +126,10 @@ def written(
             first += len(y_hat)
         if not first:
             raise InputError("there are no samples; give a file with data.")
+        if stream.y and first <= skip:
+            raise InputError(
+                f"skip={skip} leaves none of the {first} samples to score; give a smaller one."
+            )
     return Written(first, scores, settled, peaks)
 
 
@@ -306,7 +310,7 @@ def about(path: Path) -> Iterator[None]:
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="simulate")
 def main(cfg: DictConfig) -> None:
     """The command line."""
-    with user_errors():
+    with user_errors(cfg=cfg):
         simulate(cfg)
 
 

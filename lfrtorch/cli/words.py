@@ -14,7 +14,7 @@ OLD_WORDS = {
 }
 """Words that have other names now; saved runs may have them."""
 
-GROUPS = ("bla", "data", "trainer")
+GROUPS = ("bla", "frf", "data", "trainer")
 """Groups whose words are arguments of functions. Of a name in several, the last one is meant."""
 
 

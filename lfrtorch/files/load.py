@@ -279,7 +279,8 @@ class _Reader:
             if T - skip < SHORTEST:
                 raise TooShortError(
                     f"record '{name}' has {max(T - skip, 0)} scored samples of {T}, with "
-                    f"skip={skip}; it needs {SHORTEST}."
+                    f"skip={skip}; it needs {SHORTEST}: give a longer record or a smaller skip=N, "
+                    "or leave this one out."
                 )
         notes = []
         if N is not None and (automatic or settling):

@@ -133,22 +133,30 @@ class Table(ABC):
             raise InputError(
                 f"'{self.path}': {wanted!r}, named in {option}, {self.refused[wanted]}."
             )
-        close = difflib.get_close_matches(wanted, self.headers, n=1, cutoff=CLOSE) or [
-            header for header in self.headers if re.split(r"\W+", header)[-1] == wanted
-        ]
-        meant = f" Did you mean {close[0]!r}?" if len(close) == 1 else ""
+        close = self._close(wanted.lower())
+        meant = f" Did you mean {close!r}?" if close else ""
         raise NoColumnError(
             f"'{self.path}' has no column {wanted!r}, named in {option}; it has {self.listed}."
             f"{meant}"
         )
 
+    def _close(self, wanted: str) -> str | None:
+        """The name without its unit that a word in small letters may be meant for."""
+        spelt = self.headers, [column.name for column in self.columns]
+        names = {of[i].lower(): spelt[1][i] for of in spelt for i in range(len(of))}
+        close = difflib.get_close_matches(wanted, names, n=1, cutoff=CLOSE)
+        last = [name for name in spelt[1] if re.split(r"\W+", name.lower())[-1] == wanted]
+        if close:
+            return names[close[0]]
+        return last[0] if len(last) == 1 else None
+
     @property
     def listed(self) -> str:
-        """The columns, for messages."""
+        """The columns by the names that a user may give, for messages."""
         if not self.columns:
             why = "; ".join(f"{name!r} {reason}" for name, reason in self.refused.items())
             return f"no columns of numbers{f' ({why})' if why else ''}"
-        names = [repr(header) for header in self.headers]
+        names = [repr(column.name) for column in self.columns]
         shown = names if len(names) <= 24 else [*names[:20], "..."]
         return f"{len(names)} column(s): {', '.join(shown)}"
 

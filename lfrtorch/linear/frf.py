@@ -285,7 +285,7 @@ def estimate_frf(
     frf = (_robust if method == "robust" else _fast)(spectra, data, chosen)
     at_once = [
         f"noise: record '{record.name}' is used from its first sample on; a transient there counts "
-        "as noise (Record.skip leaves it out, transient=True removes it)."
+        "as noise (skip=N leaves it out, transient=True removes it)."
         for record, P in zip(data, spectra.P, strict=True)
         if record.start != "periodic" and record.samples == P * spectra.N
     ]
@@ -305,8 +305,7 @@ def _robust(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
         cov_noise = _noise(spectra, lines, fitted)
     else:
         notes.append(
-            "noise: not available from one period a record; two or more periods give it "
-            "(Record.period)."
+            "noise: not available from one period a record; two or more periods give it (period=N)."
         )
     if spare > 0:
         cov_total = _block_covariance(spectra, lines)
@@ -405,7 +404,7 @@ def _local_polynomial(
         )
     notes = [
         "noise: not told apart from nonlinear distortion without periods; two or more periods of "
-        "a multisine tell them apart (Record.period)."
+        "a multisine tell them apart (period=N)."
     ]
     if any(record.samples - record.skip > spectra.N for record in data):
         notes.append(f"the records were cut to the shortest one, {spectra.N} samples.")

@@ -117,7 +117,7 @@ def spectra_of_records(data: Sequence[Record]) -> Spectra:
 def _period(record: Record) -> int:
     if record.period is None and record.start != "periodic":
         raise InputError(
-            f"record '{record.name}' has no period; give Record.period, or use "
+            f"record '{record.name}' has no period; give period=N, or use "
             "method='local_polynomial'."
         )
     return int(record.period or record.samples)
@@ -209,7 +209,7 @@ def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
         raise InputError(
             f"record '{data[r].name}': the periods of {N} samples of input "
             f"'{data[r].inputs[channel].name}' deviate from their mean by "
-            f"{100 * change[r, channel]:.0f} % of its rms; correct Record.period, set Record.skip "
+            f"{100 * change[r, channel]:.0f} % of its rms; correct period=N, give skip=N "
             "if the periods begin later, or use method='local_polynomial'."
         )
 

@@ -214,7 +214,11 @@ def composed() -> DictConfig:
         ("a", ["nx=auto", "bla.speed=3"], "speed"),
         ("a", ["nx=2", "bla.refine=magic"], "refine is 'magic'"),
         ("a", ["nx=2", "frf.method=magic"], "method is 'magic'"),
-        ("a", ["nx=2", "frf.method=fast"], "record 'train' has no period"),
+        (
+            "a",
+            ["nx=2", "frf.method=fast"],
+            "no period; give data.period=N, or use frf.method=local_",
+        ),
         ("rest", ["nx=2"], "signal 'rest' is constant"),
         ("rest", ["nx=auto"], "signal 'rest' is constant"),
     ],
@@ -225,7 +229,7 @@ def test_settings_that_cannot_be_are_one_message(
     cfg = copy.deepcopy(composed())
     OmegaConf.set_struct(cfg, False)  # as + does on the command line
     cfg.merge_with_dotlist(overrides(csv, inputs, "x", *more)[1:])
-    with pytest.raises(SystemExit) as stop, errors.user_errors():
+    with pytest.raises(SystemExit) as stop, errors.user_errors(cfg=cfg):
         linear.identify(cfg, tmp_path)
     assert stop.value.code == 1
     assert message in capsys.readouterr().err

@@ -206,6 +206,10 @@ def test_only_the_beginning_of_a_long_file_is_read(file: Path, run, monkeypatch)
     [
         (["--inputs", "mass"], "has no column 'mass', named in --inputs"),
         (["--inputs", "force", "--outputs", "force"], "'force (N)' stands for several"),
+        (
+            ["--inputs", "force", "level", "--time", "time"],
+            "no column is left for the outputs; it has",
+        ),
         (["--out", "x.csv"], "--out is 'x.csv'; give a name that ends with .png"),
         (["--fs", "-3"], "--fs is -3.0; give a positive number"),
         (["nothing*.csv"], "no file matches 'nothing*.csv'"),

@@ -63,7 +63,7 @@ def direct() -> None:
     """The command line without the start of Hydra, which takes a quarter of a second."""
     cfg = copy.deepcopy(composed())
     cfg.merge_with_dotlist(sys.argv[1:])
-    with simulate.user_errors():
+    with simulate.user_errors(cfg=cfg):
         simulate.simulate(cfg)
 
 
@@ -300,6 +300,10 @@ def test_blocks_give_the_numbers_of_one_simulation(
         (["data.path=both.csv", "out=both.csv", "overwrite=true"], "is the file that is read"),
         (["data.path=both.csv", "out=x", "format=xlsx"], "format is 'xlsx'"),
         (["data.path=both.csv", "out=x.csv", "data.inputs=[u1,u3]"], "has no column 'u3'"),
+        (
+            ["data.path=both.csv", "out=x.csv", "data.fs=50", f"skip={T}"],
+            f"skip={T} leaves none of the {T} samples to score",
+        ),
         (["data.path=both.csv", "out=x.csv", "data.fs=25"], "data.fs is 25 Hz"),
         (["data.path=both.csv", "out=x.csv", "data.fs=fast"], "data.fs is 'fast'"),
         (
@@ -363,3 +367,12 @@ def test_help_says_all(tmp_path: Path, monkeypatch, capsys):
     for word in (*words.split(), "out", "format", "overwrite"):
         assert f"{word}=" in printed
     assert list(tmp_path.iterdir()) == []
+
+
+def test_columns_of_other_names_are_asked_for_in_words_of_the_command_line(
+    folder: Path, monkeypatch, capsys
+):
+    csv(folder / "other.csv", a=U[:, 0], b=U[:, 1])
+    with pytest.raises(SystemExit):
+        run(monkeypatch, folder, "data.path=other.csv", "out=x.csv", "data.fs=50")
+    assert "say which columns these are with data.inputs=[...]" in capsys.readouterr().err

@@ -490,6 +490,12 @@ def test_a_name_that_is_nearly_right(tmp_path):
     refused(table, "force", r"'w'\. Did you mean 'exp\.force'\?$")
     refused(table, "positon", r"Did you mean 'position'\?$")
     refused(table, "voltage", r"'w'\.$")
+    table = table_of(tmp_path, "force [N],rig.Level (mm)\n1,2\n1,2\n")
+    refused(
+        table, "forse", r"it has 2 column\(s\): 'force', 'rig\.Level'\. Did you mean 'force'\?$"
+    )
+    refused(table, "Force", r"Did you mean 'force'\?$")
+    refused(table, "level", r"Did you mean 'rig\.Level'\?$")
 
 
 def test_no_columns(tmp_path):
