@@ -26,7 +26,7 @@ from lfrtorch import LevenbergMarquardt, Model, Record
 
 NAMES = ("boucwen", "parallel_wh")
 RIDGE = 1e-3
-"""As in conf/bench/boucwen.yaml."""
+"""Ridge of conf/bench/boucwen.yaml."""
 CUTS = (0, 1024, 2048, 3072, 5120, 8192)
 """Where the Bouc-Wen record is cut: three records of one length and two of others."""
 TRAINER = "trainer" if hasattr(lfrtorch, "infer") else "optimiser"

@@ -262,7 +262,7 @@ def rule(columns: int) -> None:
 
 
 def millis(values: list[float]) -> list[str]:
-    """In thousandths."""
+    """The values in thousandths."""
     return [f"{1e3 * v:.3f}" for v in values]
 
 

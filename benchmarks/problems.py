@@ -26,11 +26,11 @@ PEER_FILES = {"boucwen": "boucwen.npz", "parallel_wh": "pwh_synth.npz"}
 RATES = {"boucwen": 750.0, "parallel_wh": 78e3}
 PARALLEL_WH = {"records": 5, "samples": 16384, "lines": 4095}
 BLA_ITERATIONS = 3
-"""Of the linear start: its quality is of no concern here, and the peer's has as many."""
+"""Iterations of the linear start, and of the peer's: its quality is of no concern here."""
 RIDGE = 1e-3
-"""As in conf/bench/boucwen.yaml."""
+"""Ridge of conf/bench/boucwen.yaml."""
 RADIUS = 0.9
-"""Of the poles of a synthetic system."""
+"""Radius of the poles of a synthetic system."""
 
 
 def write_signals(folder: Path, peers: Path | None = None) -> None:

@@ -65,7 +65,7 @@ LONG = 5000
 """Samples from which on errors in time are a band of colour."""
 
 RUN = "run.json"
-"""In the folder of a run: the time that the command took."""
+"""File in the folder of a run: the time that the command took."""
 
 
 @dataclass(frozen=True)
@@ -324,7 +324,8 @@ def entries(cases: Sequence[Case]) -> list[leaderboard.Entry]:
 def gallery(cases: Sequence[Case], folder: Path, start: Path) -> dict[str, list[Path]]:
     """Figures of the chosen runs, copied; their paths from ``start`` by benchmark.
 
-    Of each test the errors' spectrum or, of a short one, their course; and the static map.
+    For each test the spectrum of the errors, or their course if the test is short; and the static
+    map.
     """
     folder.mkdir(parents=True, exist_ok=True)
     copied: dict[str, list[Path]] = {}

@@ -15,7 +15,7 @@ from lfrtorch.model import Model
 def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | None]]:
     """Poles or zeros z = exp(s / fs) as frequency |s| / 2π in Hz, damping ratio and radius of z.
 
-    Of each conjugate pair there is one.
+    A conjugate pair counts once.
 
     Example:
         >>> from lfrtorch.analysis.poles import frequency_and_damping

@@ -149,7 +149,7 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
 
 
 def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]:
-    """Which columns are what, and remarks on what was taken.
+    """The columns by their use, and remarks on the choice.
 
     Raises:
         ValueError: a column that is not there or has two uses, or none of numbers.

@@ -340,8 +340,9 @@ def _realisation(
 ) -> Record:
     """One steady-state period by the official procedure, at any length of period.
 
-    From rest, the transient dropped: one period of 8192 samples, or as many shorter ones as
-    last that long. One more period follows, dropped for the filters' end effects.
+    The simulation starts from rest. Its transient is dropped: one period of 8192 samples, or
+    shorter ones of the same length together. One more period follows, dropped for the filters'
+    end effects.
     """
     rng = np.random.default_rng(seed)
     u = multisine(samples=samples, rms=rms, seed=rng)

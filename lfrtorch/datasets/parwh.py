@@ -187,7 +187,8 @@ def _names(level: int, realisations: int) -> tuple[str, ...]:
 
 
 def _linear(levels: Sequence[int], realisations: int) -> dict[str, tuple[str, ...]]:
-    """The published linear models: of each level, that of 1000 mV for the arrow as well."""
+    """Training records of the linear model of each test, as published: those of its level; of
+    1000 mV for the arrow."""
     of_level = {f"level_{level}": _names(level, realisations) for level in levels}
     return of_level | ({"arrow": of_level["level_1000"]} if "level_1000" in of_level else {})
 

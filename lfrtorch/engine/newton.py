@@ -57,7 +57,7 @@ def newton_states(
     tolerance = UPDATE_ROUNDING * torch.finfo(u.dtype).eps ** 0.5
     x = x0.unsqueeze(1).expand(-1, u.shape[1] + 1, -1) if guess is None else guess
     driven = u @ cell.Bu.mT
-    transition, found = cell.A, torch.zeros(len(u), dtype=torch.bool)  # of no iteration
+    transition, found = cell.A, torch.zeros(len(u), dtype=torch.bool)  # before the first iteration
     for _ in range(MAX_NEWTON):
         z, w = cell.internal(u, x[:, :-1])
         defect = x[:, :-1] @ cell.A.mT + driven + w @ cell.Bw.mT - x[:, 1:]

@@ -93,7 +93,7 @@ class TextTable(Table):
                     chunksize=samples,
                     **_exact(pd.__version__),
                 )
-                reader.get_chunk(1)  # of no sample
+                reader.get_chunk(1)  # the first line, which is no sample
                 while (part := _next(reader)) is not None:
                     if part[beyond].notna().any():
                         self._explain(columns)

@@ -385,7 +385,7 @@ def infer(
 
 
 def _largest(plain: Model, records: list[Record]) -> list[Record]:
-    """The records of the largest errors, as many as make the number of samples to look at."""
+    """The records of the largest errors, up to the number of samples to look at."""
     errors = [np.square(plain.simulate(record) - record.y).mean() for record in records]
     chosen: list[Record] = []
     samples = 0

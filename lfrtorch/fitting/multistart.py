@@ -1,14 +1,14 @@
 """A fit from several starts: the better half goes on after each of the first rounds.
 
 The rounds end at 1/16 and 1/8 of the iterations; the quarter that is left, two at least, goes to
-the end. From 16 starts 4 do, and all cost as much as 5 fits. It is successive halving whose
-decisions come early: on the Bouc-Wen benchmark (16 starts, 5 realisations, 200 iterations) they
+the end. Of 16 starts 4 do, and all cost as much as 5 fits. This is successive halving with early
+decisions: on the Bouc-Wen benchmark (16 starts, 5 realisations, 200 iterations) they
 lose little, as starts that come to nothing show at once, and later ones lose the best. Mean of the
 smallest squared validation error: all to the end 3.37 (3026 iterations), half after 1/16 or 1/8
 3.37 (1609, 1696), half after 1/5 3.45, after 3/10 3.48, quarter after 1/16 and 1/8 3.43 (926), an
 eighth after 1/8, 1/4 and 1/2 3.59 (933).
 
-Of starts that end alike the mean may be better than each of them: see :func:`lfrtorch.mean_model`.
+The mean of starts that end alike may be better than each of them: see :func:`lfrtorch.mean_model`.
 
 References:
     Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter
@@ -126,9 +126,9 @@ def fit(
             averaged as bring the mean within 1 % of the least error on validation and selection,
             which may be one; without such records all are. Starts that diverge when the training
             input is doubled take no part.
-        monitors: called with the model and its progress after every iteration; of several models a
-            list for each, called one at a time. Each process calls its own: give those that print
-            or write files to the first alone.
+        monitors: called with the model and its progress after every iteration. For several models,
+            give a list for each; they are called one at a time. Each process calls its own: give
+            those that print or write files to the first alone.
         watch: called after each round.
         ranks: the processes that share the training records, ``distributed.connect()``; each calls
             this function with the same arguments, starts from the first one's weights and returns
@@ -206,7 +206,7 @@ def fit(
         cut = next((fit for fit in field if fit.reason in CUT_SHORT), None)
         if cut is not None:
             for fit in field:
-                if not fit.reason:  # it had come to the end of the round
+                if not fit.reason:  # it reached the end of the round
                     fit.note_end(cut.reason, cut.detail)
             break
         if until < limit:
@@ -242,7 +242,7 @@ class _Judge:
         ]
 
     def ranked(self, fits: Sequence[Fit]) -> list[Fit]:
-        """Those that have begun, the best first."""
+        """The fits that have begun, the best first."""
         return sorted((fit for fit in fits if fit.history), key=self._score)
 
     def summaries(self, fits: Sequence[Fit]) -> tuple[RestartSummary, ...]:
@@ -303,7 +303,7 @@ class _Judge:
         return score if math.isfinite(score) else math.inf
 
     def number(self, fit: Fit) -> int:
-        """Its place among all."""
+        """The place of a fit among all."""
         return next(number for number, other in enumerate(self.fits) if other is fit)
 
 

@@ -17,8 +17,8 @@ class Watching(NamedTuple):
     """What a fit calls, see :func:`lfrtorch.fit`.
 
     Args:
-        monitors: of each start, after each of its iterations.
-        watch: after each round of several starts.
+        monitors: a list for each start, called after each of its iterations.
+        watch: called after each round of several starts.
     """
 
     monitors: Sequence[Sequence[Monitor]]

@@ -35,7 +35,7 @@ class SizesSearch:
 
     Args:
         nz, nw, nn, degree: the numbers to try. nz and nw are crossed, then nn or degree follows.
-        starts: most random starts of each candidate, as far as the fit has as many; 2 at least.
+        starts: random starts of each candidate: those of the fit, at least 2, at most this many.
         iterations: part of the iterations of the fit that each start gets.
 
     Example:
@@ -169,7 +169,7 @@ class Settings:
 
     @property
     def searched(self) -> tuple[str, ...]:
-        """Those of them that are ``"auto"``."""
+        """Names of the sizes that are ``"auto"``."""
         return tuple(name for name in self.size_names if getattr(self, name) == "auto")
 
     @property

@@ -162,9 +162,9 @@ class FitResult:
         seconds_per_iteration: median over the accepted iterations but the first, which may compile.
         reason: why the search ended, a :class:`lfrtorch.Reason`.
         detail: what else is known of a process that was lost.
-        starts: of several starts all, the best first.
-        averaged: of how many starts the model is the mean; history and iterate are those of the
-            best one.
+        starts: all starts if there were several, the best first.
+        averaged: number of starts that the model is the mean of; history and iterate are those
+            of the best one.
 
     Example:
         >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=3))
@@ -210,8 +210,8 @@ class Fit:
         model, train, validation, trainer, ridge, ranks: see :func:`lfrtorch.fit`.
         keep: called with the fit after every iteration, when it may be saved, and with True when
             it pauses.
-        stop: asked before each iteration whether to end there; of several processes each has one,
-            and one that says so ends all.
+        stop: asked before each iteration whether to end there. If there are several processes,
+            each has its own, and one that says so ends all.
 
     Raises:
         ValueError: see :func:`lfrtorch.fit`.

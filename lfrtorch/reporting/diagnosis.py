@@ -129,12 +129,13 @@ def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | No
 def coherent_part(signals: Sequence[Array], errors: Sequence[Array]) -> float | None:
     """Part of the errors' power that linear filters of the signals explain, by Welch's method.
 
-    The multiple coherence of each line, less its bias with n signals and K segments (as the
-    adjusted R² has it), times the error's power there; of several outputs the largest part.
+    At each line, it is the multiple coherence times the error's power. The coherence is corrected
+    for its bias with n signals and K segments, as the adjusted R² is. With several outputs the
+    largest part counts.
 
     Args:
-        signals: of each record.
-        errors: of each record.
+        signals: one array a record.
+        errors: those of the simulations, one array a record.
 
     Shape:
         signals: (T, n), errors: (T, ny) each.

@@ -148,7 +148,7 @@ def _line(name: str, unit: str, errors: Errors) -> str:
 
 
 def _sizes(metrics: Mapping[str, Any]) -> str:
-    """In words."""
+    """The sizes of the model in words."""
     sizes = dict(metrics["sizes"])
     static = (
         f"polynomial of degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])

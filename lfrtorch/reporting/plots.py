@@ -294,7 +294,7 @@ def _time_axis(record: Record, ax: Axes) -> None:
 
 
 def _legend(ax: Axes) -> None:
-    """With lines that are seen."""
+    """A legend whose lines are thick enough to be seen."""
     for handle in ax.legend(loc="upper right").get_lines():
         handle.set_linewidth(2)
 

@@ -161,7 +161,7 @@ def _extreme(signal: Array, values: Array, counts: Integers) -> Extreme:
 
 
 def _noise(signal: Array, period: int | None) -> tuple[float | None, str]:
-    """Its rms, and the method."""
+    """The rms of the noise in a signal, and the method that estimates it."""
     if period is not None:
         count = (len(signal) - find_transient(signal[:, None], period)) // period
         if count > 1:
