@@ -112,6 +112,15 @@ def _located(folder: Path, inside: Sequence[str]) -> Path:
             f"there is no '{folder}'; give the folder of a run or of a saved model, a checkpoint."
         )
     if found is None:
+        below = [
+            str(path)
+            for path in sorted(folder.glob("*"))
+            if any((path / name / DESCRIPTION).is_file() for name in ("", *inside))
+        ]
+        if below:
+            raise InputError(
+                f"'{folder}' is not a checkpoint; give one of those in it: {', '.join(below[-5:])}."
+            )
         raise InputError(
             f"'{folder}' is not a checkpoint: no {DESCRIPTION} in it or in its "
             f"{' or '.join(f'{name}/' for name in inside)} folder; "

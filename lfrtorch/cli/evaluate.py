@@ -22,6 +22,7 @@ from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import CONF, loaded, require_data
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import program
+from lfrtorch.cli.simulate import opened
 from lfrtorch.job import check_channels
 from lfrtorch.reporting import scores as report
 
@@ -39,13 +40,13 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
         if not cfg.overwrite:
             refuse_existing(cfg.out, "overwrite=true")
     folder = str(cfg.checkpoint)
-    model, bla = lfrtorch.load(folder), linear_beside(folder)
+    model, bla = opened(folder), linear_beside(folder)
     dataset = loaded(cfg)
     for record in (*dataset.tests, *dataset.validation, *dataset.selection):
         check_channels(model, record)
-    if bla is None:
+    if bla is None and model.sizes["nz"]:
         print(f"note: '{folder}' has no folder linear/, so no linear model is scored")
-    elif dataset.linear:
+    elif bla is not None and dataset.linear:
         print("note: the linear model is that of all training records; a run has one a test")
     scores = report.evaluation(model, bla, dataset, command=command)
     print(f"\n{report.table(scores, dataset.published)}")

@@ -36,9 +36,14 @@ def arguments(given: Sequence[str]) -> list[str]:
     if folder != "null":
         overrides = Path(folder) / ".hydra" / "overrides.yaml"
         if not overrides.is_file():
+            runs = sorted(str(p.parents[1]) for p in Path(folder).glob("*/.hydra/overrides.yaml"))
             raise InputError(
-                f"resume is '{folder}', which is not the folder of a run: there is no {overrides}; "
-                "give the folder that the run named at its end, runs/NAME/DATE."
+                f"resume is '{folder}', which is not the folder of a run; give "
+                + (
+                    f"one of the runs in it: {', '.join(runs[-5:])}."
+                    if runs
+                    else "the folder that the run named at its end, runs/NAME/DATE."
+                )
             )
         before = [now(str(o)) for o in OmegaConf.load(overrides)]
         before = [word for word in before if not word.startswith("resume=")]

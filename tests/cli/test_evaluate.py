@@ -101,6 +101,20 @@ def test_without_a_linear_model_its_column_is_empty(tmp_path: Path, monkeypatch,
 
 
 @pytest.mark.numeric
+def test_the_linear_model_of_a_run_is_scored_as_a_model(run_folder: Path, monkeypatch, capsys):
+    out = run_folder / "scores.json"
+    run(monkeypatch, f"checkpoint={run_folder / 'linear'}", DATA, f"out={out}")
+    alone = json.loads(out.read_text())["scores"]
+    run(monkeypatch, f"checkpoint={run_folder}", DATA, f"out={out}", "overwrite=true")
+    both = json.loads(out.read_text())["scores"]
+    for name, score in alone.items():
+        assert score["rmse"] == pytest.approx(
+            both[name]["lti_rmse"], rel=1e-9
+        )  # another recurrence
+        assert score["lti_rmse"] is None
+
+
+@pytest.mark.numeric
 def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypatch, capsys):
     folder = tmp_path / "run"
     folder.mkdir()
@@ -123,7 +137,7 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
         (["checkpoint=RUN"], "no data chosen: add +bench=boucwen"),
         (["checkpoint=RUN", DATA, "out=scores.txt"], "the scores are JSON: name it FILE.json"),
         (["checkpoint=RUN", DATA, "out=RUN/there.json"], "there.json' exists; give another name"),
-        (["checkpoint=RUN/linear", DATA], "holds a linear model"),
+        (["checkpoint=RUN/..", DATA], "is not a checkpoint; give one of those in it: RUN/../run."),
         (["checkpoint=RUN", DATA[:-1] + ", fs: 25}"], "sampled at 25 Hz and the model at 50.0 Hz"),
         (["checkpoint=RUN", DATA[:-1] + ", name: v}"], "has the inputs u1 (N) and the data v (N);"),
         (
@@ -142,7 +156,7 @@ def test_user_errors_are_one_message(
         run(monkeypatch, *(word.replace("RUN", str(run_folder)) for word in words))
     printed = capsys.readouterr()
     assert stop.value.code == 1
-    assert message in printed.err
+    assert message.replace("RUN", str(run_folder)) in printed.err
     assert "Traceback" not in printed.err + printed.out
     assert (run_folder / "there.json").read_text() == "old"
 
