@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from lfrtorch._support.errors import InputError
 from lfrtorch.records import Record
 
 
@@ -36,7 +37,7 @@ class Dataset:
 
     Args:
         name: the benchmark's name, or the file's stem.
-        train: records that are fitted.
+        train: records that are fitted; here and below a single one may stand without a list.
         validation: records that choose among iterates and starts; never fitted.
         selection: more records that choose among starts, and not among the iterates of one: at
             other amplitudes, for example.
@@ -50,6 +51,9 @@ class Dataset:
         seed: that simulated data were drawn with.
         leaderboard: test records as nonlinearbenchmark.org has them scored: cut by the package
             nonlinear_benchmarks, the start state fitted to the samples that it leaves unscored.
+
+    Raises:
+        ValueError: something else than records.
 
     Example:
         >>> data = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[record[200:]])
@@ -68,3 +72,24 @@ class Dataset:
     linear: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     leaderboard: list[Record] = field(default_factory=list)
     seed: int | None = None
+
+    def __post_init__(self) -> None:
+        for use in ("train", "validation", "tests", "selection", "leaderboard"):
+            given = getattr(self, use)
+            records = [given] if isinstance(given, Record) else given
+            if not isinstance(records, Sequence) or not all(
+                isinstance(record, Record) for record in records
+            ):
+                raise InputError(
+                    f"{use} has something else than records; give a list of them, or [] for none."
+                )
+            object.__setattr__(self, use, records)
+
+    def __repr__(self) -> str:
+        uses = {"train": self.train, "validation": self.validation, "tests": self.tests}
+        parts = [
+            f"{use}: {len(records)} record(s), {sum(record.samples for record in records)} samples"
+            for use, records in (uses | {"selection": self.selection}).items()
+            if records
+        ]
+        return f"Dataset({self.name!r}; {'; '.join(parts)})"

@@ -82,6 +82,11 @@ def identify(
         >>> score["rmse"] < score["lti_rmse"]
         True
     """
+    if not isinstance(dataset, Dataset):
+        raise InputError(
+            "identify takes a Dataset: lfrtorch.Dataset('mine', train=[...], validation=[...], "
+            f"tests=[...]), and not {type(dataset).__name__}."
+        )
     observer = Observer() if observer is None else observer
     ranks = Ranks() if ranks is None else ranks
     if settings.init_from is not None:
@@ -146,6 +151,7 @@ def scored_run(
         continued=settings.init_from is not None,
         ridge=settings.ridge != 0.0,
         searched=size_search is not None,
+        trainer=type(settings.trainer).__name__,
     )
     numbers = metrics(
         result, linear, dataset, own=test_linear, seeds=settings.seeds, search=size_search

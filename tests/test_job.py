@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -174,13 +175,16 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
         ({"nx": None}, "nx, the number of states, is not set"),
         ({"nx": 0}, "nx is 0"),
         ({"nz": "many"}, "nz is 'many'"),
-        ({"degree": "auto"}, "degree is auto, and this static map has none; give nn=auto"),
+        ({"degree": "auto"}, "degree is auto, and this static map has none; give nn='auto'"),
         ({"static": "spline"}, "static is 'spline'"),
         ({"static": torch.nn.Linear, "nz": "auto"}, "is not searched; give numbers"),
         ({"init": "magic"}, "init is 'magic'"),
         ({"minor": -1.0}, "minor is -1"),
         ({"linear": {"speed": 3}}, "linear has no option 'speed'"),
         ({"starts": 0}, "starts is 0"),
+        ({"init_from": "runs/x"}, "give a model: lfrtorch.load('runs/x')"),
+        ({"trainer": "adam"}, "trainer is 'adam'; give lfrtorch.LevenbergMarquardt() or"),
+        ({"trainer": Adam}, "give lfrtorch.LevenbergMarquardt() or lfrtorch.Adam()"),
         ({"average": 0}, "average is 0"),
         ({"seed": -1}, "seed is -1"),
         ({"dtype": torch.float16}, "dtype is torch.float16"),
@@ -188,7 +192,7 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
     ],
 )
 def test_settings_that_cannot_be_say_so(given: dict, message: str):
-    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+    with pytest.raises(ValueError, match=re.escape(message)):
         settings(**given)
 
 
@@ -197,3 +201,24 @@ def test_settings_know_what_is_searched():
     polynomial = settings(static="polynomial", degree="auto", nz="auto", trainer=Adam())
     assert polynomial.searched == ("nz", "degree")
     assert settings(seed=7, starts=3).seeds == (7, 1007, 2007)
+
+
+def test_records_alone_are_no_dataset(dataset: Dataset):
+    with pytest.raises(ValueError, match=r"takes a Dataset: lfrtorch\.Dataset\('mine', train="):
+        identify(dataset.train, settings())  # pyright: ignore[reportArgumentType]
+
+
+def test_a_dataset_takes_a_single_record_and_nothing_else_than_records():
+    record = saturation("lab", 0)
+    data = Dataset("mine", record, [], record)  # pyright: ignore[reportArgumentType]
+    assert data.train == data.tests == [record]
+    for given in ("x.csv", [record.u], None):
+        with pytest.raises(ValueError, match="train has something else than records"):
+            Dataset("mine", given, [], [])  # pyright: ignore[reportArgumentType]
+
+
+def test_a_dataset_is_shown_in_a_line(dataset: Dataset):
+    assert repr(dataset) == (
+        "Dataset('saturation'; train: 1 record(s), 300 samples; validation: 1 record(s), "
+        "300 samples; tests: 1 record(s), 300 samples)"
+    )

@@ -112,6 +112,15 @@ class Settings:
     dtype: torch.dtype = torch.float64
 
     def __post_init__(self) -> None:
+        if not isinstance(self.init_from, Model | None):
+            raise InputError(
+                f"init_from is {self.init_from!r}; give a model: lfrtorch.load({self.init_from!r})."
+            )
+        if not callable(getattr(self.trainer, "step", None)) or isinstance(self.trainer, type):
+            raise InputError(
+                f"trainer is {self.trainer!r}; give lfrtorch.LevenbergMarquardt() or "
+                "lfrtorch.Adam()."
+            )
         if self.init_from is None:
             self._check_sizes()
         for name, size in () if self.init_from is None else self.init_from.sizes.items():
@@ -154,7 +163,9 @@ class Settings:
         for name in {"nn", "degree"} - {*self.size_names}:
             if getattr(self, name) == "auto":
                 used = self.size_names[-1]
-                raise InputError(f"{name} is auto, and this static map has none; give {used}=auto.")
+                raise InputError(
+                    f"{name} is auto, and this static map has none; give {used}='auto'."
+                )
         if callable(self.static) and "auto" in (self.nz, self.nw):
             raise InputError(
                 "nz or nw is auto, and a map of one's own is not searched; give numbers."

@@ -78,6 +78,7 @@ class Evidence:
         continued: whether the fit went on from a model, so that there are no other starts.
         sizes: nx, nz, nw, and nn or degree.
         searched: whether validation chose them.
+        trainer: class of the trainer.
         ridge: whether there was one.
         louder: largest test input over the largest in training, by test.
         diverged: tests on which the NL-LFR diverges.
@@ -99,6 +100,7 @@ class Evidence:
     continued: bool = False
     sizes: Mapping[str, int] = field(default_factory=dict)
     searched: bool = False
+    trainer: str = "LevenbergMarquardt"
     ridge: bool = False
     louder: Mapping[str, float] = field(default_factory=dict)
     diverged: Sequence[str] = ()
@@ -177,7 +179,8 @@ def still_falling(e: Evidence) -> Advice | None:
     if e.falling <= FALLING:
         return None
     return Advice(
-        f"Still falling: max_iter={4 * max(e.iterations, 1)}; init_from=RUN goes on from here.",
+        f"Still falling: trainer={e.trainer}(max_iter={4 * max(e.iterations, 1)}); "
+        "init_from=run.model goes on from here.",
         f"the error fell by {percent(e.falling)} over the last tenth of the {e.iterations} "
         "iterations",
     )
@@ -205,7 +208,7 @@ def linear_part_incomplete(e: Evidence) -> Advice | None:
     if e.linear is None or e.linear <= LINEAR:
         return None
     nx = e.sizes.get("nx", 0)
-    order = f"nx={nx + 1}, nx={nx + 2} or nx=auto" if nx else "a higher nx"
+    order = f"nx={nx + 1}, nx={nx + 2} or nx='auto'" if nx else "a higher nx"
     return Advice(
         f"The linear part is incomplete: {order}.",
         f"a linear filter of the inputs explains {percent(e.linear)} of the error's power",
@@ -309,10 +312,12 @@ def noise_unknown(e: Evidence) -> Advice | None:
     structure = (e.linear or 0.0) > LINEAR or (e.nonlinear or 0.0) > NONLINEAR  # no noise
     if e.noise is not None or e.train is None or structure:
         return None
-    static = "degree=auto" if e.sizes.get("degree") else "nn=auto"
-    choose = f", or let validation choose the sizes: nx=auto nz=auto nw=auto {static}"
+    static = "degree" if e.sizes.get("degree") else "nn"
+    sizes = ", ".join(f"{name}='auto'" for name in ("nx", "nz", "nw", static))
+    choose = f", or let validation choose the sizes: Settings({sizes})"
     return Advice(
-        "Whether this is the noise is not known: give two periods of a periodic input for training"
+        "It is unknown whether the remaining error is noise: give two periods of a periodic input "
+        "for training"
         f"{'' if e.searched else choose}.",
         f"training error {percent(e.train)} of the output's standard deviation, no repeated "
         "periods in the training records",

@@ -35,6 +35,7 @@ def evidence(
     continued: bool = False,
     ridge: bool = False,
     searched: bool = False,
+    trainer: str = "LevenbergMarquardt",
 ) -> Evidence:
     """The numbers that advice rests on.
 
@@ -45,6 +46,7 @@ def evidence(
         continued: whether the fit went on from a model.
         ridge: whether it had one.
         searched: whether validation chose the sizes.
+        trainer: its class.
     """
     train, validation, tests = (
         [response for response in responses if response.use == use]
@@ -75,6 +77,7 @@ def evidence(
         continued=continued,
         sizes=result.model.sizes,
         searched=searched,
+        trainer=trainer,
         ridge=ridge,
         louder={
             test.record.name: float(

@@ -370,6 +370,12 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
     ("text", "spoken"),
     [
         ("Still falling: max_iter=240.", "Still falling: trainer.max_iter=240."),
+        (
+            "trainer=Adam(max_iter=240); init_from=run.model goes on",
+            "trainer.max_iter=240; init_from=RUN goes on",
+        ),
+        ("the sizes: Settings(nx='auto', nn=\"auto\").", "the sizes: nx=auto nn=auto."),
+        ("nx=4, nx=5 or nx='auto'", "nx=4, nx=5 or nx=auto"),
         ("start='estimated' or skip=N", "data.start=estimated or data.skip=N"),
         ("try offset=False", "try bla.offset=false"),
         ("nx=auto, data.fs=3 and starts=8", "nx=auto, data.fs=3 and starts=8"),
@@ -423,6 +429,12 @@ def test_resume_takes_the_settings_of_the_run(tmp_path: Path):
 def test_resume_needs_a_run(tmp_path: Path):
     with pytest.raises(ValueError, match="not the folder of a run"):
         run_folder.arguments([f"resume={tmp_path}"])
+    for name in ("first", "second"):
+        (tmp_path / name / ".hydra").mkdir(parents=True)
+        (tmp_path / name / ".hydra" / "overrides.yaml").touch()
+    with pytest.raises(ValueError, match=r"one of the runs in it: .*first, .*second") as refused:
+        run_folder.arguments([f"resume={tmp_path}"])
+    assert "hydra" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -599,7 +611,7 @@ def test_settings_that_cannot_be_are_one_message(
     """Of the short file, where no other data are given."""
     given = any(word.startswith(("+bench=", "data=")) for word in overrides)
     cfg = configuration(*([] if given else [*file_overrides(csv), "nx=1"]), *overrides)
-    with pytest.raises(SystemExit) as stop, errors.user_errors():
+    with pytest.raises(SystemExit) as stop, errors.user_errors(cfg=cfg):
         fit.run(cfg, tmp_path)
     assert stop.value.code == 1
     assert message in capsys.readouterr().err

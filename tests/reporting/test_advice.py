@@ -44,9 +44,10 @@ GOOD = Evidence(
         (advice.diverges, {"diverged": ["sweep"]}, "ridge=1e-3"),
         (advice.diverges, {"diverged": ["sweep"], "ridge": True}, "larger ridge"),
         (advice.starts_in_a_transient, {"transient": 4.0}, "skip=N"),
-        (advice.still_falling, {"falling": 0.05}, "max_iter=400"),
+        (advice.still_falling, {"falling": 0.05}, "trainer=LevenbergMarquardt(max_iter=400)"),
+        (advice.still_falling, {"falling": 0.05, "trainer": "Adam"}, "trainer=Adam(max_iter=400)"),
         (advice.overfits, {"validation": 0.05}, "nn=5, ridge=1e-3, or more data"),
-        (advice.linear_part_incomplete, {"linear": 0.5}, "nx=4, nx=5 or nx=auto"),
+        (advice.linear_part_incomplete, {"linear": 0.5}, "nx=4, nx=5 or nx='auto'"),
         (advice.hardly_better, {"validation": 0.19}, "nn=20, nz=2 or nw=2"),
         (
             advice.hardly_better,
@@ -57,7 +58,7 @@ GOOD = Evidence(
         (advice.best_start_alone, {"starts": (0.02, 0.03)}, "starts=16"),
         (advice.one_start, {"started": 1}, "starts=8"),
         (advice.tests_are_louder, {"louder": {"arrow": 1.5}}, "train on inputs as loud"),
-        (advice.noise_unknown, {"noise": None}, "or let validation choose the sizes"),
+        (advice.noise_unknown, {"noise": None}, "nx='auto', nz='auto', nw='auto', nn='auto'"),
         (
             advice.noise_unknown,
             {"noise": None, "searched": True},
@@ -112,7 +113,7 @@ def test_at_the_noise_nothing_larger_is_advised():
 def test_missing_states_come_before_a_larger_map():
     useless = replace(GOOD, train=0.2, validation=0.2, linear=0.9, outputs={}, noise=None)
     assert [item.text for item in advise(useless)] == [
-        "The linear part is incomplete: nx=4, nx=5 or nx=auto."
+        "The linear part is incomplete: nx=4, nx=5 or nx='auto'."
     ]
 
 
