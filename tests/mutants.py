@@ -229,7 +229,7 @@ def _run(folder: Path, module: str) -> None:
 
 
 def clean_seconds(module: str, folder: Path, processes: Any) -> float:
-    """How long the module's tests take without a fault; infinite where they fail."""
+    """How long the module's tests take without a fault; infinite if they fail."""
     begun = time.monotonic()
     process = processes.Process(target=_run, args=(folder, module))
     process.start()

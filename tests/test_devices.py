@@ -45,7 +45,7 @@ def searched(problem: SimulationProblem, steps: int = 4) -> LMState:
 
 @pytest.fixture(params=DEVICES)
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Where no kernel serves: on the CPU without them, and on a GPU where there is one."""
+    """Devices without kernels: the CPU with kernels turned off, and a GPU if there is one."""
     if request.param == "cuda":
         return "cuda"
     monkeypatch.setattr("lfrtorch.engine.linear_recurrence.COMPILED_ON", set())

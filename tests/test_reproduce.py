@@ -140,7 +140,7 @@ def test_wrong_words_are_refused(monkeypatch, capsys):
     assert "no benchmark silverboxx; there are boucwen" in capsys.readouterr().err
 
 
-def test_runs_are_repeated_only_where_they_must_be(tmp_path: Path, monkeypatch):
+def test_runs_are_repeated_only_if_they_must_be(tmp_path: Path, monkeypatch):
     """One of the same command that came to its end is taken as it is."""
     words = ["+bench=boucwen", "seed=0"]
     found = metrics(1.0, 1.0) | {"command": shlex.join(["python", "train.py", *words])}

@@ -608,7 +608,7 @@ def test_settings_that_cannot_be_are_one_message(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ):
-    """Of the short file, where no other data are given."""
+    """The short file is read if no other data are given."""
     given = any(word.startswith(("+bench=", "data=")) for word in overrides)
     cfg = configuration(*([] if given else [*file_overrides(csv), "nx=1"]), *overrides)
     with pytest.raises(SystemExit) as stop, errors.user_errors(cfg=cfg):

@@ -56,7 +56,7 @@ def test_the_rules_of_the_cuts(numbered):
     assert data.leaderboard[0].skip == 50
 
 
-def test_all_samples_train_where_none_validate(numbered):
+def test_all_samples_train_if_none_validate(numbered):
     data = cascaded_tanks.load(root=numbered)
     assert [scored(record) for record in data.train] == [(1, 1024)]
     assert data.train[0].start == "estimated"

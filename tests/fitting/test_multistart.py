@@ -286,7 +286,7 @@ def test_mean_of_as_many_starts_as_are_best_is_taken(judged_on: str):
     assert rmse(validation, result.model.simulate(validation)) == errors[1]
 
 
-def test_mean_of_more_starts_is_taken_where_it_is_as_good():
+def test_mean_of_more_starts_is_taken_if_it_is_as_good():
     """The best one is by some luck: here by less than 1 %."""
     models, train, validation = several(3)
     for i, model in enumerate(models):
@@ -299,7 +299,7 @@ def test_mean_of_more_starts_is_taken_where_it_is_as_good():
     )
 
 
-def test_mean_of_starts_is_not_taken_where_one_is_better():
+def test_mean_of_starts_is_not_taken_if_one_is_better():
     models, train, validation = several(2)
     move(models[0], -0.05)  # the one that made the data
     optimiser = LevenbergMarquardt(max_iter=1)

@@ -130,7 +130,7 @@ KINDS = {kind: (kind,) for kind in STARTS} | {"mixed": STARTS}
 def test_all_of_a_fit_comes_back_from_its_file(
     tmp_path: Path, kinds: Sequence[Start], sizes: Any, optimiser: Any
 ):
-    """From a file in the midst of a fit that was killed later, and from where one paused."""
+    """A fit goes on from a file written midway, and from one written at a pause."""
     (train, _), validation = records(kinds, **sizes()), measured("zero", 9, **sizes())
     wanted: dict[Path, dict[str, Any]] = {}
 

@@ -53,7 +53,7 @@ def test_step_leaves_its_state_alone():
     assert torch.equal(first.theta, again.theta)
 
 
-def test_search_that_spent_its_epochs_goes_on_where_there_are_more():
+def test_search_that_spent_its_epochs_goes_on_if_there_are_more():
     problem, two, three = Quadratic(), Adam(max_iter=2), Adam(max_iter=3)
     state = two.init(problem, ZERO)
     for reason in ("", "maximum number of epochs"):

@@ -131,7 +131,7 @@ def test_a_class_of_one_s_own_that_begins_with_a_network_keeps_its_coordinates()
 
 
 @pytest.mark.parametrize("seed", [1, 5])
-def test_reduction_of_before_is_kept_where_it_still_does(seed: int):
+def test_reduction_of_before_is_kept_if_it_still_does(seed: int):
     """Another choice of columns than that of these weights alone, and as exact."""
     other, cell = (random_cell(1, 1, 2, 2, 1, 4, radius=0.5, seed=s) for s in (0, seed))
     before = reduction(other, none(other))
@@ -146,7 +146,7 @@ def test_reduction_of_before_is_kept_where_it_still_does(seed: int):
 
 
 @pytest.mark.parametrize("faded", [0.0, 1e-6])
-def test_reduction_of_before_is_given_up_where_it_blows_up(faded: float):
+def test_reduction_of_before_is_given_up_if_it_blows_up(faded: float):
     """y = Cy Bu times what A makes of u: the column left out is that of the larger factor."""
     cell = random_cell(1, 1, 1, 0, 0)
     with torch.no_grad():

@@ -246,7 +246,7 @@ def test_search_ends_after_max_iter():
         assert states[-1].iteration == LevenbergMarquardt(limit).limit == limit
 
 
-def test_search_that_spent_its_iterations_goes_on_where_there_are_more():
+def test_search_that_spent_its_iterations_goes_on_if_there_are_more():
     problem, start = Problem(rosenbrock), tensor(-1.2, 1)
     two, three = LevenbergMarquardt(max_iter=2), LevenbergMarquardt(max_iter=3)
     spent = search(problem, start, two)[-1]

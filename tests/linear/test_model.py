@@ -280,7 +280,7 @@ def test_zeros_of_the_channels():
 
 
 def test_zeros_of_one_output_or_input():
-    """The other side is left whole: a square model where it has one channel."""
+    """The other side is left whole: a square model if it has one channel."""
     A, B, C, D = random_system(3, 1, 2)
     model = of_system((A, B, C, D))
     np.testing.assert_allclose(ordered(model.zeros(1)), ordered(model.zeros(1, 0)))

@@ -155,7 +155,7 @@ def test_prediction_starts_from_the_best_of_the_observers(best: int):
     fit = fit_of([record], prediction=True)
     np.testing.assert_allclose(fit.state_deviation(system), states.std(axis=0), rtol=1e-9)
     assert fit.search(system).state.cost == pytest.approx(costs[best], rel=1e-8)
-    # No observer where none is asked for.
+    # No observer if none is asked for.
     simulated = np.sum((record.y - reference.dlsim(system, record.u)) ** 2)
     assert fit_of([record]).search(system).state.cost == pytest.approx(simulated, rel=1e-8)
 

@@ -1,4 +1,4 @@
-"""Advice is what the numbers of a fit say: each rule speaks where it should, and only there."""
+"""Advice is what the numbers of a fit say: each rule speaks when it should, and only then."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ GOOD = Evidence(
         (advice.at_the_noise, {"train": 0.0105, "validation": 0.011}, "nothing to gain"),
     ],
 )
-def test_a_rule_speaks_where_its_number_says_so(rule, change, said):
+def test_a_rule_speaks_if_its_number_says_so(rule, change, said):
     assert rule(GOOD) is None
     found = rule(replace(GOOD, **change))
     assert said in found.text

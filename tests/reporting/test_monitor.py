@@ -116,7 +116,7 @@ def test_tensorboard_holds_scalars_figures_and_texts(model: lfrtorch.Model, tmp_
         assert [e.step for e in events.Images(name)] == [0, 2]
 
 
-def test_checkpoint_holds_the_best_so_far_where_it_is_time(
+def test_checkpoint_holds_the_best_so_far_when_it_is_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     clock = {"now": 0.0}

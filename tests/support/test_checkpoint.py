@@ -244,7 +244,7 @@ def test_scales_of_another_model(saved: Path):
 
 
 class Trap:
-    """Makes a folder where it is unpickled."""
+    """Makes a folder when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -255,7 +255,7 @@ class Trap:
 
 @pytest.fixture
 def trap(tmp_path: Path) -> Path:
-    """Files that run code where they are unpickled: trap.pkl and the zip archive trap.pt."""
+    """Files that run code when they are unpickled: trap.pkl and the zip archive trap.pt."""
     sprung = tmp_path / "sprung"
     (tmp_path / "trap.pkl").write_bytes(pickle.dumps(Trap(sprung)))
     torch.save(Trap(sprung), tmp_path / "trap.pt")
