@@ -143,6 +143,11 @@ def test_a_run_is_written_for_people_and_programs(
         assert np.array_equal(saved.simulate(test), found.simulate(test))
     write(run, tmp_path / "bare", draw=False)
     assert not (tmp_path / "bare" / "report.html").exists()
+    (earlier,) = (tmp_path / "bare").glob("events.*")
+    earlier.write_bytes(b"of an earlier run")
+    write(run, tmp_path / "bare", draw=False)
+    (events,) = (tmp_path / "bare").glob("events.*")
+    assert events.read_bytes() != b"of an earlier run"
 
 
 @pytest.mark.numeric

@@ -125,8 +125,13 @@ def unknown(word: Override, cfg: DictConfig) -> str:
         return f"{key} is of no use before data are chosen: add data=file, or +bench=NAME."
     names = dict(spelt(cfg))
     close = get_close_matches(key, names, n=1, cutoff=0.75)
-    meant = f"; did you mean {names[close[0]]}={value}?" if close else "; --help lists them all."
-    return f"there is no setting '{key}'{meant}"
+    if close:
+        meant = f"did you mean {names[close[0]]}={value}?"
+    elif "." in key and "_target_" in (cfg.get(key.split(".")[0]) or {}):
+        meant = f"if the function takes it, write +{key}={value}."
+    else:
+        meant = "--help lists them all."
+    return f"there is no setting '{key}'; {meant}"
 
 
 def spelt(cfg: DictConfig) -> Iterator[tuple[str, str]]:

@@ -42,6 +42,8 @@ def write(
     with whole_file(folder / "metrics.json") as fresh:
         fresh.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
     if board is None:
+        for earlier in folder.glob("events.out.tfevents.*"):
+            earlier.unlink()
         board = TensorBoard(folder)
         board.history(result.history)
     if run.size_search is not None:

@@ -175,7 +175,8 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     units = {s["unit"] for s in scored.values()} - {""}
     title = f"Simulation RMSE{f' ({next(iter(units))})' if len(units) == 1 else ''}"
     static = f"degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])
-    title += f", nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
+    title += f", nx {sizes['nx']}, "
+    title += f"nz {sizes['nz']}, nw {sizes['nw']}, {static}" if sizes["nz"] else "a linear model"
     if not rows:
         return f"{title}: nothing is scored, as there is no test and no validation record"
     references = [f"{p.label}: {p.reference}" for p in others]

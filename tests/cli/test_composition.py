@@ -20,6 +20,7 @@ FILE = ["data=file", "data.path=x.csv"]
         ("config", ["inputs=[u]"], "'inputs'; did you mean data.inputs=[u]?"),
         ("config", [*FILE, "data.input=[u]"], "'data.input'; did you mean data.inputs=[u]?"),
         ("config", ["bench=boucwen"], "a benchmark is added to the settings: +bench=boucwen."),
+        ("config", [*FILE, "data.zzzz=1"], "'data.zzzz'; if the function takes it, write +data.zz"),
         ("config", [*FILE, "zzzz=1"], "no setting 'zzzz'; --help lists them all."),
         ("config", ["data.path=x.csv"], "add data=file, or +bench=NAME"),
         ("config", [*FILE, "data.inputs=a,b"], "for a list write data.inputs=[a,b], for a run"),

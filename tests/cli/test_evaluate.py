@@ -104,6 +104,7 @@ def test_without_a_linear_model_its_column_is_empty(tmp_path: Path, monkeypatch,
 def test_the_linear_model_of_a_run_is_scored_as_a_model(run_folder: Path, monkeypatch, capsys):
     out = run_folder / "scores.json"
     run(monkeypatch, f"checkpoint={run_folder / 'linear'}", DATA, f"out={out}")
+    assert "a linear model\n" in capsys.readouterr().out
     alone = json.loads(out.read_text())["scores"]
     run(monkeypatch, f"checkpoint={run_folder}", DATA, f"out={out}", "overwrite=true")
     both = json.loads(out.read_text())["scores"]
