@@ -6,7 +6,7 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all test-machines mutants coverage check bench reproduce docs docs-links clean
+.PHONY: help setup run test test-all test-machines mutants coverage check bench first-try reproduce docs docs-links clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -41,6 +41,9 @@ check: $(READY)  ## format, lint, types, import order
 
 bench: $(READY)  ## costs against what is required (PEERS=DIR, ARGS=--quick), or beside BASELINE=DIR
 	@$(BIN)/python benchmarks/$(if $(BASELINE),baseline.py "$(BASELINE)",engine.py $(if $(PEERS),--peers "$(PEERS)")) $(ARGS)
+
+first-try: $(READY)  ## eight measurements with all sizes auto, beside a grid (ARGS="tanks --root DIR")
+	@$(BIN)/python benchmarks/first_try.py $(ARGS)
 
 reproduce: $(READY)  ## the public benchmarks at hand -> RESULTS.md (ARGS="silverbox data.root=DIR")
 	@$(BIN)/python scripts/reproduce.py $(ARGS)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-SCRIPTS = ["baseline", "cases", "engine", "linear", "nonlinear", "starts", "tanks"]
+SCRIPTS = ["baseline", "cases", "engine", "first_try", "linear", "nonlinear", "starts", "tanks"]
 
 
 @pytest.mark.slow
