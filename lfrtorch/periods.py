@@ -11,8 +11,12 @@ _ALIKE = 0.02
 """Largest difference D(p) that counts as noise. Two parts of narrow-band noise reach 0.05 at
 times."""
 
-_GROWTH = 3.0
-"""Largest growth of D over several periods: a period that is a little wrong has a factor of 4."""
+_GROWTH = 1.5
+"""Largest D(k p) / (k D(p)): it grows as k² with a p that is a little wrong, at most as k with the
+drift of an amplifier, and not at all with noise."""
+
+_BEGINNING = 1 / 3
+"""Share of the record, at its start, in which an input may differ from what it repeats later."""
 
 _NEAR = 2.0
 """The shortest period counts as good if its D is within this factor of the best: noise differs."""
@@ -36,7 +40,8 @@ def find_period(u: Array) -> int | None:
         D(p) = sum (u(k + p) - u(k))^2 / sum (u(k + p)^2 + u(k)^2),  u about its mean,
 
     is 0 for a period, 1 for unrelated signals and the noise-to-signal ratio for a period in noise.
-    A period is a p whose D is at a minimum and small, and stays as small for 2 p, 3 p, ...
+    A period is a p whose D is at a minimum and small, and stays small for 2 p, 3 p, ... A transient
+    in its first periods, which a measured input may have, makes it no longer.
 
     Args:
         u: signals that are to repeat together; constant ones are left out.
@@ -49,17 +54,41 @@ def find_period(u: Array) -> int | None:
     moving = deviation > 1e-12 * np.max(np.abs(u), axis=0, initial=0)
     if not moving.any() or len(u) < 4:
         return None
-    D = _differences((u[:, moving] - u[:, moving].mean(axis=0)) / deviation[moving])
-    p = np.arange(2, len(u) // 2 + 1)
+    u = (u[:, moving] - u[:, moving].mean(axis=0)) / deviation[moving]
+    D = _differences(u)
+    period = _shortest(D, len(u))
+    if period is None:
+        return None
+    settled = u[round(_BEGINNING * len(u)) :]
+    D_settled = _differences(settled)
+    shorter = _shortest(D_settled, len(settled))
+    if (
+        shorter is None
+        or period % shorter
+        or D_settled[shorter] > _NEAR * D[period] + _EXACT  # the signal has more than a transient
+    ):
+        return period
+    return shorter
+
+
+def _shortest(D: Array, T: int) -> int | None:
+    """The shortest period of T samples that differ by D(p)."""
+    p = np.arange(2, T // 2 + 1)
     D_next = np.append(D, np.inf)[p + 1]
     minima = p[(D[p] < D[p - 1]) & (D[p] <= D_next) & (D[p] < _ALIKE)]
-    periods = [i for i in minima if D[i::i].max() < min(_ALIKE, _GROWTH * D[i] + _EXACT)]
+    periods = [i for i in minima if _stays_small(D[i::i])]
     if not periods:
         return None
     best = D[periods].min()
     shortest = next(i for i in periods if D[i] <= _NEAR * best + _EXACT)
     # Of a slow signal in noise there are several about the period, and far multiples tell.
     return int(min((i for i in periods if i < 2 * shortest - 1), key=lambda i: D[i::i].mean()))
+
+
+def _stays_small(D: Array) -> bool:
+    """Whether D of 1, 2, ... periods is that of noise, a drift or a transient."""
+    most = np.maximum(_GROWTH * np.arange(1, len(D) + 1), 3.0) * D[0] + _EXACT
+    return bool((np.minimum(most, _ALIKE) > D).all())
 
 
 def _differences(u: Array) -> Array:

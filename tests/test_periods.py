@@ -99,6 +99,34 @@ def test_what_does_not_repeat(u):
     assert find_period(u.astype(float)) is None
 
 
+@pytest.mark.parametrize("periods", [2, 3, 4, 8, 9, 12])
+@pytest.mark.parametrize("size", [0.0, 0.01, 0.1])
+def test_period_of_an_input_that_begins_with_a_transient(periods, size):
+    """A structure acts back on its shaker: the first period of a measured force is another."""
+    k = np.arange(periods * N)
+    u = np.resize(multi(), len(k)) / np.std(multi())
+    for amplitude in (0.1, 0.3):
+        transient = amplitude * np.exp(-k / 60) * np.sin(0.3 * k)
+        assert find_period(u + transient + noise(len(k), seed=1, size=size)) == N
+
+
+def test_period_of_an_output_that_begins_with_a_transient():
+    for size in (0.0, 0.01, 0.05):
+        assert find_period(settling(9, 1e-4, size)) == N
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_period_of_an_amplifier_whose_gain_wanders(seed):
+    gain = 1 + np.cumsum(noise(12 * N, seed=seed, size=2e-4))
+    assert find_period(np.resize(multi(), 12 * N) * gain + noise(12 * N, seed=9, size=2e-3)) == N
+
+
+def test_a_shorter_period_that_explains_less_is_none():
+    k = np.arange(4 * N)
+    u = np.resize(multi(), len(k)) / np.std(multi()) + 0.1 * np.sin(np.pi * k / N)
+    assert find_period(u) == 2 * N
+
+
 # --- transients -----------------------------------------------------------------------------
 
 
