@@ -36,6 +36,7 @@ from lfrtorch.reporting.diagnosis import evidence
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
 from lfrtorch.reporting.simulations import respond
+from lfrtorch.reporting.verdict import judge
 
 
 def identify(
@@ -141,7 +142,7 @@ def scored_run(
     order_scan: OrderScan | None,
     size_search: SizeSearch | None,
 ) -> Run:
-    """All records simulated and scored, and advice."""
+    """All records simulated and scored, with verdict and advice."""
     test_linear = linear_models_of_tests(dataset, settings)
     simulations = respond(result.model, linear, dataset, test_linear)
     found = evidence(
@@ -153,8 +154,15 @@ def scored_run(
         searched=size_search is not None,
         trainer=type(settings.trainer).__name__,
     )
+    verdict = judge(result, simulations)
     numbers = metrics(
-        result, linear, dataset, own=test_linear, seeds=settings.seeds, search=size_search
+        result,
+        linear,
+        dataset,
+        own=test_linear,
+        seeds=settings.seeds,
+        search=size_search,
+        verdict=verdict,
     )
     return Run(
         dataset=dataset,
@@ -166,6 +174,7 @@ def scored_run(
         fit=result,
         simulations=simulations,
         metrics=numbers,
+        verdict=verdict,
         advice=advise(found),
     )
 

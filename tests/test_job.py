@@ -47,6 +47,9 @@ def test_the_job_scores_every_record_and_advises(dataset: Dataset):
     score = run.metrics["scores"]["test"]
     assert score["rmse"] == lfrtorch.rmse(dataset.tests[0], run.model.simulate(dataset.tests[0]))
     assert score["rmse"] < 0.8 * score["lti_rmse"]
+    assert (run.verdict.kind, run.verdict.use) == ("better", "NL-LFR")
+    assert run.metrics["verdict"]["kind"] == "better"
+    assert str(run).startswith(run.verdict.text)
     assert run.advice
     assert {start["seed"] for start in run.metrics["ranking"]} == {1, 1001}
     assert "Simulation RMSE, nx 1, nz 1, nw 1, 3 neurons" in str(run)

@@ -54,6 +54,7 @@ from lfrtorch.model import Model
 from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
 from lfrtorch.reporting.run_files import write
+from lfrtorch.reporting.verdict import LINEAR_MODEL
 
 PRINTED = 3
 """Most lines of advice that are printed; the report has all."""
@@ -97,6 +98,11 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             )
             for item in found.advice[:PRINTED]:
                 print(f"next: {item}")
+            if found.verdict.use == LINEAR_MODEL:
+                print(
+                    f"\nThe linear model: lfrtorch simulate checkpoint={folder / 'linear'} "
+                    "data.path=NEW.csv out=PREDICTED.csv"
+                )
             print(f"\nRun in {folder}" + f", its report in {folder / 'report.html'}" * cfg.figures)
             print(f"TensorBoard: tensorboard --logdir {folder}")
     reason = found.fit.reason

@@ -26,6 +26,7 @@ from lfrtorch.metrics import rms
 from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.scores import neurons
 from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.verdict import LINEAR_MODEL, Verdict, of_linear
 
 USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
 """What the records that are no tests were for."""
@@ -56,6 +57,7 @@ def render(
     dataset: Dataset,
     responses: Sequence[Response],
     images: Mapping[str, bytes],
+    verdict: Verdict,
     advice: Sequence[Advice],
     *,
     views: Mapping[str, Mapping[str, str]] | None = None,
@@ -71,6 +73,7 @@ def render(
         responses: all records beside their simulations.
         images: figures as PNG by name; ``static_map``, ``convergence``, ``frequency_response`` and
             ``poles_and_zeros`` have their places, and those of ``views`` theirs.
+        verdict: on the fit, whose colour the page's first lines have.
         advice: what to try next.
         views: of each test, by its name, captions by the names of its figures.
         config: of the run.
@@ -87,7 +90,9 @@ def render(
         name=dataset.name,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
         sizes=_sizes(metrics),
-        verdict=verdict(responses),
+        verdict=verdict,
+        comparisons=comparisons(responses),
+        linear_is_used=verdict.use == LINEAR_MODEL,
         advice=advice,
         scores=_scores(metrics, dataset, responses),
         data=_data(dataset, responses),
@@ -111,7 +116,7 @@ def render(
     )
 
 
-def verdict(responses: Sequence[Response]) -> list[str]:
+def comparisons(responses: Sequence[Response]) -> list[str]:
     """How far the NL-LFR came, beside the linear model: a line for each of a few tests.
 
     Where there is no test it is said of the validation records, or else of the training ones.
@@ -128,10 +133,10 @@ def verdict(responses: Sequence[Response]) -> list[str]:
     scored = sorted((item for item in shown if item[2].ratio > 0), key=lambda item: item[2].ratio)
     if len(shown) <= FEW or not scored:
         return [_line(*item) for item in shown]
-    least, most = (f"{number(e.ratio)} × ({name})" for name, _, e in (scored[0], scored[-1]))
+    least, most = (f"{percent(1 / e.ratio)} ({name})" for name, _, e in (scored[-1], scored[0]))
     relative = [errors.relative for _, _, errors in scored]
     line = (
-        f"{len(scored)} {use} errors: {least} to {most} below the linear model's, "
+        f"{len(scored)} {use} errors: {least} to {most} of the linear model's, "
         f"NRMSE {percent(min(relative))} to {percent(max(relative))}"
     )
     return [line, *(_line(*item) for item in shown if item not in scored)]
@@ -140,11 +145,10 @@ def verdict(responses: Sequence[Response]) -> list[str]:
 def _line(name: str, unit: str, errors: Errors) -> str:
     if not math.isfinite(errors.error):
         return f"{name}: the NL-LFR diverges"
-    lower = errors.ratio >= 1.005  # in three digits more than 1.00
-    below = f"error {number(errors.ratio)} × below" if lower else "no error below"
     error, linear = quantity(errors.error, unit), quantity(errors.linear, unit)
     relative = percent(errors.relative)
-    return f"{name}: {below} the linear model's ({error} against {linear}), NRMSE {relative}"
+    beside = of_linear(errors.error / errors.linear) if errors.linear > 0 else "not comparable"
+    return f"{name}: error {beside} ({error} against {linear}), NRMSE {relative}"
 
 
 def _sizes(metrics: Mapping[str, Any]) -> str:

@@ -18,11 +18,12 @@ from lfrtorch.model import Model
 from lfrtorch.reporting import scores
 from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.verdict import Verdict
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Run:
-    """What :func:`lfrtorch.identify` returns; ``print(run)`` shows the scores.
+    """What :func:`lfrtorch.identify` returns; ``print(run)`` shows verdict and scores.
 
     Args:
         dataset: the records.
@@ -33,6 +34,7 @@ class Run:
         fit: the nonlinear fit, of the best start or of the mean of several.
         simulations: every record with both simulations.
         metrics: what ``metrics.json`` holds: scores by record, sizes, the fit in numbers.
+        verdict: whether the NL-LFR is worth more than the linear model.
         advice: what to try next, the most useful first.
 
     Example:
@@ -54,6 +56,7 @@ class Run:
     fit: FitResult
     simulations: list[Response]
     metrics: Mapping[str, Any]
+    verdict: Verdict
     advice: list[Advice]
 
     @property
@@ -66,7 +69,7 @@ class Run:
         return f"Run({self.dataset.name}, {sizes}, {self.fit.outcome})"
 
     def __str__(self) -> str:
-        fit, parts = self.fit, []
+        fit, parts = self.fit, [f"{self.verdict}\n"]
         parts.append(
             f"{fit.outcome}; kept iteration {fit.chosen_iteration} of {fit.iterations}, "
             f"{quantity(fit.seconds, 's')}, "

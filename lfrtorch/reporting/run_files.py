@@ -59,8 +59,8 @@ def write(
         more, views = figures.of_tests(run.simulations)
         images |= {name: plots.png(figure) for name, figure in more.items()}
         page = html.render(
-            metrics, result, run.linear, dataset, run.simulations, images, run.advice,
-            views=views, config=config,
+            metrics, result, run.linear, dataset, run.simulations, images, run.verdict,
+            run.advice, views=views, config=config,
         )  # fmt: skip
         with whole_file(folder / "report.html") as path:
             path.write_text(page, encoding="utf-8")

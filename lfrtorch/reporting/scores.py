@@ -18,6 +18,7 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record
+from lfrtorch.reporting.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ def metrics(
     seeds: Sequence[int],
     command: str = "",
     search: SizeSearch | None = None,
+    verdict: Verdict | None = None,
 ) -> dict:
     """What ``metrics.json`` holds, scores by test record; None if a number is not finite.
 
@@ -82,6 +84,7 @@ def metrics(
         seeds: of the random starts.
         command: that made it.
         search: for the sizes, if they were not given.
+        verdict: on the fit.
     """
     model = result.model
     entries = evaluation(model, bla, dataset, own=own, command=command)
@@ -90,6 +93,7 @@ def metrics(
         "seed": dataset.seed,
     }
     entries |= {
+        "verdict": None if verdict is None else asdict(verdict),
         "sizes_search": [] if search is None else search.entries(),
         "fit": {
             "iterations": result.iterations,

@@ -21,6 +21,7 @@ from lfrtorch.reporting import html as html_report
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.verdict import judge
 
 pytestmark = pytest.mark.numeric
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -35,6 +36,7 @@ class Page(HTMLParser):
         self.tags: list[str] = []
         self.addresses: list[str] = []
         self.words: list[str] = []
+        self.classes: list[str] = []
         self.feed(html)
         self.close()
         assert not self.open
@@ -46,6 +48,7 @@ class Page(HTMLParser):
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        self.classes += [value or "" for name, value in attrs if name == "class"]
         if tag not in VOID:
             self.open.append(tag)
 
@@ -86,8 +89,8 @@ class Run:
         images = {"convergence": b"PNG 1", "near": b"PNG 2"}
         views = {record.name: {"near": "a close-up"} for record in self.dataset.tests}
         html = html_report.render(
-            metrics, self.result, self.bla, self.dataset, self.responses, images, advice,
-            views=views, **options,
+            metrics, self.result, self.bla, self.dataset, self.responses, images,
+            judge(self.result, self.responses), advice, views=views, **options,
         )  # fmt: skip
         return Page(html)
 
@@ -173,6 +176,7 @@ def test_a_diverging_test_and_a_resting_one_are_said(single: Run):
     )
     page = changed.page()
     assert "test: the NL-LFR diverges" in page.text
+    assert "verdict red" in page.classes
     assert "NRMSE –" in page.text
     assert not re.search(r"\b(nan|inf|None)\b", page.text)
 
@@ -181,7 +185,7 @@ def test_without_tests_the_verdict_is_on_what_there_is(single: Run):
     validated = Run(single.result, single.bla, replace(single.dataset, tests=[]))
     page = validated.page()
     assert "There is no test record" in page.text
-    (line,) = html_report.verdict(validated.responses)
+    (line,) = html_report.comparisons(validated.responses)
     assert line.startswith("validation: ")
     assert line in page.text
     model = lfrtorch.initialise(single.bla, single.dataset.train, nz=1, nw=1, nn=3)
@@ -191,7 +195,7 @@ def test_without_tests_the_verdict_is_on_what_there_is(single: Run):
     data = replace(single.dataset, tests=[], validation=[])
     trained = Run(result, single.bla, data)
     page = trained.page()
-    (line,) = html_report.verdict(trained.responses)  # one iteration may gain nothing
+    (line,) = html_report.comparisons(trained.responses)  # one iteration may gain nothing
     assert line.startswith("train: ")
     assert line in page.text
     assert "the best on training" in page.text
@@ -208,12 +212,12 @@ def test_several_outputs_have_scores_of_their_own():
     assert "test all V" in page.text
     assert page.text.count("maximum number of iterations") == 2
     assert "The best of 2 starts" in page.text
-    lines = html_report.verdict(same.responses)
+    lines = html_report.comparisons(same.responses)
     assert [line.split(":")[0] for line in lines] == ["test"]
     # Volts and metres have no error together.
     outputs = (Channel("a", "V"), Channel("b", "m"))
     mixed = [replace(r, record=replace(r.record, outputs=outputs)) for r in same.responses]
-    lines = html_report.verdict(mixed)
+    lines = html_report.comparisons(mixed)
     assert [line.split(":")[0] for line in lines] == ["test, a", "test, b"]
 
 
@@ -224,18 +228,19 @@ def test_many_tests_have_one_verdict(single: Run):
         replace(test, record=replace(test.record, name=f"t{k}"), y_hat=test.y_linear + error * part)
         for k, part in enumerate((0.5, 0.9, 0.75, math.nan, 0.0))
     ]
-    line, lost = html_report.verdict(many)
-    assert line.startswith("4 test errors: 1.00 × (t4) to 10.0 × (t1) below")
+    line, lost = html_report.comparisons(many)
+    assert line.startswith("4 test errors: 10.0 % (t1) to 100 % (t4) of the linear model's")
     assert lost == "t3: the NL-LFR diverges"
 
 
-@pytest.mark.parametrize(("part", "below"), [(1 - 1e-15, False), (1 + 1e-15, False), (0.99, True)])
-def test_a_ratio_of_one_plus_rounding_is_no_gain(single: Run, part: float, below: bool):
+@pytest.mark.parametrize(
+    ("part", "said"), [(1 - 1e-15, "100 %"), (1 + 1e-15, "100 %"), (0.99, "99.0 %")]
+)
+def test_a_ratio_of_one_plus_rounding_is_no_gain(single: Run, part: float, said: str):
     test = single.responses[-1]
     error = test.record.y - test.y_linear
-    (line,) = html_report.verdict([replace(test, y_hat=test.record.y - part * error)])
-    assert ("no error below" not in line) is below
-    assert ("error 1.01 × below" in line) is below
+    (line,) = html_report.comparisons([replace(test, y_hat=test.record.y - part * error)])
+    assert f"error {said} of the linear model's" in line
 
 
 def test_a_linear_model_alone_is_shown(single: Run):
@@ -243,7 +248,9 @@ def test_a_linear_model_alone_is_shown(single: Run):
     single.bla.write(cell, single.result.model.scaler)
     result = replace(single.result, model=replace(single.result.model, lfr=LFR(cell)))
     page = Run(result, single.bla, single.dataset).page()
-    assert "no error below the linear model's" in page.text
+    assert "Not better than the linear model" in page.text
+    assert "verdict amber" in page.classes
+    assert "checkpoint=RUN/linear" in page.text
     assert "9 parameters, 5 without" in page.text
 
 

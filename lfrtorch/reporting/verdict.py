@@ -1,0 +1,312 @@
+"""The verdict on a fit: is the NL-LFR better than the linear model on what was not fitted?
+
+The models share a record's noise, so what tells them apart is the difference of their squared
+errors, and the standard error of its mean over blocks of time, as in the search for sizes
+(:mod:`lfrtorch.fitting.size_search`). A difference is clear if it is beyond Student's quantile, or
+if one error is twice the other: one burst of a model that runs away has a large standard error,
+and is no chance. A difference below 5 % of the error is none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import t
+
+from lfrtorch._support.reasons import Reason
+from lfrtorch._support.tables import number, percent
+from lfrtorch._support.types import Array, Integers
+from lfrtorch.fitting.size_search import BLOCKS, blocked_mean, in_blocks
+from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.metrics import nrmse, rms
+from lfrtorch.reporting.simulations import Response
+
+NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
+"""What a verdict says is to be used."""
+
+SAME = 0.05
+"""Difference of two errors, of the linear model's, that is not worth a choice."""
+
+CLEAR = 2.0
+"""Ratio of two errors that is no chance, whatever its standard error."""
+
+CONFIDENCE = 0.975
+"""Probability of the quantile that a difference must exceed, one-sided; of several records each
+has its part of the rest."""
+
+EXPLAINS_NOTHING = 0.9
+"""Error over the output's standard deviation from which on a model is of no use."""
+
+LONGEST_NAME = 28
+"""Characters of a record's name in a sentence."""
+
+
+class Kind(StrEnum):
+    """What a verdict comes to.
+
+    Example:
+        >>> from lfrtorch.reporting.verdict import Kind
+        >>> Kind("worse") is Kind.WORSE
+        True
+    """
+
+    BETTER = "better"
+    """The NL-LFR is clearly better than the linear model on records that were not fitted."""
+    LINEAR = "linear"
+    """It is not: the linear model does as well."""
+    WORSE = "worse"
+    """It is clearly worse on one of these records at least."""
+    DIVERGES = "diverges"
+    """Its simulation runs away on a record, or the search failed."""
+    UNJUDGED = "unjudged"
+    """Nothing was held out: only the training error is known."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the NL-LFR is worth more than the linear model.
+
+    Args:
+        kind: what it comes to.
+        text: in a sentence of 160 characters at most.
+        use: ``"NL-LFR"``, ``"linear model"`` or ``"neither"``.
+        evidence: numbers that it rests on: the NL-LFR's error over the linear model's (``ratio``,
+            and its standard error ``ratio_std``), both errors over the output's standard deviation
+            (``nrmse``, ``linear_nrmse``), and the same of each record in ``records``.
+
+    Example:
+        >>> dataset = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[])
+        >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=1)
+        >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(nx=1, nz=1, nn=4, trainer=trainer))
+        >>> run.verdict.kind
+        <Kind.UNJUDGED: 'unjudged'>
+    """
+
+    kind: Kind
+    text: str
+    use: str
+    evidence: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def colour(self) -> str:
+        """``"red"`` if bad, ``"amber"`` if linear, ``"green"`` if better, ``"grey"`` if unknown."""
+        if self.use == NEITHER or self.kind in (Kind.WORSE, Kind.DIVERGES):
+            return "red"
+        return {Kind.BETTER: "green", Kind.LINEAR: "amber"}.get(self.kind, "grey")
+
+    def __str__(self) -> str:
+        return self.text
+
+
+class Compared(NamedTuple):
+    """The NL-LFR beside the linear model on one record or several, each output counting alike.
+
+    Args:
+        name: in a sentence, such as ``"test 'sweep'"``.
+        ratio, ratio_std: of their errors, and its standard error.
+        deviations: of the mean difference of the squared errors from 0, in standard errors.
+        clear: how many are needed.
+        nrmse, linear_nrmse: errors over the output's standard deviation.
+    """
+
+    name: str
+    ratio: float
+    ratio_std: float
+    deviations: float
+    clear: float
+    nrmse: float
+    linear_nrmse: float
+
+    @property
+    def worse(self) -> bool:
+        """Whether the NL-LFR's error is clearly larger."""
+        certain = self.deviations > self.clear or self.ratio >= CLEAR
+        return certain and self.ratio > 1.0 + SAME
+
+    @property
+    def better(self) -> bool:
+        """Whether it is clearly smaller."""
+        certain = self.deviations < -self.clear or self.ratio <= 1.0 / CLEAR
+        return certain and self.ratio < 1.0 - SAME
+
+
+class _Errors(NamedTuple):
+    """Relative squared errors of a record, summed over each block of time (B,)."""
+
+    response: Response
+    squares: Array
+    linear: Array
+    counts: Integers
+    power: float
+
+
+def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
+    """The verdict on a fit, from all records beside their simulations.
+
+    Every record that was not fitted is looked at: one on which the NL-LFR is clearly worse is
+    enough. It is better if it is so on the tests together, or without tests on validation.
+    Records of fewer than ten scored samples say nothing.
+
+    Args:
+        result: the fit.
+        responses: see :func:`lfrtorch.reporting.simulations.respond`.
+    """
+    lost = [r for r in responses if not np.isfinite(rms(r.error))]
+    failed = result.reason in (Reason.GRADIENT_DIVERGED, Reason.JACOBIAN_VANISHES)
+    errors = _errors([r for r in responses if r not in lost])
+    held_out = [e for e in errors if e.response.use != "train"]
+    judged = [e for e in held_out if e.response.use == "test"] or held_out or errors
+    every = [_compared([e], len(held_out)) for e in held_out]
+    whole = _compared(judged) if judged else None
+    evidence = {} if whole is None else _numbers(whole)
+    evidence |= {"records": [_numbers(c) for c in every], "diverges": [_name(r) for r in lost]}
+    worst = max((c for c in every if c.worse), key=lambda c: c.ratio, default=None)
+
+    if lost or (failed and result.chosen_iteration == 0):
+        what = f"diverges on {_names(lost)}" if lost else f"was not trained: {result.reason}"
+        kind, use, text = Kind.DIVERGES, LINEAR_MODEL, f"The NL-LFR {what}"
+        if lost and all(nrmse(r.record, r.y_linear) >= EXPLAINS_NOTHING for r in lost):
+            text += ", where the linear model explains nothing, either"
+            return Verdict(kind, f"{text}: neither is usable.", NEITHER, evidence)
+    elif worst is not None:
+        kind, use = Kind.WORSE, LINEAR_MODEL
+        text = (
+            f"Worse than the linear model: on {worst.name} the NL-LFR's error is "
+            f"{of_linear(worst.ratio)}"
+        )
+    elif whole is None:
+        kind, use, text = Kind.UNJUDGED, NL_LFR, f"Not judged: no record has {BLOCKS} samples"
+    elif not held_out:
+        kind, use = Kind.UNJUDGED, NL_LFR if whole.ratio < 1.0 - SAME else LINEAR_MODEL
+        text = (
+            f"Not judged, as nothing was held out: on {whole.name} the error is "
+            f"{of_linear(whole.ratio)}"
+        )
+    elif whole.better:
+        kind, use = Kind.BETTER, NL_LFR
+        text = (
+            f"Better than the linear model: on {whole.name} the NL-LFR's error is "
+            f"{of_linear(whole.ratio)}"
+        )
+    else:
+        kind, use = Kind.LINEAR, LINEAR_MODEL
+        text = (
+            f"Not better than the linear model: on {whole.name} the error is "
+            f"{number(100 * whole.ratio)} ± {percent(whole.ratio_std)} of the linear model's"
+        )
+    if whole is not None and held_out:
+        used = whole.nrmse if use == NL_LFR else whole.linear_nrmse
+        if used >= EXPLAINS_NOTHING:
+            text = (
+                f"Neither model is usable: on {whole.name} the errors are {percent(whole.nrmse)} "
+                f"(NL-LFR) and {percent(whole.linear_nrmse)} (linear) of the output"
+            )
+            return Verdict(kind, f"{text}.", NEITHER, evidence)
+    advice = "; use the linear model" if use == LINEAR_MODEL else ""
+    return Verdict(kind, f"{text}{advice}.", use, evidence)
+
+
+def of_linear(ratio: float) -> str:
+    """An error over the linear model's in words.
+
+    Example:
+        >>> from lfrtorch.reporting.verdict import of_linear
+        >>> of_linear(0.1234), of_linear(2.0)
+        ("12.3 % of the linear model's", "2.00 times the linear model's")
+    """
+    if ratio < 1.005:  # 1.00 in three digits
+        return f"{percent(ratio)} of the linear model's"
+    return f"{number(ratio)} times the linear model's"
+
+
+def _errors(responses: Sequence[Response]) -> list[_Errors]:
+    """The squared errors of the records that are long enough, each output over its deviation."""
+    train = [r.scored for r in responses if r.use == "train"]
+    if not train:
+        train = [r.scored for r in responses]
+    if not train:
+        return []
+    scale = np.concatenate(train).std(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    found = []
+    for response in responses:
+        if len(response.scored) < BLOCKS or not np.isfinite(rms(response.linear_error)):
+            continue
+        squares, linear = (
+            [np.mean((error / scale) ** 2, axis=1)]
+            for error in (response.error, response.linear_error)
+        )
+        blocks = in_blocks(squares)
+        found.append(
+            _Errors(
+                response,
+                np.array([block.sum() for block in blocks]),
+                np.array([block.sum() for block in in_blocks(linear)]),
+                np.array([len(block) for block in blocks]),
+                float(np.mean(np.var(response.scored / scale, axis=0))),
+            )
+        )
+    return found
+
+
+def _compared(errors: Sequence[_Errors], among: int = 1) -> Compared:
+    """Both models on some records, each relative to the linear model's error there.
+
+    Args:
+        errors: of the records.
+        among: records that are compared one by one.
+    """
+    counts = np.concatenate([e.counts for e in errors])
+    samples = np.array([e.counts.sum() for e in errors])
+    # A record on which the linear model is exact, as one in which nothing happens, has no scale.
+    levels = np.array([e.linear.sum() for e in errors]) / samples
+    levels = np.where(levels > 0, levels, 1.0)
+    squares, linear = (
+        np.concatenate([e / level for e, level in zip(each, levels, strict=True)])
+        for each in ([e.squares for e in errors], [e.linear for e in errors])
+    )
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        difference, error = blocked_mean(squares - linear, counts)
+    ratio = math.sqrt(squares.sum() / linear.sum()) if linear.any() else 1.0
+    power = float(np.dot([e.power for e in errors], samples)) or math.nan
+    first = errors[0].response
+    several = f"{len(errors)} {_use(first)} records"
+    return Compared(
+        name=_name(first) if len(errors) == 1 else several,
+        ratio=ratio,
+        ratio_std=float(error) / (2.0 * ratio) if ratio > 0 else 0.0,
+        deviations=float(difference / error) if error > 0 else 0.0,
+        clear=float(t.ppf(1.0 - (1.0 - CONFIDENCE) / max(1, among), len(counts) - 1)),
+        nrmse=math.sqrt(sum(e.squares.sum() for e in errors) / power),
+        linear_nrmse=math.sqrt(sum(e.linear.sum() for e in errors) / power),
+    )
+
+
+def _numbers(compared: Compared) -> dict[str, Any]:
+    """As ``metrics.json`` has it."""
+    numbers = compared._asdict()
+    return {"on": numbers.pop("name"), **numbers}
+
+
+def _use(response: Response) -> str:
+    """What a record was for, in a sentence."""
+    return "training" if response.use == "train" else response.use
+
+
+def _name(response: Response) -> str:
+    """A record in a sentence."""
+    name, use = response.record.name, _use(response)
+    if len(name) > LONGEST_NAME:
+        name = f"{name[: LONGEST_NAME - 3]}..."
+    return use if name in ("", response.use, use) else f"{use} '{name}'"
+
+
+def _names(responses: Sequence[Response]) -> str:
+    """The first of several records, and how many more there are."""
+    more = f" and {len(responses) - 1} more" if len(responses) > 1 else ""
+    return f"{_name(responses[0])}{more}"

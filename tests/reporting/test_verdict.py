@@ -1,0 +1,121 @@
+"""The verdict on a fit follows from errors on what was not fitted, and from their uncertainty."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lfrtorch._support.reasons import Reason
+from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.records import Record
+from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.verdict import Kind, Verdict, judge
+
+LONG = "a_measurement_with_a_name_that_is_longer_than_any_line_of_a_terminal" * 2
+
+
+def result(reason: str = Reason.COST_SETTLED, chosen: int = 3) -> FitResult:
+    unused: Any = None
+    return FitResult(unused, [], chosen, 1.0, 1.0, reason)
+
+
+def response(
+    use: str, part: float | np.ndarray, *, name: str = "", noise: float = 0.0, linear: float = 0.1
+) -> Response:
+    """An NL-LFR with a part of the linear model's error, and an error of its own."""
+    rng = np.random.default_rng(len(name))
+    y, error, own = rng.standard_normal((3, 1000, 1))
+    part = np.reshape(part, (-1, 1))
+    y_hat = y + linear * (part * error + noise * own)
+    return Response(Record(y, y, name=name or use), use, y + linear * error, y_hat)
+
+
+TRAIN = response("train", 0.2)
+BURST = np.where(np.arange(1000) // 20 == 30, 25.0, 0.2)
+"""0.2 of the linear model's error, but for twenty samples."""
+
+
+@pytest.mark.parametrize(
+    ("kind", "use", "colour", "said", "others"),
+    [
+        ("better", "NL-LFR", "green", "on test the NL-LFR's error is 50.0 %",
+         [response("test", 0.5)]),
+        ("better", "NL-LFR", "green", "on 2 test records",
+         [response("test", 0.5, name="a"), response("test", 0.8, name="b")]),
+        ("better", "NL-LFR", "green", "on validation", [response("validation", 0.5)]),
+        # Better on validation, which chose the iterate, and not on the test.
+        ("linear", "linear model", "amber", "100 ± 0 %",
+         [response("validation", 0.5), response("test", 1.0)]),
+        # Better by less than what is worth a choice, and worse by as little.
+        ("linear", "linear model", "amber", "use the linear model", [response("test", 0.97)]),
+        ("linear", "linear model", "amber", "use the linear model", [response("test", 1.03)]),
+        ("worse", "linear model", "red", "on test 'b' the NL-LFR's error is 3.00 times",
+         [response("test", 0.1, name="a"), response("test", 3.0, name="b"),
+          response("test", 1.5, name="c")]),
+        ("worse", "linear model", "red", "on validation", [response("validation", 1.2)]),
+        ("worse", "linear model", "red", "on test ", [response("test", BURST)]),
+        ("diverges", "linear model", "red", "diverges on test 'b' and 1 more",
+         [response("test", 0.1), response("test", np.inf, name="b"),
+          response("test", np.nan, name="c")]),
+        ("diverges", "neither", "red", "neither is usable", [response("test", np.nan, linear=2.0)]),
+        ("better", "neither", "red", "Neither model is usable", [response("test", 0.7, linear=3)]),
+        ("linear", "neither", "red", "Neither model is usable", [response("test", 1.0, linear=2)]),
+        ("unjudged", "NL-LFR", "grey", "nothing was held out", []),
+    ],
+)  # fmt: skip
+def test_records_that_were_not_fitted_make_the_verdict(kind, use, colour, said, others):
+    found = judge(result(), [TRAIN, *others])
+    assert (found.kind, found.use, found.colour) == (kind, use, colour)
+    assert said in found.text
+
+
+def test_a_difference_is_judged_by_its_standard_error():
+    # Errors that share nothing: 0.93 of the linear model's, by chance or by many samples.
+    few, many = (response("test", 0.0, noise=0.93, name=name) for name in ("few", "many"))
+    few = Response(few.record[:60], "test", few.y_linear[:60], few.y_hat[:60])
+    more = [response("test", 0.0, noise=0.93, name="n" * k) for k in range(1, 30)]
+    assert judge(result(), [TRAIN, few]).kind == Kind.LINEAR
+    assert judge(result(), [TRAIN, many, *more]).kind == Kind.BETTER
+
+
+def test_one_of_many_records_is_worse_by_chance():
+    # Thirty comparisons at one in forty each: one would be called worse without a share of each.
+    tests = [response("test", 0.0, noise=1.0, name="n" * k) for k in range(1, 31)]
+    assert max(judge(result(), [TRAIN, test]).evidence["deviations"] for test in tests) > 2.0
+    assert judge(result(), [TRAIN, *tests]).kind == Kind.LINEAR
+
+
+def test_a_failed_search_is_no_model():
+    found = judge(result(Reason.GRADIENT_DIVERGED, 0), [TRAIN, response("test", 1.0)])
+    assert (found.kind, found.use) == (Kind.DIVERGES, "linear model")
+    assert "not trained" in found.text
+    kept = judge(result(Reason.GRADIENT_DIVERGED, 5), [TRAIN, response("test", 0.3)])
+    assert kept.kind == Kind.BETTER
+
+
+def test_the_training_error_alone_is_no_verdict():
+    assert judge(result(), [response("train", 1.0)]).use == "linear model"
+    short = response("test", 3.0)
+    short = Response(short.record[:5], "test", short.y_linear[:5], short.y_hat[:5])
+    assert judge(result(), [TRAIN, short]).kind == Kind.UNJUDGED
+    assert judge(result(), [short]).kind == Kind.UNJUDGED
+
+
+def test_outputs_that_rest_are_no_error():
+    rest = np.zeros((1000, 1))
+    still = Response(Record(rest, rest, name="rest"), "test", rest, rest)
+    assert judge(result(), [TRAIN, still]).kind == Kind.LINEAR
+
+
+@pytest.mark.parametrize("part", [0.1, 0.999, 1.0, 12345.6, np.nan])
+@pytest.mark.parametrize("linear", [0.1, 2.0])
+@pytest.mark.parametrize("use", ["train", "validation", "test"])
+def test_a_verdict_is_one_line(part: float, linear: float, use: str):
+    many = [response(use, part, name=LONG, linear=linear)] * 12
+    for responses in (many[:1], many):
+        found: Verdict = judge(result(), responses)
+        assert len(found.text) <= 160
+        assert found.text.endswith(".")
+        assert str(found) == found.text
