@@ -1,6 +1,6 @@
 """Identify a model: `python train.py +bench=boucwen`, the same as `lfrtorch fit +bench=boucwen`."""
 
-from lfrtorch.cli.fit import launch
+from lfrtorch.cli.command import start
 
 if __name__ == "__main__":
-    launch()
+    start("fit")

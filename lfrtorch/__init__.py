@@ -5,106 +5,29 @@ records -> estimate_bla -> initialise or infer -> fit -> simulate, save, load
 records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 """
 
+from importlib import import_module
 from importlib.metadata import version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from lfrtorch import datasets, distributed, reporting
-
-# data
-from lfrtorch.dataset import Dataset, Published
-from lfrtorch.excitation import multisine
-from lfrtorch.files.load import load_records
-from lfrtorch.records import Channel, Record, Scaler
-
-# the linear model
-from lfrtorch.linear.bla import estimate_bla
-from lfrtorch.linear.frf import FRF, estimate_frf
-from lfrtorch.linear.model import LinearFit, LinearModel
-from lfrtorch.linear.order_scan import OrderScan, scan_orders
-
-# the nonlinear model
-from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.model import Model, load, simulate_blocks
-
-# fits
-from lfrtorch.fitting.inference import infer
-from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.size_search import SizeSearch, search_sizes
-from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.starts import initialise
-from lfrtorch.fitting.trainer import FitResult
-from lfrtorch._support.reasons import Reason
-from lfrtorch.least_squares.adam import Adam
-from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-
-# the whole job
-from lfrtorch.fitting.settings import Settings, SizesSearch
-from lfrtorch.job import identify
-from lfrtorch.reporting.run import Run
-
-# scores
-from lfrtorch.metrics import nrmse, rmse
-
-# errors
-from lfrtorch._support.errors import InputError, LfrtorchError
+if TYPE_CHECKING:
+    from lfrtorch._public import *  # noqa: F403
+    from lfrtorch._public import __all__ as __all__
 
 __version__ = version("lfrtorch")
-
-__all__ = [
-    "FRF",
-    "LFR",
-    "Adam",
-    "Channel",
-    "Dataset",
-    "FitResult",
-    "InputError",
-    "LFRCell",
-    "LevenbergMarquardt",
-    "LfrtorchError",
-    "LinearFit",
-    "LinearModel",
-    "Model",
-    "Network",
-    "OrderScan",
-    "Polynomial",
-    "Published",
-    "Reason",
-    "Record",
-    "Run",
-    "Scaler",
-    "Settings",
-    "SizeSearch",
-    "SizesSearch",
-    "Snapshots",
-    "datasets",
-    "distributed",
-    "estimate_bla",
-    "estimate_frf",
-    "fit",
-    "identify",
-    "infer",
-    "initialise",
-    "load",
-    "load_records",
-    "mean_model",
-    "multisine",
-    "nrmse",
-    "reporting",
-    "rmse",
-    "scan_orders",
-    "search_sizes",
-    "simulate_blocks",
-]
 
 _RENAMED = {"average": "mean_model", "fit_starts": "fit", "inference": "infer"}
 
 
 if not TYPE_CHECKING:  # a checker would take every name for one of these
 
-    def __getattr__(name: str) -> None:
-        """An old name ends in an error that says the new one."""
+    def __getattr__(name: str) -> Any:
+        """A public name, imported with all others; for an old one, an error that says the new."""
+        if name == "__all__" or not name.startswith("_"):
+            public = import_module("lfrtorch._public")
+            if name == "__all__" or name in getattr(public, "__all__", ()):
+                return getattr(public, name)
         now = f"; it is called lfrtorch.{_RENAMED[name]} now" if name in _RENAMED else ""
         raise AttributeError(f"module 'lfrtorch' has no attribute '{name}'{now}")
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__getattr__("__all__")})

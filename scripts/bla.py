@@ -1,6 +1,6 @@
 """The same as `lfrtorch linear`."""
 
-from lfrtorch.cli.linear import launch
+from lfrtorch.cli.command import start
 
 if __name__ == "__main__":
-    launch()
+    start("linear")

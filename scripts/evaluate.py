@@ -1,6 +1,6 @@
 """The same as `lfrtorch evaluate`."""
 
-from lfrtorch.cli.evaluate import launch
+from lfrtorch.cli.command import start
 
 if __name__ == "__main__":
-    launch()
+    start("evaluate")

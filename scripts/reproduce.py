@@ -35,7 +35,7 @@ from hydra.utils import instantiate
 import lfrtorch
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.tables import number
-from lfrtorch.cli.config import CONF
+from lfrtorch.cli import CONF
 from lfrtorch.dataset import Dataset
 from lfrtorch.reporting import leaderboard
 

@@ -1,6 +1,6 @@
 """The same as `lfrtorch simulate`."""
 
-from lfrtorch.cli.simulate import launch
+from lfrtorch.cli.command import start
 
 if __name__ == "__main__":
-    launch()
+    start("simulate")

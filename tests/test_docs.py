@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from matplotlib import pyplot
 
 import lfrtorch
-from lfrtorch.cli.config import CONF
+from lfrtorch.cli import CONF
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

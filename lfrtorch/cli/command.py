@@ -6,6 +6,10 @@ import sys
 from importlib import import_module
 from importlib.metadata import version
 
+import hydra
+
+from lfrtorch.cli import CONF, preview_words
+
 COMMANDS = {
     "preview": "look at measurements before any fit",
     "linear": "frequency response and best linear approximation",
@@ -25,9 +29,20 @@ def main() -> None:
         print(usage())
     elif word in COMMANDS:
         sys.argv[:2] = [f"lfrtorch {word}"]
-        import_module(f"lfrtorch.cli.{word}").launch()
+        start(word)
     else:
         sys.exit(f"error: there is no command '{word}'.\n{usage()}")
+
+
+def start(command: str) -> None:
+    """Start a command; its help comes without what computes, which takes seconds to import."""
+    if {"--help", "-h"}.isdisjoint(sys.argv):
+        import_module(f"lfrtorch.cli.{command}").launch()
+    elif command == "preview":
+        preview_words.parser().parse_args()
+    else:
+        name = "config" if command == "fit" else command
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(lambda _: None)()
 
 
 def usage() -> str:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.cli.config import CONF
+from lfrtorch.cli import CONF
 from lfrtorch.cli.words import GROUPS
 
 SWEEPS = {"-m", "--multirun"}

@@ -1,9 +1,8 @@
-"""The configuration: where it lies, and the dataset and settings that it describes."""
+"""The dataset and the settings that a configuration describes."""
 
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,11 +17,6 @@ from lfrtorch.cli.words import translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings, SizesSearch
 from lfrtorch.survey.notes import notes_on
-
-_PACKAGE = Path(__file__).resolve().parents[1]
-
-CONF = next(folder for folder in (_PACKAGE / "conf", _PACKAGE.parent / "conf") if folder.is_dir())
-"""Inside the package if it is installed, at the top of its repository otherwise."""
 
 
 def configured(cfg: DictConfig) -> Settings:

@@ -18,8 +18,9 @@ from omegaconf import DictConfig
 import lfrtorch
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
+from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import check_words
-from lfrtorch.cli.config import CONF, loaded, require_data
+from lfrtorch.cli.config import loaded, require_data
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import program
 from lfrtorch.cli.simulate import opened

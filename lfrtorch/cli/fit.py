@@ -26,8 +26,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.reasons import Reason
+from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import check_words
-from lfrtorch.cli.config import CONF, configured, loaded
+from lfrtorch.cli.config import configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError, Termination
 from lfrtorch.cli.run_folder import (

@@ -27,8 +27,9 @@ from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.tables import in_percent
 from lfrtorch.analysis.poles import frequency_and_damping
+from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import check_words
-from lfrtorch.cli.config import CONF, configured, loaded
+from lfrtorch.cli.config import configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
 from lfrtorch.cli.words import Terminal, translated

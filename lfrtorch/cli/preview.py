@@ -1,17 +1,9 @@
-"""Look at measurements before any fit: a table, what will hurt a model, and a figure.
-
-    lfrtorch preview x.csv --inputs force --outputs displacement --fs 750
-    lfrtorch preview 'runs/*.mat' --inputs u --outputs y
-
-A file is any that data.path takes. Without --inputs and --outputs all columns of numbers are shown,
-and nothing is said of what lies between them.
-"""
+"""Look at measurements before any fit: a table, what will hurt a model, and a figure."""
 
 from __future__ import annotations
 
 import argparse
 import glob
-import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +17,7 @@ from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.preview_words import parser
 from lfrtorch.files.formats import BLOCK, Table, open_table
 from lfrtorch.files.time_stamps import UnevenError, in_seconds, is_time, sampling
 from lfrtorch.records import Channel
@@ -54,29 +47,13 @@ class Roles(NamedTuple):
 
 def launch(words: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog=sys.argv[0], description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("paths", nargs="+", metavar="PATH", help="file, or pattern in quotes")
-    parser.add_argument("--inputs", nargs="+", default=[], metavar="NAME", type=column)
-    parser.add_argument("--outputs", nargs="+", default=[], metavar="NAME", type=column)
-    parser.add_argument("--fs", type=float, metavar="HZ", help="sampling frequency")
-    parser.add_argument(
-        "--time", type=column, metavar="COLUMN", help="of times; found if not given"
-    )
-    parser.add_argument("--out", type=Path, metavar="FIGURE.png", help="default: FILE_preview.png")
-    options = parser.parse_args(words)
+    options = parser().parse_args(words)
     with user_errors():
         if options.fs is not None:
             number("--fs", options.fs, positive=True)
         paths = matching(options.paths)
         for path in paths:
             show(path, options, figure_path(options.out, path, len(paths)))
-
-
-def column(word: str) -> str | int:
-    """A column's name or number."""
-    return int(word) if word.isdecimal() else word
 
 
 def matching(patterns: Sequence[str]) -> list[Path]:

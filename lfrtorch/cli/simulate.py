@@ -22,8 +22,8 @@ from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import check_words
-from lfrtorch.cli.config import CONF
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.linear import finite
 from lfrtorch.files.formats import open_table

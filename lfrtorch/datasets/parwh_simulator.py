@@ -21,10 +21,10 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from lfrtorch import metrics
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.metrics import rms as rms_of
 
 FS = 78125.0
 """Sampling frequency of the records, Hz."""
@@ -106,7 +106,7 @@ def multisine(
     spectrum = np.zeros(PERIOD // 2 + 1, complex)
     spectrum[_LINES] = np.exp(1j * phase)
     u = np.fft.irfft(spectrum, PERIOD)
-    return rms * u / metrics.rms(u)
+    return rms * u / rms_of(u)
 
 
 def simulate(u: ArrayLike) -> Array:
@@ -161,4 +161,4 @@ def _arrow(rng: np.random.Generator) -> Array:
     spectrum = np.zeros_like(white)
     spectrum[_LINES] = white[_LINES]
     u = np.linspace(0, 1, PERIOD) * np.fft.irfft(spectrum, PERIOD)
-    return _ARROW_RMS * u / metrics.rms(u[-PERIOD // 10 :])
+    return _ARROW_RMS * u / rms_of(u[-PERIOD // 10 :])

@@ -1,0 +1,49 @@
+"""The command ``lfrtorch``: its help, at once and of its own settings."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from lfrtorch.cli import CONF, command
+
+ALL_HELP = """
+import contextlib, sys
+from lfrtorch.cli.command import COMMANDS, main
+for word in COMMANDS:
+    sys.argv = ["lfrtorch", word, "--help"]
+    with contextlib.suppress(SystemExit):
+        main()
+print("loaded", *sorted({name.split(".")[0] for name in sys.modules}))
+"""
+
+
+def test_help_comes_without_what_computes():
+    done = subprocess.run(
+        [sys.executable, "-c", ALL_HELP], capture_output=True, text=True, check=True
+    )
+    text, loaded = done.stdout.rsplit("loaded", 1)
+    assert text.count("data.path") >= len(command.COMMANDS) - 1
+    assert {"torch", "numba", "scipy", "numpy", "pandas", "matplotlib"}.isdisjoint(loaded.split())
+
+
+@pytest.mark.parametrize(
+    ("word", "own"), [("linear", ("data/file", "bla/state_space")), ("evaluate", ("data/file",))]
+)
+def test_help_lists_the_settings_of_the_command_and_no_others(
+    word: str, own: tuple[str, ...], tmp_path: Path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lfrtorch", word, "--help"])
+    with pytest.raises(SystemExit):
+        command.main()
+    printed = capsys.readouterr().out
+    for file in own:
+        names = [str(name) for name in OmegaConf.load(CONF / f"{file}.yaml") if name != "_target_"]
+        group = file.split("/")[0]
+        assert [name for name in names if f"{group}.{name}" not in printed] == []
+    assert "sizes_search" not in printed
+    assert "init_from" not in printed
+    assert list(tmp_path.iterdir()) == []
