@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from statistics import median_high
 
 from tabulate import tabulate
 
@@ -15,6 +16,21 @@ DIGITS = 3
 
 SMALLEST, LARGEST = 1e-3, 1e5
 """Numbers in this range are written without an exponent."""
+
+PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+"""SI prefixes by their power of ten."""
+
+PREFIXED = frozenset(
+    ("A", "C", "F", "H", "Hz", "J", "N", "N m", "N/m", "N·m", "Nm", "Ohm", "Pa", "T", "V", "W",
+     "m", "m/s", "m/s2", "m/s^2", "m/s²", "rad", "rad/s", "rad/s2", "rad/s^2", "rad/s²", "s", "Ω")
+)  # fmt: skip
+"""Units that may have a prefix; others, such as °C, kg, mm and %, stay as they are."""
+
+NEVER_LARGER = ("s", "rad")
+"""What units begin with that are never kilo or more."""
+
+PLAIN = 0.1, 1000.0
+"""Numbers in this range need no prefix."""
 
 Cell = str | int | float | None
 
@@ -31,9 +47,35 @@ def number(value: float | None, digits: int = DIGITS) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
+def engineering(values: Iterable[float | None], unit: str) -> tuple[float, str]:
+    """What numbers of a unit are multiplied by to be read well, and the unit with its SI prefix.
+
+    One for all, so that they compare: their median is between 0.1 and 1000 there.
+
+    Args:
+        values: numbers of a column, or the largest one of an axis; unknown ones do not count.
+        unit: theirs; one that takes no prefix is returned as it is.
+    """
+    known = [abs(v) for v in values if v and math.isfinite(v)]
+    if not known or unit not in PREFIXED:
+        return 1.0, unit
+    typical = median_high(known)
+    power = 3 * math.floor(math.log10(typical) / 3)
+    never = power not in PREFIXES or (power > 0 and unit.startswith(NEVER_LARGER))
+    if never or PLAIN[0] <= typical < PLAIN[1]:
+        return 1.0, unit
+    return 10.0**-power, PREFIXES[power] + unit
+
+
+def quantities(values: Sequence[float | None], unit: str) -> list[str]:
+    """Numbers with their unit, all with the same SI prefix; without a unit the numbers alone."""
+    factor, unit = engineering(values, unit)
+    return [f"{number(None if v is None else factor * v)} {unit}".rstrip() for v in values]
+
+
 def quantity(value: float | None, unit: str) -> str:
-    """A number with its unit; of a signal without unit the number alone."""
-    return f"{number(value)} {unit}".rstrip()
+    """A number with its unit, with the SI prefix that it is read best in."""
+    return quantities([value], unit)[0]
 
 
 def percent(ratio: float | None) -> str:

@@ -14,7 +14,16 @@ import jinja2
 import numpy as np
 import torch
 
-from lfrtorch._support.tables import UNKNOWN, Cell, cell, number, percent, quantity
+from lfrtorch._support.tables import (
+    UNKNOWN,
+    Cell,
+    cell,
+    engineering,
+    number,
+    percent,
+    quantities,
+    quantity,
+)
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest
@@ -24,7 +33,7 @@ from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rms
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.scores import neurons
+from lfrtorch.reporting.scores import finalists, neurons
 from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import LINEAR_MODEL, Verdict, of_linear
 
@@ -75,7 +84,8 @@ def render(
             ``poles_and_zeros`` have their places, and those of ``views`` theirs.
         verdict: on the fit, whose colour the page's first lines have.
         advice: what to try next.
-        views: of each test, by its name, captions by the names of its figures.
+        views: of each record that is shown, by its name, captions by the names of its figures. The
+            first two of the first record follow the verdict.
         config: of the run.
     """
     environment = jinja2.Environment(
@@ -96,15 +106,9 @@ def render(
         advice=advice,
         scores=_scores(metrics, dataset, responses),
         data=_data(dataset, responses),
-        tests=[
-            {
-                "name": test,
-                "views": [{"figure": name, "caption": text} for name, text in own.items()],
-            }
-            for test, own in (views or {}).items()
-        ],
+        records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
         linear=_linear(bla, result),
-        fit=_fit(metrics, bool(dataset.validation)),
+        fit=_fit(metrics, result, bool(dataset.validation)),
         search=_search(metrics["sizes_search"]),
         parameters=_parameters(metrics, result),
         stability=_stability(metrics["stable_to"]),
@@ -145,7 +149,7 @@ def comparisons(responses: Sequence[Response]) -> list[str]:
 def _line(name: str, unit: str, errors: Errors) -> str:
     if not math.isfinite(errors.error):
         return f"{name}: the NL-LFR diverges"
-    error, linear = quantity(errors.error, unit), quantity(errors.linear, unit)
+    error, linear = quantities([errors.error, errors.linear], unit)
     relative = percent(errors.relative)
     beside = of_linear(errors.error / errors.linear) if errors.linear > 0 else "not comparable"
     return f"{name}: error {beside} ({error} against {linear}), NRMSE {relative}"
@@ -164,6 +168,7 @@ def _scores(
     metrics: Mapping[str, Any], dataset: Dataset, responses: Sequence[Response]
 ) -> dict[str, Any]:
     sizes = metrics["sizes"]["nz"], metrics["sizes"]["nw"]
+    in_unit = _units(responses)
     published = [p for p in dataset.published if p.sizes in (None, sizes)]
     outputs = responses[0].record.outputs
     several, units = len(outputs) > 1, any(channel.unit for channel in outputs)
@@ -173,9 +178,10 @@ def _scores(
     for response in responses:
         name, use = response.record.name, response.use
         for row, (channel, unit, of) in enumerate(_channels(response)):
-            cells = [*[channel, unit][: len(what)], *_cells(_errors(response, of))]
+            factor, shown = in_unit[unit]
+            cells = [*[channel, shown][: len(what)], *_cells(_errors(response, of), factor)]
             if use == "test":
-                known = [p.scores.get(name) if row == 0 else "" for p in published]
+                known = [_scaled(p.scores.get(name), factor) if row == 0 else "" for p in published]
                 tests.append([name if row == 0 else "", *cells, *known])
             else:
                 others.append([*([name, USES[use]] if row == 0 else ["", ""]), *cells])
@@ -184,7 +190,7 @@ def _scores(
         own = ", ".join(f"{test} of {'+'.join(used)}" for test, used in metrics["linear"].items())
         references.insert(0, f"linear: a model for each of these: {own}")
     return {
-        "unit": "" if several else outputs[0].unit,
+        "unit": "" if several else in_unit[outputs[0].unit][1],
         "words": 1 + len(what),
         "head": ["record", *what, *errors, *(p.label for p in published)],
         "tests": tests,
@@ -204,6 +210,20 @@ def _channels(response: Response) -> list[tuple[str, str, slice]]:
     return [(ALL, units.pop(), slice(None)), *single]
 
 
+def _units(responses: Sequence[Response]) -> dict[str, tuple[float, str]]:
+    """Of each unit of the outputs a factor and the unit with a prefix, for all of their errors."""
+    errors: dict[str, list[float]] = {}
+    for response in responses:
+        for _, unit, of in _channels(response):
+            found = _errors(response, of)
+            errors.setdefault(unit, []).extend([found.linear, found.error])
+    return {unit: engineering(values, unit) for unit, values in errors.items()}
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value
+
+
 def _errors(response: Response, of: slice) -> Errors:
     """The errors of some outputs."""
     linear, error = (
@@ -214,10 +234,10 @@ def _errors(response: Response, of: slice) -> Errors:
     return Errors(linear, error, ratio, linear / deviation, error / deviation)
 
 
-def _cells(errors: Errors) -> list[Cell]:
-    shown = errors.error if math.isfinite(errors.error) else "diverges"
+def _cells(errors: Errors, factor: float) -> list[Cell]:
+    shown = factor * errors.error if math.isfinite(errors.error) else "diverges"
     relative = percent(errors.linear_relative), percent(errors.relative)
-    return [errors.linear, shown, errors.ratio, *relative]
+    return [factor * errors.linear, shown, errors.ratio, *relative]
 
 
 def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
@@ -232,10 +252,10 @@ def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
     for side, named in (("input", train[0].inputs), ("output", train[0].outputs)):
         signals = [r.u if side == "input" else r.y for r in train]
         signal = np.concatenate([s[r.skip :] for s, r in zip(signals, train, strict=True)])
-        channels += [
-            [channel.name, side, channel.unit, *_moments(x)]
-            for channel, x in zip(named, signal.T, strict=True)
-        ]
+        for channel, x in zip(named, signal.T, strict=True):
+            moments = _moments(x)
+            factor, unit = engineering(moments[1:], channel.unit)
+            channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
     records = []
     for use, r in ((response.use, response.record) for response in responses):
         records.append([r.name, USES.get(use, use), r.source, r.start, r.samples, r.skip, r.period])
@@ -278,11 +298,26 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
     return {"summary": summary, "notes": notes, "caption": f"{caption}.", "poles": poles}
 
 
-def _fit(metrics: Mapping[str, Any], validated: bool) -> dict[str, Any]:
+def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict[str, Any]:
     fit, ranking = metrics["fit"], metrics["ranking"]
+    outputs = result.model.outputs
+    ended, others = finalists(metrics)
+    errors = ("train", "validation", "selection")
+    unit = outputs[0].unit if len({channel.unit for channel in outputs}) == 1 else ""
+    factor, unit = engineering([start[name] for start in ended for name in errors], unit)
     starts = [
-        [s[k] for k in ("seed", "reason", "iterations", "train", "validation", "selection")]
-        for s in ranking
+        [
+            *(s[k] for k in ("seed", "reason", "iterations")),
+            *(_scaled(s[k], factor) for k in errors),
+        ]
+        for s in ended
+    ]
+    label = f" ({unit})" if unit else ""
+    head = [
+        "seed",
+        "why it ended",
+        "iterations",
+        *(f"{name}{label}" for name in ("training", *errors[1:])),
     ]
     judge = "validation" if validated else "training"
     summary = (
@@ -293,7 +328,7 @@ def _fit(metrics: Mapping[str, Any], validated: bool) -> dict[str, Any]:
         summary += f" The best of {len(ranking)} starts."
     if metrics["averaged"] > 1:
         summary += f" The model is the mean of the best {metrics['averaged']}, side by side."
-    return {"summary": summary, "starts": starts}
+    return {"summary": summary, "head": head, "starts": starts, "others": others}
 
 
 def _search(tried: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -8,14 +8,19 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter, NullLocator
 
+from lfrtorch._support.tables import engineering, quantity
 from lfrtorch._support.types import Array
 from lfrtorch.fitting.trainer import Progress
+from lfrtorch.metrics import rms
 from lfrtorch.records import Record
 
-OUTPUT, LINEAR, NL_LFR = "tab:blue", "tab:red", "tab:green"
-"""Colours of the measured output, the linear model's error and the NL-LFR's, as in the paper."""
+OUTPUT, LINEAR, NL_LFR = "0.15", "#e69f00", "#0072b2"
+"""Colours of the measured output, the linear model and the NL-LFR, of Okabe and Ito's palette:
+colour-blind readers tell them apart, and they differ in lightness."""
 
 DPI = 150
 """Dots per inch of a figure that is written."""
@@ -23,11 +28,32 @@ DPI = 150
 MOST_POINTS = 20_000
 """Samples drawn of a long signal as a cloud."""
 
-CLOSE_UP = 500
-"""Samples of a close-up: some periods of what the model follows."""
+SWINGS = 8
+"""Periods of the output that a close-up shows."""
+
+CLOSE_UP, LARGEST_PART = (50, 2000), 0.25
+"""Fewest and most samples of a close-up, and its largest part of a record if it has more."""
 
 SEGMENT, SHORTEST = 4096, 16
 """Most and fewest samples of a segment that a power spectral density is averaged over."""
+
+NL_LFR_NAME = "NL-LFR"
+
+FAR = 10.0
+"""Deviations of the output up to which errors are counted in their distribution."""
+
+HEIGHT = 4.2
+"""Of an output in a figure, in inches."""
+
+WIDE, NARROW = 6.4, 4.4
+"""Widths in inches of figures that stand side by side on a wide page, in a column on a narrow one.
+"""
+
+TAIL = 0.95
+"""Part of the samples whose errors are no larger than the number in the legend."""
+
+BEYOND = 1.0
+"""Ranges of the measured output that are drawn beyond it, if a model runs away."""
 
 
 def errors(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figure:
@@ -55,12 +81,21 @@ def is_whole(record: Record) -> bool:
     return record.start == "periodic" and not record.skip
 
 
-def spectrum(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figure:
+def spectrum(
+    record: Record,
+    y_linear: Array,
+    y_hat: Array | None = None,
+    outputs: Sequence[int] | None = None,
+) -> Figure:
     """Magnitude of the measured output and of the errors against frequency, one panel an output.
 
+    Args:
+        record: the measurement.
+        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        outputs: numbers of those that are drawn. Default: all.
+
     Shape:
-        y_linear, y_hat: (T, ny), simulated outputs in physical units; without an NL-LFR
-            there is no y_hat.
+        y_linear, y_hat: (T, ny).
 
     Example:
         >>> from lfrtorch.reporting import plots
@@ -68,111 +103,205 @@ def spectrum(record: Record, y_linear: Array, y_hat: Array | None = None) -> Fig
         >>> [line.get_label() for line in figure.axes[0].lines]
         ['output', 'linear error', 'NL-LFR error']
     """
-    figure, axes = _panels(record)
+    figure, axes = _panels(record, outputs)
     y = record.y[record.skip :]
     f = np.fft.rfftfreq(len(y), 1.0 / record.fs)
-    for i, ax in enumerate(axes):
+    for i, ax in axes.items():
         for signal, label, colour in _signals(record, y_linear, y_hat, i):
             ax.plot(f[1:-1], _decibel(signal)[1:-1], ".", ms=2, color=colour, label=label)
         unit = record.outputs[i].unit or "1"
         ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {unit})", xlim=(0, f[-1]))
-        ax.legend(loc="upper right", markerscale=5)
-    axes[0].set_title(_title(record))
-    axes[-1].set_xlabel("frequency (Hz)")
+        _legend(ax, markerscale=5)
+    _frequency_axis(record, figure.axes[-1])
     return figure
 
 
-def density(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figure:
+def density(
+    record: Record,
+    y_linear: Array,
+    y_hat: Array | None = None,
+    outputs: Sequence[int] | None = None,
+) -> Figure:
     """Power spectral density of the measured output and of the errors, one panel an output.
 
     By Welch's method: for records that are no whole periods.
 
+    Args:
+        record: the measurement.
+        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        outputs: numbers of those that are drawn. Default: all.
+
     Shape:
-        y_linear, y_hat: (T, ny), simulated outputs in physical units; without an NL-LFR
-            there is no y_hat.
+        y_linear, y_hat: (T, ny).
 
     Example:
         >>> from lfrtorch.reporting import plots
         >>> figure = plots.density(record[:300], bla.simulate(record[:300]))
         >>> figure.savefig("density.png")
     """
-    figure, axes = _panels(record)
+    figure, axes = _panels(record, outputs)
     scored = record.samples - record.skip
     segment = min(SEGMENT, scored, max(SHORTEST, scored // 8))
-    for i, ax in enumerate(axes):
+    for i, ax in axes.items():
         for signal, label, colour in _signals(record, y_linear, y_hat, i):
             f, power = scipy.signal.welch(signal, record.fs, nperseg=segment)
             level = 10.0 * np.log10(np.maximum(power, np.finfo(float).tiny))
-            ax.plot(f[1:], level[1:], lw=0.8, color=colour, label=label)
+            ax.plot(f[1:], level[1:], color=colour, label=label)
         unit = record.outputs[i].unit or "1"
         per = f"{unit}²/Hz" if record.fs != 1.0 else f"{unit}²"
         ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {per})", xlim=(0, record.fs / 2))
         _legend(ax)
-    axes[0].set_title(_title(record))
-    axes[-1].set_xlabel("frequency (Hz)" if record.fs != 1.0 else "frequency (1/sample)")
+    _frequency_axis(record, figure.axes[-1])
     return figure
 
 
-def response(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figure:
-    """Measured output and errors against time in the record, one panel an output.
+def response(
+    record: Record,
+    y_linear: Array,
+    y_hat: Array | None = None,
+    outputs: Sequence[int] | None = None,
+) -> Figure:
+    """Measured and simulated output against time, and below them the errors; two panels an output.
+
+    The legend has the fit of each model, 100 % - NRMSE. The grey stretch is that of the close-up.
+
+    Args:
+        record: the measurement.
+        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        outputs: numbers of those that are drawn. Default: all.
 
     Shape:
-        y_linear, y_hat: (T, ny), simulated outputs in physical units; without an NL-LFR
-            there is no y_hat.
+        y_linear, y_hat: (T, ny).
 
     Example:
         >>> from lfrtorch.reporting import plots
         >>> figure = plots.response(record, bla.simulate(record))
-        >>> figure.axes[0].get_xlabel()
+        >>> [ax.get_ylabel() for ax in figure.axes]
+        ['y', 'error']
+        >>> figure.axes[-1].get_xlabel()
         'time in the record (s)'
     """
-    figure, axes = _panels(record)
-    t = np.arange(record.skip, record.samples) / record.fs
-    for i, ax in enumerate(axes):
-        for signal, label, colour in _signals(record, y_linear, y_hat, i):
-            ax.plot(*envelope(t, signal), lw=0.5, color=colour, label=label)
-        ax.set(ylabel=str(record.outputs[i]), xlim=(t[0], t[-1]))
-        _legend(ax)
-    axes[0].set_title(_title(record))
-    _time_axis(record, axes[-1])
+    whole = slice(0, record.samples - record.skip)
+    figure = _overlay(record, y_linear, y_hat, outputs, whole, WIDE, fits=True)
+    near = worst_stretch(record, y_linear, y_hat, outputs)
+    if near != whole:
+        ends = ((record.skip + end) / record.fs for end in (near.start, near.stop - 1))
+        first, last = ends
+        for ax in figure.axes:
+            ax.axvspan(first, last, color="0.9", lw=0, zorder=0)
     return figure
 
 
-def close_up(record: Record, y_linear: Array, y_hat: Array) -> Figure:
-    """The response about the largest error of the NL-LFR, and below it this error alone.
+def close_up(
+    record: Record,
+    y_linear: Array,
+    y_hat: Array | None = None,
+    outputs: Sequence[int] | None = None,
+) -> Figure:
+    """The response about the largest error of the NL-LFR, or of the linear model if it is alone.
 
-    Errors of several outputs are compared relative to the deviation of each. If the
-    model diverges, the largest error is where it first does so.
+    Args:
+        record: the measurement.
+        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        outputs: numbers of those that are drawn. Default: all.
 
     Shape:
-        y_linear, y_hat: (T, ny), simulated outputs in physical units.
+        y_linear, y_hat: (T, ny).
 
     Example:
         >>> from lfrtorch.reporting import plots
         >>> figure = plots.close_up(record, bla.simulate(record), model.simulate(record))
-        >>> len(figure.axes)  # the output with both errors, and the error of the NL-LFR
+        >>> len(figure.axes)  # the outputs, and their errors
         2
     """
-    y = record.y[record.skip :]
+    near = worst_stretch(record, y_linear, y_hat, outputs)
+    figure = _overlay(record, y_linear, y_hat, outputs, near, NARROW)
+    figure.suptitle(f"{record.name}: about the largest error", fontsize="medium")
+    return figure
+
+
+def worst_stretch(
+    record: Record,
+    y_linear: Array,
+    y_hat: Array | None = None,
+    outputs: Sequence[int] | None = None,
+) -> slice:
+    """Some periods of the output about the largest error, counted from the first scored sample.
+
+    Errors of several outputs are compared relative to the deviation of each. If the model runs
+    away, this is about where it begins.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> y_linear = record.y.copy()
+        >>> y_linear[300] += 9.0
+        >>> near = plots.worst_stretch(record, y_linear)
+        >>> near.start < 300 < near.stop
+        True
+    """
+    columns = list(range(record.y.shape[1]) if outputs is None else outputs)
+    y = record.y[record.skip :, columns]
+    found = (y_linear if y_hat is None else y_hat)[record.skip :, columns]
     deviation = np.std(y, axis=0)
-    error = np.abs(y - y_hat[record.skip :]) / np.where(deviation > 0, deviation, 1.0)
-    worst = int(np.argmax(np.where(np.isfinite(error), error, np.inf).max(axis=1)))
-    first = max(0, min(worst - CLOSE_UP // 2, len(y) - CLOSE_UP))
-    window = slice(first, first + CLOSE_UP)
-    t = (record.skip + np.arange(len(y))[window]) / record.fs
-    ny = len(record.outputs)
-    figure = Figure(figsize=(8, 1.5 + 4.5 * ny), layout="constrained")
-    axes = list(figure.subplots(2 * ny, 1, sharex=True, height_ratios=[2, 1] * ny))
-    for i, output in enumerate(record.outputs):
-        signals = _signals(record, y_linear, y_hat, i)
-        for ax, drawn in ((axes[2 * i], signals), (axes[2 * i + 1], signals[-1:])):
-            for signal, label, colour in drawn:
-                ax.plot(t, signal[window], lw=1.0, color=colour, label=label)
-            ax.set(ylabel=str(output))
-            ax.margins(x=0)
-            _legend(ax)
-    axes[0].set_title(_title(record))
-    _time_axis(record, axes[-1])
+    error = np.abs(y - found) / np.where(deviation > 0, deviation, 1.0)
+    error = np.minimum(np.where(np.isfinite(error), error, np.inf), FAR)
+    row, column = np.unravel_index(int(np.argmax(error)), error.shape)
+    above = y[:, column] > np.mean(y[:, column])
+    swings = max(1, np.count_nonzero(above[1:] != above[:-1])) / 2
+    least, most = CLOSE_UP
+    length = min(SWINGS * len(y) / swings, most, LARGEST_PART * len(y))
+    length = min(len(y), max(least, int(length)))
+    first = max(0, min(int(row) - length // 2, len(y) - length))
+    return slice(first, first + length)
+
+
+def distribution(
+    record: Record,
+    y_linear: Array,
+    y_hat: Array | None = None,
+    outputs: Sequence[int] | None = None,
+) -> Figure:
+    """How often which error occurs: density of the errors, logarithmic; one panel an output.
+
+    The legend says in which range the errors of 95 % of the samples are.
+
+    Args:
+        record: the measurement.
+        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        outputs: numbers of those that are drawn. Default: all.
+
+    Shape:
+        y_linear, y_hat: (T, ny).
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> figure = plots.distribution(record, bla.simulate(record), model.simulate(record))
+        >>> figure.axes[0].get_xlabel()
+        'error of y'
+    """
+    figure, axes = _panels(record, outputs, NARROW, sharex=False)
+    figure.suptitle(f"{record.name}: errors", fontsize="medium")
+    for i, ax in axes.items():
+        output = record.outputs[i]
+        y = record.y[record.skip :, i]
+        for error, name, colour in _signals(record, y_linear, y_hat, i)[1:]:
+            label = name
+            counted = error[np.abs(error) <= (FAR * np.std(y) or np.inf)]
+            if np.isfinite(error).all():
+                within = float(np.quantile(np.abs(error), TAIL))
+                label = f"{name}: {100 * TAIL:g} % within ±{quantity(within, output.unit)}"
+            if not len(counted):
+                ax.plot([], [], color=colour, label=label)
+                continue
+            counts, edges = np.histogram(counted, bins=min(80, max(10, len(counted) // 20)))
+            share = counts / (len(error) * np.diff(edges))
+            style = "--" if colour == LINEAR else "-"
+            ax.stairs(share, edges, color=colour, ls=style, lw=1.2, label=label)
+            ax.stairs(share, edges, color=colour, fill=True, alpha=0.15)
+        ax.set(yscale="log", ylabel="density, logarithmic", yticks=[])
+        ax.yaxis.set_minor_locator(NullLocator())
+        _engineering(ax.xaxis, ax.get_xlim(), f"error of {output.name}", output.unit)
+        _legend(ax, ncols=1)
     return figure
 
 
@@ -226,15 +355,18 @@ def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Fig
         >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=3))
         >>> figure = plots.convergence(result.history, result.chosen_iteration, unit="V")
         >>> figure.axes[0].get_ylabel()
-        'simulation RMSE (V)'
+        'simulation RMSE (mV)'
     """
     figure = Figure(figsize=(7, 4), layout="constrained")
     ax = figure.subplots()
     iterations = [p.iteration for p in history]
-    ax.semilogy(iterations, [p.train for p in history], color="0.3", label="training")
-    validation = np.array([p.validation for p in history])
+    train, validation = np.array([(p.train, p.validation) for p in history]).T
+    factor, unit = engineering(train, unit)
+    ax.semilogy(iterations, factor * train, "--", color=OUTPUT, label="training")
     if np.isfinite(validation).any():
-        ax.semilogy(iterations, validation, color=NL_LFR, label="validation")
+        ax.semilogy(iterations, factor * validation, color=NL_LFR, label="validation")
+    ax.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
+    ax.yaxis.set_major_formatter("{x:g}")
     ax.axvline(chosen, color="0.6", ls=":", label=f"kept: iteration {chosen}")
     ax.set(xlabel="iteration", ylabel=f"simulation RMSE{f' ({unit})' if unit else ''}")
     ax.grid(True, which="both", alpha=0.2)
@@ -255,19 +387,96 @@ def png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def _panels(record: Record) -> tuple[Figure, list[Axes]]:
-    ny = record.y.shape[1]
-    figure = Figure(figsize=(8, 1.5 + 3.0 * ny), layout="constrained")
-    return figure, list(figure.subplots(ny, 1, squeeze=False, sharex=True)[:, 0])
+def _panels(
+    record: Record, outputs: Sequence[int] | None, width: float = WIDE, *, sharex: bool = True
+) -> tuple[Figure, dict[int, Axes]]:
+    """A panel for each output, by its number."""
+    numbers = list(range(record.y.shape[1]) if outputs is None else outputs)
+    figure = Figure(figsize=(width, HEIGHT * len(numbers)), layout="constrained")
+    axes = figure.subplots(len(numbers), 1, squeeze=False, sharex=sharex)[:, 0]
+    figure.suptitle(_title(record), fontsize="medium")
+    return figure, dict(zip(numbers, axes, strict=True))
+
+
+def _overlay(
+    record: Record,
+    y_linear: Array,
+    y_hat: Array | None,
+    outputs: Sequence[int] | None,
+    part: slice,
+    width: float,
+    *,
+    fits: bool = False,
+) -> Figure:
+    """Measured and simulated outputs of a part of the scored samples, and the errors below."""
+    numbers = list(range(record.y.shape[1]) if outputs is None else outputs)
+    figure = Figure(figsize=(width, HEIGHT * len(numbers)), layout="constrained")
+    axes = figure.subplots(
+        2 * len(numbers), 1, squeeze=False, sharex=True, height_ratios=[2, 1] * len(numbers)
+    )[:, 0]
+    scored = slice(record.skip, None)
+    t = (record.skip + np.arange(record.samples - record.skip)[part]) / record.fs
+    models = [("linear", y_linear, LINEAR, "--"), (NL_LFR_NAME, y_hat, NL_LFR, "-")]
+    for k, i in enumerate(numbers):
+        above, below = axes[2 * k : 2 * k + 2]
+        y, output = record.y[scored, i], record.outputs[i]
+        above.plot(*envelope(t, y[part]), lw=1.6, color=OUTPUT, label="measured")
+        reach = 0.0
+        for name, simulated, colour, style in models:
+            if simulated is None:
+                continue
+            own = simulated[scored, i]
+            label = f"{name}, {fit_text(y, own)}" if fits else name
+            above.plot(*envelope(t, own[part]), style, lw=1.0, color=colour, label=label)
+            error = (y - own)[part]
+            below.plot(*envelope(t, error), style, lw=1.0, color=colour, label=name)
+            reach = max(reach, np.max(np.abs(error), initial=0.0, where=np.isfinite(error)))
+        span = float(np.ptp(y)) or 1.0
+        low, high = above.get_ylim()
+        low, high = max(low, y.min() - BEYOND * span), min(high, y.max() + BEYOND * span)
+        _engineering(above.yaxis, (low, high), output.name, output.unit)
+        reach = 1.1 * min(reach, BEYOND * span) or span
+        _engineering(below.yaxis, (-reach, reach), "error", output.unit)
+        for ax in (above, below):
+            ax.margins(x=0)
+            ax.grid(True, alpha=0.2)
+        _legend(above)
+    figure.align_ylabels(axes)
+    figure.suptitle(_title(record), fontsize="medium")
+    axes[-1].set_xlabel("time in the record (s)" if record.fs != 1.0 else "sample of the record")
+    return figure
+
+
+def fit_text(y: Array, y_hat: Array) -> str:
+    """How well a simulation follows one output: 100 % - NRMSE, to two digits of the NRMSE.
+
+    Example:
+        >>> from lfrtorch.reporting import plots
+        >>> plots.fit_text(record.y[:, 0], 1.001 * record.y[:, 0])
+        'fit 99.90 %'
+    """
+    missing = 100 * float(rms(y - y_hat)) / (float(np.std(y)) or np.nan)
+    if not np.isfinite(missing):
+        return "diverges" if not np.isfinite(y_hat).all() else "no fit: constant"
+    if missing >= 1e3:
+        return "fit below -900 %"
+    digits = 1 - int(f"{missing:.1e}".split("e")[1])  # of the rounded value
+    return f"fit {100 - missing:.{min(max(digits, 1), 6)}f} %"
 
 
 def _signals(
     record: Record, y_linear: Array, y_hat: Array | None, i: int
 ) -> list[tuple[Array, str, str]]:
+    """Measured output and errors, label and colour; of a model that diverges the label alone."""
     y = record.y[record.skip :, i]
-    signals = [(y, "output", OUTPUT), (y - y_linear[record.skip :, i], "linear error", LINEAR)]
-    if y_hat is not None:
-        signals.append((y - y_hat[record.skip :, i], "NL-LFR error", NL_LFR))
+    signals = [(y, "output", OUTPUT)]
+    for name, simulated, colour in (("linear", y_linear, LINEAR), (NL_LFR_NAME, y_hat, NL_LFR)):
+        if simulated is None:
+            continue
+        error, label = y - simulated[record.skip :, i], f"{name} error"
+        if not np.isfinite(error).all():
+            error, label = np.full_like(y, np.nan), f"{name} diverges"
+        signals.append((error, label, colour))
     return signals
 
 
@@ -289,13 +498,28 @@ def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
     return np.repeat(t[::stretch][: len(pieces)], 2), ends.ravel()
 
 
-def _time_axis(record: Record, ax: Axes) -> None:
-    ax.set_xlabel("time in the record (s)" if record.fs != 1.0 else "sample of the record")
+def _engineering(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> None:
+    """Limits of an axis, and its label and ticks in the unit with an SI prefix."""
+    low, high = limits
+    largest = max(abs(low), abs(high))
+    factor, shown = engineering([largest], unit)
+    digits = 4 + int(np.log10(largest / (high - low))) if high > low else 4
+    axis.set_view_interval(low, high, ignore=True)
+    axis.set_major_formatter(lambda tick, _: f"{factor * tick:.{digits}g}".replace("-", "−"))
+    axis.set_label_text(f"{name} ({shown})" if shown else name)
 
 
-def _legend(ax: Axes) -> None:
-    """A legend whose lines are thick enough to be seen."""
-    for handle in ax.legend(loc="upper right").get_lines():
+def _frequency_axis(record: Record, ax: Axes) -> None:
+    ax.set_xlabel("frequency (Hz)" if record.fs != 1.0 else "frequency (1/sample)")
+
+
+def _legend(ax: Axes, *, ncols: int = 3, markerscale: float = 1.0) -> None:
+    """A legend above the panel, where it hides nothing, with lines thick enough to be seen."""
+    legend = ax.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=ncols, markerscale=markerscale,
+        frameon=False, borderaxespad=0.2, columnspacing=1.2, handlelength=1.8, fontsize="small",
+    )  # fmt: skip
+    for handle in legend.get_lines():
         handle.set_linewidth(2)
 
 

@@ -50,14 +50,12 @@ def write(
         board.text("sizes", run.size_search.table())
     board.text("scores", scores.table(metrics, dataset.published))
     if draw:
-        drawn = figures.of_run(result, run.linear, dataset, run.simulations)
+        drawn, views = figures.of_run(result, run.linear, dataset, run.simulations)
         images = {name: plots.png(figure) for name, figure in drawn.items()}
         (folder / "figures").mkdir(exist_ok=True)
         for name, image in images.items():
             (folder / "figures" / f"{name}.png").write_bytes(image)
             board.image(f"result/{name}", image, result.iterations)
-        more, views = figures.of_tests(run.simulations)
-        images |= {name: plots.png(figure) for name, figure in more.items()}
         page = html.render(
             metrics, result, run.linear, dataset, run.simulations, images, run.verdict,
             run.advice, views=views, config=config,

@@ -10,6 +10,7 @@ from importlib.metadata import version
 from typing import Any
 
 from lfrtorch._support import tables
+from lfrtorch._support.reasons import Reason
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.fitting.size_search import SizeSearch
@@ -196,13 +197,27 @@ def neurons(count: int) -> str:
 
 
 def starts_table(result: Mapping[str, Any]) -> str:
-    """All starts of a fit, the best first."""
+    """The starts of a fit that went to the end, the best first, and how many others there were."""
+    ended, others = finalists(result)
     head = ["seed", "iterations", "training", "validation", "selection", ""]
     rows = [
         [s[k] for k in ("seed", "iterations", "train", "validation", "selection", "reason")]
-        for s in result["ranking"]
+        for s in ended
     ]
-    return f"Starts, the best iterate of each\n\n{tables.table(head, rows)}"
+    parts = ["Starts, the best iterate of each", tables.table(head, rows), others]
+    return "\n\n".join(part for part in parts if part)
+
+
+def finalists(result: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], str]:
+    """The entries of the starts that no others ended, and a line on those that others did.
+
+    Args:
+        result: what ``metrics`` returns.
+    """
+    ended = [start for start in result["ranking"] if start["reason"] != Reason.OTHERS_BETTER]
+    count = len(result["ranking"]) - len(ended)
+    others = f"{count} {'others' if count > 1 else 'other'} ended earlier: see metrics.json."
+    return ended, others if count else ""
 
 
 def _pooled(values: list[float | None], scores: list[Score]) -> float | None:

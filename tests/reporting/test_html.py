@@ -131,10 +131,15 @@ def test_page_has_the_numbers_and_no_address_outside(single: Run):
     assert len(page.addresses) == 2
     assert "script" not in page.tags
     test = single.responses[-1]
-    linear, error = (number(lfrtorch.rmse(test.record, y)) for y in (test.y_linear, test.y_hat))
+    linear, error = (
+        number(1e3 * lfrtorch.rmse(test.record, y)) for y in (test.y_linear, test.y_hat)
+    )
     for words in (
+        "Simulation errors (RMSE, mV)",
         f"test {linear} {error}",
-        f"({error} V against {linear} V)",
+        "ratio linear NRMSE NRMSE else",
+        "500 else:",  # what others published, in the same unit
+        f"({error} mV against {linear} mV)",
         "Do this. as x is 3",
         "else: A <i>(2001)",
         "a note",

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle, StepPatch
 
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.records import Channel, Record
@@ -20,6 +21,18 @@ def drawn(ax: Axes, label: str) -> np.ndarray:
     return np.column_stack([line.get_xdata(), line.get_ydata()])
 
 
+def labels(ax: Axes) -> list[str]:
+    """Of all lines."""
+    return [str(line.get_label()) for line in ax.get_lines()]
+
+
+def legend(ax: Axes) -> list[str]:
+    """Its lines of text."""
+    found = ax.get_legend()
+    assert found is not None
+    return [text.get_text() for text in found.get_texts()]
+
+
 def test_spectrum_shows_amplitudes_in_decibel():
     figure = plots.spectrum(RECORD, 0.9 * Y, Y - 1e-3 * Y)
     first, second = figure.axes
@@ -29,28 +42,77 @@ def test_spectrum_shows_amplitudes_in_decibel():
             peak = line[np.argmax(line[:, 1])]
             assert peak == pytest.approx([frequency, 20 * np.log10(scale * amplitude)], abs=1e-6)
     assert "dB, re 1 m" in first.get_ylabel()
-    assert first.get_title() == "lab (file)"
+    assert figure.get_suptitle() == "lab (file)"
 
 
-def test_figures_of_a_linear_model_have_its_error_alone():
+def test_figures_of_a_linear_model_have_its_lines_alone():
     periodic = Record(T, Y, 100.0, start="periodic")
     skipped = Record(T, Y, 100.0, start="periodic", skip=1)
-    for record, unit in ((periodic, "Hz"), (skipped, "s"), (RECORD, "s")):
+    for record, unit, lines in (
+        (periodic, "Hz", ["output", "linear error"]),
+        (skipped, "s", ["measured", "linear, fit 90.0 %"]),
+        (RECORD, "s", ["measured", "linear, fit 90.0 %"]),
+    ):
         figure = plots.errors(record, 0.9 * Y)
-        assert [line.get_label() for line in figure.axes[0].get_lines()] == [
-            "output",
-            "linear error",
-        ]
+        assert labels(figure.axes[0]) == lines
         assert f"({unit})" in figure.axes[-1].get_xlabel()
+    assert labels(plots.close_up(RECORD, 0.9 * Y).axes[0]) == ["measured", "linear"]
 
 
-def test_response_shows_the_scored_samples():
-    record = Record(T, Y, 100.0, skip=100, name="lab")
-    ax = plots.response(record, 0.5 * Y, Y).axes[0]
-    assert drawn(ax, "output")[0] == pytest.approx([1.0, Y[100, 0]])
-    assert len(drawn(ax, "output")) == 300
-    assert np.allclose(drawn(ax, "linear error")[:, 1], 0.5 * Y[100:, 0])
-    assert not drawn(ax, "NL-LFR error")[:, 1].any()
+def test_response_overlays_the_scored_samples_with_the_errors_below():
+    record = Record(T, Y, 100.0, skip=100, name="lab", outputs=(Channel("a", "m"), Channel("b")))
+    above, below, *_ = plots.response(record, 0.5 * Y, 0.999 * Y).axes
+    assert labels(above) == ["measured", "linear, fit 50.0 %", "NL-LFR, fit 99.90 %"]
+    assert drawn(above, "measured")[0] == pytest.approx([1.0, Y[100, 0]])
+    assert len(drawn(above, "measured")) == 300
+    assert np.allclose(drawn(above, "NL-LFR, fit 99.90 %")[:, 1], 0.999 * Y[100:, 0])
+    assert np.allclose(drawn(below, "linear")[:, 1], 0.5 * Y[100:, 0])
+    assert np.allclose(drawn(below, "NL-LFR")[:, 1], 0.001 * Y[100:, 0])
+    assert below.get_ylabel() == "error (m)"
+
+
+def test_small_signals_have_axes_with_a_prefix():
+    record = Record(T, 1e-6 * Y, 100.0, outputs=(Channel("a", "m"), Channel("b", "kg")))
+    above, below, other, _ = plots.response(record, 0.9e-6 * Y).axes
+    assert (above.get_ylabel(), below.get_ylabel(), other.get_ylabel()) == (
+        "a (µm)",
+        "error (nm)",
+        "b (kg)",
+    )
+    assert below.yaxis.get_major_formatter()(50e-9) == "50"
+
+
+def test_a_model_that_runs_away_hides_nothing():
+    lost = np.where(np.arange(400)[:, None] < 300, Y, 1e6)
+    lost[350:] = np.nan
+    above, below, *_ = plots.response(RECORD, 0.9 * Y, lost).axes
+    assert labels(above)[-1] == "NL-LFR, diverges"
+    assert max(above.get_ylim()[1], below.get_ylim()[1]) < 4
+    first, last = plots.close_up(RECORD, 0.9 * Y, lost).axes[-1].get_xlim()
+    assert first < 3.0 < last
+    for draw in (plots.spectrum, plots.density):
+        assert labels(draw(RECORD, 0.9 * Y, lost).axes[0])[-1] == "NL-LFR diverges"
+    assert legend(plots.distribution(RECORD, 0.9 * Y, lost).axes[0])[-1] == "NL-LFR diverges"
+
+
+def test_distribution_says_where_most_errors_are():
+    error = np.random.default_rng(0).uniform(-1, 1, (100_000, 1))
+    record = Record(error, error, outputs=(Channel("a", "m"),))
+    ax = plots.distribution(record, 0.5 * error, 0.998 * error).axes[0]
+    assert legend(ax) == [
+        "linear error: 95 % within ±0.475 m",
+        "NL-LFR error: 95 % within ±1.90 mm",
+    ]
+    steps = ax.patches[0]
+    assert isinstance(steps, StepPatch)
+    counts, edges, _ = steps.get_data()
+    assert np.sum(counts * np.diff(edges)) == pytest.approx(1.0)
+
+
+def test_some_of_many_outputs_are_drawn():
+    figure = plots.response(RECORD, 0.9 * Y, outputs=[1])
+    assert [ax.get_ylabel() for ax in figure.axes] == ["b", "error"]
+    assert len(plots.spectrum(RECORD, 0.9 * Y, outputs=[1]).axes) == 1
 
 
 def test_density_integrates_to_the_power():
@@ -72,23 +134,24 @@ def test_close_up_is_about_the_largest_error():
     y_hat = Y.copy()
     y_hat[300, 1] += 2.0
     long = Record(np.tile(T, 10), np.tile(Y, (10, 1)), 100.0, skip=50, name="lab")
-    figure = plots.close_up(long, 0 * long.y, np.vstack([*[Y] * 5, y_hat, *[Y] * 4]))
-    assert len(figure.axes) == 4  # two outputs, and the error alone below each
-    for ax, labels in zip(figure.axes, (3, 1, 3, 1), strict=True):
-        line = drawn(ax, "NL-LFR error")
-        assert len(ax.get_lines()) == labels
-        assert line[[0, -1], 0] == pytest.approx([20.5, 25.49])  # 23.00 s is in the middle
-    assert drawn(figure.axes[3], "NL-LFR error")[250] == pytest.approx([23.0, -2.0])
-    lost = np.where(np.arange(400)[:, None] < 100, Y, np.nan)
-    line = drawn(plots.close_up(RECORD, 0 * Y, lost).axes[0], "output")
-    assert len(line) == 400
+    simulated = np.vstack([*[Y] * 5, y_hat, *[Y] * 4])
+    figure = plots.close_up(long, 0 * long.y, simulated)
+    assert len(figure.axes) == 4  # two outputs, and the errors below each
+    for ax, name in zip(figure.axes, ("measured", "linear", "measured", "linear"), strict=True):
+        line = drawn(ax, name)
+        # 50 samples, eight periods of 20 Hz being 40, about 23.00 s
+        assert line[[0, -1], 0] == pytest.approx([22.75, 23.24])
+    assert drawn(figure.axes[3], "NL-LFR")[25] == pytest.approx([23.0, -2.0])
+    (shaded,) = plots.response(long, 0 * long.y, simulated).axes[0].patches
+    assert isinstance(shaded, Rectangle)
+    assert (shaded.get_x(), shaded.get_width()) == pytest.approx((22.75, 0.49))
 
 
 def test_long_signals_keep_their_extremes():
     y = np.sin(np.arange(100_000))
     y[77_777] = 5.0
     ax = plots.response(Record(y, y), 0 * y[:, None], y[:, None]).axes[0]
-    line = drawn(ax, "output")
+    line = drawn(ax, "measured")
     assert len(line) <= plots.MOST_POINTS + 2
     assert line[:, 1].max() == 5.0
     assert abs(line[np.argmax(line[:, 1]), 0] - 77_777) <= 10

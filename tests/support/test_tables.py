@@ -4,7 +4,15 @@ import math
 
 import pytest
 
-from lfrtorch._support.tables import UNKNOWN, number, percent, quantity, table
+from lfrtorch._support.tables import (
+    UNKNOWN,
+    engineering,
+    number,
+    percent,
+    quantities,
+    quantity,
+    table,
+)
 
 
 @pytest.mark.parametrize(
@@ -39,10 +47,37 @@ def test_more_digits_on_request():
 
 
 def test_units_follow_the_number():
-    assert quantity(0.02, "V") == "0.0200 V"
+    assert quantity(0.2, "V") == "0.200 V"
     assert quantity(0.02, "") == "0.0200"
     assert percent(0.5) == "50.0 %"
     assert percent(None) == percent(math.nan) == UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "shown"),
+    [
+        (0.02, "V", "20.0 mV"),
+        (-3.2e-6, "m", "-3.20 µm"),
+        (4.5e4, "N", "45.0 kN"),
+        (999.0, "V", "999 V"),
+        (0.0015, "m/s²", "1.50 mm/s²"),
+        (0.02, "mm", "0.0200 mm"),  # prefixed already
+        (0.02, "kg", "0.0200 kg"),
+        (0.02, "°C", "0.0200 °C"),
+        (3600.0, "s", "3600 s"),
+        (5e-3, "s", "5.00 ms"),
+        (1e-16, "V", "1.00e-16 V"),  # rounding errors
+        (math.inf, "V", f"{UNKNOWN} V"),
+    ],
+)
+def test_units_take_the_prefix_that_reads_well(value: float, unit: str, shown: str):
+    assert quantity(value, unit) == shown
+
+
+def test_numbers_of_a_column_share_their_prefix():
+    assert quantities([0.04, 0.0004, None], "V") == ["40.0 mV", "0.400 mV", f"{UNKNOWN} mV"]
+    assert engineering([1e-6, 2e-6, 3.0], "m") == (pytest.approx(1e6), "µm")
+    assert engineering([0.0, math.nan], "m") == (1.0, "m")
 
 
 def test_columns_of_words_start_at_the_left_and_others_end_at_the_right():
