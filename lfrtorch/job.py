@@ -17,6 +17,7 @@ from lfrtorch._support.threads import each_alone
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.inference import infer
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.observer import Observer
@@ -37,6 +38,9 @@ from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
 from lfrtorch.reporting.simulations import respond
 from lfrtorch.reporting.verdict import judge
+
+SLOW_SAMPLES = 5000
+"""Training samples from which a static map that is not compiled is worth a note."""
 
 
 def identify(
@@ -101,8 +105,14 @@ def identify(
         settings = replace(settings, **sizes.chosen.sizes)
     models = starting_models(dataset.train, settings, linear)
     average = _most_averaged(models, settings.average, observer)
+    samples = sum(record.samples for record in dataset.train)
+    if samples >= SLOW_SAMPLES and not is_compiled(cell := models[0].lfr.cell, cell.A.cpu()):
+        observer.say(
+            "note: the static map is a module of your own, which is not compiled: an iteration "
+            "takes some ten times as long as with a network or a polynomial"
+        )
     observer.say(
-        f"{dataset.name}: {sum(record.samples for record in dataset.train)} training samples, "
+        f"{dataset.name}: {samples} training samples, "
         f"{models[0].parameter_count} parameters "
         f"({models[0].net_parameter_count} without the gauge directions), {len(models)} start(s)"
     )

@@ -238,8 +238,8 @@ def simulate_blocks(
     """Simulated output of an input that comes in blocks, as if it were simulated in one go.
 
     Each block begins with the state at the end of the one before. The numbers are the same to the
-    bit if the model is linear or a ``Network`` on the CPU, otherwise to rounding. Only one block is
-    in memory.
+    bit if the CPU has the model compiled (linear, a ``Network`` or a ``Polynomial``), otherwise to
+    rounding. Only one block is in memory.
 
     Args:
         model: what is simulated; ``LinearModel.to_model`` gives that of a linear one.

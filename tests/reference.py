@@ -16,7 +16,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.linear.refinement import Refined
 from lfrtorch.linear.response_fit import ResponseFit
@@ -151,6 +151,18 @@ def random_cell(
             for p in loop:
                 p.div_(torch.linalg.matrix_norm(p, 2))
             cell.Bw.mul_(feedback)
+    return cell.to(dtype)
+
+
+def polynomial_cell(
+    nz: int, nw: int, degree: int, *, radius: float = 0.5, dtype: torch.dtype = torch.float64
+) -> LFRCell:
+    """Cell with two inputs, outputs and states, and a polynomial of a z of about unit size."""
+    static = Polynomial(nz, nw, degree)
+    cell = random_cell(2, 2, 2, nz, nw, static=static, radius=radius, feedback=0.05)
+    with torch.no_grad():
+        cell.Cz.mul_(0.3)
+        cell.Dzu.mul_(0.3)
     return cell.to(dtype)
 
 

@@ -79,7 +79,9 @@ def test_a_model_to_go_on_from_is_not_changed(dataset: Dataset):
         identify(Dataset("two", [other], [], []), settings(init_from=first))
 
 
-def test_a_map_of_ones_own_is_made_with_its_sizes(dataset: Dataset):
+def test_a_map_of_ones_own_is_made_with_its_sizes_and_a_slow_one_is_told(
+    dataset: Dataset, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
     class Cubic(torch.nn.Module):
         def __init__(self, nz: int, nw: int) -> None:
             super().__init__()
@@ -88,8 +90,13 @@ def test_a_map_of_ones_own_is_made_with_its_sizes(dataset: Dataset):
         def forward(self, z: torch.Tensor) -> torch.Tensor:
             return z**3 @ self.c.mT
 
-    run = identify(dataset, settings(static=Cubic))
+    run = identify(dataset, settings(static=Cubic), observer=Console())
     assert isinstance(run.model.lfr.cell.static, Cubic)
+    assert "not compiled" not in capsys.readouterr().out
+    monkeypatch.setattr("lfrtorch.job.SLOW_SAMPLES", 300)
+    for static in ("polynomial", Cubic):
+        identify(dataset, settings(static=static, degree=2), observer=Console())
+        assert ("not compiled" in capsys.readouterr().out) == (static is Cubic)
 
 
 @pytest.mark.parametrize("starts", [1, 3])

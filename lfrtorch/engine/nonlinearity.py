@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
 from itertools import combinations_with_replacement
-from operator import mul
 from typing import TypeGuard
 
 import torch
@@ -13,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call, vmap
 from torch.nn import Module, Parameter, ParameterList
-from torch.nn.functional import pad
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
@@ -94,6 +91,11 @@ def is_network(static: Module | None) -> TypeGuard[Network]:
     return type(static) is Network
 
 
+def is_polynomial(static: Module | None) -> TypeGuard[Polynomial]:
+    """Whether a map is a ``Polynomial`` itself."""
+    return type(static) is Polynomial
+
+
 class Polynomial(Module):
     """All monomials up to a total degree: w = C m(z), m(z) = (1, z1, z2, .., z1², z1 z2, ..).
 
@@ -118,8 +120,6 @@ class Polynomial(Module):
         torch.Size([1, 10])
     """
 
-    _factors: Tensor
-
     def __init__(
         self,
         nz: int,
@@ -132,10 +132,21 @@ class Polynomial(Module):
         super().__init__()
         integer("degree", degree, 1)
         self.nz, self.degree = nz, degree
-        # A monomial is a product of `degree` factors out of (1, z1, z2, ..); ones lower its degree.
-        factors = list(combinations_with_replacement(range(nz + 1), degree))
-        self.register_buffer("_factors", torch.tensor(factors, device=device), persistent=False)
-        self.C = Parameter(torch.empty(nw, len(factors), device=device, dtype=dtype))
+        monomials = [
+            factors  # numbers of the z in the product
+            for total in range(degree + 1)
+            for factors in combinations_with_replacement(range(nz), total)
+        ]
+        number = {factors: n for n, factors in enumerate(monomials)}
+        self.growth = [(number[factors[:-1]], factors[-1]) for factors in monomials[1:]]
+        """(m, j) of every monomial but the constant: it is monomial m, before it, times z_j."""
+        self.slopes: list[tuple[int, int, int, int]] = []
+        """(n, j, e, m) for every ∂(monomial n)/∂z_j that is not zero: e times monomial m."""
+        for n, factors in enumerate(monomials):
+            for j in sorted(set(factors)):
+                i = factors.index(j)
+                self.slopes.append((n, j, factors.count(j), number[factors[:i] + factors[i + 1 :]]))
+        self.C = Parameter(torch.empty(nw, len(monomials), device=device, dtype=dtype))
         self.reset_parameters()
 
     def reset_parameters(self, generator: torch.Generator | None = None) -> None:
@@ -146,8 +157,15 @@ class Polynomial(Module):
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
         """w of z."""
-        factors = pad(z, (1, 0), value=1.0)[..., self._factors]  # (..., monomials, degree)
-        return reduce(mul, factors.unbind(-1)) @ self.C.mT
+        return self.monomials(z) @ self.C.mT
+
+    def monomials(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes monomials"]:
+        """m(z)."""
+        each = z.unbind(-1)
+        m = [torch.ones_like(each[0])]
+        for before, j in self.growth:
+            m.append(m[before] * each[j])
+        return torch.stack(m, dim=-1)
 
     def extra_repr(self) -> str:
         """Sizes, for ``print(module)``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,7 +14,7 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linear_recurrence import has_kernels, to_numpy
 from lfrtorch.engine.linearised import monodromy, spectral_radius
 from lfrtorch.engine.newton import newton_states
-from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.engine.nonlinearity import is_network, is_polynomial
 from lfrtorch.engine.simulation_kernel import ACTIVATION_CODES, simulate_record
 
 PERIODIC_TOLERANCE = 1e-10
@@ -56,9 +57,9 @@ def simulate(
 ) -> Trajectory:
     """Trajectory from the state ``x0``. A model that diverges gives infinite or NaN samples.
 
-    On the CPU a linear model and a ``Network`` are simulated in machine code. Any other map, and
-    any other device, goes through Newton's method over all of time. If that fails for a record, it
-    is simulated step by step.
+    On the CPU a linear model, a ``Network`` and a ``Polynomial`` are simulated in machine code. Any
+    other map, and any other device, goes through Newton's method over all of time. If that fails
+    for a record, it is simulated step by step.
 
     Args:
         cell: the model. Its weights may have a leading axis of length R: one model a record.
@@ -141,7 +142,8 @@ def steady_state(
 
 def is_compiled(cell: LFRCell, u: Tensor) -> bool:
     """Whether the cell is simulated in machine code on the device of ``u``."""
-    return has_kernels(u) and (cell.static is None or is_network(cell.static))
+    known = cell.static is None or is_network(cell.static) or is_polynomial(cell.static)
+    return known and has_kernels(u)
 
 
 def _with_loop_where_lost(
@@ -173,7 +175,7 @@ def _compiled(
     x0: Float[Tensor, "R nx"],
     near: Trajectory | None,
 ) -> Trajectory:
-    """Trajectory of a linear cell or one hidden layer, in machine code on the CPU.
+    """Trajectory of a cell that ``is_compiled``, in machine code on the CPU.
 
     ``near`` is the trajectory of the same model and input from another initial state; it is
     overwritten. Once the two have met, the rest of it is taken over.
@@ -183,18 +185,18 @@ def _compiled(
         sizes = ((T + 1, cell.nx), (T, cell.nz), (T, cell.nw), (T, cell.ny))
         near = Trajectory(*(u.new_full((R, *size), torch.nan) for size in sizes))
     near.x[:, 0] = x0
-    if cell.static is None:
-        vectors, matrices, activation = [u.new_zeros(0)] * 2, [u.new_zeros(0, 0)] * 2, "tanh"
-    else:
-        assert is_network(cell.static)
-        network = cell.static
-        vectors, matrices = [network.bz, network.bw], [network.Wz.mT, network.Ww]
-        activation = network.activation
+    static, activation, growth = cell.static, "tanh", np.zeros((0, 2), np.int64)
+    vectors, matrices = [u.new_zeros(0), u.new_zeros(cell.nw)], [u.new_zeros(0, 0)] * 2
+    if is_network(static):
+        vectors, matrices = [static.bz, static.bw], [static.Wz.mT, static.Ww]
+        activation = static.activation
+    elif is_polynomial(static):
+        matrices[1], growth = static.C, np.array(static.growth)
     lti = (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
     # A leading axis, for one model or one a record.
     weights = [m if m.ndim == 3 else m.unsqueeze(0) for m in (*lti, *matrices)]
     weights += [v if v.ndim == 3 else v[None, None] for v in vectors]
     met_within = MET_ROUNDING * torch.finfo(u.dtype).eps
-    arguments = [to_numpy(u), *map(to_numpy, weights), ACTIVATION_CODES[activation], met_within]
-    spread(simulate_record, R, *arguments, *(signal.numpy() for signal in near))
+    arguments = [to_numpy(u), *map(to_numpy, weights), ACTIVATION_CODES[activation], growth]
+    spread(simulate_record, R, *arguments, met_within, *(signal.numpy() for signal in near))
     return near

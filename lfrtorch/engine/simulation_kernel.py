@@ -1,4 +1,4 @@
-"""One record of a linear model or a ``Network`` in machine code, one sample after another."""
+"""One record of a model in machine code: linear, or with a ``Network`` or a ``Polynomial``."""
 
 from __future__ import annotations
 
@@ -12,32 +12,40 @@ ACTIVATION_CODES = {"tanh": 0, "sigmoid": 1, "relu": 2, "rbf": 3, "softplus": 4}
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def simulate_record(
-    r, u, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, met_within, x, z, w, y
+    r, u, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth, met_within,
+    x, z, w, y,
 ):  # fmt: skip
     """Simulate record r: write its signals over those in x, z, w and y.
 
     It stops once a state agrees, within ``met_within``, with the one that it would overwrite: the
     rest of the earlier trajectory then holds for this one, too.
 
-    The weights have a leading axis: one model for all records, or one a record.
+    The weights have a leading axis: one model for all records, or one a record. The hidden layer
+    is σ(Wz z + bz), or has the monomials of a polynomial if these have a growth.
 
     Shape:
-        WzT: (models, nz, nn), bz: (models, 1, nn), bw: (models, 1, nw), x: (R, T + 1, nx),
-        u: (R, T, nu), z: (R, T, nz), w: (R, T, nw), y: (R, T, ny).
+        WzT: (models, nz, nn), bz: (models, 1, nn), bw: (models, 1, nw), growth: (nn - 1, 2) as that
+        of ``Polynomial``, or (0, 2), x: (R, T + 1, nx), u: (R, T, nu), z: (R, T, nz),
+        w: (R, T, nw), y: (R, T, ny).
     """
     m = min(r, len(A) - 1)  # which model
     A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = A[m], Bu[m], Bw[m], Cz[m], Dzu[m], Cy[m], Dyu[m], Dyw[m]
     WzT, Ww, bz, bw = WzT[m], Ww[m], bz[m, 0], bw[m, 0]
     u, x, z, w, y = u[r], x[r], z[r], w[r], y[r]
-    h = np.empty(len(bz), u.dtype)
+    h = np.empty(Ww.shape[1], u.dtype)
     for k in range(len(u)):
         _affine(Cz, x[k], Dzu, u[k], z[k])
-        for n in range(len(h)):
-            h[n] = bz[n]
-        for j in range(z.shape[1]):
+        if len(growth):
+            h[0] = 1.0
+            for n in range(len(growth)):
+                h[n + 1] = h[growth[n, 0]] * z[k, growth[n, 1]]
+        else:
             for n in range(len(h)):
-                h[n] += WzT[j, n] * z[k, j]
-        _activate(activation, h)
+                h[n] = bz[n]
+            for j in range(z.shape[1]):
+                for n in range(len(h)):
+                    h[n] += WzT[j, n] * z[k, j]
+            _activate(activation, h)
         for i in range(w.shape[1]):
             w[k, i] = bw[i] + _dot(Ww[i], h)
         _affine(Cy, x[k], Dyu, u[k], y[k])

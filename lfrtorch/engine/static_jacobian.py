@@ -11,7 +11,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vjp, vmap
 
-from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Stacked, is_network
+from lfrtorch.engine.nonlinearity import (
+    ACTIVATIONS,
+    Network,
+    Polynomial,
+    Stacked,
+    is_network,
+    is_polynomial,
+)
 
 Weights = dict[str, Tensor]
 
@@ -50,6 +57,8 @@ def linearise_static(
     """The map linearised at z, with the given weights instead of its own."""
     if is_network(static):
         return NetworkJacobian(static, z, weights)
+    if is_polynomial(static):
+        return PolynomialJacobian(static, z, weights)
     return ModuleJacobian(static, z, weights)
 
 
@@ -116,6 +125,42 @@ class NetworkJacobian:
         d_v = (d_w @ self.Ww) * self.slope
         parts = (d_v.mT @ self.z, d_v.sum(-2), d_w.mT @ self.h, d_w.sum(-2))
         return torch.cat([part.flatten(1) for part in parts], dim=-1)
+
+
+class PolynomialJacobian:
+    """w = C m(z), in closed form: every ∂w/∂z is a polynomial in the same monomials."""
+
+    def __init__(
+        self, polynomial: Polynomial, z: Float[Tensor, "R T nz"], weights: Weights
+    ) -> None:
+        C, nz = weights["C"], polynomial.nz
+        self.m, (nw, count) = polynomial.monomials(z), C.shape[-2:]
+        n, j, e, lower = torch.tensor(polynomial.slopes, device=C.device).mT
+        # Its coefficients: D[.., lower, q, j] = e C[q, n].
+        D = C.new_zeros(*C.shape[:-2], count, nw, nz)
+        D[..., lower, :, j] = (e * C[..., n]).movedim(-1, 0)
+        self.J = (self.m @ D.flatten(-2)).unflatten(-1, (nw, nz))
+
+    def part(self, records: slice, time: slice) -> StaticJacobian:
+        """The same for some of the records and samples."""
+        part = copy.copy(self)
+        part.m, part.J = self.m[records, time], self.J[records, time]
+        return part
+
+    def by_weight(self) -> Float[Tensor, "R T nw weights"]:
+        """∂w/∂φ: the monomials, in the rows of one output each."""
+        nw = self.J.shape[2]
+        if nw == 1:
+            return self.m.unsqueeze(2)
+        return torch.einsum("rtm,qp->rtqpm", self.m, torch.eye(nw).to(self.m)).flatten(-2)
+
+    def tangent(self, d_weights: Float[Tensor, "*records weights"]) -> Float[Tensor, "R T nw"]:
+        """(∂w/∂φ) dφ."""
+        return self.m @ d_weights.unflatten(-1, (self.J.shape[2], -1)).mT
+
+    def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R weights"]:
+        """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
+        return (d_w.mT @ self.m).flatten(1)
 
 
 class ModuleJacobian:

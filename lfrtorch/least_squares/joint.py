@@ -19,7 +19,7 @@ from torch.nn import Parameter
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Stacked, is_network
+from lfrtorch.engine.nonlinearity import Stacked, is_network, is_polynomial
 from lfrtorch.engine.sensitivity import Linearisation, Rows
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.least_squares.jacobian import Jacobian
@@ -42,7 +42,7 @@ def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
     own = {n.removeprefix("static."): w for n, w in weights.items() if n.startswith("static.")}
     if first.static is None:
         static = None
-    elif is_network(first.static):
+    elif is_network(first.static) or is_polynomial(first.static):
         static = copy.deepcopy(first.static)
         for name, w in own.items():  # vectors get an axis for time
             setattr(static, name, Parameter(w if w.ndim == 3 else w.unsqueeze(1)))

@@ -7,7 +7,7 @@ import reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import SIZES, normal, random_cell
+from reference import SIZES, normal, polynomial_cell, random_cell
 from torch import Tensor, nn
 from torch.testing import assert_close
 
@@ -112,6 +112,12 @@ def test_linear_cell(check):
 @pytest.mark.parametrize("check", [check_zero_start, check_periodic])
 def test_own_module_as_static_map(check):
     check(random_cell(1, 2, 2, 2, 2, static=Cubic(2, 2), radius=0.3, feedback=0.05))
+
+
+@pytest.mark.parametrize(("nz", "nw", "degree"), [(1, 1, 5), (1, 2, 1), (2, 1, 3), (3, 2, 2)])
+@pytest.mark.parametrize("check", [check_zero_start, check_periodic])
+def test_polynomial(check, nz: int, nw: int, degree: int):
+    check(polynomial_cell(nz, nw, degree, radius=0.3))
 
 
 @pytest.mark.parametrize("check", [check_zero_start, check_periodic])

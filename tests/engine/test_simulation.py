@@ -8,16 +8,17 @@ import reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import SIZES, normal, random_cell
+from reference import SIZES, normal, polynomial_cell, random_cell
 from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import linearise, monodromy, spectral_radius
-from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network
+from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Polynomial
 from lfrtorch.engine.simulation import (
     PERIODIC_TOLERANCE,
     Trajectory,
+    is_compiled,
     simulate,
     steady_state,
 )
@@ -77,6 +78,42 @@ def test_compiled_is_the_plain_loop_for_every_activation(activation: str, dtype:
     # Errors of the steps before contract: some 100 eps in all, in either order of the sums.
     eps = torch.finfo(dtype).eps
     assert_same(trajectory, reference.simulate(cell, u, x0), 1000 * eps)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("degree", [1, 2, 3, 5])
+@pytest.mark.parametrize(("nz", "nw"), [(1, 1), (2, 3), (3, 2)])
+def test_polynomial_is_compiled_and_the_plain_loop(
+    nz: int, nw: int, degree: int, dtype: torch.dtype
+):
+    cell = polynomial_cell(nz, nw, degree, dtype=dtype)
+    u, x0 = normal(3, 20, 2, dtype=dtype), normal(3, 2, seed=1, dtype=dtype)
+    assert is_compiled(cell, u)
+    trajectory = simulate(cell, u, x0)
+    assert trajectory.y.dtype == dtype
+    assert_same(trajectory, reference.simulate(cell, u, x0), 1000 * torch.finfo(dtype).eps)
+
+
+def test_steady_state_of_a_polynomial_is_the_last_of_very_many_periods():
+    cell, u = polynomial_cell(2, 2, 3), normal(2, 10, 2)
+    expected = reference.simulate(cell, u, u.new_zeros(2, 2), periods=20)
+    assert_same(steady_state(cell, u), expected, 2e-9)
+
+
+def test_polynomial_that_diverges_is_not_an_exception():
+    cell, u = polynomial_cell(1, 1, 3), 1e3 * normal(2, 20, 2)
+    assert not simulate(cell, u, u.new_zeros(2, 2)).finite
+    assert not steady_state(cell, u).finite
+
+
+def test_own_class_derived_from_the_polynomial_is_followed():
+    class Shifted(Polynomial):
+        def forward(self, z: Tensor) -> Tensor:
+            return super().forward(z + 1.0)
+
+    cell = random_cell(static=Shifted(1, 1, 2), radius=0.3, feedback=0.01)
+    u, x0 = normal(2, 20, 1), normal(2, 2, seed=1)
+    assert_same(simulate(cell, u, x0), reference.simulate(cell, u, x0), 1e-12)
 
 
 def test_linear_cell_is_the_plain_loop():

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.testing import assert_close
 
-from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Stacked
+from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Polynomial, Stacked
 from lfrtorch.engine.static_jacobian import StaticJacobian, linearise_static
 
 pytestmark = pytest.mark.numeric
@@ -65,7 +65,7 @@ def check(jacobian: StaticJacobian, static: nn.Module, weights: list[dict[str, T
             J, by = expected_slopes(static, weights[r], z[r, k])
             assert_close(jacobian.J[r, k], J, rtol=1e-12, atol=1e-14)
             assert_close(by_weight[r, k], by.double(), rtol=1e-12, atol=1e-14)
-    direction, d_w = normal(by_weight.shape[-1], seed=8), normal(R, T, nw, seed=9)
+    direction, d_w = normal(by_weight.shape[-1], seed=8), normal(*by_weight.shape[:3], seed=9)
     assert_close(jacobian.tangent(direction), by_weight @ direction, rtol=1e-12, atol=1e-12)
     expected = (by_weight * d_w.unsqueeze(-1)).sum(dim=(1, 2))
     assert_close(jacobian.adjoint(d_w), expected, rtol=1e-12, atol=1e-12)
@@ -79,6 +79,18 @@ def test_network(activation: str):
     static, z = network(activation), normal(R, T, nz)
     weights = weights_of(static)
     check(linearise_static(static, z, weights), static, [weights, weights], z)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 5])
+@pytest.mark.parametrize("nz", [1, 2, 3])
+@pytest.mark.parametrize("nw", [1, 3])
+def test_polynomial(nz: int, nw: int, degree: int):
+    static, z = Polynomial(nz, nw, degree, dtype=torch.float64), normal(R, T, nz)
+    weights = weights_of(static)
+    check(linearise_static(static, z, weights), static, [weights, weights], z)
+    each = [weights_of(static, seed=10 * r + 1) for r in range(R)]
+    stacked = {"C": torch.stack([w["C"] for w in each])}
+    check(linearise_static(static, z, stacked), static, each, z)
 
 
 def test_own_module():
