@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import glob
 import textwrap
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -92,6 +93,9 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
     wanted = [*roles.inputs, *roles.outputs]
     signals, more = read(table, wanted if roles.time is None else [*wanted, roles.time])
     fs, sentences = options.fs, []
+    for name, said in table.rates.items():
+        remarks.append(f"{name!r} says {said:.6g} Hz")
+        fs = said if fs is None else fs
     if roles.time is not None:
         fs, remark, sentences = clock(signals[:, -1], table.columns[roles.time], fs)
         remarks.append(remark)
@@ -115,6 +119,9 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
     print(f"{path}: {len(signals)} samples{'' if found.fs is None else f' at {found.fs:.6g} Hz'}")
     for remark in remarks:
         print(f"  {remark}")
+    if table.contents:
+        listed = [list(one) for one in table.contents]
+        print(f"\n{tables.table(['variable', 'shape', 'taken for'], listed)}")
     print(f"\n{numbers(found)}\n")
     for sentence in sentences:
         print(textwrap.fill(sentence, 100, initial_indent="- ", subsequent_indent="  "))
@@ -142,7 +149,17 @@ def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]
             "give every column one use, and one column of times."
         )
     heads, remarks = {}, []
-    for i in set(range(len(table.columns))) - set(named):
+    if not table.contents:
+        remarks = [f"left out: {name!r} {reason}" for name, reason in table.refused.items()]
+    rest = sorted(set(range(len(table.columns))) - set(named))
+    if table.lengths:
+        counted = Counter(table.lengths[i] for i in named or rest)
+        usual = max(counted, key=lambda T: (counted[T], T), default=0)
+        short = [table.columns[i].name for i in rest if table.lengths[i] != usual]
+        rest = [i for i in rest if table.lengths[i] == usual]
+        if short:
+            remarks.append(f"left out: {', '.join(short)}, of other lengths than {usual} samples")
+    for i in rest:
         try:
             heads[i] = next(table.blocks([i], BLOCK))[:, 0]
         except InputError as error:

@@ -26,10 +26,9 @@ from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.linear import finite
-from lfrtorch.files.formats import open_table
+from lfrtorch.cli.words import translated
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import Block, FileStream
-from lfrtorch.files.time_stamps import is_time
 from lfrtorch.files.writer import FORMATS, table_writer
 from lfrtorch.metrics import BlockScores
 
@@ -59,8 +58,10 @@ def simulate(cfg: DictConfig) -> None:
             stream = FileStream(
                 path, model.inputs, model.outputs, model.fs,
                 inputs=cfg.data.inputs, outputs=cfg.data.outputs,
-                time=time_column(cfg, model, path),
+                time=cfg.data.time, find_time=cfg.data.fs is None,
             )  # fmt: skip
+            if stream.note:
+                print(f"note: '{path}': {translated(stream.note, cfg)}")
             if not stream.y:
                 missing = ", ".join(stream.missing)
                 print(f"note: '{path}' has no column {missing}, so nothing is scored")
@@ -163,24 +164,6 @@ def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
             f"data.fs is {cfg.data.fs} Hz and the model's sampling frequency {model.fs:g} Hz; "
             "resample the file."
         )
-
-
-def time_column(cfg: DictConfig, model: lfrtorch.Model, path: Path) -> str | int | None:
-    """The column of the time: if nothing says how the file is sampled, the one named like it."""
-    if cfg.data.time is not None or cfg.data.fs is not None:
-        return cfg.data.time
-    named = [column.name for column in open_table(path).columns if is_time(column)]
-    if len(named) == 1:
-        print(
-            f"note: the column {named[0]!r} of '{path}' is taken for the time; "
-            f"data.fs={model.fs:g} instead leaves it unread"
-        )
-        return named[0]
-    print(
-        f"note: neither data.time nor data.fs says how '{path}' is sampled; the model's "
-        f"{model.fs:g} Hz is taken"
-    )
-    return None
 
 
 def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> Array | None:

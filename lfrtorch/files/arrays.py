@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -22,33 +23,48 @@ from lfrtorch.files.table import BLOCK, Clock, Table
 
 _REAL, _TIMES = "biuf", "M"
 
+_RECORD = 32
+"""Samples of a vector that tells the axis of time; a shorter one may have a number a channel."""
+
+_FREQUENCY = re.compile(
+    r"f_?s(amp|ampling|ample)?|s_?rate|sampl(e|ing)[ _-]?(rate|freq|frequency)", re.IGNORECASE
+)
+_INTERVAL = re.compile(
+    r"t_?s(amp|ampling|ample)?|d_?t|delta_?t|sampl(e|ing)[ _-]?(time|period|interval)",
+    re.IGNORECASE,
+)
+
 Stored = Callable[[Path], AbstractContextManager[Any]]
 """Opens a file: its arrays by name."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """An array of the file as samples (T, channels).
+    """An array of the file.
 
     Args:
         shape: as it is in the file.
         dtype: of its numbers.
         unit: empty if the file does not say it.
-        transposed: time runs along the last axis.
-        values: the array, if it is in memory.
+        reverse: the file has the axes in the order that is not the user's.
+        values: the array, if it is in memory; a lone number always is.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype
     unit: str = ""
-    transposed: bool = False
+    reverse: bool = False
     values: NDArray[Any] | None = None
 
     @property
-    def size(self) -> tuple[int, int]:
-        """T and channels."""
-        rows, columns = self.shape if len(self.shape) == 2 else (*self.shape, 1)
-        return (columns, rows) if self.transposed else (rows, columns)
+    def shown(self) -> str:
+        """Its shape for a user."""
+        return " × ".join(map(str, self.shape[::-1] if self.reverse else self.shape)) or "1"
+
+    @property
+    def vector(self) -> bool:
+        """Whether it is the samples of one channel."""
+        return max(self.shape, default=1) == np.prod(self.shape) > 1
 
     def refusal(self) -> str:
         """Why it is no signal; nothing if it is one."""
@@ -60,11 +76,11 @@ class Signal:
         if np.prod(self.shape) <= 1:
             return "has one number or none, and is no signal"
         if len(self.shape) > 2:
-            return f"has shape {self.shape}; give (samples,) or (samples, channels)"
-        T, channels = self.size
-        if channels > T:
+            return f"is {self.shown}; give samples × channels"
+        if len(set(self.shape)) < len(self.shape):
             return (
-                f"has {T} row(s) and {channels} columns; time must run along the rows: transpose it"
+                f"is {self.shown}, and time may run along either axis; store its channels one by "
+                "one"
             )
         return ""
 
@@ -72,7 +88,9 @@ class Signal:
 class ArrayTable(Table):
     """Arrays by name; those of a table that are read together have one length.
 
-    An array (T, k) named u has the columns u1 .. uk, one (T,), (T, 1) or (1, T) the column u.
+    Time runs along the axis of an array that is as long as a vector of the file is, and of two such
+    axes, or none, along the longer one. An array u of k channels has the columns u1 .. uk, one of a
+    channel the column u. A lone number with the name of a sampling frequency or time is a rate.
 
     Args:
         path: the file.
@@ -83,30 +101,46 @@ class ArrayTable(Table):
     def __init__(self, path: Path, found: Mapping[str, Signal | str], stored: Stored) -> None:
         self._stored = stored
         self._signals: list[tuple[str, int]] = []  # of each column
-        self._found: dict[str, Signal] = {}
-        headers, units, arrays, refused = [], {}, {}, {}
-        for name, given in found.items():
-            signal = given
-            if isinstance(signal, Signal) and len(signal.shape) == 2 and signal.size[0] == 1:
-                signal = replace(signal, transposed=not signal.transposed)
+        self._axes: dict[str, int] = {}  # of time
+        self.contents = contents = []
+        signals = {name: s for name, s in found.items() if isinstance(s, Signal)}
+        vectors = {max(s.shape) for s in signals.values() if s.vector and not s.refusal()}
+        vectors = {T for T in vectors if T >= _RECORD}
+        headers, units, arrays, refused, rates = [], {}, {}, {}, {}
+        lengths: list[int] = []
+        for name, signal in found.items():
+            shown = "" if isinstance(signal, str) else signal.shown
+            rate = None if isinstance(signal, str) else sampling_rate(name, signal)
             reason = signal if isinstance(signal, str) else signal.refusal()
+            if rate is not None:
+                rates[name] = rate
+                contents.append((name, shown, f"sampling frequency, {rate:g} Hz"))
             if isinstance(signal, str) or reason:
                 refused[name] = reason
+                if rate is None:
+                    contents.append((name, shown, f"nothing: it {reason}"))
                 continue
-            width = signal.size[1]
+            fits = [axis for axis, n in enumerate(signal.shape) if n in vectors]
+            axis = fits[0] if len(fits) == 1 else int(np.argmax(signal.shape))
+            T, width = signal.shape[axis], int(np.prod(signal.shape)) // signal.shape[axis]
             names = [name] if width == 1 else [f"{name}{i + 1}" for i in range(width)]
             if width > 1:
                 arrays[name] = tuple(range(len(headers), len(headers) + width))
             headers += names
+            lengths += [T] * width
             units |= dict.fromkeys(names, signal.unit)
             self._signals += [(name, i) for i in range(width)]
-            self._found[name] = signal
-        super().__init__(path, headers, units=units, arrays=arrays, refused=refused)
+            self._axes[name] = axis
+            channels = "signal" if width == 1 else f"signals {names[0]} .. {names[-1]}"
+            contents.append((name, shown, channels))
+        super().__init__(
+            path, headers, units=units, arrays=arrays, refused=refused, rates=rates, lengths=lengths
+        )
 
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`."""
         chosen = [self._signals[column] for column in columns]
-        lengths = {name: self._found[name].size[0] for name, _ in chosen}
+        lengths = {self._signals[column][0]: self.lengths[column] for column in columns}
         if len(set(lengths.values())) > 1:
             listed = ", ".join(f"{name!r} has {length}" for name, length in lengths.items())
             raise InputError(f"'{self.path}': {listed} samples; give arrays of one length.")
@@ -117,16 +151,36 @@ class ArrayTable(Table):
                 stop = min(start + samples, T)
                 parts = {}
                 for name in lengths:
-                    signal, array = self._found[name], stored[name]
+                    array, last = stored[name], self._axes[name] == 1
                     try:
-                        part = array[..., start:stop] if signal.transposed else array[start:stop]
+                        part = array[:, start:stop] if last else array[start:stop]
                     except OSError as error:
                         raise _damaged(self.path, error) from error
-                    part = np.asarray(part.T if signal.transposed else part)
+                    part = np.asarray(part.T if last else part)
                     if part.dtype.kind in _TIMES:
                         part = clocks[name](part)
                     parts[name] = part.reshape(stop - start, -1)
                 yield np.stack([parts[name][:, i] for name, i in chosen], axis=1, dtype=np.float64)
+
+
+def sampling_rate(name: str, signal: Signal) -> float | None:
+    """The sampling frequency in Hz, if it is a lone number with the name of that or of its inverse.
+
+    Example:
+        >>> from lfrtorch.files.arrays import Signal, sampling_rate
+        >>> Ts = np.array(0.0025)
+        >>> sampling_rate("rig.Ts", Signal(Ts.shape, Ts.dtype, values=Ts))
+        400.0
+    """
+    own = re.split(r"[./]", name)[-1]
+    frequency, interval = _FREQUENCY.fullmatch(own), _INTERVAL.fullmatch(own)
+    value = signal.values
+    if value is None or value.size != 1 or value.dtype.kind not in _REAL:
+        return None
+    number = float(value.reshape(-1)[0])
+    if not (frequency or interval) or not np.isfinite(number) or number <= 0:
+        return None
+    return number if frequency else 1 / number
 
 
 def _in_memory(path: Path, found: Mapping[str, Signal | str]) -> ArrayTable:
@@ -247,6 +301,10 @@ def _group(
 ) -> None:
     """Note the signals of an HDF5 group, and where each is."""
     h5py = optional("h5py")
+    if not matlab:
+        attributes = {f"{prefix}{key}": np.asarray(value) for key, value in group.attrs.items()}
+        given = {name: _signal(value) for name, value in attributes.items()}
+        found |= {name: one for name, one in given.items() if sampling_rate(name, one)}
     for key in group:
         if matlab and key.startswith("#"):
             continue
@@ -282,9 +340,9 @@ def _group(
         else:
             unit = item.attrs.get("units", item.attrs.get("unit", ""))
             unit = unit.decode() if isinstance(unit, bytes) else unit
-            found[name] = Signal(
-                item.shape, item.dtype, unit if isinstance(unit, str) else "", matlab
-            )
+            unit = unit if isinstance(unit, str) else ""
+            number = np.asarray(item[()]) if item.size == 1 else None
+            found[name] = Signal(item.shape, item.dtype, unit, matlab, number)
             names[name] = item.name
 
 

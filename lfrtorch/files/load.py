@@ -76,10 +76,11 @@ def load_records(
     Args:
         path: a file, a pattern as ``"runs/*.csv"``, or a list of these.
         inputs: one or several names of columns or arrays, or column numbers from 0. An array of
-            several channels is several inputs.
+            several channels is several inputs, and ``"acc[0]"`` is the first channel of ``acc``.
         outputs: likewise.
         fs: sampling frequency in Hz. Default: from ``time``.
-        time: the column of time stamps, in seconds or as ISO date-times, evenly spaced.
+        time: the column of time stamps, in seconds or as ISO date-times, evenly spaced. Default:
+            one that is named as time is, or a lone number like ``Fs`` in a file of arrays.
         units: of the channels by name. Default: those in the file's header.
         validation: records that choose among iterates and are not fitted: a fraction below 1 of
             every record, the part after that for training; a number of records, the last ones;

@@ -82,11 +82,17 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
             f"'{path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs "
             "and time; name every column once."
         )
-    if wanted.fs is None and not stamps:
-        raise InputError(
-            f"the sampling frequency of '{path}' is not given; say it in Hz with "
-            f"fs{_suggested(table, columns)}."
-        )
+    notes, fs = [], wanted.fs
+    if fs is None and not stamps:
+        rate = find_rate(table, columns)
+        if rate is None:
+            raise InputError(
+                f"the sampling frequency of '{path}' is not given; say it in Hz with "
+                f"fs{_suggested(table, columns)}."
+            )
+        fs, stamps = rate.fs, rate.stamps
+        columns = (*columns, *stamps)
+        notes.append(rate.note)
     known = {name for i in (*u, *y) for name in (table.headers[i], table.columns[i].name)}
     strange = [name for name in wanted.units if name not in known]
     if strange:
@@ -94,7 +100,6 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
             f"units names {', '.join(map(repr, strange))}, which is none of the inputs and "
             f"outputs: {', '.join(table.columns[i].name for i in (*u, *y))}."
         )
-    notes = []
     values = table.read(columns)
     present = np.flatnonzero(~np.isnan(values).all(axis=1))
     values = values[: present[-1] + 1 if present.size else 0]  # spreadsheets end in empty lines
@@ -112,7 +117,7 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
     if not stretches:
         raise InputError(f"'{path}' has no sample in which all columns have a value.")
     nu, ny = len(u), len(u) + len(y)
-    fs = wanted.fs if grid is None else grid.fs
+    fs = fs if grid is None else grid.fs
     assert fs is not None
     return Measurement(
         path,
@@ -202,26 +207,85 @@ def _agree(wanted: Wanted, grid: Sampling, table: Table, column: int) -> None:
         )
 
 
-def _beside(table: Table, columns: Sequence[int]) -> list[tuple[int, Sampling]]:
-    """Columns that are none of those, and an even grid of time as far as their first block goes."""
-    found = []
+class Rate(NamedTuple):
+    """The sampling frequency in Hz that a file says, by which column if it is one, and a note."""
+
+    fs: float
+    stamps: tuple[int, ...]
+    note: str
+
+
+def find_rate(table: Table, used: Sequence[int]) -> Rate | None:
+    """What a file says of its sampling frequency; nothing if it says none.
+
+    That is a column which is named as time is and runs evenly, or else a lone number like ``Fs``.
+
+    Args:
+        table: the file.
+        used: columns that are something else.
+
+    Raises:
+        ValueError: two of them that contradict one another.
+    """
+    times, _ = _beside(table, used, named=True)
+    said = [(f"the column {table.columns[c].name!r}", g.fs, g.uncertainty) for c, g in times]
+    said += [(repr(name), fs, 0.0) for name, fs in table.rates.items()]
+    if not said:
+        return None
+    for name, fs, uncertainty in said[1:]:
+        if abs(fs / said[0][1] - 1) > max(_SAME, uncertainty, said[0][2]):
+            raise InputError(
+                f"'{table.path}': {said[0][0]} says {said[0][1]:g} Hz and {name} {fs:g} Hz; give "
+                "the right one, fs=HZ or time=COLUMN."
+            )
+    name, fs, _ = said[0]
+    if not times:
+        return Rate(fs, (), f"fs is {fs:g} Hz, as {name} in the file says")
+    return Rate(
+        fs, (times[0][0],), f"{name} is taken for the time, {fs:g} Hz; fs=HZ leaves it unread"
+    )
+
+
+def _stamps(table: Table, column: int) -> Array:
+    """The first block of a column in seconds, what is missing between filled in."""
+    t = next(table.blocks([column]), np.empty((0, 1)))[:, 0]
+    known = np.flatnonzero(np.isfinite(t))
+    if known.size:
+        t = np.interp(np.arange(known[-1] + 1), known, t[known])
+    return in_seconds(t, table.columns[column])
+
+
+def _beside(
+    table: Table, columns: Sequence[int], *, named: bool
+) -> tuple[list[tuple[int, Sampling]], list[str]]:
+    """Columns that are none of those and an even grid of time, and why others are none.
+
+    Args:
+        table: the file, of which the first block is read.
+        columns: what is measured.
+        named: look only at columns that are named as time is.
+    """
+    found, reasons = [], []
     for column, channel in enumerate(table.columns):
-        if column in columns:
+        long = table.lengths and table.lengths[column] != table.lengths[columns[0]]
+        if column in columns or long or (named and not is_time(channel)):
             continue
         try:
-            t = next(table.blocks([column]))[:, 0]
-            if np.isfinite(t).all():
-                found.append((column, sampling(in_seconds(t, channel))))
-        except (ValueError, StopIteration):  # no numbers, or no grid
+            found.append((column, sampling(_stamps(table, column))))
+        except UnevenError as error:
+            reasons.append(f"the column {table.headers[column]!r} {error}")
+        except ValueError:  # no numbers
             continue
-    return found
+    return found, reasons
 
 
 def _suggested(table: Table, columns: Sequence[int]) -> str:
-    """The column that may be time, as the end of a message."""
+    """The column that may be time, or why none is, as the end of a message."""
+    _, reasons = _beside(table, columns, named=True)
+    if reasons:
+        return f": {reasons[0]}"
     # A counter of samples is a grid of 1 Hz.
-    grids = [(c, g) for c, g in _beside(table, columns) if is_time(table.columns[c]) or g.fs != 1]
-    grids.sort(key=lambda found: not is_time(table.columns[found[0]]))
+    grids = [(c, g) for c, g in _beside(table, columns, named=False)[0] if g.fs != 1]
     if not grids:
         return ""
     column, grid = grids[0]
@@ -229,10 +293,15 @@ def _suggested(table: Table, columns: Sequence[int]) -> str:
 
 
 def _doubts(table: Table, columns: Sequence[int], fs: float) -> list[str]:
-    """A note if a column is named as time is and contradicts ``fs``."""
-    return [
+    """Notes if a column that is named as time is, or a lone number, contradicts ``fs``."""
+    notes = [
         f"fs is {fs:g} Hz and the column {table.headers[column]!r} says {grid.fs:g} Hz; if "
         f"that is right, give time={table.columns[column].name!r} in place of fs"
-        for column, grid in _beside(table, columns)
-        if is_time(table.columns[column]) and abs(fs / grid.fs - 1) > max(_SAME, grid.uncertainty)
+        for column, grid in _beside(table, columns, named=True)[0]
+        if abs(fs / grid.fs - 1) > max(_SAME, grid.uncertainty)
+    ]
+    return notes + [
+        f"fs is {fs:g} Hz and {name!r} in the file says {said:g} Hz"
+        for name, said in table.rates.items()
+        if abs(fs / said - 1) > _SAME
     ]

@@ -11,6 +11,7 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.files.formats import BLOCK, open_table
+from lfrtorch.files.measurement import find_rate
 from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.files.time_stamps import UnevenError, in_seconds, sampling
 from lfrtorch.records import Channel
@@ -40,6 +41,7 @@ class FileStream:
         inputs, outputs: their columns, names or numbers from 0. Default: the columns with the names
             of the channels, and no outputs unless all of them are there.
         time: column of time stamps, which must run evenly at ``fs``.
+        find_time: without ``time``, look for what the file says of its sampling.
 
     Raises:
         ValueError: a file that cannot be read, or columns that are not there, too many, too few or
@@ -57,6 +59,7 @@ class FileStream:
         inputs: Columns | None = None,
         outputs: Columns | None = None,
         time: str | int | None = None,
+        find_time: bool = False,
     ) -> None:
         self.table, self.fs = open_table(path), fs
         self.u = self._found(inputs, u, "inputs")
@@ -68,6 +71,10 @@ class FileStream:
         self.times = () if time is None else self.table.find(time, "time")
         if len(self.times) > 1:
             raise InputError(f"time is {time!r}, {len(self.times)} columns; name one.")
+        self.note = ""
+        """What was found of the sampling."""
+        if time is None and find_time:
+            self.times, self.note = self._sampled()
         self.clock = self.table.columns[self.times[0]] if self.times else Channel("sample")
         """Name and unit of the time stamps; without them, of the sample numbers."""
 
@@ -98,6 +105,18 @@ class FileStream:
                 self._check(seen, first + len(block) - len(seen))
             yield Block(times, u, y)
             first += len(block)
+
+    def _sampled(self) -> tuple[tuple[int, ...], str]:
+        """The column of time that the file has, and what it says of its sampling."""
+        rate = find_rate(self.table, [*self.u, *self.y])
+        if rate is None:
+            return (), f"nothing says how it is sampled; the model's {self.fs:g} Hz are taken"
+        if not rate.stamps and abs(rate.fs / self.fs - 1) > SAME:
+            raise InputError(
+                f"'{self.table.path}': {rate.note}, and the model runs at {self.fs:g} Hz; resample "
+                "the signals."
+            )
+        return rate.stamps, rate.note
 
     def _found(
         self, wanted: Columns | None, channels: Sequence[Channel], option: str

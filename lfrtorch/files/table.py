@@ -31,6 +31,9 @@ _UNIT = re.compile(rf"{_ATOM}(?:[/*·. ]{_ATOM})*")
 _BRACKETS = re.compile(r"(.*?)(\s*)[(\[]\s*([^()\[\]]{1,16}?)\s*[)\]]")
 
 
+_CHANNEL = re.compile(r"(.+)\[(\d+)\]")
+
+
 class NoColumnError(InputError):
     """A file that has no such column."""
 
@@ -44,10 +47,14 @@ class Table(ABC):
         units: of columns by header, if the file has them apart.
         arrays: column numbers by the name of an array of several channels.
         refused: why something in the file is not a channel, by its name.
+        rates: sampling frequencies in Hz that stand in the file, by their names.
+        lengths: samples of each column, if they may differ.
     """
 
     path: Path
     columns: tuple[Channel, ...]
+    contents: Sequence[tuple[str, str, str]] = ()
+    """What is in a file of arrays: name and shape of each, and what it is taken for."""
 
     def __init__(
         self,
@@ -57,12 +64,16 @@ class Table(ABC):
         units: Mapping[str, str] | None = None,
         arrays: Mapping[str, tuple[int, ...]] | None = None,
         refused: Mapping[str, str] | None = None,
+        rates: Mapping[str, float] | None = None,
+        lengths: Sequence[int] = (),
     ) -> None:
         self.path = path
         self.headers = tuple(headers)
         self.columns = channels(headers, units or {})
         self.arrays = dict(arrays or {})
         self.refused = dict(refused or {})
+        self.rates = dict(rates or {})
+        self.lengths = tuple(lengths)
 
     @abstractmethod
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
@@ -88,7 +99,7 @@ class Table(ABC):
     def find(self, wanted: str | int | Sequence[str | int] | None, option: str) -> tuple[int, ...]:
         """Numbers of the columns that are wanted by name, by header or by number from 0.
 
-        The name of an array of several channels stands for all of them.
+        The name u of an array of several channels stands for all of them, u[0] for the first.
 
         Args:
             wanted: one or several.
@@ -119,6 +130,15 @@ class Table(ABC):
             return (wanted,)
         if wanted in self.arrays:
             return self.arrays[wanted]
+        channel = _CHANNEL.fullmatch(wanted)
+        if channel and channel[1] in self.arrays:
+            array = self.arrays[channel[1]]
+            if int(channel[2]) < len(array):
+                return (array[int(channel[2])],)
+            raise NoColumnError(
+                f"'{self.path}' has no {wanted!r}, named in {option}; the channels of "
+                f"{channel[1]!r} are {channel[1]}[0] .. {channel[1]}[{len(array) - 1}]."
+            )
         for names in (self.headers, [column.name for column in self.columns]):
             found = [i for i, name in enumerate(names) if name == wanted]
             if len(found) == 1:

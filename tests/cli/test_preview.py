@@ -174,6 +174,24 @@ def test_empty_lines_at_the_end_are_no_samples(tmp_path: Path, signals, run, cap
     assert f"{path}: {T} samples at 50 Hz" in run(path)
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_all_variables_of_a_file_of_arrays_are_listed(tmp_path: Path, signals, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    both = np.stack([signals["force"], signals["force"] + 1])
+    arrays = {"F": signals["force"], "acc": both, "Fs": FS, "rig": "left", "f": np.ones(7)}
+    savemat(tmp_path / "a.mat", arrays)
+    out = run(tmp_path / "a.mat")
+    assert f"{T} samples at 50 Hz" in out
+    assert "'Fs' says 50 Hz" in out
+    assert "left out: f, of other lengths than 2000 samples" in out
+    listed = [" ".join(line.split()) for line in out.splitlines()]
+    assert "acc 2 × 2000 signals acc1 .. acc2" in listed
+    assert "Fs 1 × 1 sampling frequency, 50 Hz" in listed
+    assert any(line.startswith("rig 1 × 4 nothing: it has no numbers") for line in listed)
+    out = run(tmp_path / "a.mat", "--inputs", "F", "--outputs", "acc[1]")
+    assert {line.split()[0] for line in out.splitlines() if " output " in line} == {"acc2"}
+
+
 def test_columns_without_values_are_refused(tmp_path: Path, capsys):
     savemat(tmp_path / "a.mat", {"u": np.full((30, 1), np.nan)})
     assert "has no values in the columns to show" in refused(capsys, tmp_path / "a.mat")

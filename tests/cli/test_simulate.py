@@ -99,7 +99,7 @@ def test_outputs_of_inputs_alone(extension: str, folder: Path, monkeypatch, caps
     printed = capsys.readouterr()
     assert printed.err == ""
     assert "model: u1 (N), u2 (N) -> y1 (mm), y2 (mm) at 50 Hz, nx 3, nz 2, nw 1" in printed.out
-    assert "note: neither data.time nor data.fs says how 'inputs.csv' is sampled" in printed.out
+    assert "note: 'inputs.csv': nothing says how it is sampled; the model's 50 Hz" in printed.out
     assert "has no column y1, y2, so nothing is scored" in printed.out
     assert "RMSE" not in printed.out
 
@@ -109,7 +109,9 @@ def test_a_column_named_like_time_is_the_time(folder: Path, monkeypatch, capsys)
     """A file at another rate is not simulated as if it were at the model's."""
     run(monkeypatch, folder, "data.path=both.csv", "out=x.csv")
     assert next(iter(columns(folder / "x.csv"))) == "t"
-    assert "note: the column 't' of 'both.csv' is taken for the time" in capsys.readouterr().out
+    assert "note: 'both.csv': the column 't' is taken for the time, 50 Hz; data.fs=HZ" in (
+        capsys.readouterr().out
+    )
     slow = columns(folder / "both.csv")
     csv(folder / "slow.csv", **slow | {"t": 2 * slow["t"]})
     message = refused(monkeypatch, capsys, folder, "data.path=slow.csv", "out=y.csv")

@@ -322,10 +322,11 @@ def test_structs_and_cells_of_mat_5(tmp_path):
         "z": Y + 1j,
         "name": "rig",
         "wide": U.T,
+        "square": np.eye(T),
     }
     scipy.io.savemat(tmp_path / "a.mat", variables)
     table = open_table(tmp_path / "a.mat")
-    assert names(table) == ["exp.u1", "exp.u2", "exp.deep.y", "exp.one.force"]
+    assert names(table) == ["exp.u1", "exp.u2", "exp.deep.y", "exp.one.force", "wide1", "wide2"]
     assert np.array_equal(whole(table, ["exp.u", "exp.deep.y"]), SIGNALS)
     assert np.array_equal(whole(table, "exp.one.force")[:, 0], Y)
     refused(table, "both", "is an array of 2 cells")
@@ -333,7 +334,8 @@ def test_structs_and_cells_of_mat_5(tmp_path):
     refused(table, "eye", "is sparse")
     refused(table, "z", "is complex")
     refused(table, "name", "has no numbers")
-    refused(table, "wide", r"has 2 row\(s\) and 40 columns.*transpose")
+    assert np.array_equal(whole(table, "wide"), U)
+    refused(table, "square", "is 40 × 40, and time may run along either axis; store its channels")
 
 
 def matlab(path: Path, write) -> None:
@@ -365,7 +367,8 @@ def test_mat_7_3(tmp_path):
 
     matlab(tmp_path / "a.mat", write)
     table = open_table(tmp_path / "a.mat")
-    assert set(names(table)) == {"u1", "u2", "y", "exp.deep.y", "one"}
+    assert set(names(table)) == {"u1", "u2", "y", "exp.deep.y", "one", "wide1", "wide2"}
+    assert ("wide", "2 × 40", "signals wide1 .. wide2") in table.contents
     assert np.array_equal(whole(table, ["u", "y"]), SIGNALS)
     assert np.array_equal(whole(table, ["one", "exp.deep.y"]), np.stack([Y, Y], axis=1))
     refused(table, "two", "is an array of 2 cells")
@@ -374,22 +377,23 @@ def test_mat_7_3(tmp_path):
     refused(table, "sparse", "is sparse")
     refused(table, "z", "is complex")
     refused(table, "none", "is empty")
-    refused(table, "wide", r"has 2 row\(s\) and 40 columns.*transpose")
+    assert np.array_equal(whole(table, "wide"), U)
 
 
 @pytest.mark.parametrize("name", ["a.h5", "a.HDF5"])
 def test_hdf5(tmp_path, name):
     with h5py.File(tmp_path / name, "w") as file:
         file["u"], file["y"] = U, Y
-        file["group/u"] = U.T
+        file["wide/u"] = U.T
         file["pairs"] = np.zeros(T, [("a", float), ("b", float)])
         file["words"] = ["a", "b"]
         file["y"].attrs["units"] = "mm"
         file["nothing"] = h5py.Empty("f")
     table = open_table(tmp_path / name)
-    check(table)
-    assert table.columns[2] == Channel("y", "mm")
-    refused(table, "group/u", r"has 2 row\(s\) and 40 columns.*transpose")
+    assert names(table) == ["u1", "u2", "wide/u1", "wide/u2", "y"]
+    assert np.array_equal(whole(table, ["u", "y"]), SIGNALS)
+    assert np.array_equal(whole(table, "wide/u"), U)
+    assert table.columns[4] == Channel("y", "mm")
     refused(table, "pairs", r"is compound \(a, b\)")
     refused(table, "words", "has no numbers")
     refused(table, "nothing", "is empty")
@@ -407,6 +411,71 @@ def test_parquet(tmp_path):
     assert np.allclose(whole(table, ["u", "n", "y", "t"]), expected, atol=1e-12, equal_nan=True)
     assert sum(len(block) for block in table.blocks([0], samples=7)) == T
     refused(table, "word", r"has no numbers \(its type is string\)")
+
+
+def aircraft(tmp_path, kind: str):
+    """A force and three accelerations along rows, as the F-16 data are published."""
+    arrays = {"Force": Y[None, :], "Acceleration": SIGNALS.T, "Fs": np.array([[400.0]])}
+    path = tmp_path / f"a.{kind}"
+    if kind == "npz":
+        np.savez(path, **arrays)
+    elif kind == "mat":
+        scipy.io.savemat(path, arrays)
+    else:
+        with h5py.File(path, "w") as file:
+            for name, array in arrays.items():
+                file[name] = array
+    return open_table(path)
+
+
+@pytest.mark.parametrize("kind", ["mat", "npz", "h5"])
+def test_arrays_of_one_file_have_time_along_their_common_length(tmp_path, kind):
+    table = aircraft(tmp_path, kind)
+    assert np.array_equal(whole(table, ["Force", "Acceleration"]), np.c_[Y, SIGNALS])
+    assert np.array_equal(whole(table, ["Acceleration[2]", "Acceleration1"]), SIGNALS[:, [2, 0]])
+    refused(table, "Acceleration[3]", r"are Acceleration\[0\] \.\. Acceleration\[2\]")
+    assert table.rates == {"Fs": 400.0}
+    assert sorted(table.contents) == [
+        ("Acceleration", "3 × 40", "signals Acceleration1 .. Acceleration3"),
+        ("Force", "1 × 40", "signal"),
+        ("Fs", "1 × 1", "sampling frequency, 400 Hz"),
+    ]
+
+
+def test_the_length_of_a_vector_tells_the_axis_of_time(tmp_path):
+    np.savez(tmp_path / "a.npz", y=Y, runs=np.outer(Y, np.arange(50)))  # more runs than samples
+    assert np.array_equal(whole(open_table(tmp_path / "a.npz"), ["y", "runs[1]"]), np.c_[Y, Y])
+    np.savez(tmp_path / "b.npz", gains=np.ones(3), y=SIGNALS.T)
+    assert np.array_equal(whole(open_table(tmp_path / "b.npz"), "y"), SIGNALS)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "fs"),
+    [
+        ("fs", 750.0, 750.0),
+        ("FS", 750, 750.0),
+        ("rig.Fs", [[750.0]], 750.0),
+        ("sampling_rate", 750.0, 750.0),
+        ("Ts", 4.0, 0.25),
+        ("dt", np.float32(0.5), 2.0),
+        ("sample time", 0.5, 2.0),
+        ("fs", -1.0, None),
+        ("fs", [1.0, 2.0], None),
+        ("gain", 3.0, None),
+    ],
+)
+def test_lone_numbers_that_say_the_rate(tmp_path, name, value, fs):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["y"], file[name] = Y, value
+    assert open_table(tmp_path / "a.h5").rates == ({} if fs is None else {name: fs})
+
+
+def test_the_rate_as_an_attribute_of_hdf5(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["run/y"] = Y
+        file["run"].attrs["fs"] = 750
+        file.attrs["author"] = "me"
+    assert open_table(tmp_path / "a.h5").rates == {"run/fs": 750.0}
 
 
 def test_arrays_of_different_lengths(tmp_path):

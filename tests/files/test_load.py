@@ -290,15 +290,67 @@ def test_refused_time(tmp_path):
 
 def test_no_sampling_frequency(tmp_path):
     path = tmp_path / "a.csv"
-    timed(path, np.arange(300) / 100)
     use = {"inputs": "u", "outputs": "y"}
-    refused(r"fs, or by a column of time stamps: time='t' \(100 Hz\)", path, use=use)
     count = np.arange(300.0)[:, None]
-    both = np.hstack([count, 3 * count, count / 7, count / 20, np.cos(count), np.sin(count)])
-    write(path, both, "n,x,v,Time [s],u,y")
-    refused(r"time='Time' \(20 Hz\)", path, use=use)
-    write(path, both[:, [0, 4, 5]], "n,u,y")
+    both = np.hstack([count, count / 20, np.cos(count), np.sin(count)])
+    write(path, both, "n,x,u,y")
+    refused(r"fs, or by a column of time stamps: time='x' \(20 Hz\)", path, use=use)
+    write(path, both[:, [0, 2, 3]], "n,u,y")
     refused(r"say it in Hz with fs\.$", path, use=use)
+    write(path, both[:, [3, 2, 3]], "t,u,y")
+    refused(r"say it in Hz with fs: the column 't' does not rise", path, use=use)
+
+
+def test_a_column_that_is_named_as_time_is_the_time(tmp_path):
+    path = tmp_path / "a.csv"
+    use: dict[str, Any] = {"inputs": "u", "outputs": "y"}
+    count = np.arange(300.0)[:, None]
+    signals = np.random.default_rng(0).normal(size=(300, 2))
+    both = np.hstack([count, count / 7, 50 * count, signals])
+    write(path, np.append(both, np.full((20, 5), np.nan), axis=0), "n,v,Time [ms],u,y")
+    data = load_records(path, **use)
+    assert data.train[0].fs == 20.0
+    assert data.notes[0] == "the column 'Time' is taken for the time, 20 Hz; fs=HZ leaves it unread"
+    assert load_records(path, **use, fs=20).notes == ()
+    write(path, np.delete(both, [100, 101], axis=0), "n,v,Time [ms],u,y")
+    refused(r"1 gap\(s\) of 2 sample\(s\)", path, use=use)
+    write(path, both[:, [0, 2, 3, 4]], "t,Time [ms],u,y")
+    refused("'t' says 1 Hz and the column 'Time' 20 Hz; give the right one", path, use=use)
+    assert load_records(path, **use, time="Time").train[0].fs == 20.0
+
+
+def test_the_rate_that_an_array_file_says(tmp_path):
+    path = tmp_path / "a.mat"
+    t, (u, y) = np.arange(300) / 50, np.random.default_rng(0).normal(size=(2, 300))
+    use: dict[str, Any] = {"inputs": "u", "outputs": "y"}
+    scipy.io.savemat(path, {"u": u, "y": y, "Ts": 0.02, "t": np.arange(8.0)})
+    data = load_records(path, **use)
+    assert data.train[0].fs == 50.0
+    assert data.notes == ("fs is 50 Hz, as 'Ts' in the file says",)
+    assert load_records(path, **use, fs=100).notes == (
+        "fs is 100 Hz and 'Ts' in the file says 50 Hz",
+    )
+    scipy.io.savemat(path, {"u": u, "y": y, "Ts": 0.02, "t": t})
+    assert "'t' is taken for the time, 50 Hz" in load_records(path, **use).notes[0]
+    scipy.io.savemat(path, {"u": u, "y": y, "Ts": 0.02, "t": 1000 * t})
+    refused("the column 't' says 0.05 Hz and 'Ts' 50 Hz; give the right one", path, use=use)
+    assert load_records(path, **use, fs=50).train[0].fs == 50.0
+
+
+@pytest.mark.data
+def test_the_aircraft_as_published(benchmark_root):
+    file = benchmark_root / "F16/F16GVT_Files/BenchmarkData/F16Data_FullMSine_Level3.mat"
+    if not file.is_file():
+        pytest.skip(f"there is no '{file}'")
+    for outputs, names in (
+        ("Acceleration", ["Acceleration1", "Acceleration2", "Acceleration3"]),
+        ("Acceleration[1]", ["Acceleration2"]),
+    ):
+        data = load_records(file, inputs="Force", outputs=outputs, test=0)
+        assert [channel.name for channel in data.train[0].outputs] == names
+    assert data.train[0].fs == 400.0
+    assert data.train[0].period == 8192
+    assert data.notes[0] == "fs is 400 Hz, as 'Fs' in the file says"
 
 
 def test_a_time_column_that_contradicts_is_noted(tmp_path):
