@@ -12,7 +12,7 @@ UNKNOWN = "–"
 """What stands for a number that is not known or not finite."""
 
 DIGITS = 3
-"""Significant digits of a number. Poles get four: radii of 0.9991 and 0.9998 differ."""
+"""Significant digits of a number."""
 
 SMALLEST, LARGEST = 1e-3, 1e5
 """Numbers in this range are written without an exponent."""
@@ -31,6 +31,9 @@ NEVER_LARGER = ("s", "rad")
 
 PLAIN = 0.1, 1000.0
 """Numbers in this range need no prefix."""
+
+NEAR, ROUNDING = 1e-3, 1e-12
+"""Distances from the unit circle: of poles whose four digits would not tell, and of none."""
 
 Cell = str | int | float | None
 
@@ -104,3 +107,19 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], digits: int = DIG
         disable_numparse=True,
         colalign=["left" if word else "right" for word in words] if rows else None,
     )
+
+
+def radius(value: float | None) -> str:
+    """Distance of a pole or zero from the origin, so that one outside the unit circle shows.
+
+    Example:
+        >>> from lfrtorch._support.tables import radius
+        >>> [radius(value) for value in (0.98765, 0.999998, 1.0, 1.00002)]
+        ['0.9877', '1 - 2.0e-6', '1', '1 + 2.0e-5']
+    """
+    beyond = (math.nan if value is None else value) - 1.0
+    if abs(beyond) < ROUNDING:
+        return "1"
+    if abs(beyond) < NEAR:
+        return f"1 {'-' if beyond < 0 else '+'} {number(abs(beyond), 2)}"
+    return number(value, 4)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,6 +42,19 @@ def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | 
             }
         )
     return listed
+
+
+def remark(root: Mapping[str, Any], *, pole: bool) -> str:
+    """Whether a root stands for two, and whether it is an unstable pole.
+
+    Example:
+        >>> from lfrtorch.analysis.poles import frequency_and_damping, remark
+        >>> roots = frequency_and_damping(np.array([1.1 + 0.1j, 1.1 - 0.1j]), fs=1.0)
+        >>> [remark(root, pole=True) for root in roots]
+        ['pair, unstable']
+    """
+    unstable = pole and root["radius"] > 1.0
+    return ", ".join(["pair"] * bool(root["imag"]) + ["unstable"] * unstable)
 
 
 @torch.no_grad()

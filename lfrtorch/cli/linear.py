@@ -26,7 +26,7 @@ import lfrtorch
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.tables import in_percent
-from lfrtorch.analysis.poles import frequency_and_damping
+from lfrtorch.analysis.poles import frequency_and_damping, remark
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import configured, loaded
@@ -215,9 +215,10 @@ def table(found: dict[str, Any]) -> str:
     listed = [["pole", p] for p in found["poles"]]
     listed += [[f"zero {n}".strip(), z] for n, zeros in found["zeros"].items() for z in zeros]
     rows = [
-        [what, r["frequency"], r["damping"], r["radius"], "pair" if r["imag"] else ""]
+        [what, r["frequency"], r["damping"], tables.radius(r["radius"]),
+         remark(r, pole=what == "pole")]
         for what, r in listed
-    ]
+    ]  # fmt: skip
     parts.append(tables.table(["", "frequency (Hz)", "damping", "radius", ""], rows, digits=4))
     rows = [[o["channel"], o["offset"], o["unit"]] for o in found["offsets"]]
     parts.append(tables.table(["operating point", "offset", "unit"], rows, digits=4))

@@ -17,6 +17,7 @@ import numpy as np
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import radius
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
 from lfrtorch.linear.frf import FRF, estimate_frf
@@ -335,18 +336,18 @@ def _notes(problem: LinearLeastSquares, estimate: SubspaceEstimate, found: Refin
         cost, _ = problem.with_input_matrices(estimate.unstable, estimate.C)
         stable, _ = problem.with_input_matrices(found.A, found.C)
         if cost < BETTER * stable:
-            radius = float(np.abs(np.linalg.eigvals(estimate.unstable)).max())
+            slowest = float(np.abs(np.linalg.eigvals(estimate.unstable)).max())
             return [
                 *notes,
-                f"the data come from an unstable system: a pole of radius {radius:.4g} explains "
-                "them much better than any stable model. Look for drift, or for feedback around "
-                "the system.",
+                f"the data come from an unstable system: a pole of radius {radius(slowest)} "
+                "explains them much better than any stable model. Look for drift, or for feedback "
+                "around the system.",
             ]
-    radius = float(np.abs(np.linalg.eigvals(found.A)).max())
-    if radius > AT_THE_LIMIT:
+    slowest = float(np.abs(np.linalg.eigvals(found.A)).max())
+    if slowest > AT_THE_LIMIT:
         notes.append(
-            f"the slowest pole has radius {radius:.6f}: data that drift or integrate ask for one, "
-            "and so does an order above what they carry; look at the data, or lower nx."
+            f"the slowest pole has radius {radius(slowest)}: data that drift or integrate ask for "
+            "one, and so does an order above what they carry; look at the data, or lower nx."
         )
     return notes
 

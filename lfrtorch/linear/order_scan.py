@@ -71,7 +71,7 @@ class OrderScan:
             s = self.singular_values
             value = s[model.nx - 1] if model.nx <= len(s) else None
             assert model.fit is not None
-            radius = float(np.abs(model.poles).max())
+            radius = tables.radius(float(np.abs(model.poles).max()))
             chosen = "chosen" if model.nx == self.chosen else ""
             rows.append([model.nx, model.fit.rmse, score, value, radius, chosen])
         head = ["nx", "fitted", how, "singular value", "largest pole", ""]

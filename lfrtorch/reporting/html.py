@@ -23,10 +23,11 @@ from lfrtorch._support.tables import (
     percent,
     quantities,
     quantity,
+    radius,
 )
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
-from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest
+from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest, remark
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.size_search import LEGEND, size_table
 from lfrtorch.fitting.trainer import FitResult
@@ -290,8 +291,9 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
         poles += [
             [
                 model,
-                *(number(p[key], 4) for key in ("frequency", "damping", "radius")),
-                "pair" if p["imag"] else "",
+                *(number(p[key], 4) for key in ("frequency", "damping")),
+                radius(p["radius"]),
+                remark(p, pole=True),
             ]
             for p in frequency_and_damping(values, bla.fs)
         ]

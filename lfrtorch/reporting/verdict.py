@@ -197,7 +197,8 @@ def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
         kind, use = Kind.LINEAR, LINEAR_MODEL
         text = (
             f"Not better than the linear model: on {whole.name} the error is "
-            f"{number(100 * whole.ratio)} ± {percent(whole.ratio_std)} of the linear model's"
+            f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of the linear "
+            "model's"
         )
     if whole is not None and held_out:
         used = whole.nrmse if use == NL_LFR else whole.linear_nrmse

@@ -11,6 +11,7 @@ from lfrtorch._support.tables import (
     percent,
     quantities,
     quantity,
+    radius,
     table,
 )
 
@@ -44,6 +45,12 @@ def test_more_digits_on_request():
     assert number(0.99913, digits=4) == "0.9991"
     assert number(0.99996, digits=4) == "1.000"
     assert number(1e-7, digits=1) == "1e-7"
+
+
+def test_a_stable_and_an_unstable_pole_do_not_look_alike():
+    shown = [radius(value) for value in (0.9986, 0.99998, 1.0 - 2e-6, 1.0, 1.0 + 2e-6, 1.0002, 1.5)]
+    assert len(set(shown)) == len(shown)
+    assert shown[2:5] == ["1 - 2.0e-6", "1", "1 + 2.0e-6"]
 
 
 def test_units_follow_the_number():
