@@ -158,11 +158,12 @@ def scored_run(
     found = evidence(
         result,
         simulations,
+        bla=linear,
         noise_rms=dataset.noise_rms,
         continued=settings.init_from is not None,
         ridge=settings.ridge != 0.0,
-        searched=size_search is not None,
-        trainer=type(settings.trainer).__name__,
+        search=size_search,
+        trainer=settings.trainer,
     )
     verdict = judge(result, simulations)
     numbers = metrics(

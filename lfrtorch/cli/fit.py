@@ -52,12 +52,11 @@ from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
-from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
 from lfrtorch.reporting.run_files import write
 from lfrtorch.reporting.verdict import LINEAR_MODEL
 
-PRINTED = 3
+PRINTED = 5
 """Most lines of advice that are printed; the report has all."""
 
 WITHOUT_FILES = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
@@ -90,7 +89,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             number = stop.asked or signal.SIGINT
             raise TerminatedError(f"{stopped}: nothing to keep", number) from None
         if files is not None:
-            advice = [Advice(translated(a.text, cfg), a.evidence) for a in found.advice]
+            advice = [a._replace(text=translated(a.text, cfg)) for a in found.advice]
             found = replace(found, advice=advice)
             print(found)
             config = OmegaConf.to_yaml(files.cfg, resolve=True)
@@ -98,7 +97,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
                 found, folder, command=command, config=config, draw=cfg.figures, board=files.board
             )
             for item in found.advice[:PRINTED]:
-                print(f"next: {item}")
+                print(f"next: {item.text}\n      ({item.evidence})")
             if found.verdict.use == LINEAR_MODEL:
                 print(
                     f"\nThe linear model: lfrtorch simulate checkpoint={folder / 'linear'} "

@@ -143,14 +143,22 @@ class SizeSearch:
         return min(near, key=lambda c: (c.parameters_net, c.error))
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """Sizes chosen that are the largest of those tried."""
+    def largest(self) -> tuple[str, ...]:
+        """Names of the sizes chosen that are the largest of those tried."""
         found = []
         for name, size in self.chosen.sizes.items():
             tried = {candidate.sizes[name] for candidate in self.candidates}
             if len(tried) > 1 and size == max(tried):
-                found.append(f"{name} {size} is the largest tried; a larger one may do better.")
+                found.append(name)
         return tuple(found)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A note on each of those."""
+        return tuple(
+            f"{name} {self.chosen.sizes[name]} is the largest tried; a larger one may do better."
+            for name in self.largest
+        )
 
     def entries(self) -> list[dict[str, Any]]:
         """Numbers of each, by name."""

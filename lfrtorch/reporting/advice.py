@@ -7,10 +7,11 @@ outputs of any unit count alike.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 from lfrtorch._support.tables import number, percent
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 
 NOISE_LIMITED = 1.1
 """Training error over the noise up to which the model's own share, √(1.1² - 1), is below half of
@@ -19,9 +20,17 @@ the noise."""
 BEYOND_NOISE = 1.5
 """Training error over the noise from which on the model's own share is above the noise."""
 
+SOUND = 0.8
+"""Training error over the noise below which the noise is not what it seems: a model of few
+parameters has no error below it."""
+
 FALLING = 0.02
-"""Part by which the error must have fallen over the last tenth of the iterations to count as still
-falling: as many iterations again would bring 18 % at that pace."""
+"""Part by which the error must have fallen over a tenth of the iterations, at the pace of the last
+ones, to count as still falling: as many iterations again would bring 18 % at that pace."""
+
+UNLIKE = 1.5
+"""Error of the linear model on validation over that in training, or its inverse, from which on the
+parts are unlike: what is seen on one says little of the other."""
 
 OVERFIT = 1.5
 """Growth from training to validation of the NL-LFR's error over that of the linear model's, which
@@ -41,6 +50,9 @@ Bouc-Wen and Silverbox, 0.00 and 0.10 for good NL-LFRs."""
 TRANSIENT = 3.0
 """Error in the first twentieth of the scored samples over that in the rest."""
 
+FREE = 0.5
+"""Part of the error's power there that a free response of the linear model must explain."""
+
 ALONE = 1.2
 """Error of the second best start over that of the best above which the best may be luck."""
 
@@ -49,10 +61,23 @@ LOUDER = 1.25
 
 
 class Advice(NamedTuple):
-    """A sentence that says what to do or to know, and the numbers that it rests on."""
+    """A sentence that says what to do or to know.
+
+    Args:
+        text: the sentence, in at most 160 characters.
+        evidence: the numbers that it rests on.
+        change: fields of the settings that follow it, for ``dataclasses.replace(settings,
+            **change)``; None if a program cannot follow it.
+
+    Example:
+        >>> from lfrtorch.reporting.advice import Advice
+        >>> print(Advice("Try several starts: starts=8.", "one start", {"starts": 8}))
+        Try several starts: starts=8. (one start)
+    """
 
     text: str
     evidence: str
+    change: Mapping[str, Any] | None = None
 
     def __str__(self) -> str:
         return f"{self.text} ({self.evidence})"
@@ -66,22 +91,26 @@ class Evidence:
         train, linear_train: errors of the NL-LFR and of the linear model on the training records.
         validation, linear_validation: on those that chose the iterate.
         outputs: the NL-LFR's error over the linear model's by output, if there are several.
+        parameters, samples: of the model without gauge directions, and scored in training.
         noise: of the outputs, known or from the differences between periods.
         linear: part of the training error's power that a linear filter of the inputs explains.
         nonlinear: part that squares and cubes of the outputs explain beyond that.
         transient: error at the beginning of the training records over that in the rest.
-        falling: part by which the error fell over the last tenth of the iterations, 0 if the
-            search ended for another reason than its limit.
+        free: part of the error's power at the beginning that a free response of the linear model
+            explains.
+        falling: part by which the error that chooses fell over a tenth of the iterations, at the
+            pace of the last ones; 0 if the search ended for another reason than its limit.
         iterations: of the fit.
         starts: errors of all starts that went to the end, the best first.
         started: number of starts.
         continued: whether the fit went on from a model, so that there are no other starts.
         sizes: nx, nz, nw, and nn or degree.
         searched: whether validation chose them.
-        trainer: class of the trainer.
+        largest: those that are the largest of a search.
+        trainer: the search.
         ridge: whether there was one.
         louder: largest test input over the largest in training, by test.
-        diverged: tests on which the NL-LFR diverges.
+        diverged: records on which the NL-LFR diverges.
     """
 
     train: float | None
@@ -89,10 +118,13 @@ class Evidence:
     validation: float | None = None
     linear_validation: float | None = None
     outputs: Mapping[str, float] = field(default_factory=dict)
+    parameters: int = 0
+    samples: int = 0
     noise: float | None = None
     linear: float | None = None
     nonlinear: float | None = None
     transient: float | None = None
+    free: float | None = None
     falling: float = 0.0
     iterations: int = 0
     starts: Sequence[float] = ()
@@ -100,7 +132,8 @@ class Evidence:
     continued: bool = False
     sizes: Mapping[str, int] = field(default_factory=dict)
     searched: bool = False
-    trainer: str = "LevenbergMarquardt"
+    largest: Sequence[str] = ()
+    trainer: Any = field(default_factory=LevenbergMarquardt)
     ridge: bool = False
     louder: Mapping[str, float] = field(default_factory=dict)
     diverged: Sequence[str] = ()
@@ -124,41 +157,89 @@ class Evidence:
 
     @property
     def noise_limited(self) -> bool:
-        """Whether the training error is noise, and validation agrees."""
-        if not self.noise or self.train is None or self.train > NOISE_LIMITED * self.noise:
+        """Whether the training error is noise, the search at its end, and validation agrees."""
+        if not self.noise or self.train is None or self.falling > FALLING:
+            return False
+        if not SOUND * self.noise <= self.train <= NOISE_LIMITED * self.noise:
             return False
         return self.overfit is None or self.overfit <= OVERFIT
 
+    @property
+    def unlike(self) -> float | None:
+        """The linear model's error on validation over that in training."""
+        if not self.linear_train or self.linear_validation is None:
+            return None
+        return self.linear_validation / self.linear_train
+
+    @property
+    def structured(self) -> bool:
+        """Whether the training error has a part that noise has not."""
+        return (self.linear or 0.0) > LINEAR or (self.nonlinear or 0.0) > NONLINEAR
+
+    @property
+    def parts_differ(self) -> bool:
+        """Whether validation and training records are unlike."""
+        return self.unlike is not None and not 1.0 / UNLIKE <= self.unlike <= UNLIKE
+
 
 def advise(evidence: Evidence) -> list[Advice]:
-    """All that the numbers suggest, the most important first.
+    """All that the numbers suggest, the most useful first.
 
     At the noise there is no advice on how to make the model larger or the search longer.
     """
-    rules = ALWAYS if evidence.noise_limited else (*ALWAYS[:2], *WHERE_NOT_NOISE, *ALWAYS[2:])
-    return [found for rule in rules if (found := rule(evidence)) is not None]
+    return [
+        found
+        for rule in RULES
+        if not (evidence.noise_limited and rule in WHERE_NOT_NOISE)
+        and (found := rule(evidence)) is not None
+    ]
 
 
 def diverges(e: Evidence) -> Advice | None:
-    """A test on which the simulation runs away."""
+    """A record on which the simulation runs away."""
     if not e.diverged:
         return None
+    ridge = "a larger ridge" if e.ridge else "ridge=1e-3"
+    loud = any(e.louder.get(name, 0.0) > LOUDER for name in e.diverged)
     return Advice(
-        "The model is not usable yet: train on inputs as loud as the tests', or use "
-        + ("a larger ridge." if e.ridge else "ridge=1e-3."),
+        "The model is not usable yet: "
+        + (f"train on inputs as loud as the tests', or use {ridge}." if loud else f"use {ridge}."),
         f"the NL-LFR diverges on {_listed(e.diverged)}",
+        None if e.ridge else {"ridge": 1e-3},
     )
 
 
 def starts_in_a_transient(e: Evidence) -> Advice | None:
-    """An error at the beginning of the records: the start state is wrong there."""
-    if e.transient is None or e.transient <= TRANSIENT:
+    """An error at the beginning of the records that another start state removes."""
+    if e.transient is None or e.transient <= TRANSIENT or e.free is None or e.free <= FREE:
         return None
     return Advice(
-        "The records do not begin at rest: skip more samples (skip=N), or estimate "
+        "The records do not begin at the model's rest: skip more samples (skip=N), or estimate "
         "their starts (start='estimated').",
         f"in their first twentieth the training error is {number(e.transient)} times that of "
-        "the rest",
+        f"the rest, and a free response explains {percent(e.free)} of its power",
+    )
+
+
+def nothing_held_out(e: Evidence) -> Advice | None:
+    """No validation record: overfitting cannot be seen, nor sizes be chosen."""
+    if e.validation is not None or e.linear_validation is not None or e.train is None:
+        return None
+    return Advice(
+        "Nothing chooses the iterate, and overfitting would not show: hold out a part for "
+        "validation (validation=0.2).",
+        f"{e.parameters} parameters are fitted to {e.samples} samples",
+    )
+
+
+def validation_is_unlike(e: Evidence) -> Advice | None:
+    """A validation part on which the linear model does much better or worse than in training."""
+    if not e.parts_differ:
+        return None
+    return Advice(
+        "The validation part is unlike the training part: choose other parts, or cross-validate.",
+        f"error of the linear model: validation {percent(e.linear_validation)}, "
+        f"training {percent(e.linear_train)}",
     )
 
 
@@ -175,31 +256,34 @@ def at_the_noise(e: Evidence) -> Advice | None:
 
 
 def still_falling(e: Evidence) -> Advice | None:
-    """The iterations ended before the search did."""
-    if e.falling <= FALLING:
+    """The iterations ended before the search did, and the error that falls is on validation."""
+    if e.falling <= FALLING or e.validation is None:
         return None
+    limit = 4 * max(e.iterations, 1)
     return Advice(
-        f"Still falling: trainer={e.trainer}(max_iter={4 * max(e.iterations, 1)}); "
+        f"Still falling: trainer={type(e.trainer).__name__}(max_iter={limit}); "
         "init_from=run.model goes on from here.",
-        f"the error fell by {percent(e.falling)} over the last tenth of the {e.iterations} "
-        "iterations",
+        f"at the pace of the last iterations the validation error falls by {percent(e.falling)} "
+        f"in a tenth of the {e.iterations}",
+        {"trainer": replace(e.trainer, max_iter=limit)},
     )
 
 
 def overfits(e: Evidence) -> Advice | None:
     """Validation much above training."""
-    if e.overfit is None or e.overfit <= OVERFIT:
+    if e.overfit is None or e.overfit <= OVERFIT or e.parts_differ:
         return None
+    change: dict[str, Any] = {}
     if e.sizes.get("degree"):
-        smaller = f"degree={max(2, e.sizes['degree'] - 1)}"
+        change = {"degree": max(2, e.sizes["degree"] - 1)}
     elif e.sizes.get("nn", 0) > 1:
-        smaller = f"nn={e.sizes['nn'] // 2}"
-    else:
-        smaller = "smaller sizes"
+        change = {"nn": e.sizes["nn"] // 2}
+    smaller = _written(change) or "smaller sizes"
     return Advice(
         f"Overfit: {smaller}, {'a larger ridge' if e.ridge else 'ridge=1e-3'}, or more data.",
         f"validation error {percent(e.validation)}, training error {percent(e.train)}: "
         f"{number(e.overfit)} times the growth of the linear model's",
+        change or None,
     )
 
 
@@ -212,29 +296,36 @@ def linear_part_incomplete(e: Evidence) -> Advice | None:
     return Advice(
         f"The linear part is incomplete: {order}.",
         f"a linear filter of the inputs explains {percent(e.linear)} of the error's power",
+        {"nx": nx + 1} if nx else None,
     )
 
 
 def hardly_better(e: Evidence) -> Advice | None:
     """No gain over the linear model, of which no states are missing."""
     error, linear_error, which = e.judged
-    if e.linear is not None and e.linear > LINEAR:
+    if e.parts_differ or (e.linear is not None and e.linear > LINEAR):
         return None
     if error is None or not linear_error or error <= USELESS * linear_error:
         return None
     gain = f"{which} error {percent(error)}, of the linear model {percent(linear_error)}"
     if e.linear_train and e.noise and e.linear_train <= NOISE_LIMITED * e.noise:
+        if e.linear_train < SOUND * e.noise:
+            return None
         return Advice("The system is linear at this level: the linear model is enough.", gain)
     if e.searched:
         return Advice(
-            "Hardly better than the linear model at any of the sizes that were searched: the "
-            "system is linear at this level, or what is left is no static map of a few signals.",
+            "Hardly better than the linear model at any size searched: the system is linear at "
+            "this level, or the rest is no static map of a few signals.",
             gain,
         )
+    change = _larger(e)
+    if not e.continued and e.started < 8:
+        change = {"starts": 8, **change}
     return Advice(
         "Hardly better than the linear model: the system is linear at this level, or the search "
-        f"or the sizes are too small: {_more_starts(e)}{_larger(e)}.",
+        f"or the sizes are too small: {_written(change)}.",
         gain,
+        change,
     )
 
 
@@ -245,10 +336,11 @@ def outputs_left_out(e: Evidence) -> Advice | None:
     if not behind or error is None or not linear_error or error > USELESS * linear_error:
         return None
     ratios = ", ".join(f"{number(ratio)} times on '{name}'" for name, ratio in behind.items())
+    change: dict[str, Any] = {name: e.sizes.get(name, 0) + 1 for name in ("nw", "nz")}
     return Advice(
-        f"Some outputs gain nothing, or are linear: nw={e.sizes.get('nw', 0) + 1}, "
-        f"nz={e.sizes.get('nz', 0) + 1}.",
+        f"Some outputs gain nothing, or are linear: {_written(change)}.",
         f"{which} error {ratios} that of the linear model, and less on the others",
+        change,
     )
 
 
@@ -265,13 +357,13 @@ def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
         evidence = f"training error {number(e.train / e.noise)} times the noise"
         if e.linear is not None:
             evidence += f", and only {percent(e.linear)} of its power linear in the inputs"
-        return Advice(f"Nonlinear behaviour is left: {_larger(e)}.", evidence)
-    if e.nonlinear is not None and e.nonlinear > NONLINEAR:
-        return Advice(
-            f"Nonlinear behaviour is left: {_larger(e)}.",
-            f"squares and cubes of the outputs explain {percent(e.nonlinear)} of the error's power",
-        )
-    return None
+    elif e.nonlinear is not None and e.nonlinear > NONLINEAR:
+        part = percent(e.nonlinear)
+        evidence = f"squares and cubes of the outputs explain {part} of the error's power"
+    else:
+        return None
+    change = _larger(e)
+    return Advice(f"Nonlinear behaviour is left: {_written(change)}.", evidence, change)
 
 
 def best_start_alone(e: Evidence) -> Advice | None:
@@ -279,10 +371,12 @@ def best_start_alone(e: Evidence) -> Advice | None:
     found = sorted(e.starts)
     if len(found) < 2 or found[0] <= 0 or found[1] <= ALONE * found[0]:
         return None
+    starts = 2 * max(e.started, 4)
     return Advice(
-        f"The minimum may be a poor one: starts={2 * max(e.started, 4)}.",
+        f"The minimum may be a poor one: starts={starts}.",
         f"the second best start's error is {number(found[1] / found[0])} times that of the best, "
         f"of {e.started}",
+        {"starts": starts},
     )
 
 
@@ -292,7 +386,11 @@ def one_start(e: Evidence) -> Advice | None:
     useless = error is not None and linear_error and error > USELESS * linear_error  # said there
     if e.started > 1 or e.continued or useless:
         return None
-    return Advice("Try several starts: starts=8.", "one start; fits end in one of several minima")
+    return Advice(
+        "Try several starts: starts=8.",
+        "one start; fits end in one of several minima",
+        {"starts": 8},
+    )
 
 
 def tests_are_louder(e: Evidence) -> Advice | None:
@@ -307,24 +405,63 @@ def tests_are_louder(e: Evidence) -> Advice | None:
     )
 
 
-def noise_unknown(e: Evidence) -> Advice | None:
-    """No telling whether the error is noise."""
-    structure = (e.linear or 0.0) > LINEAR or (e.nonlinear or 0.0) > NONLINEAR  # no noise
-    if e.noise is not None or e.train is None or structure:
+def largest_sizes(e: Evidence) -> Advice | None:
+    """Sizes that validation chose at the edge of what was tried."""
+    if not e.largest:
+        return None
+    sizes = {name: e.sizes[name] for name in e.largest}
+    return Advice(
+        f"The largest sizes tried were chosen; larger ones may do better: try beyond "
+        f"{_written(sizes)}.",
+        "sizes_search says what is tried",
+    )
+
+
+def choose_sizes(e: Evidence) -> Advice | None:
+    """Sizes that were guessed, and validation records that can choose them."""
+    if e.searched or e.continued or e.validation is None or e.parts_differ or e.structured:
         return None
     static = "degree" if e.sizes.get("degree") else "nn"
-    sizes = ", ".join(f"{name}='auto'" for name in ("nx", "nz", "nw", static))
-    choose = f", or let validation choose the sizes: Settings({sizes})"
+    change: dict[str, Any] = dict.fromkeys(["nx", "nz", "nw", static], "auto")
     return Advice(
-        "It is unknown whether the remaining error is noise: give two periods of a periodic input "
-        "for training"
-        f"{'' if e.searched else choose}.",
+        f"Let validation choose the sizes: Settings({_written(change)}).",
+        "the sizes were given",
+        change,
+    )
+
+
+def noise_unknown(e: Evidence) -> Advice | None:
+    """No telling whether the error is noise."""
+    if e.noise is not None or e.train is None or e.structured:
+        return None
+    return Advice(
+        "It is unknown whether the remaining error is noise: measure two periods of a periodic "
+        "input in steady state for training.",
         f"training error {percent(e.train)} of the output's standard deviation, no repeated "
         "periods in the training records",
     )
 
 
-ALWAYS = (diverges, starts_in_a_transient, at_the_noise, tests_are_louder, noise_unknown)
+RULES = (
+    diverges,
+    validation_is_unlike,
+    nothing_held_out,
+    starts_in_a_transient,
+    at_the_noise,
+    still_falling,
+    overfits,
+    linear_part_incomplete,
+    hardly_better,
+    outputs_left_out,
+    nonlinear_part_incomplete,
+    best_start_alone,
+    one_start,
+    tests_are_louder,
+    choose_sizes,
+    largest_sizes,
+    noise_unknown,
+)
+"""All of them, the most useful first."""
 
 WHERE_NOT_NOISE = (
     still_falling,
@@ -335,21 +472,22 @@ WHERE_NOT_NOISE = (
     nonlinear_part_incomplete,
     best_start_alone,
     one_start,
+    choose_sizes,
+    largest_sizes,
 )
 
 
-def _larger(e: Evidence) -> str:
-    """Settings of a larger static map."""
-    sizes = [f"{name}={max(2, e.sizes.get(name, 0) + 1)}" for name in ("nz", "nw")]
+def _larger(e: Evidence) -> dict[str, int]:
+    """Sizes of a larger static map."""
+    sizes = {name: max(2, e.sizes.get(name, 0) + 1) for name in ("nz", "nw")}
     if e.sizes.get("degree"):
-        sizes.insert(0, f"degree={e.sizes['degree'] + 2}")
-    elif e.sizes.get("nn"):
-        sizes.insert(0, f"nn={2 * e.sizes['nn']}")
-    return " or ".join([", ".join(sizes[:-1]), sizes[-1]])
+        return {"degree": e.sizes["degree"] + 2, **sizes}
+    return {"nn": 2 * e.sizes["nn"], **sizes} if e.sizes.get("nn") else sizes
 
 
-def _more_starts(e: Evidence) -> str:
-    return "" if e.continued or e.started >= 8 else "starts=8, "
+def _written(change: Mapping[str, Any]) -> str:
+    """The change as one writes it."""
+    return ", ".join(f"{name}={value!r}" for name, value in change.items())
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -10,7 +10,10 @@ import scipy
 
 from lfrtorch._support.reasons import SPENT, Reason
 from lfrtorch._support.types import Array
-from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.fitting.size_search import SizeSearch
+from lfrtorch.fitting.trainer import FitResult, Trainer
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.spectra import spectra_of_periods
 from lfrtorch.metrics import rms
 from lfrtorch.records import Record
@@ -26,27 +29,39 @@ LONGEST, SHORTEST = 1024, 64
 BEGINNING = 0.05
 """Part of a record that is its beginning."""
 
+LAST = 5
+"""Iterations that the pace of a search is taken from, at least; of a long one the last tenth."""
+
+PARTS = 10
+"""Parts of time in which the differences between periods are looked at."""
+
+STEADY = 4.0
+"""Power of the differences between periods in a tenth of them over the median of all tenths, from
+which on they are no noise but a transient or a disturbance."""
+
 
 def evidence(
     result: FitResult,
     responses: Sequence[Response],
     *,
+    bla: LinearModel | None = None,
     noise_rms: float | None = None,
     continued: bool = False,
     ridge: bool = False,
-    searched: bool = False,
-    trainer: str = "LevenbergMarquardt",
+    search: SizeSearch | None = None,
+    trainer: Trainer | None = None,
 ) -> Evidence:
     """The numbers that advice rests on.
 
     Args:
         result: the fit.
         responses: of the training records, and of validation and tests if there are any.
+        bla: the linear model of the training records, whose free responses tell a wrong start.
         noise_rms: of the training outputs in their unit, if it is known.
         continued: whether the fit went on from a model.
         ridge: whether it had one.
-        searched: whether validation chose the sizes.
-        trainer: its class.
+        search: for the sizes, if validation chose them.
+        trainer: of the fit. Default: Levenberg-Marquardt.
     """
     train, validation, tests = (
         [response for response in responses if response.use == use]
@@ -60,24 +75,29 @@ def evidence(
         noise = np.full(len(scale), noise_rms)
     linear, nonlinear = explained_parts(train)
     peak = _peak(train, result.model.scaler.u_offset)
+    transient, free = (None, None) if bla is None else _transient(train, scale, bla)
     return Evidence(
         train=_error([r.error for r in train], scale),
         linear_train=_error([r.linear_error for r in train], scale),
         validation=_error([r.error for r in validation], scale),
         linear_validation=_error([r.linear_error for r in validation], scale),
         outputs=_by_output(validation or train),
+        parameters=result.model.net_parameter_count,
+        samples=sum(len(r.scored) for r in train),
         noise=None if noise is None else float(rms(noise / scale)),
         linear=linear,
         nonlinear=nonlinear,
-        transient=_transient(train, scale),
+        transient=transient,
+        free=free,
         falling=falling(result),
         iterations=result.iterations,
         starts=_finished(result),
         started=max(1, len(result.starts)),
         continued=continued,
         sizes=result.model.sizes,
-        searched=searched,
-        trainer=trainer,
+        searched=search is not None,
+        largest=[] if search is None else search.largest,
+        trainer=LevenbergMarquardt() if trainer is None else trainer,
         ridge=ridge,
         louder={
             test.record.name: float(
@@ -85,20 +105,21 @@ def evidence(
             )
             for test in tests
         },
-        diverged=[test.record.name for test in tests if test.diverged],
+        diverged=[r.record.name for r in responses if r.use != "train" and r.diverged],
     )
 
 
 def noise_of_periods(records: Sequence[Record]) -> Array | None:
     """Standard deviation (ny,) of the noise in the outputs, from the differences between periods.
 
-    None if no record has two periods, if an input does not repeat, or if the periods differ.
+    None if no record has two periods, if an input does not repeat, if the periods differ, or if
+    the differences are not steady: those of a transient or a disturbance are no noise.
     """
     try:
         spectra = spectra_of_periods(records)
     except ValueError:
         return None
-    if not spectra.freedom:
+    if not spectra.freedom or not all(_steady(record, spectra.N) for record in records):
         return None
     power = np.diagonal(spectra.C, axis1=1, axis2=2).real  # of each line
     return np.sqrt(power[1:, : records[0].y.shape[1]].sum(axis=0))
@@ -174,19 +195,22 @@ def coherent_part(signals: Sequence[Array], errors: Sequence[Array]) -> float | 
 
 
 def falling(result: FitResult) -> float:
-    """Part by which the error that chooses fell over the last tenth of the iterations.
+    """Part by which the error that chooses fell over a tenth of the iterations, at the last pace.
 
-    0 if the search ended for another reason than its limit.
+    The pace is that of the last tenth, and of five iterations at least. 0 if the search ended for
+    another reason than its limit, or rises.
     """
     history = result.history
-    if result.reason not in SPENT or len(history) < 2:
+    iterations = len(history) - 1
+    if result.reason not in SPENT or not iterations:
         return 0.0
-    tenth = max(1, len(history) // 10)
-    before = min(p.score for p in history[:-tenth])
+    last = min(max(LAST, iterations // 10), iterations)
+    before = min(p.score for p in history[:-last])
     after = min(p.score for p in history)
-    if not (math.isfinite(before) and before > 0):
+    lately = min(p.score for p in history[-math.ceil(last / 2) :])
+    if not (math.isfinite(before) and before > 0) or lately > after:
         return 0.0
-    return 1.0 - math.sqrt(after / before)
+    return 1.0 - math.sqrt(after / before) ** (iterations / 10 / last)
 
 
 def _error(errors: Sequence[Array], scale: Array) -> float | None:
@@ -209,19 +233,59 @@ def _by_output(responses: Sequence[Response]) -> dict[str, float]:
     return {c.name: float(e / b) for c, e, b in zip(outputs, error, linear, strict=True) if b > 0}
 
 
-def _transient(train: Sequence[Response], scale: Array) -> float | None:
-    """Error at the beginning of the records over the rest; None if their start is known."""
-    first, rest = [], []
+def _steady(record: Record, N: int) -> bool:
+    """Whether the differences between successive periods of N samples have the same power in time.
+
+    The first of two periods may have a transient, which is no noise.
+    """
+    count = (record.samples - record.skip) // N
+    if count < 2:
+        return True
+    periods = record.y[record.samples - count * N :].reshape(count, N, -1)
+    power = np.diff(periods, axis=0).reshape((count - 1) * N, -1) ** 2
+    parts = np.array([part.mean(axis=0) for part in np.array_split(power, PARTS)])
+    return bool(np.all(parts.max(axis=0) <= STEADY * np.median(parts, axis=0)))
+
+
+def _transient(
+    train: Sequence[Response], scale: Array, bla: LinearModel
+) -> tuple[float | None, float | None]:
+    """What the errors at the beginning of the records say of the start states.
+
+    Returns:
+        The error there over that in the rest, and the part of its power that free responses of the
+        linear model explain: their states are fitted to the first half of the beginning, and are to
+        be right in the second, too. None if the starts are known or fitted.
+    """
+    first, rest, left = [], [], []
     for response in train:
-        if response.record.start not in ("periodic", "estimated"):
-            error = response.error / scale
-            count = math.ceil(BEGINNING * len(error))
-            first.append(error[:count])
-            rest.append(error[count:])
+        if response.record.start in ("periodic", "estimated"):
+            continue
+        error = response.error / scale
+        count = math.ceil(BEGINNING * len(error))
+        first.append(error[:count])
+        rest.append(error[count:])
+        x, free = np.linalg.matrix_power(bla.A, response.record.skip), []
+        for _ in range(count):
+            free.append(bla.C @ x / scale[:, None])
+            x = bla.A @ x
+        half = max(1, count // 2)
+        if half * len(scale) > bla.nx and np.isfinite(error[:count]).all():
+            response_to = np.array(free)
+            state = np.linalg.lstsq(
+                response_to[:half].reshape(-1, bla.nx), error[:half].ravel(), rcond=None
+            )[0]
+            left.append(error[:count] - response_to @ state)
     if not first or not sum(map(len, rest)):
-        return None
+        return None, None
     beginning, usual = (float(np.mean(rms(np.concatenate(part), axis=0))) for part in (first, rest))
-    return beginning / usual if 0 < usual < math.inf and math.isfinite(beginning) else None
+    if not (0 < usual < math.inf and math.isfinite(beginning)):
+        return None, None
+    free_part = None
+    if len(left) == len(first) and beginning > 0:
+        powers = [sum(float(np.sum(part**2)) for part in parts) for parts in (left, first)]
+        free_part = max(0.0, 1.0 - powers[0] / powers[1])
+    return beginning / usual, free_part
 
 
 def _peak(responses: Sequence[Response], offset: Array) -> Array:

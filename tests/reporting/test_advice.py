@@ -33,9 +33,12 @@ GOOD = Evidence(
     starts=(0.021, 0.022, 0.03),
     started=8,
     sizes={"nx": 3, "nz": 1, "nw": 1, "nn": 10},
+    searched=True,
     louder={"test": 1.0},
 )
 """A fit of which nothing is to be said but that nonlinear behaviour is left."""
+
+SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
 
 
 @pytest.mark.parametrize(
@@ -43,28 +46,32 @@ GOOD = Evidence(
     [
         (advice.diverges, {"diverged": ["sweep"]}, "ridge=1e-3"),
         (advice.diverges, {"diverged": ["sweep"], "ridge": True}, "larger ridge"),
-        (advice.starts_in_a_transient, {"transient": 4.0}, "skip=N"),
+        (advice.starts_in_a_transient, {"transient": 4.0, "free": 0.9}, "skip=N"),
+        (advice.nothing_held_out, {"validation": None, "linear_validation": None}, "hold out"),
+        (advice.validation_is_unlike, {"linear_validation": 0.4}, "cross-validate"),
+        (advice.validation_is_unlike, {"linear_validation": 0.1}, "cross-validate"),
         (advice.still_falling, {"falling": 0.05}, "trainer=LevenbergMarquardt(max_iter=400)"),
-        (advice.still_falling, {"falling": 0.05, "trainer": "Adam"}, "trainer=Adam(max_iter=400)"),
+        (
+            advice.still_falling,
+            {"falling": 0.05, "trainer": lfrtorch.Adam()},
+            "trainer=Adam(max_iter=400)",
+        ),
         (advice.overfits, {"validation": 0.05}, "nn=5, ridge=1e-3, or more data"),
         (advice.linear_part_incomplete, {"linear": 0.5}, "nx=4, nx=5 or nx='auto'"),
-        (advice.hardly_better, {"validation": 0.19}, "nn=20, nz=2 or nw=2"),
         (
             advice.hardly_better,
-            {"validation": 0.19, "linear_train": 0.01},
+            {"validation": 0.19, "linear_train": 0.01, "linear_validation": 0.01},
             "linear model is enough",
         ),
         (advice.outputs_left_out, {"outputs": {"y1": 0.95, "y2": 0.1}}, "nw=2, nz=2"),
         (advice.best_start_alone, {"starts": (0.02, 0.03)}, "starts=16"),
         (advice.one_start, {"started": 1}, "starts=8"),
         (advice.tests_are_louder, {"louder": {"arrow": 1.5}}, "train on inputs as loud"),
-        (advice.noise_unknown, {"noise": None}, "nx='auto', nz='auto', nw='auto', nn='auto'"),
-        (
-            advice.noise_unknown,
-            {"noise": None, "searched": True},
-            "of a periodic input for training.",
-        ),
-        (advice.hardly_better, {"validation": 0.199, "searched": True}, "sizes that were searched"),
+        (advice.noise_unknown, {"noise": None}, "in steady state for training."),
+        (advice.choose_sizes, {"searched": False}, "nx='auto', nz='auto', nw='auto', nn='auto'"),
+        (advice.largest_sizes, {"largest": ["nn"]}, "nn=10"),
+        (advice.hardly_better, {"validation": 0.199}, "at any size searched"),
+        (advice.hardly_better, {"validation": 0.199, "searched": False}, "nn=20, nz=2, nw=2"),
         (advice.at_the_noise, {"train": 0.0105, "validation": 0.011}, "nothing to gain"),
     ],
 )
@@ -73,7 +80,10 @@ def test_a_rule_speaks_if_its_number_says_so(rule, change, said):
     found = rule(replace(GOOD, **change))
     assert said in found.text
     assert found.evidence
+    assert max(len(found.text), len(found.evidence)) <= 160
     assert found in advise(replace(GOOD, **change))
+    if found.change is not None:
+        assert replace(SETTINGS, **found.change) != SETTINGS
 
 
 def test_nonlinear_behaviour_is_left_where_the_error_is_neither_noise_nor_linear():
@@ -81,7 +91,7 @@ def test_nonlinear_behaviour_is_left_where_the_error_is_neither_noise_nor_linear
     polynomial = replace(GOOD, sizes={"nx": 3, "nz": 1, "nw": 1, "degree": 3})
     seen = replace(GOOD, noise=None, nonlinear=0.3)
     for found, said in (
-        (rule(GOOD), "nn=20, nz=2 or nw=2. (training error 2.00 times the noise"),
+        (rule(GOOD), "nn=20, nz=2, nw=2. (training error 2.00 times the noise"),
         (rule(polynomial), "degree=5"),
         (rule(seen), "30.0 % of the error's power"),
     ):
@@ -97,7 +107,7 @@ def test_nonlinear_behaviour_is_left_where_the_error_is_neither_noise_nor_linear
 
 def test_at_the_noise_nothing_larger_is_advised():
     noisy = replace(
-        GOOD, train=0.01, validation=0.011, linear=0.5, falling=0.05, started=1,
+        GOOD, train=0.01, validation=0.011, linear=0.5, started=1,
         louder={"test": 2.0},
     )  # fmt: skip
     assert [item.text.split(":")[0] for item in advise(noisy)] == [
@@ -105,20 +115,39 @@ def test_at_the_noise_nothing_larger_is_advised():
         "Some tests extrapolate",
     ]
     # Below the noise on training and above it on validation is overfit.
-    assert advise(replace(noisy, train=0.007, linear=0.0, falling=0.0))[0].text.startswith(
-        "Overfit"
-    )
+    assert advise(replace(noisy, train=0.007, linear=0.0))[0].text.startswith("Overfit")
+    # A search that goes on, or an error below the noise, says that the noise is not known so well.
+    for change in ({"falling": 0.05}, {"train": 0.005, "validation": 0.005}):
+        assert advice.at_the_noise(replace(noisy, **change)) is None
 
 
 def test_missing_states_come_before_a_larger_map():
     useless = replace(GOOD, train=0.2, validation=0.2, linear=0.9, outputs={}, noise=None)
+    useless = replace(useless, searched=False)
     assert [item.text for item in advise(useless)] == [
         "The linear part is incomplete: nx=4, nx=5 or nx='auto'."
     ]
 
 
 def test_what_spoils_the_linear_model_as_much_is_no_overfit():
-    assert advice.overfits(replace(GOOD, validation=0.06, linear_validation=0.6)) is None
+    unlike = replace(GOOD, validation=0.06, linear_validation=0.6)
+    assert advice.overfits(unlike) is None
+    assert advice.overfits(replace(unlike, validation=0.027, linear_validation=0.27)) is None
+
+
+def test_what_is_seen_on_unlike_parts_is_not_the_system():
+    """The linear model is as good on a validation part of which it is no model."""
+    unlike = replace(GOOD, linear_train=0.01, validation=0.98, linear_validation=0.98)
+    texts = [item.text for item in advise(unlike)]
+    assert texts[0].startswith("The validation part is unlike the training part")
+    assert not any("linear" in text for text in texts[1:])
+
+
+def test_without_validation_nothing_rests_on_it():
+    alone = replace(GOOD, validation=None, linear_validation=None, falling=0.1, searched=False)
+    texts = [item.text for item in advise(alone)]
+    assert "overfitting would not show: hold out a part" in texts[0]
+    assert not any("auto" in text or "Still falling" in text for text in texts)
 
 
 def test_a_model_that_diverges_everywhere_has_advice():
@@ -188,7 +217,8 @@ def fitted() -> tuple[FitResult, list[Response]]:
 
 def test_evidence_is_measured_on_the_records(fitted):
     result, responses = fitted
-    found = evidence(result, responses, noise_rms=0.1)
+    bla = lfrtorch.estimate_bla(responses[0].record[100:], nx=1)
+    found = evidence(result, responses, noise_rms=0.1, bla=bla)
     deviation = responses[0].record.y.std(axis=0)
     assert found.noise == pytest.approx(np.sqrt(np.mean((0.1 / deviation) ** 2)))
     expected = np.sqrt(np.mean(np.mean(responses[0].error ** 2, axis=0) / deviation**2))
@@ -196,7 +226,9 @@ def test_evidence_is_measured_on_the_records(fitted):
     assert (found.validation, found.linear_validation) == (None, None)
     assert found.transient is not None
     assert found.transient > 10.0
-    assert found.falling == 0.5
+    assert found.free == pytest.approx(1.0, abs=0.2)
+    assert (found.parameters, found.samples) == (result.model.net_parameter_count, 800)
+    assert found.falling == 1.0 - 0.25**0.1  # of two iterations: a tenth of them, at their pace
     assert list(found.starts) == [1.0, 1.5]
     assert found.started == 3
     assert set(found.outputs) == {"a", "b"}
@@ -204,7 +236,7 @@ def test_evidence_is_measured_on_the_records(fitted):
     test, train = (np.abs(r.record.u - offset).max() for r in responses[::-1])
     assert found.louder == {"loud": pytest.approx(test / train)}
     texts = [item.text for item in advise(found)]
-    assert any(text.startswith("The records do not begin at rest") for text in texts)
+    assert any(text.startswith("The records do not begin at the model's rest") for text in texts)
 
 
 def test_a_diverging_simulation_is_evidence_and_no_error(fitted):
@@ -212,6 +244,7 @@ def test_a_diverging_simulation_is_evidence_and_no_error(fitted):
     lost = replace(responses[1], y_hat=np.full_like(responses[1].y_hat, np.inf))
     found = evidence(result, [responses[0], lost])
     assert found.diverged == ["loud"]
+    assert advice.diverges(found) is not None
     first = replace(responses[0], y_hat=np.full_like(responses[0].y_hat, np.nan))
     found = evidence(result, [first, lost])
     assert (found.train, found.linear, found.nonlinear) == (None, None, None)
@@ -223,3 +256,87 @@ def test_a_search_that_converged_or_rose_is_not_still_falling(fitted):
     assert falling(replace(result, reason="converged: the cost no longer falls")) == 0.0
     assert falling(replace(result, history=history([1.0, 0.5, 0.8]))) == 0.0
     assert falling(replace(result, history=history([1.0]))) == 0.0
+    # 1 % at each of the last iterations but one, which is no better.
+    pace = falling(replace(result, history=history([*(0.99**k for k in range(100)), 0.99**99])))
+    assert 0.05 < pace < 1.0 - 0.99**10
+
+
+def system(samples: int = 2000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Input and output, both of about 1 rms, of a resonance."""
+    u = np.random.default_rng(seed).standard_normal((samples, 1))
+    return u, 0.36 * resonant(u)
+
+
+def resonant(u: np.ndarray) -> np.ndarray:
+    return np.asarray(scipy.signal.lfilter([0.0, 0.0, 1.0], [1.0, -1.2, 0.8], u, axis=0))
+
+
+@pytest.fixture(scope="module")
+def resonance() -> tuple[FitResult, lfrtorch.LinearModel]:
+    """A fit of it, and its linear model."""
+    record = Record(*system())
+    bla = lfrtorch.estimate_bla(record, nx=2)
+    model = lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4)
+    return FitResult(model, history([1.0, 1.0]), 1, 1.0, 1.0, Reason.COST_SETTLED), bla
+
+
+def told(resonance, *parts: tuple[str, np.ndarray, np.ndarray], **options) -> str:
+    """Advice for records of these uses with these errors of the NL-LFR and the linear model."""
+    result, bla = resonance
+    responses = []
+    for use, error, linear_error in parts:
+        u, y = system(len(error))
+        record = Record(u, y + error, name=use, **options)
+        responses.append(Response(record, use, record.y - linear_error, y))
+    return "\n".join(map(str, advise(evidence(result, responses, bla=bla))))
+
+
+WHITE = np.random.default_rng(7).standard_normal((2000, 1))
+
+
+def test_a_filtered_input_in_the_error_asks_for_states_and_white_noise_does_not(resonance):
+    filtered = 0.1 * scipy.signal.lfilter([0.3], [1.0, -0.95], system()[0], axis=0)
+    said = "The linear part is incomplete"
+    assert said in told(
+        resonance, ("train", filtered, filtered), ("validation", filtered, filtered)
+    )
+    for error in (0.1 * WHITE, 0.1 * system()[1] ** 2):
+        assert said not in told(resonance, ("train", error, error), ("validation", error, error))
+
+
+def test_squares_in_the_error_ask_for_a_larger_map_and_white_noise_does_not(resonance):
+    square = 0.05 * (system()[1] ** 2 - 1.0)
+    said = "Nonlinear behaviour is left"
+    for error, is_said in ((square, True), (0.05 * WHITE, False), (0.05 * system()[0], False)):
+        parts = [(use, error, 3 * error) for use in ("train", "validation")]
+        assert (said in told(resonance, *parts)) is is_said
+
+
+def test_a_free_response_is_a_wrong_start_and_a_loud_beginning_is_not(resonance):
+    free = resonant(np.eye(2000, 1)) + 0.01 * WHITE
+    loud = 0.01 * WHITE * np.where(np.arange(2000) < 60, 20.0, 1.0)[:, None]
+    said = "do not begin at the model's rest"
+    assert said in told(resonance, ("train", free, WHITE))
+    assert said not in told(resonance, ("train", loud, WHITE))
+    assert said not in told(resonance, ("train", free, WHITE), start="estimated")
+
+
+@pytest.mark.parametrize("noisy", [True, False])
+def test_what_differs_between_periods_is_noise_if_it_is_steady(noisy: bool, resonance):
+    result, bla = resonance
+    u = np.tile(system(1000)[0], (3, 1))
+    u, y, error = u[1000:], 0.36 * resonant(u)[1000:], 0.05 * WHITE  # in steady state
+    transient = 0.0 if noisy else 2.0 * 0.97 ** np.arange(2000)[:, None]
+    record = Record(u, y + error * noisy + transient, period=1000)
+    # An error that is as large as the differences would have it.
+    size = np.sqrt(np.mean(np.diff(record.y.reshape(2, 1000), axis=0) ** 2) / 2)
+    y_hat = y if noisy else record.y + size * WHITE
+    found = evidence(result, [Response(record, "train", 0.0 * y, y_hat)], bla=bla)
+    assert (advice.at_the_noise(found) is not None) is noisy
+
+
+def test_validation_like_the_training_is_not_called_unlike(resonance):
+    said = "The validation part is unlike"
+    for factor, is_said in ((1.0, False), (1.3, False), (2.2, True)):
+        parts = ("train", 0.1 * WHITE, 0.3 * WHITE), ("validation", WHITE, factor * 0.3 * WHITE)
+        assert (said in told(resonance, *parts)) is is_said
