@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.cli import CONF
+from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.words import GROUPS
 
 SWEEPS = {"-m", "--multirun"}
@@ -61,7 +62,7 @@ def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) ->
 def parsed(word: str) -> Override:
     """The word as Hydra reads it."""
     try:
-        return OverridesParser.create().parse_override(word)
+        return OverridesParser.create().parse_override(quoted(word))
     except HydraException:
         raise InputError(
             f"'{word}' is not understood; write NAME=VALUE, and quotes around the word if a space, "

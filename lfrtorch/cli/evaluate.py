@@ -22,6 +22,7 @@ from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import loaded, require_data
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import program
 from lfrtorch.cli.simulate import opened
 from lfrtorch.job import check_channels
@@ -77,5 +78,6 @@ def main(cfg: DictConfig) -> None:
 def launch() -> None:
     """The command."""
     with user_errors():
+        sys.argv[1:] = [quoted(word) for word in sys.argv[1:]]
         check_words("evaluate", sys.argv[1:])
     main()

@@ -31,6 +31,7 @@ from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError, Termination
+from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import (
     CONFIG,
     SNAPSHOTS,
@@ -174,7 +175,7 @@ def launch() -> None:
         sys.exit("error: torchrun shares one fit; start several runs one after another.")
     with user_errors(os.environ.get("RANK", "0")):
         given = sys.argv[1:]
-        sys.argv[1:] = arguments(given)
+        sys.argv[1:] = [quoted(word) for word in arguments(given)]
         check_words("config", given, sys.argv[1:])
     if WORLD > 1 and os.environ["RANK"] != "0":
         sys.argv += WITHOUT_FILES

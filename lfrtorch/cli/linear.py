@@ -31,6 +31,7 @@ from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.config import configured, loaded
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
 from lfrtorch.cli.words import Terminal, translated
 from lfrtorch.dataset import Dataset
@@ -251,6 +252,6 @@ def launch() -> None:
     """The command, with the settings of the run in ``resume=DIR`` before its words."""
     with user_errors():
         given = sys.argv[1:]
-        sys.argv[1:] = arguments(given)
+        sys.argv[1:] = [quoted(word) for word in arguments(given)]
         check_words("linear", given, sys.argv[1:])
     main()

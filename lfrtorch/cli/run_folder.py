@@ -45,7 +45,8 @@ def arguments(given: Sequence[str]) -> list[str]:
                     else "the folder that the run named at its end, runs/NAME/DATE."
                 )
             )
-        before = [now(str(o)) for o in OmegaConf.load(overrides)]
+        listed = cast("list[str]", OmegaConf.to_container(OmegaConf.load(overrides)))
+        before = [now(word) for word in listed]
         before = [word for word in before if not word.startswith("resume=")]
         escaped = folder.replace("\\", "\\\\").replace("'", "\\'")
         return [*before, *given, f"hydra.run.dir='{escaped}'"]

@@ -26,6 +26,7 @@ from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import check_words
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.linear import finite
+from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.words import translated
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import Block, FileStream
@@ -300,5 +301,6 @@ def main(cfg: DictConfig) -> None:
 def launch() -> None:
     """The command."""
     with user_errors():
+        sys.argv[1:] = [quoted(word) for word in sys.argv[1:]]
         check_words("simulate", sys.argv[1:])
     main()
