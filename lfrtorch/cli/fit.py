@@ -35,6 +35,7 @@ from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import (
     CONFIG,
     SNAPSHOTS,
+    STARTS,
     WORLD,
     arguments,
     chosen_before,
@@ -77,7 +78,8 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
         torch.set_num_threads(cfg.threads)
     dataset = loaded(cfg)
     if cfg.resume is None and ranks.rank == 0:
-        shutil.rmtree(folder / SNAPSHOTS, ignore_errors=True)
+        for old in (SNAPSHOTS, STARTS):
+            shutil.rmtree(folder / old, ignore_errors=True)
     kept = folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None
     snapshots = Snapshots(kept, writes=ranks.rank == 0)
     files = _Folder(cfg, folder, least=snapshots.least) if ranks.rank == 0 else None
@@ -140,14 +142,15 @@ class _Folder(Terminal):
         if len(models) == 1:
             self._boards = []
             return Watching([[*printing[0], self.board, keep]], watch)
-        self._boards = [TensorBoard(self.folder / "starts" / str(i)) for i in range(len(models))]
+        self._boards = [
+            TensorBoard(self.folder / STARTS / f"{i:02d}", finalist=True)
+            for i in range(len(models))
+        ]
         own = zip(printing, self._boards, strict=True)
         return Watching([[*lines, board, keep] for lines, board in own], watch)
 
     def end(self, result: FitResult) -> None:
         super().end(result)
-        if self._boards:
-            self.board.history(result.history)
         for board in self._boards:
             board.close()
 

@@ -21,8 +21,9 @@ from lfrtorch.distributed import Ranks
 WORLD = int(os.environ.get("WORLD_SIZE", "1"))
 """Processes of one fit that torchrun started."""
 
-CONFIG, SNAPSHOTS = "config.yaml", "resume"
-"""In the folder of a run: its settings, and its starts as far as they came."""
+CONFIG, SNAPSHOTS, STARTS = "config.yaml", "resume", "starts"
+"""In the folder of a run: its settings, its starts as far as they came, and events of those that go
+to the end."""
 
 
 def arguments(given: Sequence[str]) -> list[str]:
@@ -107,7 +108,7 @@ def no_empty_folder(folder: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        passing = {".hydra", CONFIG, SNAPSHOTS, "starts"}
+        passing = {".hydra", CONFIG, SNAPSHOTS, STARTS}
         names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
         if names and all(name in passing or name.startswith("events.out") for name in names):
             shutil.rmtree(folder)

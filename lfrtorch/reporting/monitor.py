@@ -12,13 +12,13 @@ from statistics import median
 from time import monotonic
 from typing import TextIO
 
-import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
+from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 
 from lfrtorch.engine.simulation import spectral_radius
-from lfrtorch.fitting.multistart import Round
+from lfrtorch.fitting.multistart import ROUNDS, Round
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -129,12 +129,17 @@ class StartsLine:
 class TensorBoard:
     """Scalars of every iteration, and figures of the validation record now and then.
 
+    The file is made at the first iteration that is written. It replaces what earlier files in the
+    folder have of this and later iterations: a fit that goes on has each of them once.
+
     Args:
         folder: of the event file.
-        record: record whose spectrum and static map are drawn, usually the validation record; left
+        record: record whose output and static map are drawn, usually the validation record; left
             out for scalars alone.
         y_linear: output of the linear model on it, (T, ny), for the error beside ours.
         every: iterations between figures; they cost about half a second.
+        finalist: whether nothing is written before the last round of a fit from several starts, so
+            that starts that others end leave no run.
 
     Example:
         >>> from lfrtorch.reporting.monitor import TensorBoard
@@ -149,50 +154,75 @@ class TensorBoard:
         record: Record | None = None,
         y_linear: plots.Array | None = None,
         every: int = 50,
+        *,
+        finalist: bool = False,
     ) -> None:
-        self.writer = SummaryWriter(str(folder))
+        self.folder, self.finalist = Path(folder), finalist
         self.record, self.y_linear, self.every = record, y_linear, every
+        self._writer: SummaryWriter | None = None
+        self._waiting: list[tuple[Progress, float]] = []
+
+    @property
+    def begun(self) -> bool:
+        """Whether something is written."""
+        return self._writer is not None
 
     def history(self, history: Sequence[Progress]) -> None:
         """Log iterations of the past."""
         for progress in history:
-            step = progress.iteration
-            self.writer.add_scalar("rmse/train", progress.train, step)
+            writer, step = self._from(progress.iteration), progress.iteration
+            writer.add_scalar("rmse/train", progress.train, step)
             if not math.isnan(progress.validation):
-                self.writer.add_scalar("rmse/validation", progress.validation, step)
+                writer.add_scalar("rmse/validation", progress.validation, step)
             for name, value in progress.report.items():
-                self.writer.add_scalar(f"optimiser/{name}", value, step)
+                writer.add_scalar(f"search/{name}", value, step)
 
     def __call__(self, model: Model, progress: Progress) -> None:
         """Log one iteration."""
         step = progress.iteration
-        self.history([progress])
-        radius = spectral_radius(model.lfr.cell.A.detach())
-        self.writer.add_scalar("model/spectral_radius_A", radius, step)
+        self._waiting.append((progress, float(spectral_radius(model.lfr.cell.A.detach()))))
+        if self.finalist and step <= math.ceil(ROUNDS[-1] * progress.limit):
+            return
+        for one, radius in self._waiting:
+            self.history([one])
+            self._from(step).add_scalar("stability/spectral_radius_A", radius, one.iteration)
+        self._waiting = []
         if self.record is not None and self.y_linear is not None and step % self.every == 0:
             y_hat, signals = model.simulate(self.record), model.signals(self.record)
-            self.figure(
-                "validation/spectrum", plots.spectrum(self.record, self.y_linear, y_hat), step
-            )
+            self.figure("signals/response", plots.response(self.record, self.y_linear, y_hat), step)
             drawn = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
-            self.figure("validation/static_map", drawn, step)
+            self.figure("signals/static_map", drawn, step)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """Add a figure."""
-        self.writer.add_figure(name, figure, step, close=False)
+        self.image(name, plots.png(figure), step)
 
     def image(self, name: str, png: bytes, step: int) -> None:
         """Add a figure that is drawn already."""
-        pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
-        self.writer.add_image(name, pixels, step, dataformats="HWC")
+        width, height = Image.open(io.BytesIO(png)).size
+        image = Summary.Image(
+            encoded_image_string=png, width=width, height=height, colorspace=len("RGB")
+        )
+        summary = Summary(value=[Summary.Value(tag=name, image=image)])
+        file = self._from(step).file_writer
+        assert file is not None
+        file.add_summary(summary, step)
 
-    def text(self, name: str, text: str) -> None:
+    def text(self, name: str, text: str, step: int = 0) -> None:
         """Add a text in a fixed-width font."""
-        self.writer.add_text(name, "\n".join("    " + line for line in text.splitlines()))
+        shown = "\n".join("    " + line for line in text.splitlines())
+        self._from(step).add_text(name, shown, step)
 
     def close(self) -> None:
         """Write what is pending."""
-        self.writer.close()
+        if self._writer is not None:
+            self._writer.close()
+
+    def _from(self, step: int) -> SummaryWriter:
+        """The writer, made at the first step."""
+        if self._writer is None:
+            self._writer = SummaryWriter(str(self.folder), purge_step=step)
+        return self._writer
 
 
 class Checkpoint:

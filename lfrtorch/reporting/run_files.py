@@ -31,7 +31,7 @@ def write(
         folder: of the files; those of an earlier run there are replaced.
         command, config: that made the run, for ``metrics.json`` and ``report.html``.
         draw: whether figures and ``report.html`` are made.
-        board: TensorBoard that has the history already. Default: a new one.
+        board: TensorBoard, with the history if it has begun. Default: a new one.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -41,21 +41,27 @@ def write(
     metrics = {**run.metrics, "command": command}
     with whole_file(folder / "metrics.json") as fresh:
         fresh.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
-    if board is None:
+    board = TensorBoard(folder) if board is None else board
+    if not board.begun:
         for earlier in folder.glob("events.out.tfevents.*"):
             earlier.unlink()
-        board = TensorBoard(folder)
         board.history(result.history)
-    if run.size_search is not None:
-        board.text("sizes", run.size_search.table())
-    board.text("scores", scores.table(metrics, dataset.published))
+    texts = {
+        "report": "\n\n".join(map(str, [run.verdict, *run.advice])),
+        "scores": scores.table(metrics, dataset.published),
+        "settings": config,
+        "sizes": "" if run.size_search is None else run.size_search.table(),
+    }
+    for name, text in texts.items():
+        if text:
+            board.text(name, text, result.iterations)
     if draw:
         drawn, views = figures.of_run(result, run.linear, dataset, run.simulations)
         images = {name: plots.png(figure) for name, figure in drawn.items()}
         (folder / "figures").mkdir(exist_ok=True)
         for name, image in images.items():
             (folder / "figures" / f"{name}.png").write_bytes(image)
-            board.image(f"result/{name}", image, result.iterations)
+            board.image(f"summary/{name}", image, result.iterations)
         page = html.render(
             metrics, result, run.linear, dataset, run.simulations, images, run.verdict,
             run.advice, views=views, config=config,

@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import lfrtorch
 from lfrtorch.fitting.multistart import Round
 from lfrtorch.fitting.trainer import Progress, RestartSummary
 from lfrtorch.records import Channel, Record
+from lfrtorch.reporting import plots
 from lfrtorch.reporting.monitor import (
     Checkpoint,
     ProgressLine,
@@ -88,32 +90,61 @@ def test_a_round_of_starts_is_a_line(model: lfrtorch.Model):
         assert text.count("\n") == 1
 
 
+def events(folder: Path) -> EventAccumulator:
+    """What TensorBoard would show of a folder."""
+    found = EventAccumulator(str(folder))
+    found.Reload()
+    return found
+
+
 def test_tensorboard_without_a_record_has_scalars_alone(model: lfrtorch.Model, tmp_path: Path):
     board = TensorBoard(tmp_path)
     board(model, step(0))
     board.close()
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
-    assert "rmse/train" in events.Tags()["scalars"]
-    assert not events.Tags()["images"]
+    assert "rmse/train" in events(tmp_path).Tags()["scalars"]
+    assert not events(tmp_path).Tags()["images"]
 
 
 @pytest.mark.numeric
-def test_tensorboard_holds_scalars_figures_and_texts(model: lfrtorch.Model, tmp_path: Path):
+def test_tensorboard_holds_scalars_figures_and_texts(
+    model: lfrtorch.Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(plots, "DPI", 40)
     board = TensorBoard(tmp_path, RECORD, 0.5 * RECORD.y, every=2)
     for iteration in range(3):
         board(model, step(iteration, damping=0.5))
-    board.text("scores", "a\nb")
+    board.text("scores", "a\nb", 2)
     board.close()
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
+    found = events(tmp_path)
     for name, value in (("rmse/train", 1.5e-3), ("rmse/validation", 2.5e-3)):
-        assert [e.value for e in events.Scalars(name)] == pytest.approx([value] * 3)
-    assert [e.step for e in events.Scalars("optimiser/damping")] == [0, 1, 2]
+        assert [e.value for e in found.Scalars(name)] == pytest.approx([value] * 3)
+    assert [e.step for e in found.Scalars("search/damping")] == [0, 1, 2]
     radius = np.abs(np.linalg.eigvals(model.lfr.cell.A.detach().numpy())).max()
-    assert events.Scalars("model/spectral_radius_A")[0].value == pytest.approx(radius)
-    for name in ("validation/spectrum", "validation/static_map"):
-        assert [e.step for e in events.Images(name)] == [0, 2]
+    assert found.Scalars("stability/spectral_radius_A")[0].value == pytest.approx(radius)
+    for name in ("signals/response", "signals/static_map"):
+        assert [e.step for e in found.Images(name)] == [0, 2]
+        assert Image.open(io.BytesIO(found.Images(name)[0].encoded_image_string)).size[0] > 100
+    groups = {tag.split("/")[0] for tags in ("scalars", "images") for tag in found.Tags()[tags]}
+    assert min(groups) == "rmse"  # the first in TensorBoard
+
+
+def test_tensorboard_has_a_run_of_finalists_alone(model: lfrtorch.Model, tmp_path: Path):
+    boards = [TensorBoard(tmp_path / name, finalist=True) for name in ("early", "late")]
+    for board, last in zip(boards, (5, 6), strict=True):  # an eighth of 40 iterations, and more
+        for iteration in range(last + 1):
+            board(model, step(iteration))
+        board.close()
+    assert not (tmp_path / "early").exists()
+    assert [e.step for e in events(tmp_path / "late").Scalars("rmse/train")] == list(range(7))
+
+
+def test_iterations_that_are_done_again_are_shown_once(model: lfrtorch.Model, tmp_path: Path):
+    for first, last in ((0, 5), (3, 8)):  # a run that ended, and went on from a snapshot
+        board = TensorBoard(tmp_path)
+        for iteration in range(first, last):
+            board(model, step(iteration))
+        board.close()
+    assert [e.step for e in events(tmp_path).Scalars("rmse/train")] == list(range(8))
 
 
 def test_checkpoint_holds_the_best_so_far_when_it_is_time(
