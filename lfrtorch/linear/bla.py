@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
@@ -21,6 +22,16 @@ from lfrtorch._support.tables import radius
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
 from lfrtorch.linear.frf import FRF, estimate_frf
+from lfrtorch.linear.integrators import (
+    differenced,
+    differenced_response,
+    differenced_weight,
+    gain,
+    integrated,
+    placed,
+    simulation_errors,
+    whitening_pole,
+)
 from lfrtorch.linear.model import LinearFit, LinearModel, balancing
 from lfrtorch.linear.refinement import Matrices, Refined, Search
 from lfrtorch.linear.requirements import (
@@ -39,6 +50,7 @@ from lfrtorch.linear.spectral_data import (
 from lfrtorch.linear.subspace import SubspaceEstimate
 from lfrtorch.metrics import rms
 from lfrtorch.records import Record, Scaler, as_records, without_coordinates
+from lfrtorch.survey.integration import integrators as count_integrators
 
 Criterion = Literal["simulation", "prediction", "frequency"]
 
@@ -64,6 +76,9 @@ ROUNDING = 1e-6
 
 POOR = 0.7
 """A model with an error above this part of the output's rms explains little: half its power."""
+
+COLOURED = 0.3
+"""Pole of the whitening filter up to which the fit of a differenced output does without."""
 
 BETTER = 0.25
 """The data come from an unstable system if its cost is below this part of a stable model's."""
@@ -110,6 +125,7 @@ def estimate_bla(
     weight: Weight | Array | None = None,
     offset: bool = True,
     feedthrough: bool = True,
+    integrators: Literal[0, 1, 2] = 0,
     coordinates: Literal["balanced", "given"] = "balanced",
     max_iter: int = 200,
 ) -> LinearModel:
@@ -139,6 +155,10 @@ def estimate_bla(
         offset: whether constants are removed and stored as operating point.
         feedthrough: whether the input acts on the output at once; otherwise D is 0, as it must be
             for data under feedback, which a prediction fits without bias.
+        integrators: poles at z = 1 behind each output, exactly: 1 from a speed to a position, 2
+            from a force without friction. ``nx`` counts them. Then G₁ = (z - 1)ⁿ G is fitted, in a
+            simulation error that is filtered so that it is about white. Not for a prediction, and
+            not for records in steady state: the system has none of its own.
         coordinates: ``"balanced"`` states, or ``"given"`` by the subspace estimate.
         max_iter: iterations of the refinement; 0 keeps the best subspace estimate.
 
@@ -172,23 +192,74 @@ def estimate_bla(
         raise InputError(f"coordinates is {coordinates!r}; use 'balanced' or 'given'.")
     if refine not in (None, *get_args(Criterion)):
         raise InputError(f"refine is {refine!r}; use 'simulation', 'prediction' or 'frequency'.")
-    records = [] if isinstance(data, FRF) else [without_coordinates(r) for r in as_records(data)]
-    notes: list[str] = []
-    if records:
-        check_signals(records)
-    about: FRF | Record
-    if isinstance(data, FRF) or refine == "frequency":
+    if integrators not in (0, 1, 2):
+        raise InputError(f"integrators is {integrators!r}; use 0, 1 or 2, for each output.")
+    if integrators and refine == "prediction":
+        raise InputError(
+            "integrators are for refine='simulation' or 'frequency'; a prediction finds poles near "
+            "1 without."
+        )
+    if isinstance(data, FRF):
         if refine not in (None, "frequency"):
             raise InputError(f"refine is {refine!r}, an error of records; a response has none.")
         refine = "frequency"
+    else:
+        data = [without_coordinates(record) for record in as_records(data)]
+        check_signals(data)
+        refine = refine or "simulation"
+    if refine != "frequency" and weight is not None:
+        raise InputError("weight is that of a response: use refine='frequency'.")
+    settings = _Settings(refine, weight, offset, feedthrough, coordinates, max_iter)
+    estimate = partial(_integrating, integrators=integrators) if integrators else _stable
+    model = estimate(data, nx, settings)
+    fit = _fit(model)
+    notes = fit.notes
+    if not integrators and not isinstance(data, FRF):
+        notes += _integrator_notes(data)
+    if fit.rmse > POOR and refine != "frequency":
+        notes += (
+            f"the model explains little: {100 * fit.rmse:.0f} % of the output's rms remain. Look "
+            "at the columns (are input and output swapped?), for drift (try offset=False if "
+            "the system integrates), a long delay, strong noise or an even nonlinearity.",
+        )
+    return replace(model, fit=replace(fit, seconds=time.perf_counter() - clock, notes=notes))
+
+
+def _integrator_notes(records: list[Record]) -> tuple[str, ...]:
+    """What to do about outputs that integrate, by the longest record."""
+    longest = max(records, key=lambda record: record.samples)
+    u, y = longest.u[longest.skip :], longest.y[longest.skip :]
+    counts = [count_integrators(u, y[:, i]) for i in range(y.shape[1])]
+    if not any(counts):
+        return ()
+    names = ", ".join(f"'{c.name}'" for c, n in zip(longest.outputs, counts, strict=True) if n)
+    return (f"output {names} integrates: use integrators={max(counts)} for exact poles at z = 1.",)
+
+
+class _Settings(NamedTuple):
+    """The settings of :func:`estimate_bla`, checked."""
+
+    refine: Criterion
+    weight: Weight | Array | None
+    offset: bool
+    feedthrough: bool
+    coordinates: Literal["balanced", "given"]
+    max_iter: int
+
+
+def _stable(data: list[Record] | FRF, nx: int, settings: _Settings) -> LinearModel:
+    """The model with all poles inside the unit circle."""
+    refine, weight, offset, feedthrough, coordinates, max_iter = settings
+    records = [] if isinstance(data, FRF) else data
+    notes: list[str] = []
+    about: FRF | Record
+    if refine == "frequency":
         about = data if isinstance(data, FRF) else estimate_frf(records)
         spectra, scaler, known, more = spectral_data_of_response(about, weight, offset=offset)
         problem = ResponseFit(spectra, known=known, feedthrough=feedthrough)
         notes += [*about.notes, *more]
     else:
-        if weight is not None:
-            raise InputError("weight is that of a response: use refine='frequency'.")
-        refine, about = refine or "simulation", records[0]
+        about = records[0]
         scaler = Scaler.of(records, offset=offset)
         problem = _of_records(
             records,
@@ -220,12 +291,6 @@ def estimate_bla(
             errors = errors - errors.mean(axis=0)
         if refine == "simulation":
             rmse = float(rms(errors / scaler.y_scale))
-    if rmse > POOR and refine != "frequency":
-        notes.append(
-            f"the model explains little: {100 * rmse:.0f} % of the output's rms remain. Look "
-            "at the columns (are input and output swapped?), for drift (try offset=False if "
-            "the system integrates), a long delay, strong noise or an even nonlinearity."
-        )
     return replace(
         model,
         fit=LinearFit(
@@ -233,11 +298,62 @@ def estimate_bla(
             rmse=rmse,
             iterations=found.iterations,
             reason=found.reason,
-            seconds=time.perf_counter() - clock,
+            seconds=0.0,
             singular_values=tuple(map(float, estimate.singular_values)),
             notes=tuple(notes),
         ),
     )
+
+
+def _integrating(
+    data: list[Record] | FRF, nx: int, settings: _Settings, integrators: int
+) -> LinearModel:
+    """The model of the differenced output, with the integrators behind it."""
+    about = data if isinstance(data, FRF) else data[0]
+    added = integrators * len(about.outputs)
+    order, records = nx - added, [] if isinstance(data, FRF) else data
+    if order < isinstance(data, FRF):
+        raise InputError(
+            f"nx is {nx}, and {integrators} integrator(s) behind each of {len(about.outputs)} "
+            f"output(s) take {added} states; raise nx."
+        )
+    if settings.refine != "frequency" and any(r.start == "periodic" for r in records):
+        raise InputError(
+            "start is 'periodic', and a system that integrates has no steady state of its own: "
+            "use start='estimated'."
+        )
+
+    def found(max_iter: int, *, feedthrough: bool, pole: float = 0.0) -> LinearModel:
+        own = settings._replace(feedthrough=True, max_iter=max_iter)
+        if isinstance(data, FRF):
+            if isinstance(own.weight, np.ndarray):
+                own = own._replace(weight=differenced_weight(data, own.weight, integrators))
+            response = differenced_response(data, integrators, feedthrough=feedthrough)
+            return _stable(response, order, own)
+        parts = [differenced(r, integrators, pole, feedthrough=feedthrough) for r in data]
+        return _stable(parts, order, own) if order else gain(parts, offset=settings.offset)
+
+    # The input acts on the output at once or with the next sample, whichever explains more.
+    feedthrough = settings.feedthrough and (
+        _fit(found(0, feedthrough=True)).rmse < _fit(found(0, feedthrough=False)).rmse
+    )
+    model = found(settings.max_iter, feedthrough=feedthrough)
+    if settings.refine == "simulation":
+        parts = [differenced(r, integrators, feedthrough=feedthrough) for r in records]
+        pole = whitening_pole([simulation_errors(model, r) for r in parts], integrators)
+        if pole > COLOURED:
+            model = found(settings.max_iter, feedthrough=feedthrough, pole=pole)
+    notes = tuple(f"of the differenced output: {note}" for note in _fit(model).notes)
+    for _ in range(integrators):
+        model = integrated(model, feedthrough=feedthrough)
+    fit = replace(_fit(model), criterion=settings.refine, notes=notes)
+    model = replace(model, outputs=about.outputs, fit=fit)
+    return placed(model, records, added, offset=settings.offset) if records else model
+
+
+def _fit(model: LinearModel) -> LinearFit:
+    assert model.fit is not None
+    return model.fit
 
 
 def _of_records(

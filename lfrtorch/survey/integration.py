@@ -1,0 +1,129 @@
+"""Whether an output integrates the inputs, by the spectra at the lowest frequencies excited.
+
+If it integrates n times, its n-th difference V follows the inputs U there with a real gain that
+does not change with frequency. Of any other stable system that gain is imaginary and rises, or
+belongs to a resonance and changes quickly. A fit of first order tells how soon the system forgets,
+
+    V + a V / jω = (b + jω c) U,
+
+over a few lines more: its time constant is 1 / a.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lfrtorch._support.types import Array, Complex
+
+SHORTEST = 100
+"""Least samples of a record that can tell."""
+
+LOWEST = {1: 12, 2: 4}
+"""The first excited line is at most this one. Two integrators need a lower one: above its resonance
+a mass on a spring looks like a free one."""
+
+EXCITED, STRONG = 1e-3, 1e-2
+"""Power of the first excited line, and of those in the fit, relative to the largest."""
+
+COHERENT, REAL, UPPER, EVEN = 0.95, 25.0, 0.4, 0.6
+"""In the lower band V has this coherence with the inputs, and phases of at most REAL degrees; in
+the upper band, where friction distorts, the coherence UPPER. Its size relative to the inputs'
+differs between the bands by at most the factor EVEN."""
+
+LINES, FITTED, FORGETS, GAIN, LAG = 12, 0.75, 3.0, 0.5, 0.3
+"""The fit has LINES lines for each input and more, and tells if it explains FITTED of them. Then it
+is an integrator if the record is shorter than FORGETS time constants, b alone explains 1 ± GAIN of
+the lowest lines, and c is at most LAG of it there."""
+
+
+def integrators(u: Array, y: Array) -> int:
+    """How many integrators, 0, 1 or 2, lie between the inputs and an output of a record.
+
+    A system that forgets more slowly than in a third of the record counts as one that integrates.
+
+    Shape:
+        u: (T, nu), y: (T,).
+
+    Example:
+        >>> from lfrtorch.survey.integration import integrators
+        >>> u = np.random.default_rng(0).standard_normal((1000, 1))
+        >>> integrators(u, np.cumsum(u)), integrators(u, u[:, 0])
+        (1, 0)
+    """
+    T, u = len(y), u[:, np.ptp(u, axis=0) > 0]
+    if T < SHORTEST or np.ptp(y) == 0 or not u.size:
+        return 0
+    U = _spectrum(u / u.std(axis=0), T)
+    power = (np.abs(U) ** 2).sum(axis=1)
+    power[0] = 0.0
+    first = int(np.argmax(power > EXCITED * power.max()))
+    for n, lowest in LOWEST.items():
+        if first > lowest:
+            break
+        V, before = (_differenced(y, times) for times in (n, n - 1))
+        fitted, integrates = _first_order(U, V, before, power, first)
+        if integrates if fitted else _even(U, V, max(first, 2)):
+            return n
+    return 0
+
+
+def _spectrum(signals: Array, T: int) -> Complex:
+    """Spectrum of signals (up to T, n) under a Hann window, T lines."""
+    window = np.hanning(len(signals))[:, None]
+    return np.fft.rfft((signals - signals.mean(axis=0)) * window, T, axis=0)
+
+
+def _differenced(y: Array, times: int) -> Complex:
+    """Spectrum of a difference of y (T,), which lies between the samples."""
+    T = len(y)
+    V = _spectrum(np.diff(y, times)[:, None], T)[:, 0]
+    return V * np.exp(-1j * np.pi * times * np.arange(len(V)) / T)
+
+
+def _first_order(
+    U: Complex, V: Complex, before: Complex, power: Array, first: int
+) -> tuple[bool, bool]:
+    """Whether the fit of first order tells, and whether it says integrator."""
+    nu = U.shape[1]
+    k = np.arange(first, min(3 * first + LINES * nu, len(V)))
+    k = k[power[k] > STRONG * power[k].max()]
+    jw = 2j * np.pi * k[:, None] / (2 * (len(V) - 1))
+    around = np.abs(k[:, None] - k) <= 2
+    weight = 1.0 / np.sqrt(np.maximum(around @ np.abs(V[k]) ** 2, 1e-300))
+    rows = weight[:, None] * np.hstack([V[k, None], -before[k, None], U[k], jw * U[k]])
+    rows = np.vstack([rows.real, rows.imag])
+    target, rows = rows[:, 0], rows[:, 1:]
+    size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    theta = np.linalg.lstsq(rows / size, target, rcond=None)[0] / size
+    left = np.sum((target - rows @ theta) ** 2)
+    if len(k) < 2 * (1 + 2 * nu) or left > (1 - FITTED) * np.sum(target**2):
+        return False, False
+    low = k <= k[0] + 3
+    gain, lag = U[k[low]] @ theta[1 : 1 + nu], (jw * U[k])[low] @ theta[1 + nu :]
+    share = np.sum(np.abs(gain) ** 2) / np.sum(np.abs(V[k[low]]) ** 2)
+    return True, bool(
+        abs(theta[0]) * 2 * (len(V) - 1) < FORGETS
+        and abs(share - 1) < GAIN
+        and np.sum(np.abs(lag) ** 2) < LAG**2 * np.sum(np.abs(gain) ** 2)
+    )
+
+
+def _even(U: Complex, V: Complex, first: int) -> bool:
+    """Whether V follows U with a real gain that is the same in two bands."""
+    middle = 2 * first + 2 * U.shape[1]
+    if 3 * middle > len(V):
+        return False
+    sizes = []
+    for band, coherent in (
+        (slice(first, middle), COHERENT),
+        (slice(middle, 3 * middle), UPPER),
+    ):
+        H = np.linalg.lstsq(U[band], V[band], rcond=None)[0]
+        total = np.sum(np.abs(V[band]) ** 2)
+        if np.sum(np.abs(V[band] - U[band] @ H) ** 2) > (1 - coherent) * total:
+            return False
+        turned = np.abs(H.imag) > np.tan(np.deg2rad(REAL)) * np.abs(H.real)
+        if total == 0 or (not sizes and turned.any()):
+            return False
+        sizes.append(total / np.sum(np.abs(U[band]) ** 2))
+    return bool(EVEN < np.sqrt(sizes[1] / sizes[0]) < 1 / EVEN)
