@@ -2,34 +2,11 @@
 
 from lfrtorch import datasets, distributed, reporting
 
-# errors
-from lfrtorch._support.errors import InputError, LfrtorchError
-from lfrtorch._support.reasons import Reason
-
 # data
 from lfrtorch.dataset import Dataset, Published
-
-# the nonlinear model
-from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.excitation import multisine
 from lfrtorch.files.load import load_records
-
-# fits
-from lfrtorch.fitting.inference import infer
-from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.multistart import fit
-
-# the whole job
-from lfrtorch.fitting.settings import Settings, SizesSearch
-from lfrtorch.fitting.size_search import SizeSearch, search_sizes
-from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.starts import initialise
-from lfrtorch.fitting.trainer import FitResult
-from lfrtorch.job import identify
-from lfrtorch.least_squares.adam import Adam
-from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.records import Channel, Record, Scaler
 
 # the linear model
 from lfrtorch.linear.bla import estimate_bla
@@ -37,11 +14,35 @@ from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
 
+# the nonlinear model
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.model import Model, load, simulate_blocks
+
+# fits
+from lfrtorch.fitting.inference import infer
+from lfrtorch.fitting.means import mean_model
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.size_search import SizeSearch, search_sizes
+from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.starts import initialise
+from lfrtorch.fitting.trainer import FitResult
+from lfrtorch._support.reasons import Reason
+from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+
+# the whole job
+from lfrtorch.fitting.settings import Settings, SizesSearch
+from lfrtorch.fitting.observer import Observer
+from lfrtorch.job import identify
+from lfrtorch.reporting.run import Run
+
 # scores
 from lfrtorch.metrics import nrmse, rmse
-from lfrtorch.model import Model, load, simulate_blocks
-from lfrtorch.records import Channel, Record, Scaler
-from lfrtorch.reporting.run import Run
+
+# errors
+from lfrtorch._support.errors import InputError, LfrtorchError
 
 __all__ = [
     "FRF",
@@ -58,6 +59,7 @@ __all__ = [
     "LinearModel",
     "Model",
     "Network",
+    "Observer",
     "OrderScan",
     "Polynomial",
     "Published",

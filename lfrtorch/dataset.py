@@ -6,7 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.records import Record
+from lfrtorch.records import Record, signals
+
+LISTED = 3
+"""Most records of a use that a printed dataset lists."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,10 @@ class Dataset:
         >>> data = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[record[200:]])
         >>> [test.samples for test in data.tests]
         [200]
+        >>> print(data)
+        Dataset 'mine': u -> y at 100 Hz
+          train       400 samples: record (400, periodic)
+          tests       200 samples: record (200, zero)
     """
 
     name: str
@@ -86,10 +93,18 @@ class Dataset:
             object.__setattr__(self, use, records)
 
     def __repr__(self) -> str:
-        uses = {"train": self.train, "validation": self.validation, "tests": self.tests}
-        parts = [
-            f"{use}: {len(records)} record(s), {sum(record.samples for record in records)} samples"
-            for use, records in (uses | {"selection": self.selection}).items()
-            if records
-        ]
-        return f"Dataset({self.name!r}; {'; '.join(parts)})"
+        uses = ("train", "validation", "selection", "tests", "leaderboard")
+        given = {use: records for use in uses if (records := getattr(self, use))}
+        lines = [f"Dataset {self.name!r}"]
+        if given:
+            first = next(iter(given.values()))[0]
+            lines[0] += f": {signals(first)} at {first.fs:g} Hz"
+        for use, records in given.items():
+            listed = [
+                f"{r.name} ({r.samples}, {r.start}{f', skip {r.skip}' if r.skip else ''})"
+                for r in records[:LISTED]
+            ]
+            more = [f"{len(records) - LISTED} more"] if len(records) > LISTED else []
+            total = sum(record.samples for record in records)
+            lines.append(f"  {use:11} {total} samples: {', '.join([*listed, *more])}")
+        return "\n".join(lines)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import closing
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,7 @@ from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.inference import infer
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.observer import Observer
+from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
@@ -57,8 +58,9 @@ def identify(
     Args:
         dataset: records by use.
         settings: sizes, starts and trainer.
-        observer: who is told of every step. Default: nobody;
-            :class:`lfrtorch.reporting.Console` prints.
+        observer: who is told of every step. Default: a line on a terminal or in a notebook shows
+            how far it is. :class:`lfrtorch.reporting.Console` prints every step,
+            :class:`Observer` nothing.
         snapshots: where the starts are kept, for a program that goes on with them.
         ranks, stop: processes that share the training records, and what ends the fit early, see
             :func:`lfrtorch.fit`.
@@ -92,8 +94,22 @@ def identify(
             "identify takes a Dataset: lfrtorch.Dataset('mine', train=[...], validation=[...], "
             f"tests=[...]), and not {type(dataset).__name__}."
         )
-    observer = Observer() if observer is None else observer
     ranks = Ranks() if ranks is None else ranks
+    if observer is None:
+        observer = LineObserver() if ranks.rank == 0 else Observer()
+    with closing(observer):
+        return _identified(dataset, settings, observer, snapshots, ranks, stop)
+
+
+def _identified(
+    dataset: Dataset,
+    settings: Settings,
+    observer: Observer,
+    snapshots: Snapshots | None,
+    ranks: Ranks,
+    stop: Stop | None,
+) -> Run:
+    """``identify`` with somebody who looks on."""
     if settings.init_from is not None:
         check_channels(settings.init_from, dataset.train[0])
     linear, order_scan = linear_model(
@@ -104,6 +120,8 @@ def identify(
     if sizes is not None:
         settings = replace(settings, **sizes.chosen.sizes)
     models = starting_models(dataset.train, settings, linear)
+    if settings.init_from is not None and settings.starts > 1:
+        observer.say("note: starts is 1: the fit starts from the model of init_from alone")
     average = _most_averaged(models, settings.average, observer)
     samples = sum(record.samples for record in dataset.train)
     if samples >= SLOW_SAMPLES and not is_compiled(cell := models[0].lfr.cell, cell.A.cpu()):

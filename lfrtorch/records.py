@@ -35,6 +35,9 @@ from lfrtorch._support.types import Array
 
 Start = Literal["zero", "given", "estimated", "periodic"]
 
+_LISTED = 4
+"""Most channels of a side that a printed record names."""
+
 _MANY_CHANNELS = 16
 """An array of more channels than this and fewer samples is taken for a transposed one."""
 
@@ -91,8 +94,8 @@ class Record:
         >>> record = lfrtorch.Record(np.sin(np.arange(100.0)), np.zeros(100), fs=50.0, skip=10)
         >>> record.samples, record.u.shape, str(record.inputs[0])
         (100, (100, 1), 'u')
-        >>> record[20:].samples  # a part is a record, too
-        80
+        >>> record[20:]  # a part is a record, too
+        Record('record': u -> y, 80 samples at 50 Hz, start zero)
     """
 
     u: Array
@@ -192,6 +195,12 @@ class Record:
                 )
             object.__setattr__(self, name, values)
 
+    def __repr__(self) -> str:
+        parts = [f"{self.samples} samples at {self.fs:g} Hz", f"start {self.start}"]
+        parts += [f"skip {self.skip}"] if self.skip else []
+        parts += [f"period {self.period}"] if self.period else []
+        return f"Record({self.name!r}: {signals(self)}, {', '.join(parts)})"
+
     @property
     def factors(self) -> Array:
         """What the errors (T, ny) are multiplied by in a fit: √weight, 0 in the skipped samples."""
@@ -226,6 +235,22 @@ class Record:
         return replace(
             self, u=u, y=y, start="zero", skip=0, period=period, x0=None, line_weight=None
         )
+
+
+def signals(record: Record) -> str:
+    """Inputs and outputs of a record, the first ones if they are many.
+
+    Example:
+        >>> from lfrtorch.records import signals
+        >>> signals(record)
+        'u -> y'
+    """
+
+    def listed(channels: Sequence[Channel]) -> str:
+        names = [str(channel) for channel in channels[:_LISTED]]
+        return ", ".join(names + ["..."] * (len(channels) > _LISTED))
+
+    return f"{listed(record.inputs)} -> {listed(record.outputs)}"
 
 
 def as_records(records: Record | Sequence[Record]) -> list[Record]:

@@ -13,7 +13,16 @@ from command_line import configuration
 from torch.utils.tensorboard import SummaryWriter
 
 import lfrtorch
-from lfrtorch import Adam, Dataset, LevenbergMarquardt, Record, Settings, SizesSearch, identify
+from lfrtorch import (
+    Adam,
+    Channel,
+    Dataset,
+    LevenbergMarquardt,
+    Record,
+    Settings,
+    SizesSearch,
+    identify,
+)
 from lfrtorch.cli import config, fit
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import StoppedError
@@ -74,6 +83,11 @@ def test_a_model_to_go_on_from_is_not_changed(dataset: Dataset):
     run = identify(dataset, settings(nx=None, nn=7, init_from=first))
     assert run.model.sizes == first.sizes
     assert all(torch.equal(*pair) for pair in zip(before, first.lfr.parameters(), strict=True))
+    said: list[str] = []
+    observer = Console()
+    observer.say = said.append  # pyright: ignore[reportAttributeAccessIssue]
+    identify(dataset, settings(starts=3, init_from=first), observer=observer)
+    assert any("starts is 1" in text for text in said)
     other = Record(np.ones((300, 2)), dataset.train[0].y)
     with pytest.raises(ValueError, match="the model has the inputs"):
         identify(Dataset("two", [other], [], []), settings(init_from=first))
@@ -232,8 +246,14 @@ def test_a_dataset_takes_a_single_record_and_nothing_else_than_records():
             Dataset("mine", given, [], [])  # pyright: ignore[reportArgumentType]
 
 
-def test_a_dataset_is_shown_in_a_line(dataset: Dataset):
-    assert repr(dataset) == (
-        "Dataset('saturation'; train: 1 record(s), 300 samples; validation: 1 record(s), "
-        "300 samples; tests: 1 record(s), 300 samples)"
-    )
+def test_a_dataset_is_shown_in_a_few_lines():
+    channels = tuple(Channel(f"output{i}", "V") for i in range(12))
+    long = Record(np.ones(99), np.ones((99, 12)), 50.0, outputs=channels, skip=3, name="a")
+    shown = repr(Dataset("many", [long] * 40, [long], [long, long], selection=[long]))
+    lines = shown.splitlines()
+    assert len(lines) == 5
+    assert max(map(len, lines)) < 120
+    parts = "many", "u -> output0 (V)", "50 Hz", "3960 samples", "a (99, zero, skip 3)", "37 more"
+    assert all(part in shown for part in parts)
+    assert "\n" not in repr(long)
+    assert repr(Dataset("none", [], [], [])) == "Dataset 'none'"

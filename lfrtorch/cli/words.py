@@ -58,6 +58,7 @@ class Terminal(Console):
     """Prints in words of the command line."""
 
     def __init__(self, cfg: DictConfig) -> None:
+        super().__init__()
         self.cfg = cfg
 
     def say(self, text: str) -> None:

@@ -20,7 +20,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import replace
 from math import ceil
 from threading import Event, Lock
 from typing import cast
@@ -34,6 +35,7 @@ from lfrtorch._support.threads import each_alone, spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import (
@@ -42,6 +44,7 @@ from lfrtorch.fitting.trainer import (
     Monitor,
     Progress,
     RestartSummary,
+    Round,
     Stop,
     StoppedError,
     Trainer,
@@ -64,22 +67,6 @@ AS_GOOD = 1.01
 starts is so by luck, too, on the records that chose it."""
 
 
-@dataclass(frozen=True)
-class Round:
-    """A round that has ended.
-
-    Args:
-        number, count: its number, from 1, and the number of all rounds.
-        starts: that took part in it, the best first.
-        seconds: since the beginning.
-    """
-
-    number: int
-    count: int
-    starts: tuple[RestartSummary, ...]
-    seconds: float
-
-
 @renamed(optimiser="trainer", model="models")
 @spread_by_hand()
 def fit(
@@ -91,7 +78,7 @@ def fit(
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
     average: int = 1,
-    monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] = (),
+    monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None = None,
     watch: Callable[[Round], None] = lambda _: None,
     ranks: Ranks | None = None,
     snapshots: Snapshots | None = None,
@@ -128,7 +115,8 @@ def fit(
             input is doubled take no part.
         monitors: called with the model and its progress after every iteration. For several models,
             give a list for each; they are called one at a time. Each process calls its own: give
-            those that print or write files to the first alone.
+            those that print or write files to the first alone. Default: a line on a terminal or in
+            a notebook, and nothing elsewhere; ``[]`` for nothing at all.
         watch: called after each round.
         ranks: the processes that share the training records, ``distributed.connect()``; each calls
             this function with the same arguments, starts from the first one's weights and returns
@@ -164,7 +152,8 @@ def fit(
     """
     alone = isinstance(models, Model)
     starts = [models] if alone else list(models)
-    watching = cast(Sequence[Sequence[Monitor]], [monitors] if alone else monitors)
+    given = [monitors] if alone and monitors is not None else monitors
+    watching = cast(Sequence[Sequence[Monitor]], given or ())
     if not starts:
         raise InputError("there is no model to start from; give one or more.")
     if watching and len(watching) != len(starts):
@@ -190,29 +179,32 @@ def fit(
     snapshots.restore(fits)
     unseen = [r for some in (validation, selection) if some for r in as_records(some)]
     judge = _Judge(fits, unseen if selection else [], unseen)
-    together = _Together(fits, watching or [()] * len(fits), halt)
-    limit, field = fits[0].trainer.limit, fits
-    rounds = ROUNDS if len(fits) > 1 else ()
-    ends = sorted({ceil(part * limit) for part in rounds} | {limit})
-    for number, until in enumerate(ends, start=1):
-        if number <= len(snapshots.rounds):
-            field = _drop_others(field, [fits[i] for i in snapshots.rounds[number - 1]])
-            continue
-        together.advance(field, until)
-        field = judge.ranked(field)
-        if not field:
-            raise StoppedError("stopped before the first iterate of the fit")
-        watch(Round(number, len(ends), judge.summaries(field), time.perf_counter() - clock))
-        cut = next((fit for fit in field if fit.reason in CUT_SHORT), None)
-        if cut is not None:
-            for fit in field:
-                if not fit.reason:  # it reached the end of the round
-                    fit.note_end(cut.reason, cut.detail)
-            break
-        if until < limit:
-            kept = max(FINALISTS, average, ceil(len(field) / 2))
-            snapshots.decided([judge.number(fit) for fit in field[:kept]])
-            field = _drop_others(field, field[:kept])
+    field, planned = fits, schedule(len(fits), fits[0].trainer.limit, average)
+    with ExitStack() as ending:
+        if monitors is None and fits[0].ranks.rank == 0:
+            line = line_of(starts, planned)
+            watching = [[line]] * len(starts)
+            ending.callback(line.close)
+        together = _Together(fits, watching or [()] * len(fits), halt)
+        for number, (_, until) in enumerate(planned, start=1):
+            if number <= len(snapshots.rounds):
+                field = _drop_others(field, [fits[i] for i in snapshots.rounds[number - 1]])
+                continue
+            together.advance(field, until)
+            field = judge.ranked(field)
+            if not field:
+                raise StoppedError("stopped before the first iterate of the fit")
+            watch(Round(number, len(planned), judge.summaries(field), time.perf_counter() - clock))
+            cut = next((fit for fit in field if fit.reason in CUT_SHORT), None)
+            if cut is not None:
+                for fit in field:
+                    if not fit.reason:  # it reached the end of the round
+                        fit.note_end(cut.reason, cut.detail)
+                break
+            if number < len(planned):
+                kept, _ = planned[number]
+                snapshots.decided([judge.number(fit) for fit in field[:kept]])
+                field = _drop_others(field, field[:kept])
     ranked = judge.ranked(fits)
     result = ranked[0].result()
     if not alone:
@@ -222,6 +214,44 @@ def fit(
         if mean is not None:
             result = replace(result, model=mean, averaged=count)
     return replace(result, seconds=time.perf_counter() - clock)
+
+
+def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]:
+    """How many starts take part in each round, and the iteration at which it ends.
+
+    Example:
+        >>> from lfrtorch.fitting.multistart import schedule
+        >>> schedule(8, 200)
+        [(8, 13), (4, 25), (2, 200)]
+    """
+    parts = ROUNDS if starts > 1 else ()
+    planned = []
+    for until in sorted({ceil(part * limit) for part in parts} | {limit}):
+        planned.append((starts, until))
+        starts = min(starts, max(FINALISTS, average, ceil(starts / 2)))
+    return planned
+
+
+def iterations_of(planned: Sequence[tuple[int, int]]) -> int:
+    """Iterations of all starts together.
+
+    Example:
+        >>> from lfrtorch.fitting.multistart import iterations_of
+        >>> iterations_of([(8, 13), (4, 25), (2, 200)])
+        502
+    """
+    ends = [0, *(until for _, until in planned)]
+    return sum(count * (b - a) for (count, _), a, b in zip(planned, ends, ends[1:], strict=False))
+
+
+def line_of(
+    models: Sequence[Model], planned: Sequence[tuple[int, int]]
+) -> ProgressLine | StartsLine:
+    """The line that follows a fit on a terminal or in a notebook; nothing is seen elsewhere."""
+    if len(models) == 1:
+        return ProgressLine(every=None)
+    unit = models[0].outputs[0].unit
+    return StartsLine(len(models), unit, iterations=iterations_of(planned), rounds=False)
 
 
 class _Judge:

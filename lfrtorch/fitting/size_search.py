@@ -277,6 +277,7 @@ def search_sizes(
                     validation,
                     trainer=trainer,
                     ridge=ridge,
+                    monitors=(),
                     ranks=ranks,
                     stop=stop,
                 )

@@ -151,6 +151,22 @@ class RestartSummary:
 
 
 @dataclass(frozen=True)
+class Round:
+    """A round that has ended.
+
+    Args:
+        number, count: its number, from 1, and the number of all rounds.
+        starts: that took part in it, the best first.
+        seconds: since the beginning.
+    """
+
+    number: int
+    count: int
+    starts: tuple[RestartSummary, ...]
+    seconds: float
+
+
+@dataclass(frozen=True)
 class FitResult:
     """Outcome of a fit; the best iterate is in ``model``.
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lfrtorch.dataset import Dataset
+from lfrtorch.fitting.live_line import ProgressLine, StartsLine
+from lfrtorch.fitting.multistart import iterations_of, schedule
 from lfrtorch.fitting.observer import Observer, Watching
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
-from lfrtorch.reporting.monitor import ProgressLine, StartsLine
 
 
 class Console(Observer):
@@ -22,6 +23,9 @@ class Console(Observer):
         note: the input is constant
     """
 
+    def __init__(self) -> None:
+        self._line: ProgressLine | StartsLine | None = None
+
     def say(self, text: str) -> None:
         """Print it."""
         print(text, flush=True)
@@ -29,14 +33,22 @@ class Console(Observer):
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
     ) -> Watching:
-        """Show a line that follows the iterations, or for several starts a line a round."""
-        if len(models) > 1:
-            lines = StartsLine(len(models), models[0].outputs[0].unit)
-            return Watching([[lines]] * len(models), lines.round)
-        self._line = ProgressLine()
-        return Watching([[self._line]], lambda _: None)
+        """Show a line that follows the iterations; of several starts a line a round stays."""
+        count = len(models)
+        if count == 1:
+            self._line = ProgressLine()
+            return Watching([[self._line]], lambda _: None)
+        planned = schedule(count, settings.trainer.limit, settings.average)
+        unit = models[0].outputs[0].unit
+        self._line = lines = StartsLine(count, unit, iterations=iterations_of(planned))
+        return Watching([[lines]] * count, lines.round)
 
     def end(self, result: FitResult) -> None:
         """End the line."""
-        if not result.starts or len(result.starts) == 1:
+        self.close()
+
+    def close(self) -> None:
+        """End the line, if there is one."""
+        if self._line is not None:
             self._line.close()
+        self._line = None

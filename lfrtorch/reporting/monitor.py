@@ -1,16 +1,13 @@
-"""What a user sees while a fit runs, a progress line and TensorBoard, and what is left of it."""
+"""What a fit leaves while it runs: TensorBoard and checkpoints."""
 
 from __future__ import annotations
 
 import copy
 import io
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import median
 from time import monotonic
-from typing import TextIO
 
 from matplotlib.figure import Figure
 from PIL import Image
@@ -18,112 +15,11 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 
 from lfrtorch.engine.simulation import spectral_radius
-from lfrtorch.fitting.multistart import ROUNDS, Round
+from lfrtorch.fitting.multistart import ROUNDS
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 from lfrtorch.reporting import plots
-
-
-class ProgressLine:
-    """One live line on a terminal; elsewhere a line now and then.
-
-    Args:
-        every: iterations between lines if the output is not a terminal.
-        stream: where to write; Default: standard output.
-
-    Example:
-        >>> from lfrtorch.reporting.monitor import ProgressLine
-        >>> line, trainer = ProgressLine(every=2), lfrtorch.LevenbergMarquardt(max_iter=3)
-        >>> result = lfrtorch.fit(model, record, trainer=trainer, monitors=[line])
-        0/3  train ...
-        2/3  train ...
-        >>> line.close()
-        3/3  train ...
-    """
-
-    def __init__(self, every: int = 10, stream: TextIO | None = None) -> None:
-        self.every = every
-        self.stream = sys.stdout if stream is None else stream
-        self._unseen = ""
-
-    def __call__(self, model: Model, progress: Progress) -> None:
-        """Show the progress."""
-        live = self.stream.isatty()
-        text = progress_text(progress, model.outputs[0].unit)
-        shown = live or progress.iteration % self.every == 0
-        self._unseen = "" if shown else text + "\n"
-        if shown:
-            self.stream.write(f"\r{text}\033[K" if live else text + "\n")
-            self.stream.flush()
-
-    def close(self) -> None:
-        """End the live line; elsewhere show the last iteration."""
-        self.stream.write("\n" if self.stream.isatty() else self._unseen)
-
-
-def progress_text(progress: Progress, unit: str) -> str:
-    """Iteration, errors (a star marks the best so far), optimiser's scalars, time left."""
-    parts = [
-        f"{progress.iteration:>{len(str(progress.limit))}}/{progress.limit}",
-        f"train {progress.train:.3e} {unit}".rstrip(),
-    ]
-    if not math.isnan(progress.validation):
-        star = "*" if progress.best else " "
-        parts.append(f"validation {progress.validation:.3e} {unit}".rstrip() + star)
-    shown = {"damping": "damping", "gain_ratio": "gain", "gradient_norm": "|gradient|"}
-    for key, label in shown.items():
-        if key in progress.report and math.isfinite(progress.report[key]):
-            parts.append(f"{label} {progress.report[key]:.2g}")
-    if progress.iteration:
-        parts.append(f"{progress.seconds_left:.0f} s left")
-    return "  ".join(parts)
-
-
-class StartsLine:
-    """A line for each round of several starts; on a terminal the count of iterations between.
-
-    Args:
-        starts: how many there are.
-        unit: of the errors.
-        stream: where to write; Default: standard output.
-
-    Example:
-        >>> from lfrtorch.reporting.monitor import StartsLine
-        >>> models = [lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4, seed=i) for i in range(4)]
-        >>> line, trainer = StartsLine(4), lfrtorch.LevenbergMarquardt(max_iter=16)
-        >>> result = lfrtorch.fit(
-        ...     models, record, trainer=trainer, monitors=[[line]] * 4, watch=line.round
-        ... )
-        round 1 of 3: 4 start(s) to iteration 1, best ...
-        round 2 of 3: 2 start(s) to iteration 2, best ...
-        round 3 of 3: 2 start(s) to iteration 16, best ...
-    """
-
-    def __init__(self, starts: int, unit: str = "", stream: TextIO | None = None) -> None:
-        self.starts, self.unit, self._count = starts, unit, 0
-        self.stream = sys.stdout if stream is None else stream
-
-    def __call__(self, model: Model, progress: Progress) -> None:
-        """Count an iteration of any of the starts."""
-        self._count += 1
-        if self.stream.isatty():
-            self.stream.write(f"\r{self._count} iterations of {self.starts} starts\033[K")
-            self.stream.flush()
-
-    def round(self, ended: Round) -> None:
-        """Show a round that has ended."""
-        judged = [(s.selection, s.validation, s.train) for s in ended.starts]
-        errors = [next(e for e in each if not math.isnan(e)) for each in judged]
-        numbers = {"best": errors[0], "median": median(errors), "worst": max(errors)}
-        text = (
-            f"round {ended.number} of {ended.count}: {len(errors)} start(s) to iteration "
-            f"{max(s.iterations for s in ended.starts)}, "
-            + ", ".join(f"{name} {value:.3e}" for name, value in numbers.items())
-        )
-        text = f"{text} {self.unit}".rstrip() + f", {ended.seconds:.0f} s"
-        self.stream.write(f"\r{text}\033[K\n" if self.stream.isatty() else text + "\n")
-        self.stream.flush()
 
 
 class TensorBoard:

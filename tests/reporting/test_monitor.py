@@ -1,7 +1,6 @@
-"""The progress line, the TensorBoard events and the checkpoints of a fit."""
+"""The TensorBoard events and the checkpoints of a fit."""
 
 import io
-import math
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +10,16 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import lfrtorch
-from lfrtorch.fitting.multistart import Round
-from lfrtorch.fitting.trainer import Progress, RestartSummary
+from lfrtorch.fitting.trainer import Progress
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import plots
 from lfrtorch.reporting.monitor import (
     Checkpoint,
-    ProgressLine,
-    StartsLine,
     TensorBoard,
-    progress_text,
 )
 
 U = np.random.default_rng(0).standard_normal(100)
 RECORD = Record(U, np.tanh(U), 10.0, outputs=(Channel("y", "m"),))
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 @pytest.fixture(scope="module")
@@ -40,54 +30,6 @@ def model() -> lfrtorch.Model:
 
 def step(iteration: int, **report: float) -> Progress:
     return Progress(iteration, 40, 1.5e-3, 2.5e-3, 2.0 * iteration, iteration == 4, report, 1.0)
-
-
-def test_text_names_every_number():
-    text = progress_text(step(4, damping=0.125, gain_ratio=0.75, rank=9), "m")
-    assert text == (
-        " 4/40  train 1.500e-03 m  validation 2.500e-03 m*  damping 0.12  gain 0.75  72 s left"
-    )
-    assert "left" not in progress_text(step(0), "m")
-
-
-def test_a_file_gets_a_line_now_and_then_and_the_last(model: lfrtorch.Model):
-    stream = io.StringIO()
-    line = ProgressLine(every=10, stream=stream)
-    for iteration in range(13):
-        line(model, step(iteration))
-    line.close()
-    assert [text.split("/")[0].strip() for text in stream.getvalue().splitlines()] == [
-        "0",
-        "10",
-        "12",
-    ]
-
-
-def test_a_terminal_gets_one_live_line(model: lfrtorch.Model):
-    stream = Terminal()
-    line = ProgressLine(stream=stream)
-    for iteration in range(3):
-        line(model, step(iteration))
-    line.close()
-    assert stream.getvalue().count("\r") == 3
-    assert stream.getvalue().count("\n") == 1
-
-
-def test_a_round_of_starts_is_a_line(model: lfrtorch.Model):
-    starts = tuple(
-        RestartSummary(i, 25, 1.0, e, math.nan, "") for i, e in ((3, 1e-3), (0, 2e-3), (1, 5e-3))
-    )
-    for stream, live in ((io.StringIO(), False), (Terminal(), True)):
-        line = StartsLine(3, "m", stream)
-        line(model, step(1))
-        line.round(Round(1, 4, starts, 7.2))
-        text = stream.getvalue()
-        assert (
-            "round 1 of 4: 3 start(s) to iteration 25, "
-            "best 1.000e-03, median 2.000e-03, worst 5.000e-03 m, 7 s"
-        ) in text
-        assert ("1 iterations of 3 starts" in text) is live
-        assert text.count("\n") == 1
 
 
 def events(folder: Path) -> EventAccumulator:
