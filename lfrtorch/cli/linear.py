@@ -38,7 +38,8 @@ from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.job import linear_model
 from lfrtorch.metrics import rms
-from lfrtorch.reporting import linear_plots, plots
+from lfrtorch.reporting import figures as run_figures
+from lfrtorch.reporting import linear_plots
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
@@ -98,7 +99,9 @@ def figures(
     scan: lfrtorch.OrderScan | None,
 ) -> dict:
     """All figures of a run by file name."""
-    drawn = {record.name: plots.errors(record, model.simulate(record)) for record in dataset.tests}
+    drawn = {}
+    for record in dataset.tests or dataset.validation:
+        drawn |= run_figures.of_record(record, model.simulate(record))[0]
     drawn["frequency_response"] = linear_plots.frequency_response(model, frf)
     drawn["poles_and_zeros"] = linear_plots.poles_and_zeros(model)
     if scan is not None:

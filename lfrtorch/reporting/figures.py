@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
+from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.frf import FRF, estimate_frf
@@ -59,18 +60,9 @@ def of_records(simulated: Sequence[Response]) -> tuple[dict[str, Figure], Views]
     drawn: dict[str, Figure] = {}
     views: Views = {}
     for response in shown[:MOST_RECORDS]:
-        views[response.record.name] = {}
-        ny = len(response.record.outputs)
-        for first in range(0, ny, MOST_OUTPUTS):
-            outputs = range(first, min(first + MOST_OUTPUTS, ny))
-            suffix = f"_outputs_{first + 1}_to_{outputs[-1] + 1}" if first else ""
-            page, captions = _views(response, outputs, suffix)
-            drawn |= page
-            if not first:
-                more = (
-                    "" if ny <= MOST_OUTPUTS else f" Outputs from {MOST_OUTPUTS + 1} on: figures/."
-                )
-                views[response.record.name] = {n: text + more for n, text in captions.items()}
+        record = response.record
+        own, views[record.name] = of_record(record, response.y_linear, response.y_hat)
+        drawn |= own
     for response in shown[MOST_RECORDS:]:
         if response.use == "test":
             record, signals = response.record, (response.record, response.y_linear, response.y_hat)
@@ -86,28 +78,34 @@ def _relative(response: Response) -> float:
     return error if math.isfinite(error) else math.inf
 
 
-def _views(
-    response: Response, outputs: Sequence[int], suffix: str
+def of_record(
+    record: Record, y_linear: Array, y_hat: Array | None = None
 ) -> tuple[dict[str, Figure], dict[str, str]]:
-    """Figures of a record and their captions, by names that end with the suffix."""
-    record, name = response.record, response.record.name
-    of = (record, response.y_linear, response.y_hat, outputs)
+    """All views of a record by file name, and captions of those of its first outputs.
+
+    Shape:
+        y_linear, y_hat: (T, ny), simulated outputs; without an NL-LFR there is no y_hat.
+    """
+    name, ny = record.name, len(record.outputs)
     whole = plots.is_whole(record)
     spectrum = plots.spectrum if whole else plots.density
-    found = {
-        f"{name}_response" if whole else name: (
-            plots.response,
-            "Measured and simulated output, and the errors. Fit: 100 % - NRMSE.",
-        ),
-        f"{name}_near": (plots.close_up, "The grey stretch: where the error is largest."),
-        name if whole else f"{name}_density": (
-            spectrum,
-            "Spectrum over whole periods." if whole else "Power spectral density.",
-        ),
-        f"{name}_distribution": (plots.distribution, "How often which error occurs."),
-    }
-    drawn = {key + suffix: draw(*of) for key, (draw, _) in found.items()}
-    return drawn, {key + suffix: text for key, (_, text) in found.items()}
+    of_spectrum = "Spectrum over whole periods." if whole else "Power spectral density."
+    views = (
+        ("_response" * whole, plots.response, "Outputs and errors. Fit: 100 % − NRMSE."),
+        ("_near", plots.close_up, "The grey stretch, about the largest error."),
+        ("_density" * (not whole), spectrum, of_spectrum),
+        ("_distribution", plots.distribution, "How often which error occurs."),
+    )
+    drawn, captions = {}, {}
+    more = f" Outputs {MOST_OUTPUTS + 1} to {ny}: in figures/." if ny > MOST_OUTPUTS else ""
+    for first in range(0, ny, MOST_OUTPUTS):
+        outputs = range(first, min(first + MOST_OUTPUTS, ny))
+        for view, draw, caption in views:
+            page = f"_{first + 1}_to_{outputs[-1] + 1}" if first else ""
+            drawn[f"{name}{view}{page}"] = draw(record, y_linear, y_hat, outputs)
+            if not first:
+                captions[f"{name}{view}"] = caption + more
+    return drawn, captions
 
 
 def measured(records: Sequence[Record]) -> FRF | None:

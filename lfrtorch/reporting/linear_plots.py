@@ -7,7 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import (
+    LogFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    StrMethodFormatter,
+)
 from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._support.errors import InputError
@@ -17,8 +23,9 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.records import Channel
 
-MEASURED, MODEL, DIFFERENCE = "tab:blue", "black", "tab:green"
-TOTAL, NOISE, ODD, EVEN = "tab:red", "0.5", "tab:red", "tab:green"
+MEASURED, MODEL, DIFFERENCE = "#0072b2", "black", "#e69f00"
+TOTAL, NOISE, ODD, EVEN = "#d55e00", "0.5", "#d55e00", "#cc79a7"
+"""Of Okabe and Ito's palette, which colour-blind readers tell apart."""
 
 GRID = 500
 """Frequencies at which a model is drawn, beside those of its poles."""
@@ -29,8 +36,9 @@ LOG_DECADES = 1.5
 LOWEST = 1e-3
 """First frequency of a model drawn alone, relative to half the sampling frequency."""
 
-RANGE = 120.0
-"""Most dB that an axis shows: a zero on a grid point is no information."""
+RANGE, ABOVE = 120.0, 30.0
+"""Most dB that an axis shows, and above the model: a zero on a grid point is no information, and a
+measured response at lines that the input does not excite is none."""
 
 STRETCHES = 200
 """Parts of the frequency axis: a variance is drawn as its mean over each. Line by line it hid the
@@ -91,7 +99,7 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
                 _dots(phase, frf.frequencies, np.degrees(turned), "nonparametric", MEASURED)
             magnitude.plot(f, _decibel(fit), lw=1.0, color=MODEL, label="model")
             phase.plot(f, np.degrees(angle), lw=1.0, color=MODEL, label="model")
-            limits = _limit(magnitude)
+            limits = _limit(magnitude, _decibel(fit))
             if std is not None:
                 low, high = (centre[:, i, j] + sign * 2 * std[:, i, j] for sign in (-1, 1))
                 low = np.maximum(low, 10 ** (-RANGE / 20) * high.max())
@@ -170,12 +178,13 @@ def distortion(frf: FRF) -> Figure:
     figure = Figure(figsize=(8, 1.5 + 3.0 * ny), layout="constrained")
     grid = figure.subplots(ny, 1, squeeze=False, sharex=True)
     for i, (output, ax) in enumerate(zip(frf.outputs, grid[:, 0], strict=True)):
-        for level, label, colour in (
-            (levels.output, "output", MEASURED),
-            (levels.odd, "odd distortion and noise", ODD),
-            (levels.even, "even distortion and noise", EVEN),
+        for level, label, colour, marker in (
+            (levels.output, "output", MEASURED, "."),
+            (levels.odd, "odd distortion and noise", ODD, "^"),
+            (levels.even, "even distortion and noise", EVEN, "v"),
         ):
-            _dots(ax, level.frequencies, _decibel(np.sqrt(level.power[:, i])), label, colour)
+            power = _decibel(np.sqrt(level.power[:, i]))
+            _dots(ax, level.frequencies, power, label, colour, marker)
         noise = _mean(levels.output.frequencies, levels.output.noise[:, i])
         ax.plot(*noise, lw=1.2, color=NOISE, label="noise")
         _limit(ax)
@@ -208,6 +217,8 @@ def order_scan(scan: OrderScan) -> Figure:
         ax.axvline(scan.chosen, color=TOTAL, ls=":", label=f"chosen: {scan.chosen}")
         ax.set(xlabel="order nx")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
         ax.grid(True, which="both", alpha=0.2)
         ax.legend()
     return figure
@@ -266,8 +277,8 @@ def _frequency_axis(grid: NDArray[np.object_], first: float, last: float) -> Non
         ax.set_xlabel("frequency (Hz)")
 
 
-def _dots(ax: Axes, f: Array, level: Array, label: str, colour: str) -> None:
-    ax.plot(f, level, ".", ms=2.5 if len(f) < MANY else 1.0, color=colour, label=label)
+def _dots(ax: Axes, f: Array, level: Array, label: str, colour: str, marker: str = ".") -> None:
+    ax.plot(f, level, marker, ms=2.5 if len(f) < MANY else 1.0, color=colour, label=label)
 
 
 def _mean(f: Array, variance: Array) -> tuple[Array, Array]:
@@ -281,13 +292,15 @@ def _mean(f: Array, variance: Array) -> tuple[Array, Array]:
 
 def _legend(figure: Figure, ax: Axes) -> None:
     """One legend beside the panels, which all have the same lines."""
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper", markerscale=5)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper", markerscale=3)
 
 
-def _limit(ax: Axes) -> tuple[float, float]:
-    """The limits of the axis, no more than RANGE apart."""
+def _limit(ax: Axes, model: Array | None = None) -> tuple[float, float]:
+    """The limits of the axis, no more than RANGE apart, and no more than ABOVE above the model."""
     low, high = ax.get_ylim()
-    return ax.set_ylim(max(low, high - RANGE), high)
+    drawn = np.zeros(0) if model is None else model[np.isfinite(model)]
+    high = min(high, drawn.max() + ABOVE) if len(drawn) else high
+    return ax.set_ylim(min(max(low, high - RANGE), high - ABOVE), high)
 
 
 def _decibel(amplitude: ArrayLike) -> Array:

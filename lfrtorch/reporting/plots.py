@@ -300,7 +300,7 @@ def distribution(
             ax.stairs(share, edges, color=colour, fill=True, alpha=0.15)
         ax.set(yscale="log", ylabel="density, logarithmic", yticks=[])
         ax.yaxis.set_minor_locator(NullLocator())
-        _engineering(ax.xaxis, ax.get_xlim(), f"error of {output.name}", output.unit)
+        unit_axis(ax.xaxis, ax.get_xlim(), f"error of {output.name}", output.unit)
         _legend(ax, ncols=1)
     return figure
 
@@ -374,6 +374,26 @@ def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Fig
     return figure
 
 
+def unit_axis(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> None:
+    """Limits of an axis, its label, and ticks in the unit with an SI prefix.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from lfrtorch.reporting import plots
+        >>> ax = Figure().subplots()
+        >>> plots.unit_axis(ax.yaxis, (0.0, 2e-6), "displacement", "m")
+        >>> ax.get_ylabel()
+        'displacement (µm)'
+    """
+    low, high = limits
+    largest = max(abs(low), abs(high))
+    factor, shown = engineering([largest], unit)
+    digits = 4 + int(np.log10(largest / (high - low))) if high > low else 4
+    axis.set_view_interval(low, high, ignore=True)
+    axis.set_major_formatter(lambda tick, _: f"{factor * tick:.{digits}g}".replace("-", "−"))
+    axis.set_label_text(f"{name} ({shown})" if shown else name)
+
+
 def png(figure: Figure) -> bytes:
     """The figure as a PNG file.
 
@@ -434,9 +454,9 @@ def _overlay(
         span = float(np.ptp(y)) or 1.0
         low, high = above.get_ylim()
         low, high = max(low, y.min() - BEYOND * span), min(high, y.max() + BEYOND * span)
-        _engineering(above.yaxis, (low, high), output.name, output.unit)
+        unit_axis(above.yaxis, (low, high), output.name, output.unit)
         reach = 1.1 * min(reach, BEYOND * span) or span
-        _engineering(below.yaxis, (-reach, reach), "error", output.unit)
+        unit_axis(below.yaxis, (-reach, reach), "error", output.unit)
         for ax in (above, below):
             ax.margins(x=0)
             ax.grid(True, alpha=0.2)
@@ -496,17 +516,6 @@ def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
     pieces = signal[: len(signal) // stretch * stretch].reshape(-1, stretch)
     ends = np.column_stack([pieces.min(axis=1), pieces.max(axis=1)])
     return np.repeat(t[::stretch][: len(pieces)], 2), ends.ravel()
-
-
-def _engineering(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> None:
-    """Limits of an axis, and its label and ticks in the unit with an SI prefix."""
-    low, high = limits
-    largest = max(abs(low), abs(high))
-    factor, shown = engineering([largest], unit)
-    digits = 4 + int(np.log10(largest / (high - low))) if high > low else 4
-    axis.set_view_interval(low, high, ignore=True)
-    axis.set_major_formatter(lambda tick, _: f"{factor * tick:.{digits}g}".replace("-", "−"))
-    axis.set_label_text(f"{name} ({shown})" if shown else name)
 
 
 def _frequency_axis(record: Record, ax: Axes) -> None:

@@ -8,11 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfrtorch._support.types import Array
-from lfrtorch.reporting.plots import envelope
+from lfrtorch.reporting.plots import envelope, unit_axis
 from lfrtorch.survey.measurement import Survey
 from lfrtorch.survey.signal import LEAST, SignalSurvey, longest_run
 
-INPUT, OUTPUT, BAND, CLIPPED = "tab:blue", "tab:green", "0.9", "tab:red"
+INPUT, OUTPUT, BAND, CLIPPED = "#0072b2", "0.15", "0.9", "#d55e00"
 
 RANGE = 120.0
 """Most dB that a spectrum shows."""
@@ -55,7 +55,8 @@ def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
         time.plot(*envelope(t, signal), lw=0.6, color=colour)
         for end in one.clipped:
             time.axhline(end.value, lw=1.0, ls="--", color=CLIPPED)
-        time.set(ylabel=str(one.channel), xlim=(0, max(t[-1], 1 / fs)))
+        time.set_xlim(0, max(t[-1], 1 / fs))
+        unit_axis(time.yaxis, time.get_ylim(), one.channel.name, one.channel.unit)
         known = signal[np.isfinite(signal)]
         share = np.full(len(known), 100 / max(len(known), 1))
         values.hist(known, BINS, weights=share, orientation="horizontal", color=colour)
@@ -64,7 +65,7 @@ def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
         _spectrum(lines, one, signal, fs, colour)
     clipped = any(one.clipped for one in found.signals)
     heads = (
-        f"signal{' (red: clipped)' if clipped else ''}",
+        f"signal{' (dashed: clipped)' if clipped else ''}",
         "",
         "spectrum (grey: 99 % of the power)",
     )

@@ -1,0 +1,59 @@
+"""Which records and outputs a report shows."""
+
+import numpy as np
+import pytest
+
+from lfrtorch.records import Channel, Record
+from lfrtorch.reporting import figures, plots
+from lfrtorch.reporting.simulations import Response
+
+Y = np.random.default_rng(0).standard_normal((200, 1))
+
+
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A figure is what it was asked to show."""
+    for name in ("response", "close_up", "spectrum", "density", "distribution", "errors"):
+        monkeypatch.setattr(plots, name, lambda *asked, name=name: (name, *asked[3:]))
+
+
+def responses(use: str, errors: dict[str, float]) -> list[Response]:
+    """Records by name with an error each."""
+    return [
+        Response(Record(Y, Y, name=name), use, 0.5 * Y, Y + error) for name, error in errors.items()
+    ]
+
+
+def test_the_report_begins_with_the_worst_test():
+    tests = responses("test", {"a": 0.1, "b": np.inf, "c": 0.3})
+    drawn, views = figures.of_records([*responses("validation", {"v": 9.0}), *tests])
+    assert list(views) == ["b", "c", "a"]
+    assert list(views["b"]) == ["b", "b_near", "b_density", "b_distribution"]
+    assert set(drawn) == {name for own in views.values() for name in own}
+    assert drawn["b"] == ("response", range(1))
+
+
+def test_of_many_tests_the_worst_have_all_views_and_each_its_errors():
+    tests = responses("test", {f"t{k}": 1.0 / (1 + k) for k in range(6)})
+    drawn, views = figures.of_records(tests)
+    assert list(views) == ["t0", "t1", "t2", "t3"]
+    assert {name for name in drawn if name.startswith(("t4", "t5"))} == {
+        "t4", "t4_density", "t5", "t5_density"
+    }  # fmt: skip
+
+
+def test_without_tests_what_there_is_is_shown():
+    validation, train = responses("validation", {"v": 0.1}), responses("train", {"a": 9.0})
+    assert list(figures.of_records([*train, *validation])[1]) == ["v"]
+    assert list(figures.of_records(train)[1]) == ["a"]
+
+
+def test_many_outputs_have_several_files_and_the_first_is_in_the_report():
+    y = np.tile(Y, 6)
+    outputs = tuple(Channel(f"y{i}") for i in range(6))
+    record = Record(Y, y, name="a", outputs=outputs, start="periodic")
+    drawn, captions = figures.of_record(record, y, y)
+    assert list(captions) == ["a_response", "a_near", "a", "a_distribution"]
+    assert drawn["a"] == ("spectrum", range(4))
+    assert drawn["a_response_5_to_6"] == ("response", range(4, 6))
+    assert all("Outputs 5 to 6: in figures/." in caption for caption in captions.values())
