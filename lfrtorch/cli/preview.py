@@ -148,9 +148,9 @@ def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]
             f"'{table.path}': {', '.join(map(repr, twice)) or '--time'} stands for several; "
             "give every column one use, and one column of times."
         )
-    heads, remarks = {}, []
+    heads, remarks = {}, list(table.notes)
     if not table.contents:
-        remarks = [f"left out: {name!r} {reason}" for name, reason in table.refused.items()]
+        remarks += [f"left out: {name!r} {reason}" for name, reason in table.refused.items()]
     rest = sorted(set(range(len(table.columns))) - set(named))
     if table.lengths:
         counted = Counter(table.lengths[i] for i in named or rest)

@@ -61,8 +61,8 @@ def simulate(cfg: DictConfig) -> None:
                 inputs=cfg.data.inputs, outputs=cfg.data.outputs,
                 time=cfg.data.time, find_time=cfg.data.fs is None,
             )  # fmt: skip
-            if stream.note:
-                print(f"note: '{path}': {translated(stream.note, cfg)}")
+            for note in filter(None, (*stream.table.notes, stream.note)):
+                print(f"note: '{path}': {translated(note, cfg)}")
             if not stream.y:
                 missing = ", ".join(stream.missing)
                 print(f"note: '{path}' has no column {missing}, so nothing is scored")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.files import arrays as array_table
+from lfrtorch.files.excel import EXTENSIONS, ExcelTable, workbook
 from lfrtorch.files.parquet import ParquetTable
 from lfrtorch.files.table import BLOCK, Table
 from lfrtorch.files.text import TextTable
@@ -21,13 +22,14 @@ FORMATS: dict[str, Callable[[Path], Table]] = {
     ".npy": array_table.npy,
     **dict.fromkeys((".h5", ".hdf5"), array_table.hdf5),
     ".parquet": ParquetTable,
+    **dict.fromkeys(EXTENSIONS, ExcelTable),
 }
 """How a file is read, by its extension; a text file may be compressed (.csv.gz)."""
 
 _SHOWN = 8
 _INSTEAD = {
-    ".xlsx": "save the sheet as CSV",
-    ".xls": "save the sheet as CSV",
+    ".xls": "save it as .xlsx",
+    ".ods": "save it as .xlsx",
     ".tdms": "export it as text or convert it to HDF5",
     ".mdf": "export it as text, MATLAB or Parquet",
     ".mf4": "export it as text, MATLAB or Parquet",
@@ -39,7 +41,8 @@ def open_table(path: str | Path) -> Table:
 
     Args:
         path: a text file (.csv, .tsv, .txt, .dat, .lvm, these also as .gz), a MATLAB file of any
-            version, .npz, .npy, HDF5 (.h5, .hdf5) or Parquet.
+            version, .npz, .npy, HDF5 (.h5, .hdf5), Parquet or Excel (.xlsx, .xlsm), whose sheet may
+            stand behind its name: ``rig.xlsx#Run 2``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -53,16 +56,17 @@ def open_table(path: str | Path) -> Table:
             f"'{path}' is a folder; name a file"
             + (f": {', '.join(inside[:_SHOWN])}." if inside else ", it has none of a known format.")
         )
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file '{path}'{similar(path)}.")
-    kind = extension(path)
+    file, _ = workbook(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"there is no file '{file}'{similar(file)}.")
+    kind = extension(file)
     if kind not in FORMATS:
         instead = _INSTEAD.get(path.suffix.lower(), "convert it")
         raise InputError(
             f"'{path}' has the unknown extension '{path.suffix}'; {instead}, or rename it if it "
             f"is one of these: {', '.join(FORMATS)}."
         )
-    if path.stat().st_size == 0:
+    if file.stat().st_size == 0:
         raise InputError(f"'{path}' is empty; give a file with data.")
     return FORMATS[kind](path)
 

@@ -13,6 +13,7 @@ from typing import Literal, cast, get_args
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch.dataset import Dataset
+from lfrtorch.files.excel import workbook
 from lfrtorch.files.formats import similar
 from lfrtorch.files.measurement import (
     Gaps,
@@ -68,13 +69,14 @@ def load_records(
     """Measurements from files, each a record, by use: training, validation and test.
 
     Text (.csv, .tsv, .txt, .dat, .lvm, also .gz) with or without header, units line and preamble;
-    MATLAB (.mat), .npz, .npy, HDF5 (.h5, .hdf5) and Parquet.
+    MATLAB (.mat), .npz, .npy, HDF5 (.h5, .hdf5), Parquet and Excel (.xlsx, .xlsm).
 
     What is cut off by a fraction begins where its record begins and is simulated from there: only
     its own part is scored, so that the transient of the start reaches neither validation nor test.
 
     Args:
-        path: a file, a pattern as ``"runs/*.csv"``, or a list of these.
+        path: a file, a pattern as ``"runs/*.csv"``, or a list of these; ``"rig.xlsx#Run 2"`` is a
+            sheet of a workbook. Default: its first that has samples.
         inputs: one or several names of columns or arrays, or column numbers from 0. An array of
             several channels is several inputs, and ``"acc[0]"`` is the first channel of ``acc``.
         outputs: likewise.
@@ -338,8 +340,10 @@ def _counting(text: str) -> list[tuple[int, str]]:
 
 
 def _stem(path: Path) -> str:
-    name = path.name
-    return Path(name[:-3] if name.lower().endswith(".gz") else name).stem
+    file, sheet = workbook(path)
+    name = file.name
+    stem = Path(name[:-3] if name.lower().endswith(".gz") else name).stem
+    return f"{stem}_{sheet}" if sheet else stem
 
 
 def _stems(paths: Sequence[Path], taken: Container[str]) -> list[str]:

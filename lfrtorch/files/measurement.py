@@ -82,7 +82,7 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
             f"'{path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs "
             "and time; name every column once."
         )
-    notes, fs = [], wanted.fs
+    notes, fs = [*table.notes], wanted.fs
     if fs is None and not stamps:
         rate = find_rate(table, columns)
         if rate is None:

@@ -53,6 +53,8 @@ class Table(ABC):
 
     path: Path
     columns: tuple[Channel, ...]
+    notes: tuple[str, ...] = ()
+    """What a user should know of how the file is read."""
     contents: Sequence[tuple[str, str, str]] = ()
     """What is in a file of arrays: name and shape of each, and what it is taken for."""
 

@@ -34,7 +34,9 @@ _DATE = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?(Z|[+-]\d\
 _DAMAGED = (OSError, EOFError, zlib.error, UnicodeError)
 
 
-class _Line(NamedTuple):
+class Line(NamedTuple):
+    """Cells of a line that is not blank."""
+
     number: int  # from 1
     cells: list[str]
     comment: bool
@@ -118,7 +120,7 @@ class TextTable(Table):
                 return f"line {line.number}"
         return super().where(sample)
 
-    def _lines(self) -> Iterator[_Line]:
+    def _lines(self) -> Iterator[Line]:
         """The lines of samples."""
         with _opened(self.path, self.layout.encoding) as stream:
             for line in _split(stream, self.layout.delimiter):
@@ -139,7 +141,7 @@ class TextTable(Table):
             for column in sorted(columns):
                 cell = cells[column] if column < len(cells) else ""
                 known = _is_date if column in self.layout.dates else self._is_number
-                if not (_is_missing(cell) or known(cell)):
+                if not (is_missing(cell) or known(cell)):
                     kind = "date-time" if column in self.layout.dates else "number"
                     raise InputError(
                         f"'{self.path}', line {line.number}: {cell!r} in column "
@@ -231,7 +233,7 @@ def _decodes(text: bytes, encoding: str) -> bool:
     return True
 
 
-def _split(lines: Iterator[str] | IO[str], delimiter: str) -> Iterator[_Line]:
+def _split(lines: Iterator[str] | IO[str], delimiter: str) -> Iterator[Line]:
     """Cells of the lines that are not blank."""
     for number, line in enumerate(lines, 1):
         text = line.rstrip("\r\n")
@@ -240,7 +242,7 @@ def _split(lines: Iterator[str] | IO[str], delimiter: str) -> Iterator[_Line]:
         comment = _COMMENT.match(text) is not None
         if comment:
             text = text.lstrip().lstrip(_MARKS)
-        yield _Line(number, _cells(text, delimiter), comment)
+        yield Line(number, _cells(text, delimiter), comment)
 
 
 def _cells(text: str, delimiter: str) -> list[str]:
@@ -269,21 +271,21 @@ def _layout(path: Path) -> _Layout:
         )
     except csv.Error as error:
         raise InputError(f"'{path}' is not a readable table ({error}); save it again.") from error
-    return _found(path, encoding, delimiter, lines)
+    return layout_of(path, encoding, delimiter, lines)
 
 
-def _bulk(lines: Sequence[_Line]) -> list[list[str]]:
+def _bulk(lines: Sequence[Line]) -> list[list[str]]:
     """Cells of the second half of the lines: samples, but for the longest preambles."""
     samples = [line.cells for line in lines if not line.comment]
     return samples[len(samples) // 2 :]
 
 
-def _order(delimiter: str, lines: Sequence[_Line]) -> tuple[float, float]:
+def _order(delimiter: str, lines: Sequence[Line]) -> tuple[float, float]:
     """How well a delimiter does: the share of cells that are numbers, then their count."""
     bulk = _bulk(lines)
     comma = delimiter != ","
     known = [
-        sum(_is_number(c, comma) or _is_date(c) or _is_missing(c) for c in cells) / len(cells)
+        sum(_is_number(c, comma) or _is_date(c) or is_missing(c) for c in cells) / len(cells)
         for cells in bulk
         if cells
     ]
@@ -294,7 +296,7 @@ def _order(delimiter: str, lines: Sequence[_Line]) -> tuple[float, float]:
     )
 
 
-def _found(path: Path, encoding: str, delimiter: str, lines: list[_Line]) -> _Layout:
+def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> _Layout:
     """The layout of a file from its first lines."""
     bulk = _bulk(lines)
     decimal = delimiter != ","
@@ -307,7 +309,7 @@ def _found(path: Path, encoding: str, delimiter: str, lines: list[_Line]) -> _La
     # Columns that hold numbers, and the first line that has them in these.
     most = set()
     for i in range(width):
-        given = [numeric(cells[i]) for cells in whole if not _is_missing(cells[i])]
+        given = [numeric(cells[i]) for cells in whole if not is_missing(cells[i])]
         if 2 * sum(given) > len(given):
             most.add(i)
     clean = (
@@ -316,7 +318,7 @@ def _found(path: Path, encoding: str, delimiter: str, lines: list[_Line]) -> _La
         if not line.comment
         and len(line.cells) == width
         and any(numeric(line.cells[c]) for c in most)
-        and all(numeric(line.cells[c]) or _is_missing(line.cells[c]) for c in most)
+        and all(numeric(line.cells[c]) or is_missing(line.cells[c]) for c in most)
     )
     start = next(clean, None)
     if start is None:
@@ -386,7 +388,8 @@ def _is_date(cell: str) -> bool:
     return _DATE.fullmatch(cell) is not None
 
 
-def _is_missing(cell: str) -> bool:
+def is_missing(cell: str) -> bool:
+    """Whether a cell says that there is no value."""
     return cell.lower() in _MISSING
 
 

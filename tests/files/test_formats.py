@@ -3,10 +3,12 @@
 import gzip
 import sys
 import tracemalloc
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import h5py
 import numpy as np
+import openpyxl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -486,7 +488,71 @@ def test_arrays_of_different_lengths(tmp_path):
     assert len(table.read([1])) == T
 
 
-@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.mat", "a.h5", "a.parquet"])
+def book(path: Path, **sheets: list[list]) -> Path:
+    """A workbook of sheets of rows."""
+    made = openpyxl.Workbook()
+    made.remove(made.worksheets[0])
+    for name, rows in sheets.items():
+        sheet = made.create_sheet(name)
+        for row in rows:
+            sheet.append(row)
+    made.save(path)
+    return path
+
+
+def rows_of(*columns) -> list[list]:
+    return [list(row) for row in zip(*(list(column) for column in columns), strict=True)]
+
+
+@pytest.mark.parametrize("name", ["a.xlsx", "a.XLSM"])
+def test_excel(tmp_path, name):
+    rows = rows_of(*SIGNALS.T.tolist())
+    rows[3][1], rows[4][2], rows[6][0] = None, "n/a", "1,5"
+    rows.insert(10, [None] * 3)  # an empty row is no sample
+    head = [["Rig 7", "measured by me"], [], ["Förderstrom", "Druck", "Füllstand (mm)"]]
+    table = open_table(book(tmp_path / name, Run=[*head, ["l/min", "bar", None], *rows]))
+    assert table.notes == ()
+    assert [*map(str, table.columns)] == ["Förderstrom (l/min)", "Druck (bar)", "Füllstand (mm)"]
+    same = {"rtol": 1e-14, "equal_nan": True}  # 16 digits are in the file
+    expected = SIGNALS.copy()
+    expected[3, 1] = expected[4, 2] = np.nan
+    expected[6, 0] = 1.5
+    assert np.allclose(whole(table, [0, "Druck", "Füllstand"]), expected, **same)
+    blocks = list(table.blocks([2, 0], samples=15))
+    assert [len(block) for block in blocks] == [15, 15, 10]
+    assert np.allclose(np.concatenate(blocks), expected[:, [2, 0]], **same)
+    assert table.where(10) == "row 16 of sheet 'Run'"
+
+
+def test_sheets_and_cells_of_excel(tmp_path):
+    numbers, words = [["u", "y"], *rows_of(Y.tolist(), U[:, 0].tolist())], [["by me"], ["today"]]
+    path = book(tmp_path / "a.xlsx", Cover=words, Run1=numbers, Run2=numbers[:9], Notes=words)
+    table = open_table(path)
+    assert len(table.read([0])) == T
+    assert table.notes == (f"the sheet 'Run1' is read; '{path}#Run2' is the other one",)
+    assert len(open_table(f"{path}#Run2").read([0])) == 8
+    with pytest.raises(ValueError, match="has no sheet 'Run3'; it has 'Cover', 'Run1', 'Run2'"):
+        open_table(f"{path}#Run3")
+    with pytest.raises(ValueError, match="has no samples"):
+        open_table(f"{path}#Notes")
+    with pytest.raises(FileNotFoundError, match=r"no file '.*b\.xlsx'; there is 'a\.xlsx'"):
+        open_table(tmp_path / "b.xlsx#Run1")
+    start = datetime(2024, 2, 28, 23, 59, 59)
+    stamps = [start + timedelta(milliseconds=250 * k) for k in range(T)]
+    rows = rows_of(stamps, [timedelta(seconds=k) for k in range(T)], Y.tolist())
+    # A table need not begin in the first cell.
+    rows = [[None] * 3, [None, "when", "since", "y"], *([None, *row] for row in rows)]
+    table = open_table(book(tmp_path / "b.xlsx", Run=rows))
+    assert names(table) == ["when", "since", "y"]
+    k = np.arange(T)
+    assert np.allclose(whole(table, ["when", "since", "y"]), np.c_[k / 4, k, Y], atol=1e-9)
+    rows[20][3] = "broken"
+    table = open_table(book(tmp_path / "c.xlsx", Run=rows))
+    with pytest.raises(ValueError, match="row 21 of sheet 'Run': 'broken' in column 'y' is not a"):
+        table.read([2])
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.mat", "a.h5", "a.parquet", "a.xlsx"])
 def test_damaged_files(tmp_path, name):
     path = tmp_path / name
     if name == "a.npz":
@@ -498,6 +564,8 @@ def test_damaged_files(tmp_path, name):
     elif name == "a.h5":
         with h5py.File(path, "w") as file:
             file["u"], file["y"] = U, Y
+    elif name == "a.xlsx":
+        book(path, Run=rows_of(Y.tolist()))
     else:
         pq.write_table(pa.table({"u": Y}), path)
     content = path.read_bytes()
@@ -510,7 +578,10 @@ def test_damaged_files(tmp_path, name):
         open_table(path)
 
 
-@pytest.mark.parametrize(("name", "package"), [("a.h5", "h5py"), ("a.parquet", "pyarrow")])
+@pytest.mark.parametrize(
+    ("name", "package"),
+    [("a.h5", "h5py"), ("a.parquet", "pyarrow"), ("a.xlsx", "openpyxl")],
+)
 def test_optional_packages(tmp_path, monkeypatch, name, package):
     (tmp_path / name).write_bytes(b"something")
     monkeypatch.setitem(sys.modules, package, None)
@@ -526,7 +597,7 @@ def test_refused_paths(tmp_path):
         open_table(tmp_path)
     with pytest.raises(FileNotFoundError, match="in its folder, and none of a known format"):
         open_table(tmp_path / "absent.csv")
-    for name in ("rig_1.csv", "rig_2.csv", "other.mat", "notes.pdf", "book.xlsx"):
+    for name in ("rig_1.csv", "rig_2.csv", "other.mat", "notes.pdf", "book.xls"):
         (tmp_path / name).write_text("u,y\n1,2\n")
     with pytest.raises(FileNotFoundError, match=r"Rig_1\.cvs'; there is 'rig_1\.csv'"):
         open_table(tmp_path / "Rig_1.cvs")
@@ -538,8 +609,8 @@ def test_refused_paths(tmp_path):
         open_table(tmp_path)
     with pytest.raises(ValueError, match=r"unknown extension '\.pdf'.*\.csv.*\.parquet"):
         open_table(tmp_path / "notes.pdf")
-    with pytest.raises(ValueError, match="save the sheet as CSV"):
-        open_table(tmp_path / "book.xlsx")
+    with pytest.raises(ValueError, match=r"save it as \.xlsx"):
+        open_table(tmp_path / "book.xls")
 
 
 def test_find(tmp_path):

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import openpyxl
 import pandas as pd
 import pytest
 import scipy.io
@@ -360,6 +361,22 @@ def test_a_time_column_that_contradicts_is_noted(tmp_path):
     (note,) = load_records(path, **use, fs=1000).notes
     assert note.startswith("fs is 1000 Hz and the column 't' says 100 Hz")
     assert load_records(path, **use, fs=100).notes == ()
+
+
+def test_sheets_are_records(tmp_path, signals):
+    path = tmp_path / "rig.xlsx"
+    made = openpyxl.Workbook()
+    for name in ("Run 1", "Run 2"):
+        sheet = made.create_sheet(name)
+        for row in [["Zeit (s)", "u1", "u2", "y"], *np.c_[np.arange(200) / 50, signals].tolist()]:
+            sheet.append(row)
+    made.save(path)
+    use = {"inputs": ["u1", "u2"], "outputs": "y"}
+    data = load_records([f"{path}#Run 1", f"{path}#Run 2"], **use, validation=1, test=0)
+    assert [record.name for record in (*data.train, *data.validation)] == ["train", "validation"]
+    assert np.allclose(joined(data.train[0]), signals, rtol=1e-14)  # 16 digits are in the file
+    assert data.train[0].fs == 50.0
+    assert any("the sheet 'Run 1' is read" in note for note in load_records(path, **use).notes)
 
 
 # --- gaps -----------------------------------------------------------------------------------

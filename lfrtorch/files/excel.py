@@ -1,0 +1,180 @@
+"""A sheet of an Excel workbook as a table."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import date, datetime, time, timedelta
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
+from lfrtorch.files.arrays import optional
+from lfrtorch.files.table import BLOCK, Clock, Table
+from lfrtorch.files.text import Line, is_missing, layout_of
+
+_HEAD = 1000
+"""Rows that tell where the samples begin."""
+
+EXTENSIONS = (".xlsx", ".xlsm")
+
+
+def workbook(path: Path) -> tuple[Path, str]:
+    """The file of a path and the sheet behind it, empty if it names none.
+
+    Example:
+        >>> from lfrtorch.files.excel import workbook
+        >>> workbook(Path("rig.xlsx#Run 2"))
+        (PosixPath('rig.xlsx'), 'Run 2')
+    """
+    name, mark, sheet = str(path).rpartition("#")
+    file = Path(name)
+    named = mark and file.suffix.lower() in EXTENSIONS and not path.is_file()
+    return (file, sheet) if named else (path, "")
+
+
+class ExcelTable(Table):
+    """A sheet, a row a sample; above may be names, units and what else is not read.
+
+    It is the first sheet that has samples, or that named behind the path: ``x.xlsx#Run 2``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file, sheet = workbook(path)
+        with self._opened() as book:
+            names = [one.title for one in book.worksheets]
+            if sheet and sheet not in names:
+                raise InputError(f"'{self._file}' has no sheet {sheet!r}; it has {_listed(names)}.")
+            with_samples = []
+            refusal = None
+            for one in [sheet] if sheet else names:
+                try:
+                    with_samples.append((one, self._layout(book[one])))
+                except InputError as error:
+                    refusal = error
+        if not with_samples:
+            raise refusal or InputError(f"'{self._file}' has no sheet.")
+        self._sheet, (self._first, self._used, headers, units, self._dates) = with_samples[0]
+        super().__init__(path, headers, units=units)
+        others = [one for one, _ in with_samples[1:]]
+        if others:
+            self.notes = (
+                f"the sheet {self._sheet!r} is read; '{self._file}#{others[0]}' is "
+                + ("the other one" if len(others) == 1 else f"another one, of {_listed(others)}"),
+            )
+
+    def _layout(self, sheet: Any) -> tuple[int, list[int], tuple[str, ...], dict, frozenset[int]]:
+        """First row of samples, columns in use, headers, units and columns of date-times."""
+        head = [[_text(cell) for cell in row] for row in islice(_rows(sheet), _HEAD)]
+        width = max(map(len, head), default=0)
+        used = [i for i in range(width) if any(i < len(row) and row[i] for row in head)]
+        lines = [
+            Line(number, [row[i] if i < len(row) else "" for i in used], False)
+            for number, row in enumerate(head, 1)
+            if any(row)
+        ]
+        if not lines:
+            raise InputError(f"'{self._file}' is empty; give a file with data.")
+        found = layout_of(self._file, "", ";", lines)
+        return found.first, used[: len(found.headers)], found.headers, found.units, found.dates
+
+    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
+        """See :meth:`Table.blocks`; empty cells are missing values, empty rows no samples."""
+        clocks = {column: Clock() for column in columns}
+        rows = self._samples()
+        while part := list(islice(rows, samples)):
+            found = np.empty((len(part), len(columns)))
+            for i, column in enumerate(columns):
+                k = self._used[column]
+                cells = [(number, row[k] if k < len(row) else None) for number, row in part]
+                if column in self._dates:
+                    times = [self._date(cell, number, column) for number, cell in cells]
+                    found[:, i] = clocks[column](np.array(times, "M8[ns]"))
+                else:
+                    found[:, i] = [self._number(cell, number, column) for number, cell in cells]
+            yield found
+
+    def where(self, sample: int) -> str:
+        """The row of a sample."""
+        row = next(islice(self._samples(), sample, None), None)
+        return super().where(sample) if row is None else f"row {row[0]} of sheet {self._sheet!r}"
+
+    def _samples(self) -> Iterator[tuple[int, Sequence[Any]]]:
+        """Rows that are not empty, with their numbers."""
+        with self._opened() as book:
+            for number, row in enumerate(_rows(book[self._sheet]), 1):
+                if number >= self._first and any(_text(row[k]) for k in self._used if k < len(row)):
+                    yield number, row
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        openpyxl = optional("openpyxl")
+        book = None
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # styles and extensions that say nothing of numbers
+                book = openpyxl.load_workbook(self._file, read_only=True, data_only=True)
+        except Exception as error:  # a damaged file raises any of a dozen kinds
+            raise InputError(
+                f"'{self._file}' is not a readable Excel file ({error}); save it again as .xlsx."
+            ) from error
+        try:
+            yield book
+        finally:
+            book.close()
+
+    def _number(self, cell: Any, row: int, column: int) -> float:
+        if isinstance(cell, int | float):
+            return float(cell)
+        text = _text(cell)
+        if is_missing(text):
+            return np.nan
+        try:
+            return float(text.replace(",", "."))
+        except ValueError:
+            raise self._refusal(text, row, column, "number") from None
+
+    def _date(self, cell: Any, row: int, column: int) -> np.datetime64:
+        text = _text(cell)
+        if is_missing(text):
+            return np.datetime64("NaT")
+        try:
+            return np.datetime64(
+                datetime.fromisoformat(text.replace(",", ".")).replace(tzinfo=None)
+            )
+        except ValueError:
+            raise self._refusal(text, row, column, "date-time") from None
+
+    def _refusal(self, text: str, row: int, column: int, kind: str) -> InputError:
+        return InputError(
+            f"'{self.path}', row {row} of sheet {self._sheet!r}: {text!r} in column "
+            f"{self.headers[column]!r} is not a {kind}; correct it, or leave the cell empty where "
+            "the value is missing."
+        )
+
+
+def _rows(sheet: Any) -> Iterator[Sequence[Any]]:
+    sheet.reset_dimensions()  # what programs write of the size may be wrong
+    return sheet.iter_rows(values_only=True)
+
+
+def _text(cell: Any) -> str:
+    """A cell as a text file would have it; a time of day or a duration in seconds."""
+    if cell is None:
+        return ""
+    if isinstance(cell, time):
+        cell = datetime.combine(date.min, cell) - datetime.min
+    if isinstance(cell, timedelta):
+        return repr(cell.total_seconds())
+    if isinstance(cell, date):
+        return cell.isoformat()
+    return str(int(cell) if isinstance(cell, bool) else cell).strip()
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(map(repr, names))
