@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import glob
+import sys
 import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.cli.composition import parsed
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.preview_words import parser
 from lfrtorch.files.formats import BLOCK, Table, open_table
@@ -46,15 +48,51 @@ class Roles(NamedTuple):
     time: int | None
 
 
+USES = {
+    "data.path": "paths",
+    "data.inputs": "inputs",
+    "data.outputs": "outputs",
+    "data.fs": "fs",
+    "data.time": "time",
+}
+"""Options by the words that other commands have for them."""
+
+
 def launch(words: Sequence[str] | None = None) -> None:
     """The command line."""
-    options = parser().parse_args(words)
+    given = sys.argv[1:] if words is None else words
+    data = [word for word in given if word.startswith("data.") and "=" in word]
+    options = parser().parse_args([w for w in given if w not in (*data, "data=file")])
     with user_errors():
+        for word in data:
+            take(word, options)
+        if not options.paths:
+            raise InputError("no file is named; give its path, or data.path=FILE.")
         if options.fs is not None:
             number("--fs", options.fs, positive=True)
         paths = matching(options.paths)
         for path in paths:
             show(path, options, figure_path(options.out, path, len(paths)))
+
+
+def take(word: str, options: argparse.Namespace) -> None:
+    """Read a word of other commands into the options.
+
+    Raises:
+        ValueError: one that is none of ``USES``, or whose option is given already.
+    """
+    read = parsed(word)
+    name = read.key_or_group
+    if name not in USES:
+        raise InputError(f"preview does not read {name}; it takes {', '.join(USES)}.")
+    if read.is_sweep_override():
+        raise InputError(f"for several values write {name}=[{read.get_value_string()}].")
+    if getattr(options, USES[name]):
+        raise InputError(f"{name} is given twice, the other time as an option or a path.")
+    value: Any = read.value()
+    if value is not None:
+        listed = value if isinstance(value, list) else [value]
+        setattr(options, USES[name], value if name in ("data.fs", "data.time") else listed)
 
 
 def matching(patterns: Sequence[str]) -> list[Path]:

@@ -11,8 +11,11 @@ ABOUT = """Look at measurements before any fit: a table, what will hurt a model,
     lfrtorch preview x.csv --inputs force --outputs displacement --fs 750
     lfrtorch preview 'runs/*.mat' --inputs u --outputs y
 
-A file is any that data.path takes. Without --inputs and --outputs all columns of numbers are shown,
-and nothing is said of what lies between them.
+    lfrtorch preview data.path=x.mat 'data.inputs=[Force (N)]' data.outputs=[acc]
+
+A file is any that data.path takes; the words data.path, data.inputs, data.outputs, data.fs and
+data.time of the other commands are understood. Without --inputs and --outputs all columns of
+numbers are shown, and nothing is said of what lies between them.
 """
 
 
@@ -21,7 +24,7 @@ def parser() -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(
         prog=sys.argv[0], description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    found.add_argument("paths", nargs="+", metavar="PATH", help="file, or pattern in quotes")
+    found.add_argument("paths", nargs="*", metavar="PATH", help="file, or pattern in quotes")
     found.add_argument("--inputs", nargs="+", default=[], metavar="NAME", type=column)
     found.add_argument("--outputs", nargs="+", default=[], metavar="NAME", type=column)
     found.add_argument("--fs", type=float, metavar="HZ", help="sampling frequency")

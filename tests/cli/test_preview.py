@@ -219,6 +219,25 @@ def test_only_the_beginning_of_a_long_file_is_read(file: Path, run, monkeypatch)
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_the_words_of_other_commands_are_understood(file: Path, signals, run, capsys):
+    expected = run(file, "--inputs", "force", "--outputs", "level", "--fs", 50, "--time", "time")
+    words = ["data.inputs=[force]", "data.outputs=level", "data.fs=50", "data.time=time"]
+    assert run("data=file", f"data.path={file}", *words) == expected
+    assert run(file, "--inputs", 1, *words[1:]) == expected
+    other = written(file.parent / "ü.csv", {"Füllstand (a)": signals["force"]})
+    assert "Füllstand" in run(f"data.path=[{other}]", "data.outputs=[Füllstand (a)]")
+    for word, message in (
+        ("data.start=zero", "preview does not read data.start; it takes data.path, data.inputs"),
+        ("data.inputs=a,b", "for several values write data.inputs=[a,b]."),
+        (f"data.path={file}", "data.path is given twice"),
+        ("data.inputs=[a", "is not understood"),
+        ("data.fs=-3", "--fs is -3; give a positive number"),
+    ):
+        assert message in refused(capsys, file, word)
+    assert "no file is named" in refused(capsys, "data.fs=3")
+
+
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("words", "message"),
     [
