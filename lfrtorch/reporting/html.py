@@ -255,7 +255,7 @@ def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
         signal = np.concatenate([s[r.skip :] for s, r in zip(signals, train, strict=True)])
         for channel, x in zip(named, signal.T, strict=True):
             moments = _moments(x)
-            factor, unit = engineering(moments[1:], channel.unit)
+            factor, unit = engineering([moments[1]], channel.unit)
             channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
     records = []
     for use, r in ((response.use, response.record) for response in responses):

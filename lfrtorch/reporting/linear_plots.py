@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import (
-    LogFormatter,
     LogLocator,
     MaxNLocator,
     NullFormatter,
@@ -22,6 +21,7 @@ from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.records import Channel
+from lfrtorch.reporting.plots import plain_ticks
 
 MEASURED, MODEL, DIFFERENCE = "#0072b2", "black", "#e69f00"
 TOTAL, NOISE, ODD, EVEN = "#d55e00", "0.5", "#d55e00", "#cc79a7"
@@ -217,8 +217,7 @@ def order_scan(scan: OrderScan) -> Figure:
         ax.axvline(scan.chosen, color=TOTAL, ls=":", label=f"chosen: {scan.chosen}")
         ax.set(xlabel="order nx")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-        ax.yaxis.set_major_formatter("{x:g}")
-        ax.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
+        plain_ticks(ax.yaxis)
         ax.grid(True, which="both", alpha=0.2)
         ax.legend()
     return figure

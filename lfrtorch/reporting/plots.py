@@ -10,7 +10,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter, NullLocator
+from matplotlib.ticker import NullFormatter, NullLocator
 
 from lfrtorch._support.tables import engineering, quantity
 from lfrtorch._support.types import Array
@@ -365,8 +365,7 @@ def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Fig
     ax.semilogy(iterations, factor * train, "--", color=OUTPUT, label="training")
     if np.isfinite(validation).any():
         ax.semilogy(iterations, factor * validation, color=NL_LFR, label="validation")
-    ax.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
-    ax.yaxis.set_major_formatter("{x:g}")
+    plain_ticks(ax.yaxis)
     ax.axvline(chosen, color="0.6", ls=":", label=f"kept: iteration {chosen}")
     ax.set(xlabel="iteration", ylabel=f"simulation RMSE{f' ({unit})' if unit else ''}")
     ax.grid(True, which="both", alpha=0.2)
@@ -392,6 +391,23 @@ def unit_axis(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> 
     axis.set_view_interval(low, high, ignore=True)
     axis.set_major_formatter(lambda tick, _: f"{factor * tick:.{digits}g}".replace("-", "−"))
     axis.set_label_text(f"{name} ({shown})" if shown else name)
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Numbers instead of powers of ten at a logarithmic axis; below a decade also between them.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from lfrtorch.reporting import plots
+        >>> ax = Figure().subplots()
+        >>> lines = ax.semilogy([0.02, 0.05])
+        >>> plots.plain_ticks(ax.yaxis)
+        >>> ax.yaxis.get_minor_formatter()(0.03)
+        '0.03'
+    """
+    low, high = axis.get_view_interval()
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("{x:.3g}" if high < 10 * low else NullFormatter())
 
 
 def png(figure: Figure) -> bytes:
