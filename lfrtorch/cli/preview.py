@@ -306,15 +306,16 @@ def row(one: SignalSurvey, found: Survey) -> list[str | float | None]:
     """What the table says of a signal."""
     use = "" if not found.inputs else "input" if one in found.inputs else "output"
     ends = one.minimum, one.maximum
-    noise = None if one.noise is None else tables.number(one.noise, 4)
+    factor, unit = tables.engineering([one.rms], one.channel.unit)
+    noise = None if one.noise is None else tables.number(factor * one.noise, 4)
     return [
-        str(one.channel),
+        str(one.channel._replace(unit=unit)),
         use,
         one.samples,
         one.missing,
-        one.mean,
-        one.rms,
-        *(end.value for end in ends),
+        factor * one.mean,
+        factor * one.rms,
+        *(factor * end.value for end in ends),
         *(100 * end.samples / one.samples for end in ends),
         max(end.run for end in ends),
         *(one.band or (None, None)),

@@ -14,7 +14,9 @@ from matplotlib.image import imread
 from scipy.io import savemat
 from scipy.signal import lfilter
 
+from lfrtorch._support.tables import number
 from lfrtorch.cli import config, preview
+from lfrtorch.records import Channel
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import survey_measurement
 from lfrtorch.survey.notes import examine
@@ -85,6 +87,15 @@ def test_one_command_gives_table_notes_and_figure(file: Path, run):
     assert "- output 'level' has its largest value 0.3" in said
     assert out.count("\n- ") == 2
     assert len(np.asarray(imread(file.parent / "lab_preview.png"))[0]) > 1000
+
+
+def test_numbers_of_small_signals_have_a_prefix(signals):
+    small = 1e-5 * signals["level"]
+    found = survey_measurement(signals["force"], small, FS, outputs=(Channel("level", "m"),))
+    row = preview.row(found.outputs[0], found)
+    assert row[0] == "level (µm)"
+    assert row[7] == pytest.approx(3.0)
+    assert str(row[-1]).startswith(f"~ {number(1e6 * (found.outputs[0].noise or 0), 4)}")
 
 
 @pytest.mark.numeric
