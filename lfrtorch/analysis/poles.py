@@ -17,7 +17,8 @@ from lfrtorch.model import Model
 def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | None]]:
     """Poles or zeros z = exp(s / fs) as frequency |s| / 2π in Hz, damping ratio and radius of z.
 
-    A conjugate pair counts once.
+    A conjugate pair counts once. The frequency is at most fs / 2, that of a negative root, which
+    alternates from sample to sample; of a root at 0 it is not known.
 
     Example:
         >>> from lfrtorch.analysis.poles import frequency_and_damping
@@ -36,7 +37,7 @@ def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | 
             {
                 "real": float(z.real),
                 "imag": float(z.imag),
-                "frequency": frequency if math.isfinite(frequency) else None,
+                "frequency": min(frequency, fs / 2) if math.isfinite(frequency) else None,
                 "damping": damping,
                 "radius": radius,
             }

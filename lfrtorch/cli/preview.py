@@ -298,7 +298,8 @@ def numbers(found: Survey) -> str:
     if "periods" in methods:
         legend.append("Noise: the scatter from period to period.")
     if "spectrum" in methods:
-        legend.append("Noise ~: a guess from the quietest part of the spectrum.")
+        follows = " that follows no input" if found.inputs else ""
+        legend.append(f"Noise ~: a guess from the quietest part of the spectrum{follows}.")
     return f"{text}\n{' '.join(legend)}"
 
 

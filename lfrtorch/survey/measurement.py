@@ -80,10 +80,13 @@ def survey_measurement(
     if period is None and nu and length:
         period = find_period(u[whole])
     surveys = []
-    for signal, channel in zip(signals.T, named, strict=True):
+    for i, (signal, channel) in enumerate(zip(signals.T, named, strict=True)):
         part = signal[whole]
         own = period if nu or not length else find_period(part)
-        surveys.append(survey_signal(signal, part, channel, fs=fs or 1.0, period=own))
+        inputs = u[whole] if i >= nu > 0 else None
+        surveys.append(
+            survey_signal(signal, part, channel, fs=fs or 1.0, period=own, inputs=inputs)
+        )
     return Survey(tuple(surveys[:nu]), tuple(surveys[nu:]), fs, whole)
 
 

@@ -37,6 +37,10 @@ LEVELS = 16
 clipped."""
 
 
+SILENT = 1e-10
+"""Power of a combination of inputs, relative to the largest, that counts as none."""
+
+
 class Extreme(NamedTuple):
     """The smallest or largest value: how many samples have it, and how many in a row."""
 
@@ -63,7 +67,8 @@ class SignalSurvey(NamedTuple):
         noise: its estimated rms, ``None`` if it cannot be told from the signal.
         method: of the noise. ``"periods"``: the scatter of whole periods in steady state;
             ``"spectrum"``: a guess, the level of the quietest part of the spectrum as if of white
-            noise: too much if signal is everywhere, too little if a filter took noise away.
+            noise. Of an output it is what does not follow the inputs; of another signal too much
+            if signal is everywhere. Too little if a filter took noise away.
     """
 
     channel: Channel
@@ -88,7 +93,13 @@ class SignalSurvey(NamedTuple):
 
 
 def survey_signal(
-    signal: Array, whole: Array, channel: Channel, *, fs: float = 1.0, period: int | None = None
+    signal: Array,
+    whole: Array,
+    channel: Channel,
+    *,
+    fs: float = 1.0,
+    period: int | None = None,
+    inputs: Array | None = None,
 ) -> SignalSurvey:
     """The numbers of a signal.
 
@@ -98,9 +109,10 @@ def survey_signal(
         channel: its name and unit.
         fs: sampling frequency in Hz.
         period: samples of a period, if it repeats.
+        inputs: what it follows in that part, if it is an output.
 
     Shape:
-        signal: (T,), whole: (up to T,).
+        signal: (T,), whole: (N,), inputs: (N, nu); N is at most T.
     """
     missing = ~np.isfinite(signal)
     known = signal[~missing] if missing.any() else signal
@@ -108,7 +120,7 @@ def survey_signal(
     some = len(values) > 0
     noise, method = None, ""
     if len(values) > 1:
-        noise, method = _noise(whole, period)
+        noise, method = _noise(whole, period, inputs)
     return SignalSurvey(
         channel,
         samples=len(signal),
@@ -160,7 +172,9 @@ def _extreme(signal: Array, values: Array, counts: Integers) -> Extreme:
     return Extreme(float(values[0]), samples, run, bool(clipped))
 
 
-def _noise(signal: Array, period: int | None) -> tuple[float | None, str]:
+def _noise(
+    signal: Array, period: int | None, inputs: Array | None = None
+) -> tuple[float | None, str]:
     """The rms of the noise in a signal, and the method that estimates it."""
     if period is not None:
         count = (len(signal) - find_transient(signal[:, None], period)) // period
@@ -170,6 +184,22 @@ def _noise(signal: Array, period: int | None) -> tuple[float | None, str]:
     length = min(len(signal) // SEGMENTS, LONGEST)
     if length < LEAST or np.ptp(signal) == 0:
         return None, ""
-    _, density = scipy.signal.welch(signal, nperseg=length)  # one-sided, over 0 .. 1/2
+    density = _unexplained(signal, inputs, length)
     noise = float(np.sqrt(np.quantile(density[1:-1], QUIET) / 2))
     return (noise, "spectrum") if noise < LOUD * signal.std() else (None, "")
+
+
+def _unexplained(signal: Array, inputs: Array | None, length: int) -> Array:
+    """One-sided spectral density over 0 .. 1/2 of what does not follow the inputs linearly."""
+    _, density = scipy.signal.welch(signal, nperseg=length)
+    moving = [] if inputs is None else [u for u in inputs.T if np.ptp(u) > 0]
+    segments = len(signal) // length
+    if not moving or len(moving) >= segments:
+        return density
+    u = np.stack(moving) / np.std(moving, axis=1, keepdims=True)
+    _, Suu = scipy.signal.csd(u[:, None], u[None], nperseg=length)
+    _, Suy = scipy.signal.csd(u, signal, nperseg=length)
+    Suu, Suy = np.moveaxis(Suu, -1, 0), Suy.T[:, :, None]
+    followed = (Suy.conj() * (np.linalg.pinv(Suu, rcond=SILENT, hermitian=True) @ Suy)).real
+    left = np.maximum(density - followed.sum(axis=(1, 2)), 0.0)
+    return left * segments / (segments - len(moving))  # some of the noise follows by chance
