@@ -12,15 +12,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from omegaconf import OmegaConf
 
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import parsed
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.preview_words import parser
+from lfrtorch.cli.words import translated
 from lfrtorch.files.formats import BLOCK, Table, open_table
 from lfrtorch.files.time_stamps import UnevenError, in_seconds, is_time, sampling
 from lfrtorch.records import Channel
@@ -36,6 +39,9 @@ RATE = 0.01
 """Relative difference of two sampling frequencies that are the same."""
 
 THOUSANDS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+
+BLA, FILE = (CONF / name for name in ("bla/state_space.yaml", "data/file.yaml"))
+"""Settings whose names the notes use."""
 
 FIGURES = (".png", ".pdf", ".svg")
 
@@ -149,7 +155,8 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
         inputs=[table.columns[i] for i in roles.inputs],
         outputs=[table.columns[i] for i in roles.outputs],
     )
-    sentences += [note.text for note in examine(found, u, y)]
+    words = OmegaConf.create({"bla": OmegaConf.load(BLA), "data": OmegaConf.load(FILE)})
+    sentences += [translated(note.text, words) for note in examine(found, u, y)]
     if found.fs is None:
         remarks.append("no sampling frequency: give --fs; frequencies are in cycles/sample")
     if not roles.inputs:

@@ -26,6 +26,7 @@ from lfrtorch.files.split import SHORTEST, TooShortError, cut
 from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.periods import find_period, find_transient
 from lfrtorch.records import Record
+from lfrtorch.survey.integration import integrators
 
 __all__ = ["load_records"]
 
@@ -293,7 +294,12 @@ class _Reader:
                 said += "; the first period is the transient and is not fitted"
             elif count:
                 said += f"; the first {count} periods are the transient and are not fitted"
-            elif start == "zero" and self.skip is None and not find_transient(y, N):
+            elif (
+                start == "zero"
+                and self.skip is None
+                and not find_transient(y, N)
+                and not any(integrators(u, channel) for channel in y.T)
+            ):
                 said += "; the output is settled from the first sample on: use start='periodic'"
             notes.append(said)
         record = Record(

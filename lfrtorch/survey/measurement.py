@@ -83,9 +83,9 @@ def survey_measurement(
     for i, (signal, channel) in enumerate(zip(signals.T, named, strict=True)):
         part = signal[whole]
         own = period if nu or not length else find_period(part)
-        inputs = u[whole] if i >= nu > 0 else None
+        followed = u[whole] if i >= nu > 0 else None
         surveys.append(
-            survey_signal(signal, part, channel, fs=fs or 1.0, period=own, inputs=inputs)
+            survey_signal(signal, part, channel, fs=fs or 1.0, period=own, inputs=followed)
         )
     return Survey(tuple(surveys[:nu]), tuple(surveys[nu:]), fs, whole)
 

@@ -11,7 +11,9 @@ import scipy
 from lfrtorch._support.types import Array
 from lfrtorch.records import Record, as_records
 from lfrtorch.survey.causality import TwoSidedResponse, two_sided_response
+from lfrtorch.survey.integration import integrators
 from lfrtorch.survey.measurement import Survey, survey_measurement
+from lfrtorch.survey.mechanics import reacting, rubs
 from lfrtorch.survey.signal import SignalSurvey, longest_run
 
 SHORT = 300
@@ -30,7 +32,7 @@ record, which is looked at in STRETCHES parts."""
 STUCK = 0.1
 """Share of the record in which an output does not change at all, while an input does."""
 
-OVERSAMPLED, WANTED = 50, 10
+OVERSAMPLED, WANTED = 30, 10
 """A record is oversampled if all power lies below fs / OVERSAMPLED; decimation leaves it below
 fs / WANTED."""
 
@@ -232,8 +234,7 @@ def _excitation(found: Survey, u: Array) -> Iterator[Note]:
         yield Note(
             "oversampled",
             f"all power lies below {highest:.3g} {unit}, fs / {fs / highest:.0f}: the record is "
-            f"oversampled; decimate by {factor} (scipy.signal.decimate) for a fit that is "
-            "faster and better conditioned.",
+            f"oversampled; decimate by {factor} (scipy.signal.decimate) for a faster fit.",
         )
     period = found.inputs[0].period if found.inputs else None
     if period is not None and period < T < 2 * period:
@@ -274,10 +275,37 @@ def _relations(found: Survey, u: Array, y: Array) -> Iterator[Note]:
                 "swapped? (Or a controller makes the input from the output.)",
             )
             return
+    counts = [integrators(u, channel) for channel in y.T]
+    noisy = "" if any(counts) else ", and refine='prediction' if it is noisy"
+    moving = [one for one, signal in zip(found.inputs, u.T, strict=True) if np.ptp(signal) > 0]
+    for one, part in zip(moving, reacting(u, y), strict=True):
+        if part:
+            yield Note(
+                f"feedback {one.channel.name}",
+                f"input '{one.channel.name}' reacts to the output: a controller closes the loop "
+                f"and noise biases a model; use feedthrough=False{noisy}.",
+            )
     for i, output in enumerate(found.outputs):
         pairs = {j: pair for (k, j), pair in between.items() if k == i}
-        name = output.channel.name
-        if pairs and sum(p.coherence - p.chance for p in pairs.values()) < UNRELATED:
+        name, integrates = output.channel.name, counts[i]
+        if integrates:
+            yield Note(
+                f"integrates {name}",
+                f"output '{name}' integrates: use integrators={integrates} and "
+                "start='estimated'; it has no steady state.",
+            )
+        force = next((j for j in range(u.shape[1]) if rubs(u[:, j], y[:, i])), None)
+        if force is not None:
+            yield Note(
+                f"friction {name}",
+                f"input '{found.inputs[force].channel.name}' changes with the direction of "
+                f"'{name}': dry friction or play; take nx so large that a state can be the speed.",
+            )
+        if (
+            not integrates
+            and pairs
+            and sum(p.coherence - p.chance for p in pairs.values()) < UNRELATED
+        ):
             yield Note(
                 f"unrelated {name}",
                 f"hardly anything of output '{name}' follows from the inputs linearly: other "
@@ -297,7 +325,8 @@ def _relations(found: Survey, u: Array, y: Array) -> Iterator[Note]:
                     f"'{found.inputs[j].channel.name}' to output '{name}': shift the output by it, "
                     "or a model spends as many states on it.",
                 )
-        yield from _drift(output, y[:, i], u)
+        if not integrates:
+            yield from _drift(output, y[:, i], u)
 
 
 def _first(pair: TwoSidedResponse) -> bool:

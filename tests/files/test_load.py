@@ -488,6 +488,16 @@ def test_settled_data_from_rest_are_noted(tmp_path):
 
 
 @pytest.mark.numeric
+def test_no_steady_state_is_advised_for_a_system_that_integrates(tmp_path):
+    """Its output repeats if the mean of the input is 0, and would not if it were simulated."""
+    u = np.tile(np.random.default_rng(0).standard_normal(N), 5)
+    u -= u.mean()
+    write(tmp_path / "a.csv", np.stack([u, np.cumsum(u)], axis=1), "u,y")
+    notes = load_records(tmp_path / "a.csv", **PERIODIC).notes
+    assert notes[0] == f"the input repeats every {N} samples, 5 times"
+
+
+@pytest.mark.numeric
 def test_steady_state_is_cut_to_whole_periods(tmp_path):
     table = periodic(tmp_path / "a.csv", 7, more=40)
     data = load_records(tmp_path / "a.csv", **PERIODIC, start="periodic")

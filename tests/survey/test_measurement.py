@@ -70,6 +70,14 @@ def test_noise_by_the_quiet_part_of_the_spectrum(rng):
     assert (white.noise, white.method) == (None, "")
 
 
+@pytest.mark.parametrize("noise", [0.01, 0.1])
+def test_noise_of_an_output_whose_spectrum_is_nowhere_quiet(noise: float, rng):
+    u = rng.standard_normal((T, 2))
+    y = lfilter([0, 1], [1, -0.9], u @ [1.0, 0.5])
+    output = survey_measurement(u, y + noise * rng.standard_normal(T)).outputs[0]
+    assert output.noise == pytest.approx(noise, rel=0.5)
+
+
 def test_signals_without_roles_have_periods_of_their_own(rng):
     both = np.column_stack([np.tile(rng.standard_normal(64), 64), rng.standard_normal(T)])
     found = survey_measurement(np.empty((T, 0)), both)

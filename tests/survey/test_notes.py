@@ -75,12 +75,12 @@ def test_nothing_is_said_of_usual_systems(system, coloured, u):
         u = sosfilt(butter(3, 0.3, output="sos"), u)
     y = SYSTEMS[system](u)
     y = y + NOISE * y.std() * np.random.default_rng(2).standard_normal(T)
-    assert found(u, y) == {}
+    assert set(found(u, y)) == ({"integrates"} if system == "integrator" else set())
     assert ("swapped" in found(y, u)) == (system in REVERSED) or coloured
 
 
 def test_an_integrator_fed_through_is_not_swapped(u):
-    assert found(lfilter([1, -1], [1], u), u) == {}
+    assert set(found(lfilter([1, -1], [1], u), u)) <= {"integrates"}
 
 
 def test_feedback_is_not_swapped(rng):
@@ -247,6 +247,74 @@ def test_drift(u):
     assert "drifts by 1" in found(u, y + line)["drift"]
     assert found(u, y + 0.1 * line) == {}
     assert found(u + line, lag(u + line)) == {}  # its cause is the input's
+
+
+def test_integrating_output(u):
+    """Of all inputs, and no matter what the noise is; the line that it drifts along is its own."""
+    y = lfilter([0, 1], np.poly([1.0, 0.9]), u + 0.1)
+    said = found(u, y)
+    assert set(said) == {"integrates"}
+    assert "use integrators=1 and start='estimated'" in said["integrates"]
+    slow = np.convolve(u, np.ones(20) / 20, "same")
+    twice = found(slow, np.cumsum(np.cumsum(slow)))
+    assert "integrators=2" in twice["integrates"]
+    both = found(np.column_stack([u, u[::-1]]), lfilter([0, 1], [1, -1], u - 2 * u[::-1]))
+    assert set(both) == {"integrates"}
+
+
+@pytest.mark.parametrize("constants", [5, 10, 50])
+def test_a_slow_system_does_not_integrate(constants, u):
+    """It forgets several times in the record."""
+    assert found(u, lag(u, 1 - constants / T)) == {}
+
+
+def test_a_random_walk_that_no_input_makes_does_not_integrate(u, rng):
+    assert "integrates" not in found(u, np.cumsum(rng.standard_normal(T)))
+
+
+def drive(friction: float, noise: float, *, feedback: bool = True) -> tuple[Array, Array]:
+    """Force and position of a mass under a controller of the measured position."""
+    rng = np.random.default_rng(0)
+    e, wanted = noise * rng.standard_normal(T), np.repeat(rng.uniform(-1, 1, T // 200), 200)
+    u, y = np.zeros(T), np.zeros(T)
+    x, v, last = 0.0, 0.0, 0.0
+    for k in range(T):
+        y[k] = x + e[k]
+        u[k] = 0.5 * (wanted[k] - last) - 3 * v + 0.02 * rng.standard_normal()
+        last = y[k] if feedback else x
+        held = v == 0 and abs(u[k]) < friction
+        force = 0.0 if held else u[k] - friction * np.sign(v if v else u[k])
+        after = 0.95 * v + 0.05 * force
+        v = 0.0 if friction and after * v < 0 else after
+        x += 0.1 * v
+    return u, y
+
+
+def test_dry_friction():
+    said = found(*drive(0.1, 0.0))
+    assert "input 'u1' changes with the direction of 'y1'" in said["friction"]
+    assert set(found(*drive(0.0, 0.0))) == {"integrates"}
+
+
+def test_a_binary_force_is_no_friction(u):
+    u = np.repeat(np.sign(u[: T // 50]), 50)
+    assert "friction" not in found(u, lag(u, noise=0))
+
+
+def test_feedback():
+    said = found(*drive(0.0, 0.1))
+    assert "input 'u1' reacts to the output" in said["feedback"]
+    assert "prediction" not in said["feedback"]
+    assert set(found(*drive(0.0, 0.1, feedback=False))) == {"integrates"}
+
+
+def test_feedback_of_a_system_that_forgets(rng):
+    u, y, x = np.zeros(T), np.zeros(T), 0.0
+    for k in range(T):
+        u[k] = rng.standard_normal() - 0.5 * y[k - 1]
+        y[k] = x + 0.5 * rng.standard_normal()
+        x = 0.9 * x + 0.1 * u[k]
+    assert "feedthrough=False, and refine='prediction'" in found(u, y)["feedback"]
 
 
 def test_unrelated(u, rng):
