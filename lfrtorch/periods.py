@@ -25,7 +25,7 @@ _EXACT = 1e-9  # difference of what repeats exactly, far above rounding
 _FASTER = 0.75  # of the record: the largest shift that is looked at
 
 _SETTLED = 2.0
-"""Largest mean square difference of a period in steady state from the last one, relative to
+"""Largest mean square difference of a period in steady state from the next one, relative to
 noise."""
 
 _SMALL = 1e-5  # rms difference over that of the output which is no transient, noise or not
@@ -112,7 +112,7 @@ def _differences(u: Array) -> Array:
 def find_transient(y: Array, period: int) -> int:
     """Samples of the whole first periods in which the outputs have not settled.
 
-    These are the periods, from the first on, that differ from the last one by more than the last
+    These are the periods, from the first on, that differ from the next one by more than the last
     two from each other. Of two periods the end of their difference is taken for noise.
 
     Args:
@@ -130,7 +130,8 @@ def find_transient(y: Array, period: int) -> int:
     if count < 2:
         return 0
     periods = y[: count * period].reshape(count, period, -1)
-    difference = (periods[:-1] - periods[-1]) ** 2  # (count - 1, period, ny)
+    # From the next one, not from the last: a drift is no transient.
+    difference = np.diff(periods, axis=0) ** 2  # (count - 1, period, ny)
     size = difference.mean(axis=1)
     noise = size[-1] if count > 2 else difference[0, -(period // _TAIL) - 1 :].mean(axis=0)
     least = (_SMALL * np.std(y, axis=0)) ** 2

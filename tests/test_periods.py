@@ -158,6 +158,11 @@ def test_the_worst_output_counts():
     assert find_transient(both, N) == 2 * N
 
 
+def test_a_drift_is_no_transient():
+    gain = 1 + np.linspace(0, 0.05, 9 * N)
+    assert find_transient(settling(9, 1e-4, 1e-3) * gain, N) == N
+
+
 def test_one_period_shows_no_transient():
     assert find_transient(settling(1, 0.1), N) == 0
     assert find_transient(np.resize(multi(), 2 * N - 1), N) == 0

@@ -61,11 +61,10 @@ class ExcelTable(Table):
             raise refusal or InputError(f"'{self._file}' has no sheet.")
         self._sheet, (self._first, self._used, headers, units, self._dates) = with_samples[0]
         super().__init__(path, headers, units=units)
-        others = [one for one, _ in with_samples[1:]]
-        if others:
+        if len(with_samples) > 1:
             self.notes = (
-                f"the sheet {self._sheet!r} is read; '{self._file}#{others[0]}' is "
-                + ("the other one" if len(others) == 1 else f"another one, of {_listed(others)}"),
+                f"the sheet {self._sheet!r} is read, the first of {len(with_samples)} with "
+                f"samples; '{self._file.name}#{with_samples[1][0]}' is the next",
             )
 
     def _layout(self, sheet: Any) -> tuple[int, list[int], tuple[str, ...], dict, frozenset[int]]:

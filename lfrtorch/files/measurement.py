@@ -87,8 +87,8 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
         rate = find_rate(table, columns)
         if rate is None:
             raise InputError(
-                f"the sampling frequency of '{path}' is not given; say it in Hz with "
-                f"fs{_suggested(table, columns)}."
+                f"the sampling frequency of '{path}' is not known; give fs=HZ"
+                f"{_suggested(table, columns)}."
             )
         fs, stamps = rate.fs, rate.stamps
         columns = (*columns, *stamps)
@@ -283,7 +283,7 @@ def _suggested(table: Table, columns: Sequence[int]) -> str:
     """The column that may be time, or why none is, as the end of a message."""
     _, reasons = _beside(table, columns, named=True)
     if reasons:
-        return f": {reasons[0]}"
+        return f"; {reasons[0]}"
     # A counter of samples is a grid of 1 Hz.
     grids = [(c, g) for c, g in _beside(table, columns, named=False)[0] if g.fs != 1]
     if not grids:

@@ -529,7 +529,9 @@ def test_sheets_and_cells_of_excel(tmp_path):
     path = book(tmp_path / "a.xlsx", Cover=words, Run1=numbers, Run2=numbers[:9], Notes=words)
     table = open_table(path)
     assert len(table.read([0])) == T
-    assert table.notes == (f"the sheet 'Run1' is read; '{path}#Run2' is the other one",)
+    assert table.notes == (
+        "the sheet 'Run1' is read, the first of 2 with samples; 'a.xlsx#Run2' is the next",
+    )
     assert len(open_table(f"{path}#Run2").read([0])) == 8
     with pytest.raises(ValueError, match="has no sheet 'Run3'; it has 'Cover', 'Run1', 'Run2'"):
         open_table(f"{path}#Run3")

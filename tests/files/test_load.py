@@ -295,11 +295,11 @@ def test_no_sampling_frequency(tmp_path):
     count = np.arange(300.0)[:, None]
     both = np.hstack([count, count / 20, np.cos(count), np.sin(count)])
     write(path, both, "n,x,u,y")
-    refused(r"fs, or by a column of time stamps: time='x' \(20 Hz\)", path, use=use)
+    refused(r"fs=HZ, or by a column of time stamps: time='x' \(20 Hz\)", path, use=use)
     write(path, both[:, [0, 2, 3]], "n,u,y")
-    refused(r"say it in Hz with fs\.$", path, use=use)
+    refused(r"is not known; give fs=HZ\.$", path, use=use)
     write(path, both[:, [3, 2, 3]], "t,u,y")
-    refused(r"say it in Hz with fs: the column 't' does not rise", path, use=use)
+    refused(r"give fs=HZ; the column 't' does not rise", path, use=use)
 
 
 def test_a_column_that_is_named_as_time_is_the_time(tmp_path):

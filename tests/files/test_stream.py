@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from lfrtorch.files.stream import FileStream
 from lfrtorch.records import Channel
@@ -170,3 +171,21 @@ def test_a_parquet_file_is_not_read_ahead(tmp_path: Path):
     blocks = opened(tmp_path / "x.parquet").blocks(n)
     held = max(pa.total_allocated_bytes() - before for _ in blocks)
     assert held < groups * 2 * n * 8 / 4  # a quarter of the file
+
+
+def test_the_rate_that_the_file_says_is_the_models(tmp_path: Path):
+    path = tmp_path / "x.mat"
+    signals = {"u1": U[:, 0], "u2": U[:, 1]}
+    taken = "the column 't' is taken for the time, 750 Hz; fs=HZ leaves it unread"
+    for found, note in (
+        ({}, "nothing says how it is sampled; the model's 750 Hz are taken"),
+        ({"Ts": 1 / FS}, "fs is 750 Hz, as 'Ts' in the file says"),
+        ({"t": TIMES}, taken),
+    ):
+        savemat(path, signals | found)
+        stream = opened(path, find_time=True)
+        assert stream.note == note
+        assert bool(stream.times) == ("t" in found)
+    savemat(path, signals | {"fs": 400.0})
+    refused("as 'fs' in the file says, and the model runs at 750 Hz", path, find_time=True)
+    read(path)
