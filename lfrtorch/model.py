@@ -269,8 +269,7 @@ def simulate_blocks(
         if lost.any():
             raise InputError(
                 f"the model diverges: its output is not finite at sample {first + lost.argmax()}; "
-                "check the units of the inputs and whether they are louder than those it was "
-                "fitted to, or start from another state."
+                "are the inputs in its units, and no louder than those that it was fitted to?"
             )
         yield y
         first, state = first + len(u), trajectory.x[0, -1].numpy()

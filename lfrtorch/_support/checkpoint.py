@@ -100,7 +100,7 @@ def _located(folder: Path, inside: Sequence[str]) -> Path:
     if folder.is_file():
         raise InputError(
             f"'{folder}' is a file, and a checkpoint is a folder with {DESCRIPTION} and {WEIGHTS}; "
-            f"give that folder, or the folder of a run. Other files ({', '.join(CODE[:4])}) may "
+            f"give that folder, or the folder of a run.\nOther files ({', '.join(CODE[:4])}) may "
             "carry code and are never opened."
         )
     places = [folder, *(folder / name for name in inside)]
@@ -125,7 +125,7 @@ def _located(folder: Path, inside: Sequence[str]) -> Path:
             f"'{folder}' is not a checkpoint: no {DESCRIPTION} in it or in its "
             f"{' or '.join(f'{name}/' for name in inside)} folder; "
             "give the folder of a run or of a saved model."
-            + (f" {', '.join(code)} may carry code and is never opened." if code else "")
+            + (f"\n{', '.join(code)} may carry code and is never opened." if code else "")
         )
     if code:
         raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterable, Sequence
 from statistics import median_high
 
@@ -35,7 +36,25 @@ PLAIN = 0.1, 1000.0
 NEAR, ROUNDING = 1e-3, 1e-12
 """Distances from the unit circle: of poles whose four digits would not tell, and of none."""
 
+WIDEST = 160
+"""Characters of a line of a message."""
+
 Cell = str | int | float | None
+
+
+def in_lines(text: str) -> str:
+    """A sentence whose first line is not too long to be read; a table stays as it is.
+
+    Example:
+        >>> from lfrtorch._support.tables import in_lines
+        >>> in_lines("the input is constant")
+        'the input is constant'
+    """
+    if "\n" in text:
+        return text
+    return textwrap.fill(
+        text, WIDEST, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+    )
 
 
 def number(value: float | None, digits: int = DIGITS) -> str:

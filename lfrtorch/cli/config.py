@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ from torch.nn import Module
 import lfrtorch
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.words import translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings, SizesSearch
@@ -75,12 +77,13 @@ def opened(cfg: DictConfig) -> lfrtorch.Model:
 
 
 def loaded(cfg: DictConfig) -> Dataset:
-    """The records; what is to be known of them is printed."""
+    """The records; what is to be known of them is printed, and kept for the report."""
     dataset: Dataset = instantiate(cfg.data)
     measured = [record for record in dataset.train if record.source == "file"]
-    for note in (*dataset.notes, *(notes_on(measured) if measured else ())):
-        print(f"note: {translated(note, cfg)}")
-    return dataset
+    notes = (*dataset.notes, *(notes_on(measured) if measured else ()))
+    for note in notes:
+        print(in_lines(f"note: {translated(note, cfg)}"))
+    return replace(dataset, notes=notes)
 
 
 def require_data(cfg: DictConfig) -> None:

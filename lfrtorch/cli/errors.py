@@ -12,6 +12,7 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig
 
 from lfrtorch._support.errors import LfrtorchError
+from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.interrupts import TerminatedError
 from lfrtorch.cli.words import translated
 
@@ -27,7 +28,7 @@ def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None
 
     def show(message: str) -> None:
         text = message if cfg is None else translated(message, cfg)
-        print(f"{error}: {text}", file=sys.stderr)
+        print(in_lines(f"{error}: {text}"), file=sys.stderr)
 
     try:
         yield

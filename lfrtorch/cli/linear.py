@@ -59,7 +59,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     assert model.fit is not None
     for note in notes:
         if note not in model.fit.notes:
-            print(f"note: {translated(note, cfg)}")
+            print(tables.in_lines(f"note: {translated(note, cfg)}"))
 
     found = numbers(model, dataset, frf, scan)
     found |= {

@@ -152,8 +152,8 @@ def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
         ratio = (beginning / settled.rmse)[transient].max()
         notes.append(
             f"the error over the first {BEGINNING} scored samples is {tables.number(ratio)} "
-            "times that of the rest: start=estimated finds the state that the file starts from, "
-            "skip=N leaves out the transient"
+            "times that of the rest: start=estimated finds the start state, skip=N leaves out the "
+            "transient"
         )
     return notes
 

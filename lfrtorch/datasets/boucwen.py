@@ -129,7 +129,7 @@ def load(
     if 0 in offsets or _TEST_OFFSET in offsets:
         raise InputError(
             f"validation_seed_offset={validation_seed_offset} and {len(levels) - 1} level(s) of "
-            "selection_rms: none may be the training or simulated test realisation "
+            "selection_rms: none may be the training or simulated test realisation\n"
             f"(offsets 0 and {_TEST_OFFSET}); use for example 1000."
         )
     folder = _official_folder(root, download)
@@ -383,7 +383,7 @@ def _official_folder(root: str | Path | None, download: bool) -> Path:
     if not any(path.is_file() for test in _TESTS for path in _pair(folder, test)):
         raise FileNotFoundError(
             f"no Bouc-Wen test files in '{root}': expected '{_FILES}/uval_multisine.mat', "
-            "yval_multisine.mat, uval_sinesweep.mat and yval_sinesweep.mat below it. Give the "
+            "yval_multisine.mat, uval_sinesweep.mat and yval_sinesweep.mat below it.\nGive the "
             "folder that holds 'BoucWen', or leave root out to simulate the tests."
         )
     return folder

@@ -146,7 +146,7 @@ def _checked(levels: Sequence[int], validation_level: int) -> list[int]:
     if len(chosen) < 2 or len(set(chosen)) < len(chosen):
         raise InputError(
             f"levels is {levels} and validation_level is {validation_level}; give one or "
-            f"more of {', '.join(map(str, _ESTIMATION))} to train, for example [1, 3, 7], and "
+            f"more of {', '.join(map(str, _ESTIMATION))} to train, as [1, 3, 7], and "
             "another one of them to validate on, each once."
         )
     return chosen[:-1]

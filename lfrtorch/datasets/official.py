@@ -74,13 +74,13 @@ def find(
         path = _present(below, (file, *others))
         if path is None:
             raise FileNotFoundError(
-                f"nonlinear_benchmarks.{loader}() left no '{file}' in '{below}'; it downloads "
-                "nothing if an archive is there already, even an empty one: remove that from "
-                f"'{below / file.partition('/')[0]}' and try again."
+                f"nonlinear_benchmarks.{loader}() left no '{file}' in '{below}'; if an archive is "
+                f"there, even an empty one, remove that from '{below / file.partition('/')[0]}' "
+                "and try again."
             )
     if path is None:
         raise FileNotFoundError(
-            f"there is no '{file}' in '{below}'. Give the folder that holds "
+            f"there is no '{file}' in '{below}'.\nGive the folder that holds "
             f"'{file.partition('/')[0]}' with root=DIR, or have it downloaded: pip install "
             f"'lfrtorch[bench]', then download=True (nonlinear_benchmarks.{loader}())."
         )
@@ -192,7 +192,7 @@ def held_out(samples: int, validation: float, least: int = 1) -> int:
         raise InputError(
             f"validation is {validation}, which leaves {samples - count} of the {samples} "
             f"estimation samples for training, and {count} to validate on; it needs {least} and 1 "
-            "at least: give a fraction like 0.2."
+            "at least:\ngive a fraction like 0.2."
         )
     return count
 
@@ -225,7 +225,7 @@ def _download(below: Path, file: str, loader: str) -> None:
     except ImportError as error:
         raise FileNotFoundError(
             f"there is no '{file}' in '{below}', and the package that downloads it cannot be "
-            f"imported ({error}): pip install 'lfrtorch[bench]'. Or give the folder that holds "
+            f"imported ({error}):\npip install 'lfrtorch[bench]'. Or give the folder that holds "
             f"'{file.partition('/')[0]}' with root=DIR."
         ) from error
     below.mkdir(parents=True, exist_ok=True)

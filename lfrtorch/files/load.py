@@ -157,7 +157,7 @@ def load_records(
         reader.note(
             "",
             "the parts of a record have the same input in every period: validation and test show "
-            "noise rather than how the model does on other inputs; give them records of their own",
+            "noise, and no other inputs; give them records of their own",
         )
     for use, records in parts.items():
         if len(records) == 1:
@@ -283,8 +283,7 @@ class _Reader:
             if T - skip < SHORTEST:
                 raise TooShortError(
                     f"record '{name}' has {max(T - skip, 0)} scored samples of {T}, with "
-                    f"skip={skip}; it needs {SHORTEST}: give a longer record or a smaller skip=N, "
-                    "or leave this one out."
+                    f"skip={skip}; it needs {SHORTEST}: give a longer record or a smaller skip=N."
                 )
         notes = []
         if N is not None and (automatic or settling):

@@ -38,8 +38,7 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
     if steady and total - sum(held) < 1:
         raise TooShortError(
             f"record '{record.name}' has {total} whole period(s) after the transient, and "
-            f"{', '.join(names)} need one each; give a longer record, set validation or "
-            "test to 0, or use start='zero'."
+            f"{', '.join(names)} need one each; set validation or test to 0, or start='zero'."
         )
     ends = [total - sum(held)]
     for count in held:
@@ -53,8 +52,8 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
             if end - first < SHORTEST:
                 raise TooShortError(
                     f"record '{record.name}': the {name} part has {max(end - first, 0)} scored "
-                    f"samples of {total}, with skip={record.skip}; it needs {SHORTEST}. Change the "
-                    "fractions or skip, or give a longer file."
+                    f"samples of {total}, with skip={record.skip}; it needs {SHORTEST}: change the "
+                    "fractions or skip."
                 )
             part = replace(record[:end], start=record.start, skip=first)
         parts[name], begin = part, end

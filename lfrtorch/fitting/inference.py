@@ -364,9 +364,8 @@ def infer(
     for record in data:
         if record.start != "periodic":
             raise InputError(
-                f"record '{record.name}' has start={record.start!r}; inference works line by line "
-                "on records in steady state (start='periodic'): use "
-                "initialise(method='zero_output'), init=zero_output, for others."
+                f"record '{record.name}' has start={record.start!r}; inference needs steady state "
+                "(start='periodic'): use initialise(method='zero_output'), init=zero_output."
             )
     plain = initialise(
         bla, data, nz=nz, nw=nw, nn=nn, activation=activation, static=static, seed=seed, dtype=dtype

@@ -218,9 +218,8 @@ def estimate_bla(
         notes += _integrator_notes(data)
     if fit.rmse > POOR and refine != "frequency":
         notes += (
-            f"the model explains little: {100 * fit.rmse:.0f} % of the output's rms remain. Look "
-            "at the columns (are input and output swapped?), for drift (try offset=False if "
-            "the system integrates), a long delay, strong noise or an even nonlinearity.",
+            f"the model explains little: {100 * fit.rmse:.0f} % of the output's rms remain. Are "
+            "columns swapped, or is there drift, a long delay, noise, an even nonlinearity?",
         )
     return replace(model, fit=replace(fit, seconds=time.perf_counter() - clock, notes=notes))
 
@@ -456,8 +455,7 @@ def _notes(problem: LinearLeastSquares, estimate: SubspaceEstimate, found: Refin
             return [
                 *notes,
                 f"the data come from an unstable system: a pole of radius {radius(slowest)} "
-                "explains them much better than any stable model. Look for drift, or for feedback "
-                "around the system.",
+                "explains them much better than any stable model. Look for drift or feedback.",
             ]
     slowest = float(np.abs(np.linalg.eigvals(found.A)).max())
     if slowest > AT_THE_LIMIT:

@@ -313,8 +313,8 @@ def _robust(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
             cov_total = covariance(outer(fitted.residual) / spare, fitted.weights)
     else:
         notes.append(
-            f"total: not available, as {R} experiment(s) of {nu} input(s) leave no freedom after "
-            "G; more realisations give it, or a random odd multisine and method='fast'."
+            f"total: not available, as {R} experiment(s) of {nu} input(s) leave no freedom; "
+            "more realisations give it, or a random odd multisine and method='fast'."
         )
     return FRF(
         spectra.frequencies(lines),
@@ -439,15 +439,14 @@ def _response(spectra: Spectra, lines: Integers) -> Regression:
     if nu > R:
         raise InputError(
             f"{R} record(s) cannot tell {nu} inputs apart at one line; give at least {nu} "
-            "experiments, best of orthogonal multisines (lfrtorch.multisine), or use "
-            "method='local_polynomial'."
+            "experiments (lfrtorch.multisine), or use method='local_polynomial'."
         )
     fitted = regress(spectra.U[lines], spectra.Y[lines], nu)
     if not fitted.determined.all():
         line = lines[np.argmin(fitted.determined)]
         raise InputError(
             f"the inputs of the {R} experiments depend on each other at line {line} "
-            f"({line * spectra.resolution:g} Hz); use orthogonal multisines (lfrtorch.multisine), "
+            f"({line * spectra.resolution:g} Hz); use orthogonal ones (lfrtorch.multisine), "
             "or leave the line out."
         )
     return fitted

@@ -38,7 +38,7 @@ def check_length(records: list[Record], nx: int) -> None:
         raise InputError(
             f"the longest of {len(records)} record(s) has {max(lengths)} samples; order nx={nx} "
             f"with {nu} input(s) and {ny} output(s) needs one of {shortest(nx, nu, ny)}, or many "
-            "shorter ones: record more, or lower nx."
+            "shorter ones:\nrecord more, or lower nx."
         )
 
 
@@ -70,5 +70,5 @@ def excitation_notes(records: list[Record], nx: int) -> list[str]:
         return []
     return [
         f"the input is too narrow: it excites {rank} of the {nu * wanted} directions that "
-        f"order {nx} has (one a frequency and phase); between its frequencies the model is a guess."
+        f"order {nx} has; between its frequencies the model is a guess."
     ]

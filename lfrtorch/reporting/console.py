@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lfrtorch._support.tables import in_lines
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.multistart import iterations_of, schedule
@@ -28,7 +29,7 @@ class Console(Observer):
 
     def say(self, text: str) -> None:
         """Print it."""
-        print(text, flush=True)
+        print(in_lines(text), flush=True)
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]

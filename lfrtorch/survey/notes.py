@@ -171,9 +171,8 @@ def _levels(found: Survey, u: Array, y: Array) -> Iterator[Note]:
             yield Note(
                 f"clipped {name} {what}",
                 f"{kind}'{name}' has its {what} value {end.value:.6g} in {end.samples} samples "
-                f"({100 * end.samples / T:.2g} %), {end.run} in a row: it is clipped. If the "
-                "sensor does it, measure again with more range; if the system does, a model "
-                "can learn it.",
+                f"({100 * end.samples / T:.2g} %), {end.run} in a row: it is clipped; if by the "
+                "sensor, use more range.",
             )
         first, length = longest_run(np.diff(signal) == 0)
         length += 1
@@ -188,9 +187,9 @@ def _levels(found: Survey, u: Array, y: Array) -> Iterator[Note]:
         if T > FEW and one.values > 2 and one.step > COARSE * one.rms:
             yield Note(
                 f"coarse {name}",
-                f"{kind}'{name}' has {one.values} different values, in steps of {one.step:.3g} "
-                f"({100 * one.step / one.rms:.0f} % of its rms): no model comes below an rms error "
-                f"of about {one.step / np.sqrt(12):.2g}; use more of the converter's range.",
+                f"{kind}'{name}' has {one.values} values, in steps of {one.step:.3g} "
+                f"({100 * one.step / one.rms:.0f} % of its rms): an rms error of about "
+                f"{one.step / np.sqrt(12):.2g} is the least; use more of the converter's range.",
             )
     if T < SHORT:
         yield Note(
@@ -218,8 +217,8 @@ def _excitation(found: Survey, u: Array) -> Iterator[Note]:
             yield Note(
                 f"narrow {name}",
                 f"input '{name}' excites {count} frequenc{'y' if count == 1 else 'ies'} or so, "
-                f"{low:.4g} to {high:.4g} {unit}: enough for a linear model of order {count} and "
-                "no more; excite the band where the model is used.",
+                f"{low:.4g} to {high:.4g} {unit}: enough for order {count}; "
+                "excite the band where the model is used.",
             )
         elif high - low < NARROW * (high + low) / 2:
             yield Note(
@@ -308,9 +307,8 @@ def _relations(found: Survey, u: Array, y: Array) -> Iterator[Note]:
         ):
             yield Note(
                 f"unrelated {name}",
-                f"hardly anything of output '{name}' follows from the inputs linearly: other "
-                "columns, times that do not fit, noise, or a purely even nonlinearity, for which "
-                "there is no linear model to start from.",
+                f"hardly anything of output '{name}' follows from the inputs linearly: "
+                "other columns, times that do not fit, noise, or a purely even nonlinearity.",
             )
         for j, pair in pairs.items():
             if (
@@ -349,10 +347,9 @@ def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Note]:
     if share > DRIFT and steady and max(others, default=1.0) < OTHERS:
         yield Note(
             f"drift {output.channel.name}",
-            f"output '{output.channel.name}' drifts by {slope * len(y):.3g} over the record, "
-            f"{abs(slope) * len(y) / output.rms:.1f} times its rms, and no input does: take the "
-            "line off (scipy.signal.detrend) if the sensor drifts; leave it if the system "
-            "integrates.",
+            f"output '{output.channel.name}' drifts by {slope * len(y):.3g} in the record, "
+            f"{abs(slope) * len(y) / output.rms:.1f} times its rms, and no input does: take it "
+            "off if the sensor drifts; leave it if the system integrates.",
         )
 
 
