@@ -52,6 +52,8 @@ class Dataset:
             test and records; tests without an entry have the linear model of all records.
         notes: what a reader of the scores should know of the data, a sentence each.
         seed: that simulated data were drawn with.
+        unscored: records that cannot be scored, each after its use (``"test"``, ...): too few
+            samples to determine the start state and score the rest.
         leaderboard: test records as nonlinearbenchmark.org has them scored: cut by the package
             nonlinear_benchmarks, the start state fitted to the samples that it leaves unscored.
 
@@ -79,6 +81,7 @@ class Dataset:
     linear: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     leaderboard: list[Record] = field(default_factory=list)
     seed: int | None = None
+    unscored: Sequence[tuple[str, Record]] = ()
 
     def __post_init__(self) -> None:
         for use in ("train", "validation", "tests", "selection", "leaderboard"):

@@ -31,6 +31,7 @@ from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
+from lfrtorch.linear.score_window import with_score_windows
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 from lfrtorch.reporting.advice import advise
@@ -115,7 +116,10 @@ def _identified(
     linear, order_scan = linear_model(
         dataset.train, settings, dataset.validation, observer=observer, ranks=ranks
     )
-    settings = replace(settings, nx=linear.nx)
+    settings, known = replace(settings, nx=linear.nx), dataset.notes
+    dataset = with_score_windows(dataset, linear.to_model())
+    for note in dataset.notes[len(known) :]:
+        observer.say(f"note: {note}")
     sizes = choose_sizes(dataset, settings, linear, observer=observer, ranks=ranks, stop=stop)
     if sizes is not None:
         settings = replace(settings, **sizes.chosen.sizes)

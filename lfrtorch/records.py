@@ -67,10 +67,12 @@ class Record:
         fs: sampling frequency in Hz.
         start: ``"zero"`` simulates from x = 0 (at rest at the input's offset), ``"given"`` from
             ``x0``; ``"estimated"`` fits the start state to the record, too: in a fit together with
-            the parameters; in a simulation or a score to the skipped samples alone, or to all if
-            none is skipped; ``"periodic"`` says that the record is a whole number of periods in
-            steady state.
+            the parameters; in a simulation to the skipped samples alone, or to all if none is
+            skipped; ``"periodic"`` says that the record is a whole number of periods in steady
+            state.
         skip: samples at the beginning that are left out of cost and score.
+        skip_more: whether ``skip`` is the least number only: if the start is estimated, a score
+            then leaves out as many as determine the state. Without ``skip`` that is so anyway.
         x0: the given start state, in the coordinates of the model.
         weight: of the squared normalised errors in a fit, one number or one for each output.
         line_weight: of the squared errors in a fit by spectral line, for whole periods without
@@ -111,6 +113,7 @@ class Record:
     x0: Array | None = None
     weight: float | Array = 1.0
     line_weight: Array | None = None
+    skip_more: bool = False
 
     def __post_init__(self) -> None:
         inputs = _channels(self.inputs, self.u, "u")
@@ -233,8 +236,9 @@ class Record:
         u, y = self.u[window], self.y[window]
         period = self.period if self.period is not None and self.period <= len(u) else None
         return replace(
-            self, u=u, y=y, start="zero", skip=0, period=period, x0=None, line_weight=None
-        )
+            self, u=u, y=y, start="zero", skip=0, period=period, x0=None, line_weight=None,
+            skip_more=False,
+        )  # fmt: skip
 
 
 def signals(record: Record) -> str:

@@ -37,9 +37,11 @@ from lfrtorch.cli.words import Terminal, translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.job import linear_model
+from lfrtorch.linear.score_window import fitted, with_score_windows
 from lfrtorch.metrics import rms
 from lfrtorch.reporting import figures as run_figures
 from lfrtorch.reporting import linear_plots
+from lfrtorch.reporting.scores import of_samples
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
@@ -55,6 +57,10 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     model, scan = linear_model(
         data, settings, dataset.validation, observer=Terminal(cfg), ranks=Ranks()
     )
+    known = dataset.notes
+    dataset = with_score_windows(dataset, model.to_model())
+    for note in dataset.notes[len(known) :]:
+        print(f"note: {note}")
     cfg.nx = model.nx
     assert model.fit is not None
     for note in notes:
@@ -121,6 +127,8 @@ def numbers(
     fit = model.fit
     assert fit is not None
     used = {"train": dataset.train, "validation": dataset.validation, "test": dataset.tests}
+    scores = [score(model, r, use) for use, records in used.items() for r in records]
+    scores += [score(None, r, use) for use, r in dataset.unscored]
     found: dict[str, Any] = {
         "bench": dataset.name,
         "nx": model.nx,
@@ -131,7 +139,7 @@ def numbers(
             "reason": fit.reason,
             "seconds": fit.seconds,
         },
-        "scores": [score(model, r, use) for use, records in used.items() for r in records],
+        "scores": scores,
         "poles": frequency_and_damping(model.poles, model.fs),
         "zeros": {
             name: frequency_and_damping(z, model.fs)
@@ -161,17 +169,23 @@ def numbers(
     return found
 
 
-def score(model: lfrtorch.LinearModel, record: lfrtorch.Record, use: str) -> dict[str, Any]:
-    """Simulation errors of each output after the skip window."""
+def score(model: lfrtorch.LinearModel | None, record: lfrtorch.Record, use: str) -> dict[str, Any]:
+    """Simulation errors of each output after the skip window; no model: of one not scored.
+
+    The estimated start of a training record is fitted to all samples, as in the fit.
+    """
     y = record.y[record.skip :]
-    rmse = rms(y - model.simulate(record)[record.skip :], axis=0)
-    deviation = np.std(y, axis=0)
+    rmse = deviation = np.full(y.shape[1], np.nan)
+    if model is not None:
+        y_hat = model.simulate(fitted(record) if use == "train" else record)
+        rmse, deviation = rms(y - y_hat[record.skip :], axis=0), np.std(y, axis=0)
     return {
         "use": use,
         "record": record.name,
         "source": record.source,
         "samples": record.samples,
         "skip": record.skip,
+        "scored": 0 if model is None else len(y),
         "outputs": [
             {
                 "output": channel.name,
@@ -208,13 +222,21 @@ def table(found: dict[str, Any]) -> str:
     """The numbers of a run for people."""
     fit = found["fit"]
     parts = [f"Linear model of order {found['nx']}, {fit['criterion']} error"]
-    about = "use", "record", "source", "samples", "skip"
+    sources = any(s["source"] != "file" for s in found["scores"])
+    about = ["record", "use", *["source"] * sources]
     scores = [
-        [*(s[key] for key in about), o["output"], o["rmse"], o["unit"], in_percent(o["nrmse"])]
+        [
+            *(s[key] for key in about),
+            of_samples(s["scored"], s["samples"]),
+            o["output"],
+            o["rmse"],
+            o["unit"],
+            in_percent(o["nrmse"]),
+        ]
         for s in found["scores"]
         for o in s["outputs"]
     ]
-    head = ["use", "record", "source", "samples", "skip", "output", "RMSE", "unit", "% of std"]
+    head = [*about, "scored", "output", "RMSE", "unit", "% of std"]
     parts.append(tables.table(head, scores, digits=4))
     listed = [["pole", p] for p in found["poles"]]
     listed += [[f"zero {n}".strip(), z] for n, zeros in found["zeros"].items() for z in zeros]

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,13 +32,18 @@ from lfrtorch.cli.words import translated
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import Block, FileStream
 from lfrtorch.files.writer import FORMATS, table_writer
+from lfrtorch.linear.score_window import determining_samples
 from lfrtorch.metrics import BlockScores
+from lfrtorch.reporting.scores import of_samples
 
 BEGINNING = 100
 """Samples in which the transient of a wrong start state would be seen."""
 
 TRANSIENT = 3.0
 """Error there over that of the rest above which it is."""
+
+LOOKED_AT = 10_000
+"""Samples among which those are sought that determine the start state."""
 
 FAR = 6.0
 """Standard deviations of the training input that Gaussian noise and most signals stay within."""
@@ -66,16 +72,16 @@ def simulate(cfg: DictConfig) -> None:
             if not stream.y:
                 missing = ", ".join(stream.missing)
                 print(f"note: '{path}' has no column {missing}, so nothing is scored")
-            x0 = start_state(cfg, model, stream)
-            result = written(model, stream, x0, out, cfg.skip)
+            x0, skip = start_state(cfg, model, stream)
+            result = written(model, stream, x0, out, skip, cfg.skip or 0)
         print(
             f"{out}: {result.samples} samples, {tables.quantity(time.perf_counter() - clock, 's')}"
         )
         for note in noted(result, model, cfg):
             print(f"note: {note}")
-        rows += scored(path, model, result.scores, cfg.skip) if stream.y else []
+        rows += scored(path, model, result) if stream.y else []
     if rows:
-        head = ["file", "output", "unit", "samples", "skip", "RMSE", "NRMSE (%)"]
+        head = ["file", "output", "unit", "scored", "RMSE", "NRMSE (%)"]
         print(f"\n{tables.table(head, rows)}")
 
 
@@ -97,11 +103,22 @@ class Written(NamedTuple):
 
 
 def written(
-    model: lfrtorch.Model, stream: FileStream, x0: Array | None, out: Path, skip: int
+    model: lfrtorch.Model,
+    stream: FileStream,
+    x0: Array | None,
+    out: Path,
+    skip: int | None,
+    asked: int,
 ) -> Written:
-    """Simulate a file block by block into another."""
+    """Simulate a file block by block into another.
+
+    Args:
+        model, stream, x0, out: what is simulated, from where and to where.
+        skip: samples that are not scored; None for all.
+        asked: that the user wants to be skipped.
+    """
     names = [channel.name for channel in model.outputs]
-    scores, settled = (BlockScores(len(names), skip + more) for more in (0, BEGINNING))
+    scores, settled = (BlockScores(len(names), (skip or 0) + more) for more in (0, BEGINNING))
     first, peaks = 0, np.zeros(len(model.inputs))
     read: list[Block] = []
 
@@ -120,7 +137,7 @@ def written(
                 if stream.y:
                     found[name] = block.y[:, i]
                     found[f"{name}_error"] = block.y[:, i] - y_hat[:, i]
-            if stream.y:
+            if stream.y and skip is not None:
                 scores.add(block.y, y_hat)
                 settled.add(block.y, y_hat)
             peaks = np.maximum(peaks, np.abs(model.scaler.normalise_u(block.u)).max(axis=0))
@@ -128,9 +145,9 @@ def written(
             first += len(y_hat)
         if not first:
             raise InputError("there are no samples; give a file with data.")
-        if stream.y and first <= skip:
+        if stream.y and first <= asked:
             raise InputError(
-                f"skip={skip} leaves none of the {first} samples to score; give a smaller one."
+                f"skip={asked} leaves none of the {first} samples to score; give a smaller one."
             )
     return Written(first, scores, settled, peaks)
 
@@ -167,47 +184,70 @@ def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
         )
 
 
-def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> Array | None:
-    """The state to start from; None for zero. How one was estimated is printed."""
+def start_state(
+    cfg: DictConfig, model: lfrtorch.Model, stream: FileStream
+) -> tuple[Array | None, int | None]:
+    """The state to start from, None for zero, and how many samples are not scored, None for all.
+
+    How a state was estimated is printed. It is never fitted to samples that are scored.
+    """
     if cfg.start == "given":
-        return np.array(cfg.x0, dtype=np.float64)
+        return np.array(cfg.x0, dtype=np.float64), cfg.skip or 0
     if cfg.start == "zero":
-        return None
+        return None, cfg.skip or 0
     if not stream.y:
         raise InputError(
             "start=estimated needs measured outputs; name their columns with data.outputs=[...], "
             "or use start=zero."
         )
-    parts, count = [], 0
-    for block in stream.blocks(cfg.estimate):
+    asked = cfg.estimate or cfg.skip
+    parts, count, most = [], 0, asked or LOOKED_AT
+    for block in stream.blocks(most):
         parts.append(block)
         count += len(block.u)
-        if count >= cfg.estimate:
+        if count >= most:
             break
     if not parts:
-        return None
-    u, y = (np.concatenate(part)[: cfg.estimate] for part in list(zip(*parts, strict=True))[1:])
+        return None, cfg.skip
+    u, y = (np.concatenate(part)[:most] for part in list(zip(*parts, strict=True))[1:])
+    if not asked:
+        u, y = (signal[: first_missing(y)] for signal in (u, y))
     record = lfrtorch.Record(u, y, fs=model.fs, start="estimated", name=stream.table.path.name)
+    skip: int | None = len(u)
+    if not asked:
+        skip = determining_samples(model, record)
+        u, y = u[:skip], y[:skip]
+        record = replace(record, u=u, y=y)
     trajectory = model.signals(record)
     fitted = lfrtorch.rmse(record, model.scaler.restore_y(trajectory.y[0].double().numpy()))
     there, at_rest = map(tables.number, (fitted, lfrtorch.rmse(record, model.simulate(u))))
     print(
         f"start: the state is estimated from the first {len(u)} samples of '{record.name}'; RMSE "
-        f"there {there}, from zero state {at_rest}"
-        + (f" (skip={len(u)} leaves them out of the scores)" if cfg.skip < len(u) else "")
+        f"there {there}, from zero state {at_rest} (they are not scored)"
     )
-    return trajectory.x[0, 0].numpy()
+    if skip is None:
+        print(
+            f"note: the first {len(u)} samples of '{record.name}' are too few to determine the "
+            "start state and score the rest: not scored"
+        )
+    return trajectory.x[0, 0].numpy(), None if skip is None else max(skip, cfg.skip or 0)
 
 
-def scored(path: Path, model: lfrtorch.Model, scores: BlockScores, skip: int) -> list[list]:
+def first_missing(y: Array) -> int | None:
+    """Number of the first sample after the first one that lacks an output; None if none does."""
+    missing = ~np.isfinite(y[1:]).all(axis=1)
+    return 1 + int(missing.argmax()) if missing.any() else None
+
+
+def scored(path: Path, model: lfrtorch.Model, result: Written) -> list[list]:
     """Rows of the table of scores, one an output."""
+    scores = result.scores
     return [
         [
             path.name,
             channel.name,
             channel.unit,
-            int(scores.samples[i]),
-            skip,
+            of_samples(int(scores.samples[i]), result.samples),
             finite(scores.rmse[i]),
             tables.in_percent(finite(scores.nrmse[i])),
         ]
@@ -242,8 +282,9 @@ def require(cfg: DictConfig) -> None:
     x0 = cfg.x0 if isinstance(cfg.x0, ListConfig | None) else [None]
     if not all(isinstance(x, int | float) and np.isfinite(x) for x in x0 or []):
         raise InputError(f"x0 is {cfg.x0}; give a list of finite numbers, one a state.")
-    integer("estimate", cfg.estimate, 1)
-    integer("skip", cfg.skip, 0)
+    for name, least in (("estimate", 1), ("skip", 0)):
+        if cfg[name] is not None:
+            integer(name, cfg[name], least)
     if cfg.data.fs is not None:
         number("data.fs", cfg.data.fs, positive=True)
     if f".{cfg.format}" not in FORMATS:

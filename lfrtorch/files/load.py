@@ -96,7 +96,7 @@ def load_records(
         period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
         skip: samples at the beginning of every record that are left out of cost and score.
             Default: the periods that the output takes to settle; 5 % of the record if the input
-            does not repeat.
+            does not repeat, and for the score of an estimated start as many more as determine it.
         gaps: ``"error"`` refuses missing values and missing time stamps, ``"split"`` makes a record
             of every stretch between them.
 
@@ -312,6 +312,7 @@ class _Reader:
             inputs=measured.inputs,
             outputs=measured.outputs,
             period=N,
+            skip_more=self.skip is None and start == "estimated",
         )
         return record, notes
 

@@ -52,6 +52,7 @@ from lfrtorch.fitting.trainer import (
 from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
+from lfrtorch.linear.score_window import settled
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
@@ -98,7 +99,8 @@ def fit(
         models: where to start: a model, or several of which the best is kept. Their weights are
             changed in place.
         train: records that are fitted.
-        validation: records that choose among the iterates.
+        validation: records that choose among the iterates. Of an estimated start as many samples
+            as determine it are not scored; a record that has too few does not choose.
         selection: more records to judge starts on, and not the iterates of one. They should have
             amplitudes that are not fitted: starts that fit alike differ there. (On the Bouc-Wen
             benchmark the sweep's error has a rank correlation of 0.45 with that at the training's
@@ -131,9 +133,9 @@ def fit(
         the best first, and ``averaged`` says of how many the model is the mean.
 
     Raises:
-        ValueError: no model, one that diverges on the training records at the start, fewer records
-            than processes, another number of lists of monitors, or models to average that have no
-            network.
+        ValueError: no model, one that diverges on the training records at the start, validation
+            records that all have too few samples, fewer records than processes, another number of
+            lists of monitors, or models to average that have no network.
         ProcessLostError, StoppedError: before there was an iterate to keep.
 
     Example:
@@ -167,6 +169,7 @@ def fit(
             f"average is {average}, and the mean is of models with a network as their static "
             "nonlinearity; give average=1 for other maps."
         )
+    validation, selection = (_scored(starts[0], some, train) for some in (validation, selection))
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots
     halt = Event()
@@ -252,6 +255,20 @@ def line_of(
         return ProgressLine(every=None)
     unit = models[0].outputs[0].unit
     return StartsLine(len(models), unit, iterations=iterations_of(planned), rounds=False)
+
+
+def _scored(
+    model: Model, records: Record | Sequence[Record], train: Record | Sequence[Record]
+) -> list[Record]:
+    """Those of the records that can be scored, with their windows."""
+    given = as_records(records) if records else []
+    found, _ = settled(model, given, as_records(train))
+    if given and not found:
+        raise InputError(
+            f"record '{given[0].name}' has {given[0].samples} samples, too few to determine the "
+            "start state and score the rest; give a longer one, or none."
+        )
+    return found
 
 
 class _Judge:

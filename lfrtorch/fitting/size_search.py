@@ -49,6 +49,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import MARGIN
+from lfrtorch.linear.score_window import is_open, settled
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, as_records
 
@@ -259,6 +260,10 @@ def search_sizes(
             f"{', '.join(tried)} to numbers."
         )
     ranks = Ranks() if ranks is None else ranks
+    if any(map(is_open, as_records(validation))):  # the same samples for all sizes
+        first = {name: values[0] for name, values in tried.items()}
+        model = start(first, seeds[0]) if linear is None else linear.to_model()
+        validation, _ = settled(model, as_records(validation), as_records(train))
     judge = _Judge(as_records(validation), linear, ranks)
     trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer
     found: list[Candidate] = []

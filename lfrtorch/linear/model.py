@@ -175,14 +175,15 @@ class LinearModel:
         """Simulated output (T, ny) in physical units, from the record's kind of initial state.
 
         A bare input (T, nu) is simulated from rest. A given ``x0`` of a record is in other
-        coordinates; the initial state that fits best takes its place.
+        coordinates; the initial state that fits best takes its place. In that fit all outputs count
+        alike, whatever their units.
 
         Example:
             >>> y_hat = bla.simulate(record)
             >>> y_hat.shape, lfrtorch.nrmse(record, y_hat) < 0.3
             ((400, 1), True)
         """
-        data = without_coordinates(data) if isinstance(data, Record) else data
+        data = without_units(without_coordinates(data)) if isinstance(data, Record) else data
         return self.to_model().simulate(data)
 
     def predict(self, record: Record) -> Array:
@@ -376,6 +377,14 @@ class LinearModel:
         if f.ndim != 1:
             raise InputError(f"the frequencies have shape {f.shape}; give one dimension, in Hz.")
         return np.exp(2j * np.pi * f / self.fs)
+
+
+def without_units(record: Record) -> Record:
+    """The record with weights by which its outputs count alike in a fit in physical units."""
+    if record.y.shape[1] == 1:
+        return record
+    power = np.var(record.y, axis=0)
+    return replace(record, weight=record.weight / np.where(power > 0, power, 1.0))
 
 
 _ARRAYS = ("A", "B", "C", "D", "u_offset", "y_offset")

@@ -34,7 +34,7 @@ from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rms
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.scores import finalists, neurons
+from lfrtorch.reporting.scores import NOT_SCORED, finalists, neurons, of_samples
 from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import LINEAR_MODEL, Verdict, of_linear
 
@@ -186,6 +186,13 @@ def _scores(
                 tests.append([name if row == 0 else "", *cells, *known])
             else:
                 others.append([*([name, USES[use]] if row == 0 else ["", ""]), *cells])
+    for use, record in dataset.unscored:
+        nothing = [*[""] * len(what), *[UNKNOWN] * len(errors)]
+        nothing[len(what) + 1] = NOT_SCORED
+        if use == "test":
+            tests.append([record.name, *nothing, *[""] * len(published)])
+        else:
+            others.append([record.name, USES[use], *nothing])
     references = [f"{p.label}: {p.reference}" for p in published if tests]
     if metrics["linear"]:
         own = ", ".join(f"{test} of {'+'.join(used)}" for test, used in metrics["linear"].items())
@@ -258,8 +265,14 @@ def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
             factor, unit = engineering([moments[1]], channel.unit)
             channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
     records = []
-    for use, r in ((response.use, response.record) for response in responses):
-        records.append([r.name, USES.get(use, use), r.source, r.start, r.samples, r.skip, r.period])
+    used = [(response.use, response.record) for response in responses]
+    for use, r in (*used, *dataset.unscored):
+        count = (
+            NOT_SCORED
+            if (use, r) in dataset.unscored
+            else of_samples(r.samples - r.skip, r.samples)
+        )
+        records.append([r.name, USES.get(use, use), r.source, r.start, count, r.period])
     return {
         "summary": summary,
         "notes": dataset.notes,

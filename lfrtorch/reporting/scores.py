@@ -21,30 +21,41 @@ from lfrtorch.model import Model
 from lfrtorch.records import Record
 from lfrtorch.reporting.verdict import Verdict
 
+NOT_SCORED = "not scored"
+"""What tables say of a record that has too few samples."""
+
 
 @dataclass(frozen=True)
 class Score:
     """Simulation errors on one record, after its skip window.
 
     Args:
-        rmse, lti_rmse: of the model and of the linear model, in ``unit``; None without the latter.
+        rmse, lti_rmse: of the model and of the linear model, in ``unit``; None without the latter,
+            or if the record cannot be scored.
         nrmse: rmse over the standard deviation of the measured output.
         unit: of the outputs.
         source: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
         samples, skip: length of the record, and how many at its beginning do not count.
+        use: ``"test"``, ``"validation"`` or ``"selection"``.
+        scored: how many samples count, 0 of a record that cannot be scored.
     """
 
-    rmse: float
+    rmse: float | None
     lti_rmse: float | None
-    nrmse: float
+    nrmse: float | None
     unit: str
     source: str
     samples: int
     skip: int
+    use: str
+    scored: int
 
 
-def score(model: Model, bla: LinearModel | None, record: Record) -> Score:
+def score(model: Model, bla: LinearModel | None, record: Record, use: str = "test") -> Score:
     """Scores of the model, and of the linear model if there is one, on one record.
+
+    The record says which samples are scored: see
+    :func:`lfrtorch.linear.score_window.with_score_windows` for estimated starts.
 
     Example:
         >>> from lfrtorch.reporting.scores import score
@@ -61,7 +72,15 @@ def score(model: Model, bla: LinearModel | None, record: Record) -> Score:
         source=record.source,
         samples=record.samples,
         skip=record.skip,
+        use=use,
+        scored=record.samples - record.skip,
     )
+
+
+def _unscored(record: Record, use: str) -> Score:
+    """The entry of a record that has too few samples."""
+    unit = ", ".join(dict.fromkeys(c.unit for c in record.outputs))
+    return Score(None, None, None, unit, record.source, record.samples, record.skip, use, 0)
 
 
 def metrics(
@@ -126,8 +145,11 @@ def evaluation(
         dataset, own, command: see :func:`metrics`.
     """
     own = own or {}
-    validation = [score(model, bla, record) for record in dataset.validation]
-    selection = [score(model, bla, record) for record in dataset.selection]
+    validation = [score(model, bla, record, "validation") for record in dataset.validation]
+    selection = [score(model, bla, record, "selection") for record in dataset.selection]
+    lost: dict[bool, dict[str, Any]] = {True: {}, False: {}}
+    for use, record in dataset.unscored:
+        lost[use == "test"][record.name] = asdict(_unscored(record, use))
     entries = {
         "bench": dataset.name,
         "sizes": model.sizes,
@@ -144,12 +166,14 @@ def evaluation(
                     (*validation, *selection),
                     strict=True,
                 )
-            },
+            }
+            | lost[False],
         },
         "scores": {
             record.name: asdict(score(model, own.get(record.name, bla), record))
             for record in dataset.tests
-        },
+        }
+        | lost[True],
         "linear": {name: list(dataset.linear[name]) for name in own},
         "command": command,
         "versions": {
@@ -161,23 +185,24 @@ def evaluation(
 
 
 def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
-    """The benchmark's table: our linear model and NL-LFR beside the published ones, in one unit."""
+    """Our linear model and NL-LFR beside the published ones, in one unit; tests come first."""
     sizes = result["sizes"]
     mine = (sizes["nz"], sizes["nw"])
     others = [p for p in published if p.sizes in (None, mine)]
-    head = ["record", "source", "samples", "skip", "linear", "NL-LFR", *(p.label for p in others)]
+    listed = [*result["scores"].items(), *result["validation"]["records"].items()]
+    sources = any(s["source"] != "file" for _, s in listed)
+    models = ["lti_rmse", "rmse"] if sizes["nz"] else ["rmse"]
+    head = ["record", "use", *["source"] * sources, "scored", *["linear", "NL-LFR"][: len(models)]]
+    head += [p.label for p in others]
     rows = [
-        [name, s["source"], s["samples"], s["skip"], s["lti_rmse"], s["rmse"]]
-        + [p.scores.get(name) for p in others]
-        for name, s in result["scores"].items()
+        [
+            *(name, s["use"], *[s["source"]] * sources, of_samples(s["scored"], s["samples"])),
+            *(s[model] for model in models),
+            *(p.scores.get(name) if s["use"] == "test" else None for p in others),
+        ]
+        for name, s in listed
     ]
-    rows += [
-        [name, "not fitted", s["samples"], s["skip"], s["lti_rmse"], s["rmse"]]
-        + [None] * len(others)
-        for name, s in result["validation"]["records"].items()
-    ]
-    scored = {**result["validation"]["records"], **result["scores"]}
-    units = {s["unit"] for s in scored.values()} - {""}
+    units = {s["unit"] for _, s in listed} - {""}
     title = f"Simulation RMSE{f' ({next(iter(units))})' if len(units) == 1 else ''}"
     static = f"degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])
     title += f", nx {sizes['nx']}, "
@@ -189,6 +214,11 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
         models = ", ".join(f"{n} of {'+'.join(r)}" for n, r in result["linear"].items())
         references.insert(0, f"linear: a model for each of these: {models}")
     return "\n".join([title, "", tables.table(head, rows), *[""] * bool(references), *references])
+
+
+def of_samples(scored: int, samples: int) -> str:
+    """How many samples count, in words."""
+    return f"{scored} of {samples}" if scored else NOT_SCORED
 
 
 def neurons(count: int) -> str:
@@ -222,9 +252,8 @@ def finalists(result: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], str]:
 
 def _pooled(values: list[float | None], scores: list[Score]) -> float | None:
     """RMSE over several records, each with the weight of its scored samples."""
-    counts = [s.samples - s.skip for s in scores]
-    squares = [n * v**2 for n, v in zip(counts, values, strict=True) if v is not None]
-    return (sum(squares) / sum(counts)) ** 0.5 if squares else None
+    squares = [s.scored * v**2 for s, v in zip(scores, values, strict=True) if v is not None]
+    return (sum(squares) / sum(s.scored for s in scores)) ** 0.5 if squares else None
 
 
 def _finite(entry: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.score_window import fitted
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -59,7 +60,10 @@ def respond(
     dataset: Dataset,
     own: Mapping[str, LinearModel],
 ) -> list[Response]:
-    """All records beside their simulations; tests with linear models of their own have those."""
+    """All records beside their simulations; tests with linear models of their own have those.
+
+    Estimated starts of training records are fitted to all samples, as in the fit.
+    """
     used = {
         "train": dataset.train,
         "validation": dataset.validation,
@@ -70,5 +74,6 @@ def respond(
     for use, records in used.items():
         for record in records:
             linear = own.get(record.name, bla) if use == "test" else bla
-            found.append(Response(record, use, linear.simulate(record), model.simulate(record)))
+            driven = fitted(record) if use == "train" else record
+            found.append(Response(record, use, linear.simulate(driven), model.simulate(driven)))
     return found

@@ -78,7 +78,7 @@ def test_scores_are_those_of_the_model_from_the_start_of_each_record(
         assert words in printed.out
     assert "note: the linear model is that of all training records" in printed.out
     rest = next(line for line in printed.out.splitlines() if line.startswith("rest "))
-    assert rest.split()[1:4] == ["simulated", "80", "30"]
+    assert rest.split()[1:6] == ["test", "simulated", "50", "of", "80"]
     assert rest.split()[-2:] == ["0.250", "0.125"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "scores.json"]
 
@@ -104,7 +104,10 @@ def test_without_a_linear_model_its_column_is_empty(tmp_path: Path, monkeypatch,
 def test_the_linear_model_of_a_run_is_scored_as_a_model(run_folder: Path, monkeypatch, capsys):
     out = run_folder / "scores.json"
     run(monkeypatch, f"checkpoint={run_folder / 'linear'}", DATA, f"out={out}")
-    assert "a linear model\n" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "a linear model\n" in printed
+    assert "linear  " in printed.split("record")[1]
+    assert "NL-LFR" not in printed
     alone = json.loads(out.read_text())["scores"]
     run(monkeypatch, f"checkpoint={run_folder}", DATA, f"out={out}", "overwrite=true")
     both = json.loads(out.read_text())["scores"]

@@ -133,9 +133,9 @@ def test_measured_outputs_are_scored(folder: Path, monkeypatch, capsys):
     rows = [line.split() for line in lines if line.startswith("both.csv")]
     for i, row in enumerate(rows):
         rmse = np.sqrt(np.mean(NOISE[100:, i] ** 2))
-        assert row[:5] == ["both.csv", f"y{i + 1}", "mm", "200", "100"]
-        assert float(row[5]) == pytest.approx(rmse, rel=5e-3)
-        assert float(row[6]) == pytest.approx(100 * rmse / np.std(Y[100:, i]), rel=5e-3)
+        assert row[:6] == ["both.csv", f"y{i + 1}", "mm", "200", "of", "300"]
+        assert float(row[6]) == pytest.approx(rmse, rel=5e-3)
+        assert float(row[7]) == pytest.approx(100 * rmse / np.std(Y[100:, i]), rel=5e-3)
     assert len(rows) == 2
 
 
@@ -240,13 +240,42 @@ def test_an_estimated_start_goes_on_where_the_measurement_was_cut(
     assert np.allclose(found["y1_hat"], y[:, 0], rtol=0, atol=1e-8)  # tolerance of the state
     printed = capsys.readouterr().out
     assert "start: the state is estimated from the first 50 samples of 'cut.csv'; RMSE" in printed
-    assert "(skip=50 leaves them out of the scores)" in printed
+    assert [line.split()[3:6] for line in printed.splitlines() if line.startswith("cut.csv ")] == [
+        ["150", "of", "200"]
+    ] * 2
 
 
 @pytest.mark.numeric
-def test_a_file_shorter_than_the_estimate(folder: Path, monkeypatch, capsys):
-    run(monkeypatch, folder, "data.path=both.csv", "out=x.npz", "start=estimated", "skip=299")
-    assert "from the first 300 samples of 'both.csv'" in capsys.readouterr().out
+def test_no_start_is_fitted_to_samples_that_are_scored(folder: Path, monkeypatch, capsys):
+    for words, fitted, scored in (
+        (["skip=299"], 299, "1 of 300"),
+        (["estimate=1000"], 300, "not scored"),
+        (["estimate=50", "skip=70"], 50, "230 of 300"),
+    ):
+        run(monkeypatch, folder, "data.path=both.csv", "out=x.npz", "start=estimated",
+            "overwrite=true", *words)  # fmt: skip
+        printed = capsys.readouterr().out
+        assert f"from the first {fitted} samples of 'both.csv'" in printed
+        assert printed.count(f"  {scored}  ") == 2
+
+
+@pytest.mark.numeric
+def test_as_many_samples_as_determine_the_start_are_left_out(folder: Path, monkeypatch, capsys):
+    run(monkeypatch, folder, "data.path=both.csv", "out=x.npz", "start=estimated")
+    row = next(
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("both.csv ")
+    )
+    scored = int(row.split()[3])
+    assert 200 < scored < 300
+    assert float(row.split()[6]) == pytest.approx(
+        np.sqrt(np.mean(NOISE[-scored:, 0] ** 2)), rel=0.1
+    )
+    short = columns(folder / "both.csv")
+    csv(folder / "short.csv", **{name: column[:10] for name, column in short.items()})
+    run(monkeypatch, folder, "data.path=short.csv", "data.fs=50", "out=y.npz", "start=estimated")
+    printed = capsys.readouterr().out
+    assert "10 samples of 'short.csv' are too few to determine the start state" in printed
+    assert printed.count("not scored  ") == 2
 
 
 # --- long files -----------------------------------------------------------------------------

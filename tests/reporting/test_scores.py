@@ -95,6 +95,8 @@ def test_metrics_are_what_the_model_scores(result):
         "source": "simulated",
         "samples": 300,
         "skip": 5,
+        "use": "test",
+        "scored": 295,
     }
     expected = lfrtorch.rmse(validation, fitted.model.simulate(validation))
     assert metrics["validation"]["rmse"] == pytest.approx(expected, rel=1e-12)
@@ -108,7 +110,10 @@ def test_metrics_are_what_the_model_scores(result):
 
 
 def test_pooled_validation_weighs_samples():
-    scores = [report.Score(3.0, 0, 0, "", "", 110, 10), report.Score(4.0, 0, 0, "", "", 300, 0)]
+    scores = [
+        report.Score(3.0, 0, 0, "", "", 110, 10, "validation", 100),
+        report.Score(4.0, 0, 0, "", "", 300, 0, "validation", 300),
+    ]
     expected = math.sqrt((100 * 9 + 300 * 16) / 400)
     assert report._pooled([s.rmse for s in scores], scores) == pytest.approx(expected)
     assert report._pooled([], []) is None
@@ -120,12 +125,33 @@ def test_table_shows_published_results_of_these_sizes_only(result):
     lines = report.table(metrics, data.published).splitlines()
     assert lines[0] == "Simulation RMSE (V), nx 2, nz 1, nw 1, 3 neurons"
     head, row = lines[2].split(), lines[4].split()
-    assert head == ["record", "source", "samples", "skip", "linear", "NL-LFR", "everybody", "small"]
-    assert row[:4] == ["test", "simulated", "300", "5"]
-    assert float(row[5]) == pytest.approx(metrics["scores"]["test"]["rmse"], rel=5e-3)
-    assert row[6:] == ["0.500", "0.250"]
-    assert lines[5].startswith("validation  not fitted")
+    columns = ["record", "use", "source", "scored", "linear", "NL-LFR", "everybody", "small"]
+    assert head == columns
+    assert row[:6] == ["test", "test", "simulated", "295", "of", "300"]
+    assert float(row[7]) == pytest.approx(metrics["scores"]["test"]["rmse"], rel=5e-3)
+    assert row[8:] == ["0.500", "0.250"]
+    assert lines[5].split()[:3] == ["validation", "validation", "simulated"]
     assert lines[-2:] == ["everybody: A (2001)", "small: B (2002)"]
+
+
+def test_records_that_cannot_be_scored_are_named_without_numbers(result):
+    fitted, bla, data = result
+    lost = [("test", replace(data.tests[0], name="short")), ("validation", data.validation[0])]
+    metrics = report.metrics(
+        fitted, bla, replace(data, validation=[], unscored=lost, published=()), seeds=[0]
+    )
+    assert metrics["scores"]["test"]["rmse"] > 0
+    assert metrics["validation"]["rmse"] is None
+    rows = report.table(metrics, []).splitlines()[4:]
+    for name, of, row in (
+        ("short", metrics["scores"], rows[1]),
+        ("validation", metrics["validation"]["records"], rows[2]),
+    ):
+        assert [of[name][key] for key in ("rmse", "lti_rmse", "nrmse", "scored")] == [None] * 3 + [
+            0
+        ]
+        assert row.startswith(name)
+        assert row.split()[-4:] == ["not", "scored", "–", "–"]
 
 
 def test_what_is_not_finite_becomes_null():
