@@ -28,9 +28,11 @@ def workbook(path: Path) -> tuple[Path, str]:
     """The file of a path and the sheet behind it, empty if it names none.
 
     Example:
+        >>> from pathlib import Path
         >>> from lfrtorch.files.excel import workbook
-        >>> workbook(Path("rig.xlsx#Run 2"))
-        (PosixPath('rig.xlsx'), 'Run 2')
+        >>> file, sheet = workbook(Path("rig.xlsx#Run 2"))
+        >>> file.name, sheet
+        ('rig.xlsx', 'Run 2')
     """
     name, mark, sheet = str(path).rpartition("#")
     file = Path(name)
