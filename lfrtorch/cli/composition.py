@@ -50,8 +50,8 @@ def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) ->
             raise InputError(
                 f"there is no {word.key_or_group}={word.value()}; give {', '.join(choices)}."
             )
-    if any(isinstance(word.value(), Glob) or word.is_interval_sweep() for word in words):
-        return
+    # The values of a glob or an interval are known to the sweeper alone.
+    every = [w for w in every if not (isinstance(w.value(), Glob) or w.is_interval_sweep())]
     cfg = composed(command, [first_run(word) for word in every if is_choice(word)])
     for word in words:
         if not (is_choice(word) or word.is_delete() or taken(word, cfg)):

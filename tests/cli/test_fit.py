@@ -34,6 +34,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 import lfrtorch
+from lfrtorch import InputError
 from lfrtorch.cli import config, errors, fit, interrupts, run_folder, words
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
@@ -249,6 +250,9 @@ def test_init_from_says_which_sizes_it_takes(
     saved = OmegaConf.load(second / "config.yaml")
     assert (saved.nz, saved.nn) == (1, 4)
     assert "nz is 1, that of the model in" in capsys.readouterr().out
+    with pytest.raises(InputError, match="a linear model: give the folder of a run") as told:
+        fit.run(configuration(*arguments, f"init_from={first / 'linear'}"), second)
+    assert "lfrtorch.LinearModel" not in str(told.value)
     with pytest.raises(ValueError, match=r"has the inputs u and the data u \(N\)"):
         fit.run(configuration("+bench=boucwen", f"init_from={first}"), second)
 
