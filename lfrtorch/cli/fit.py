@@ -102,9 +102,10 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             for item in found.advice[:PRINTED]:
                 print(f"next: {item.text}\n      ({item.evidence})")
             if found.verdict.use == LINEAR_MODEL:
+                checkpoint = shlex.quote(f"checkpoint={folder / 'linear'}")
                 print(
-                    f"\nThe linear model: lfrtorch simulate checkpoint={folder / 'linear'} "
-                    "data.path=NEW.csv out=PREDICTED.csv"
+                    f"\nThe linear model: lfrtorch simulate {checkpoint} data.path=NEW.csv "
+                    "out=PREDICTED.csv"
                 )
             print(f"\nRun in {folder}" + f", its report in {folder / 'report.html'}" * cfg.figures)
             print(f"TensorBoard: tensorboard --logdir {folder}")

@@ -59,6 +59,9 @@ ALONE = 1.2
 LOUDER = 1.25
 """Largest test input over the largest in training above which the model extrapolates."""
 
+FEW = 3
+"""Most records or outputs that are named."""
+
 
 class Advice(NamedTuple):
     """A sentence that says what to do or to know.
@@ -204,7 +207,7 @@ def diverges(e: Evidence) -> Advice | None:
     return Advice(
         "The model is not usable yet: "
         + (f"train on inputs as loud as the tests', or use {ridge}." if loud else f"use {ridge}."),
-        f"the NL-LFR diverges on {_listed(e.diverged)}",
+        f"the NL-LFR diverges on {_listed([repr(name) for name in e.diverged])}",
         None if e.ridge else {"ridge": 1e-3},
     )
 
@@ -319,6 +322,8 @@ def hardly_better(e: Evidence) -> Advice | None:
             gain,
         )
     change = _larger(e)
+    if e.linear is None and e.sizes.get("nx"):
+        change = {"nx": e.sizes["nx"] + 1, **change}
     if not e.continued and e.started < 8:
         change = {"starts": 8, **change}
     return Advice(
@@ -335,7 +340,7 @@ def outputs_left_out(e: Evidence) -> Advice | None:
     behind = {name: ratio for name, ratio in e.outputs.items() if ratio > USELESS}
     if not behind or error is None or not linear_error or error > USELESS * linear_error:
         return None
-    ratios = ", ".join(f"{number(ratio)} times on '{name}'" for name, ratio in behind.items())
+    ratios = _listed([f"{number(ratio)} times on '{name}'" for name, ratio in behind.items()])
     change: dict[str, Any] = {name: e.sizes.get(name, 0) + 1 for name in ("nw", "nz")}
     return Advice(
         f"Some outputs gain nothing, or are linear: {_written(change)}.",
@@ -384,8 +389,8 @@ def one_start(e: Evidence) -> Advice | None:
     """Nothing to compare the minimum with."""
     error, linear_error, _ = e.judged
     useless = error is not None and linear_error and error > USELESS * linear_error  # said there
-    if e.started > 1 or e.continued or useless:
-        return None
+    if e.started > 1 or e.continued or useless or e.validation is None:
+        return None  # without validation the start that overfits most would be chosen
     return Advice(
         "Try several starts: starts=8.",
         "one start; fits end in one of several minima",
@@ -398,7 +403,7 @@ def tests_are_louder(e: Evidence) -> Advice | None:
     far = {name: ratio for name, ratio in e.louder.items() if ratio > LOUDER}
     if not far:
         return None
-    ratios = ", ".join(f"'{name}' up to {number(ratio)} times" for name, ratio in far.items())
+    ratios = _listed([f"'{name}' up to {number(ratio)} times" for name, ratio in far.items()])
     return Advice(
         "Some tests extrapolate: train on inputs as loud as those the model is for.",
         f"the largest input, over that in training: {ratios}",
@@ -419,7 +424,7 @@ def largest_sizes(e: Evidence) -> Advice | None:
 
 def choose_sizes(e: Evidence) -> Advice | None:
     """Sizes that were guessed, and validation records that can choose them."""
-    if e.searched or e.continued or e.validation is None or e.parts_differ or e.structured:
+    if e.searched or e.continued or e.validation is None or e.parts_differ:
         return None
     static = "degree" if e.sizes.get("degree") else "nn"
     change: dict[str, Any] = dict.fromkeys(["nx", "nz", "nw", static], "auto")
@@ -448,16 +453,16 @@ RULES = (
     nothing_held_out,
     starts_in_a_transient,
     at_the_noise,
-    still_falling,
     overfits,
     linear_part_incomplete,
     hardly_better,
     outputs_left_out,
     nonlinear_part_incomplete,
+    choose_sizes,
     best_start_alone,
     one_start,
+    still_falling,
     tests_are_louder,
-    choose_sizes,
     largest_sizes,
     noise_unknown,
 )
@@ -490,5 +495,7 @@ def _written(change: Mapping[str, Any]) -> str:
     return ", ".join(f"{name}={value!r}" for name, value in change.items())
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names)
+def _listed(items: Sequence[str]) -> str:
+    """The first of them, and how many more there are."""
+    more = f" and {len(items) - FEW} more" if len(items) > FEW else ""
+    return ", ".join(items[:FEW]) + more

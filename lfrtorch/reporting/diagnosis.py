@@ -26,6 +26,9 @@ AVERAGES = 8
 LONGEST, SHORTEST = 1024, 64
 """Samples of a segment: as long as the memory of an error filter may be, and too few to tell."""
 
+LAGS = 12
+"""Least memory of a filter that is fitted in time, to records too short for segments."""
+
 BEGINNING = 0.05
 """Part of a record that is its beginning."""
 
@@ -145,21 +148,25 @@ def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | No
     linear = coherent_part(inputs, errors)
     both = [np.hstack(pair) for pair in zip(inputs, powers, strict=True)]
     beyond = coherent_part(both, errors)
-    if linear is None or beyond is None:
+    alike = coherent_part(inputs, errors, of=both[0].shape[1])  # by the same filters' memory
+    if beyond is None or alike is None:
         return linear, None
-    return linear, max(0.0, beyond - linear)
+    return linear, max(0.0, beyond - alike)
 
 
-def coherent_part(signals: Sequence[Array], errors: Sequence[Array]) -> float | None:
+def coherent_part(
+    signals: Sequence[Array], errors: Sequence[Array], *, of: int | None = None
+) -> float | None:
     """Part of the errors' power that linear filters of the signals explain, by Welch's method.
 
     At each line, it is the multiple coherence times the error's power. The coherence is corrected
     for its bias with n signals and K segments, as the adjusted R² is. With several outputs the
-    largest part counts.
+    largest part counts. For records too short for that see :func:`filtered_part`.
 
     Args:
         signals: one array a record.
         errors: those of the simulations, one array a record.
+        of: number of signals that the filters' memory is short enough for. Default: n.
 
     Shape:
         signals: (T, n), errors: (T, ny) each.
@@ -169,9 +176,10 @@ def coherent_part(signals: Sequence[Array], errors: Sequence[Array]) -> float | 
     """
     n = signals[0].shape[1]
     T, shortest = sum(map(len, errors)), min(map(len, errors))
-    N = 2 ** int(math.log2(max(1, min(LONGEST, T / (AVERAGES * n), shortest))))
+    most = T / (AVERAGES * (of or n))
+    N = 2 ** int(math.log2(max(1, min(LONGEST, most, shortest))))
     if N < SHORTEST:
-        return None
+        return filtered_part(signals, errors, min(int(most), shortest // 2))
     S = np.zeros((N // 2 + 1, n + errors[0].shape[1], n + errors[0].shape[1]), complex)
     for x, e in zip(signals, errors, strict=True):
         both = np.hstack([x, e])
@@ -192,6 +200,37 @@ def coherent_part(signals: Sequence[Array], errors: Sequence[Array]) -> float | 
     left = np.minimum((power - explained) * K / (K - n), power)
     part = np.where(total > 0, (power - left).sum(axis=0) / np.where(total > 0, total, 1.0), 0.0)
     return float(np.clip(part.max(), 0.0, 1.0))
+
+
+def filtered_part(signals: Sequence[Array], errors: Sequence[Array], lags: int) -> float | None:
+    """Part of the errors' power that filters of a finite memory explain, by least squares.
+
+    It is the adjusted R², of the output of which most is explained.
+
+    Args:
+        signals, errors: see :func:`coherent_part`.
+        lags: samples of the memory.
+
+    Returns:
+        0 to 1, or None if the memory is too short.
+    """
+    if lags < LAGS:
+        return None
+    n = signals[0].shape[1]
+    memory = np.concatenate(
+        [
+            np.lib.stride_tricks.sliding_window_view(x, lags, axis=0).reshape(-1, n * lags)
+            for x in signals
+        ]
+    )
+    left = np.concatenate([e[lags - 1 :] for e in errors])
+    memory, left = memory - memory.mean(axis=0), left - left.mean(axis=0)
+    fitted = memory @ np.linalg.lstsq(memory, left, rcond=None)[0]
+    total = np.sum(left**2, axis=0)
+    freedom = len(left) - 1
+    adjusted = freedom / max(1, freedom - n * lags)
+    parts = 1.0 - adjusted * np.sum((left - fitted) ** 2, axis=0) / np.where(total > 0, total, 1.0)
+    return float(np.clip(np.where(total > 0, parts, 0.0).max(), 0.0, 1.0))
 
 
 def falling(result: FitResult) -> float:

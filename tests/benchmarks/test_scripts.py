@@ -5,7 +5,17 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-SCRIPTS = ["baseline", "cases", "engine", "first_try", "linear", "nonlinear", "starts", "tanks"]
+SCRIPTS = [
+    "advice",
+    "baseline",
+    "cases",
+    "engine",
+    "first_try",
+    "linear",
+    "nonlinear",
+    "starts",
+    "tanks",
+]
 
 
 @pytest.mark.slow

@@ -46,6 +46,7 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
     [
         (advice.diverges, {"diverged": ["sweep"]}, "ridge=1e-3"),
         (advice.diverges, {"diverged": ["sweep"], "ridge": True}, "larger ridge"),
+        (advice.diverges, {"diverged": [f"sweep {k}" for k in range(99)]}, "use ridge=1e-3"),
         (advice.starts_in_a_transient, {"transient": 4.0, "free": 0.9}, "skip=N"),
         (advice.nothing_held_out, {"validation": None, "linear_validation": None}, "hold out"),
         (advice.validation_is_unlike, {"linear_validation": 0.4}, "cross-validate"),
@@ -71,7 +72,11 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
         (advice.choose_sizes, {"searched": False}, "nx='auto', nz='auto', nw='auto', nn='auto'"),
         (advice.largest_sizes, {"largest": ["nn"]}, "nn=10"),
         (advice.hardly_better, {"validation": 0.199}, "at any size searched"),
-        (advice.hardly_better, {"validation": 0.199, "searched": False}, "nn=20, nz=2, nw=2"),
+        (
+            advice.hardly_better,
+            {"validation": 0.199, "searched": False, "linear": None, "started": 1},
+            "starts=8, nx=4, nn=20, nz=2, nw=2",
+        ),
         (advice.at_the_noise, {"train": 0.0105, "validation": 0.011}, "nothing to gain"),
     ],
 )
@@ -124,9 +129,9 @@ def test_at_the_noise_nothing_larger_is_advised():
 def test_missing_states_come_before_a_larger_map():
     useless = replace(GOOD, train=0.2, validation=0.2, linear=0.9, outputs={}, noise=None)
     useless = replace(useless, searched=False)
-    assert [item.text for item in advise(useless)] == [
-        "The linear part is incomplete: nx=4, nx=5 or nx='auto'."
-    ]
+    states, sizes = (item.text for item in advise(useless))
+    assert states == "The linear part is incomplete: nx=4, nx=5 or nx='auto'."
+    assert sizes.startswith("Let validation choose the sizes")
 
 
 def test_what_spoils_the_linear_model_as_much_is_no_overfit():
@@ -148,6 +153,7 @@ def test_without_validation_nothing_rests_on_it():
     texts = [item.text for item in advise(alone)]
     assert "overfitting would not show: hold out a part" in texts[0]
     assert not any("auto" in text or "Still falling" in text for text in texts)
+    assert advice.one_start(replace(alone, started=1)) is None
 
 
 def test_a_model_that_diverges_everywhere_has_advice():
@@ -167,6 +173,11 @@ def test_a_linear_filter_of_the_input_is_seen_in_the_error():
     assert coherent_part([u], [noise]) == pytest.approx(0.0, abs=0.1)
     assert coherent_part([u, u], [filtered, filtered]) == pytest.approx(1.0, abs=0.05)
     assert coherent_part([u[:60]], [noise[:60]]) is None
+    # Filters fitted in time: 300 samples and 37 lags leave a standard deviation of 0.06.
+    assert coherent_part([u[:300]], [both[:300]]) == pytest.approx(0.5, abs=0.2)
+    assert coherent_part([u[:300]], [noise[:300]]) == pytest.approx(0.0, abs=0.2)
+    parts = [u[:300], u[300:600]], [filtered[:300], filtered[300:600]]
+    assert coherent_part(*parts) == pytest.approx(1.0, abs=0.1)
     assert coherent_part([u], [0.0 * noise]) == 0.0
     assert coherent_part([0.0 * u], [noise]) == pytest.approx(0.0, abs=0.1)
 
