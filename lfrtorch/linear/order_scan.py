@@ -89,7 +89,8 @@ def scan_orders(
 
     Args:
         data: as for ``estimate_bla``.
-        orders: the values of nx; those that need more data than there are are left out.
+        orders: the values of nx; those that need more data than there are are left out, and those
+            below the number of integrators, if there are others.
         validation: records that choose the order.
         options: of ``estimate_bla``.
 
@@ -108,6 +109,9 @@ def scan_orders(
         raise InputError("orders is empty; give at least one, for example range(1, 13).")
     for nx in orders:
         integer("orders", nx, 1)
+    outputs = data.outputs if isinstance(data, FRF) else as_records(data)[0].outputs
+    least = options.get("integrators", 0) * len(outputs)
+    orders = [nx for nx in orders if nx >= least] or orders
     judges = as_records(validation) if validation else []
     models: list[LinearModel] = []
     for nx in sorted(set(orders)):

@@ -123,6 +123,8 @@ def notes_on(records: Record | Sequence[Record]) -> list[str]:
             r.u[scored], r.y[scored], r.fs, inputs=r.inputs, outputs=r.outputs, period=r.period
         )
         for kind, text in examine(found, r.u[scored], r.y[scored]):
+            if kind.startswith("integrates") and r.start == "estimated":
+                continue  # a fit says it, if its model does not integrate
             by_kind.setdefault(kind, []).append((r.name, text))
     sentences = []
     for (name, text), *more in by_kind.values():

@@ -334,6 +334,12 @@ def test_notes_of_records(u):
     assert notes_on(replace(bad, y=lag(u))) == []
 
 
+def test_a_start_that_is_estimated_needs_no_advice(u):
+    record = Record(u, lfilter([0, 1], [1, -1], u))
+    assert "start='estimated'" in notes_on(record)[0]
+    assert notes_on(replace(record, start="estimated")) == []
+
+
 def test_skipped_samples_are_not_looked_at(u):
     record = Record(u, lag(u) + 5 * (np.arange(T) < 2000), skip=2000)
     assert notes_on(record) == []
