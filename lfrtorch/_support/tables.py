@@ -89,10 +89,15 @@ def engineering(values: Iterable[float | None], unit: str) -> tuple[float, str]:
     return 10.0**-power, PREFIXES[power] + unit
 
 
+def times(factor: float, value: float | None) -> float | None:
+    """The product, if the value is known."""
+    return None if value is None else factor * value
+
+
 def quantities(values: Sequence[float | None], unit: str) -> list[str]:
     """Numbers with their unit, all with the same SI prefix; without a unit the numbers alone."""
     factor, unit = engineering(values, unit)
-    return [f"{number(None if v is None else factor * v)} {unit}".rstrip() for v in values]
+    return [f"{number(times(factor, v))} {unit}".rstrip() for v in values]
 
 
 def quantity(value: float | None, unit: str) -> str:
@@ -108,7 +113,7 @@ def percent(ratio: float | None) -> str:
 
 def in_percent(ratio: float | None) -> float | None:
     """100 times a ratio, if it is known."""
-    return None if ratio is None else 100 * ratio
+    return times(100, ratio)
 
 
 def cell(value: Cell, digits: int = DIGITS) -> str:

@@ -224,13 +224,17 @@ def table(found: dict[str, Any]) -> str:
     parts = [f"Linear model of order {found['nx']}, {fit['criterion']} error"]
     sources = any(s["source"] != "file" for s in found["scores"])
     about = ["record", "use", *["source"] * sources]
+    errors: dict[str, list[float | None]] = {}
+    for o in (o for s in found["scores"] for o in s["outputs"]):
+        errors.setdefault(o["unit"], []).append(o["rmse"])
+    prefixed = {unit: tables.engineering(own, unit) for unit, own in errors.items()}
     scores = [
         [
             *(s[key] for key in about),
             of_samples(s["scored"], s["samples"]),
             o["output"],
-            o["rmse"],
-            o["unit"],
+            tables.times(prefixed[o["unit"]][0], o["rmse"]),
+            prefixed[o["unit"]][1],
             in_percent(o["nrmse"]),
         ]
         for s in found["scores"]
@@ -246,7 +250,10 @@ def table(found: dict[str, Any]) -> str:
         for what, r in listed
     ]  # fmt: skip
     parts.append(tables.table(["", "frequency (Hz)", "damping", "radius", ""], rows, digits=4))
-    rows = [[o["channel"], o["offset"], o["unit"]] for o in found["offsets"]]
+    rows = []
+    for o in found["offsets"]:
+        factor, unit = tables.engineering([o["offset"]], o["unit"])
+        rows.append([o["channel"], factor * o["offset"], unit])
     parts.append(tables.table(["operating point", "offset", "unit"], rows, digits=4))
     if found["response_std"]:
         rows = [

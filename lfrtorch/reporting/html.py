@@ -24,6 +24,7 @@ from lfrtorch._support.tables import (
     quantities,
     quantity,
     radius,
+    times,
 )
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
@@ -182,7 +183,7 @@ def _scores(
             factor, shown = in_unit[unit]
             cells = [*[channel, shown][: len(what)], *_cells(_errors(response, of), factor)]
             if use == "test":
-                known = [_scaled(p.scores.get(name), factor) if row == 0 else "" for p in published]
+                known = [times(factor, p.scores.get(name)) if row == 0 else "" for p in published]
                 tests.append([name if row == 0 else "", *cells, *known])
             else:
                 others.append([*([name, USES[use]] if row == 0 else ["", ""]), *cells])
@@ -226,10 +227,6 @@ def _units(responses: Sequence[Response]) -> dict[str, tuple[float, str]]:
             found = _errors(response, of)
             errors.setdefault(unit, []).extend([found.linear, found.error])
     return {unit: engineering(values, unit) for unit, values in errors.items()}
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else factor * value
 
 
 def _errors(response: Response, of: slice) -> Errors:
@@ -323,7 +320,7 @@ def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict
     starts = [
         [
             *(s[k] for k in ("seed", "reason", "iterations")),
-            *(_scaled(s[k], factor) for k in errors),
+            *(times(factor, s[k]) for k in errors),
         ]
         for s in ended
     ]

@@ -194,16 +194,20 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     models = ["lti_rmse", "rmse"] if sizes["nz"] else ["rmse"]
     head = ["record", "use", *["source"] * sources, "scored", *["linear", "NL-LFR"][: len(models)]]
     head += [p.label for p in others]
+    errors = [s[model] for _, s in listed for model in models]
+    factor, unit = tables.engineering(errors, _unit(result))
     rows = [
         [
             *(name, s["use"], *[s["source"]] * sources, of_samples(s["scored"], s["samples"])),
-            *(s[model] for model in models),
-            *(p.scores.get(name) if s["use"] == "test" else None for p in others),
+            *(tables.times(factor, s[model]) for model in models),
+            *(
+                tables.times(factor, p.scores.get(name)) if s["use"] == "test" else None
+                for p in others
+            ),
         ]
         for name, s in listed
     ]
-    units = {s["unit"] for _, s in listed} - {""}
-    title = f"Simulation RMSE{f' ({next(iter(units))})' if len(units) == 1 else ''}"
+    title = f"Simulation RMSE{f' ({unit})' if unit else ''}"
     static = f"degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])
     title += f", nx {sizes['nx']}, "
     title += f"nz {sizes['nz']}, nw {sizes['nw']}, {static}" if sizes["nz"] else "a linear model"
@@ -214,6 +218,13 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
         models = ", ".join(f"{n} of {'+'.join(r)}" for n, r in result["linear"].items())
         references.insert(0, f"linear: a model for each of these: {models}")
     return "\n".join([title, "", tables.table(head, rows), *[""] * bool(references), *references])
+
+
+def _unit(result: Mapping[str, Any]) -> str:
+    """The unit of all errors; none if there are several."""
+    listed = [*result["scores"].values(), *result["validation"]["records"].values()]
+    units = {s["unit"] for s in listed} - {""}
+    return units.pop() if len(units) == 1 else ""
 
 
 def of_samples(scored: int, samples: int) -> str:
@@ -229,12 +240,15 @@ def neurons(count: int) -> str:
 def starts_table(result: Mapping[str, Any]) -> str:
     """The starts of a fit that went to the end, the best first, and how many others there were."""
     ended, others = finalists(result)
+    names = ("train", "validation", "selection")
+    factor, unit = tables.engineering([s[name] for s in ended for name in names], _unit(result))
     head = ["seed", "iterations", "training", "validation", "selection", ""]
     rows = [
-        [s[k] for k in ("seed", "iterations", "train", "validation", "selection", "reason")]
+        [s["seed"], s["iterations"], *(tables.times(factor, s[n]) for n in names), s["reason"]]
         for s in ended
     ]
-    parts = ["Starts, the best iterate of each", tables.table(head, rows), others]
+    title = f"Starts, RMSE of the best iterate of each{f' ({unit})' if unit else ''}"
+    parts = [title, tables.table(head, rows), others]
     return "\n\n".join(part for part in parts if part)
 
 

@@ -123,13 +123,13 @@ def test_table_shows_published_results_of_these_sizes_only(result):
     fitted, bla, data = result
     metrics = report.metrics(fitted, bla, data, seeds=[0])
     lines = report.table(metrics, data.published).splitlines()
-    assert lines[0] == "Simulation RMSE (V), nx 2, nz 1, nw 1, 3 neurons"
+    assert lines[0] == "Simulation RMSE (mV), nx 2, nz 1, nw 1, 3 neurons"
     head, row = lines[2].split(), lines[4].split()
     columns = ["record", "use", "source", "scored", "linear", "NL-LFR", "everybody", "small"]
     assert head == columns
     assert row[:6] == ["test", "test", "simulated", "295", "of", "300"]
-    assert float(row[7]) == pytest.approx(metrics["scores"]["test"]["rmse"], rel=5e-3)
-    assert row[8:] == ["0.500", "0.250"]
+    assert float(row[7]) == pytest.approx(1e3 * metrics["scores"]["test"]["rmse"], rel=5e-3)
+    assert row[8:] == ["500", "250"]
     assert lines[5].split()[:3] == ["validation", "validation", "simulated"]
     assert lines[-2:] == ["everybody: A (2001)", "small: B (2002)"]
 
