@@ -15,6 +15,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.fitting.nonlinear_end import nonlinear_end
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.modes import MINOR, without_slow_minor_modes
 from lfrtorch.model import Model
@@ -55,6 +56,10 @@ def initialise(
     - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021), for a polynomial
       C = 0. The more reliable one. A module of another class starts so if its output vanishes on
       the data, with the weights that it has, and else as with ``"paper"``.
+
+    If a static map of the linear model's output explains most of its error, as in a Wiener system,
+    ``"zero_output"`` begins there: the first z are the linear model's outputs, and Bw = 0. If one
+    of its input does, as in a Hammerstein system, the first z are the inputs.
 
     Args:
         bla: stable linear model, best in balanced coordinates.
@@ -121,7 +126,8 @@ def initialise(
         parameter.uniform_(-limit, limit, generator=generator)
 
     with torch.no_grad():
-        x = torch.cat([response.signals(record).x[0, :-1] for record in data])
+        found = [response.signals(record) for record in data]
+        x = torch.cat([trajectory.x[0, :-1] for trajectory in found])
         u = torch.cat([torch.as_tensor(scaler.normalise_u(r.u)).to(x) for r in data])
         std = _deviation(x)
         cell.A.copy_(cell.A * std / std[:, None])
@@ -129,6 +135,11 @@ def initialise(
         cell.Cy.mul_(std)
         uniform(cell.Cz)
         uniform(cell.Dzu)
+        end = nonlinear_end(response, data, found) if method == "zero_output" else None
+        if end == "output":
+            cell.Cz[: cell.ny], cell.Dzu[: cell.ny] = cell.Cy[:nz], cell.Dyu[:nz]
+        elif end == "input":
+            cell.Cz[: cell.nu], cell.Dzu[: cell.nu] = 0.0, torch.eye(cell.nu).to(u)[:nz]
         z = (x / std) @ cell.Cz.mT + u @ cell.Dzu.mT
         spread = _deviation(z)[:, None]
         cell.Cz.div_(spread)
@@ -136,7 +147,7 @@ def initialise(
         for name in OUTPUT_WEIGHTS.get(type(static), ()) if method == "zero_output" else ():
             static.get_parameter(name).zero_()
         if method == "zero_output" and not static((z / spread.mT).unsqueeze(0)).any():
-            uniform(cell.Bw, OUTPUT_RANGE)
+            uniform(cell.Bw, 0.0 if end == "output" else OUTPUT_RANGE)
             uniform(cell.Dyw, OUTPUT_RANGE)
     return model
 

@@ -7,13 +7,17 @@ import pytest
 import reference
 import torch
 from reference import random_system
+from scipy.signal import butter, lfilter
 from torch import Tensor, nn
 
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.starts import OUTPUT_RANGE, initialise
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -225,3 +229,70 @@ def test_given_map_of_other_sizes(bla: LinearModel, static: nn.Module):
 def test_neither_neurons_nor_a_map(bla: LinearModel):
     with pytest.raises(ValueError, match="nn is None; give a whole number of at least 1"):
         initialise(bla, RECORDS, nz=2, nw=3)
+
+
+# --- a nonlinearity at one end --------------------------------------------------------------
+
+
+def bent(end: str, samples: int = 500, noise: float = 0.01) -> Record:
+    """Two inputs through a filter each, and a bend at the input, the output or in the feedback."""
+    generator = np.random.default_rng(3)
+    u, x = generator.normal(size=(samples, 2)), np.zeros(2)
+    v = u + 0.3 * u**2 if end == "input" else u
+    y = np.empty((samples, 2))
+    for k in range(samples):
+        y[k] = x
+        fed_back = np.tanh(x) if end == "feedback" else x
+        x = [0.7, 0.5] * fed_back + v[k]
+    if end == "output":
+        y = np.tanh(y + 0.5)
+    return Record(u, y + noise * generator.normal(size=y.shape), skip=20)
+
+
+@pytest.mark.parametrize(("nz", "nw"), [(1, 2), (2, 2), (3, 1)])
+def test_start_where_the_nonlinearity_is(nz: int, nw: int):
+    for end in ("input", "output"):
+        record = bent(end)
+        bla = estimate_bla(record, 2)
+        model = initialise(bla, record, nz=nz, nw=nw, nn=3)
+        z, y = (signal[0].numpy() for signal in model.signals(record)[1::2])
+        source = y if end == "output" else record.u
+        for i in range(min(nz, 2)):
+            assert abs(np.corrcoef(z[:, i], source[:, i])[0, 1]) > 1 - 1e-9
+        cell = model.lfr.cell
+        assert bool(cell.Bw.any()) == (end == "input")
+        assert cell.Dyw.all()
+        np.testing.assert_allclose(model.simulate(record), bla.simulate(record), rtol=0, atol=1e-10)
+        usual = initialise(bla, record, nz=nz, nw=nw, nn=3, method="paper").signals(record).z[0]
+        assert abs(np.corrcoef(usual[:, 0], source[:, 0])[0, 1]) < 1 - 1e-3
+
+
+@pytest.mark.parametrize(
+    ("record", "nx"),
+    [
+        (bent("feedback"), 2),
+        (bent("neither"), 2),
+        (bent("output", noise=0.3), 2),
+        (bent("output", samples=80), 2),
+    ],
+    ids=["feedback", "linear", "noise", "short"],
+)
+def test_start_is_random_where_no_end_explains_the_error(record: Record, nx: int):
+    cell = initialise(estimate_bla(record, nx), record, nz=2, nw=1, nn=3).lfr.cell
+    assert cell.Bw.all()
+    assert cell.Cz.all()
+
+
+@pytest.mark.parametrize("end", ["input", "output"])
+def test_every_start_finds_a_nonlinearity_at_one_end(end: str):
+    """Of third order at the input and of first order at the output, most random z do not."""
+    generator = np.random.default_rng(0)
+    u = generator.normal(size=800)
+    b, a = butter(3, 0.2) if end == "input" else ([0.0, 1.0], [1.0, -0.7])
+    y = lfilter(b, a, u + 0.3 * u**2) if end == "input" else np.tanh(lfilter(b, a, u))
+    record = Record(u, y, skip=50)
+    bla = estimate_bla(record, len(a) - 1)
+    for seed in range(3):
+        model = initialise(bla, record, nz=1, nw=1, nn=4, seed=seed)
+        found = fit(model, record, trainer=LevenbergMarquardt(max_iter=15))
+        assert found.history[-1].train < 0.1 * rmse(record, bla.simulate(record))

@@ -1,0 +1,71 @@
+"""Whether the nonlinearity of a system is at its input (Hammerstein) or at its output (Wiener)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from lfrtorch._support.types import Array
+from lfrtorch.engine.simulation import Trajectory
+from lfrtorch.fitting.chebyshev import chebyshev
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+AT_ONE_END, DEGREE = 0.85, 7
+"""The nonlinearity is at the input or the output if a polynomial of this degree there explains this
+part of the linear model's squared error. Wiener and Hammerstein systems, simulated: 0.96 and more
+without noise, less by a third degree; the benchmarks (benchmarks/starts.md): 0.80 and less."""
+
+LEAST_ROWS = 20
+"""Errors for each coefficient of that polynomial; fewer do not tell."""
+
+
+def nonlinear_end(
+    linear: Model, data: Sequence[Record], found: Sequence[Trajectory]
+) -> Literal["input", "output"] | None:
+    """The end of the linear model at which a static map explains most of its error, if one does.
+
+    The map is a polynomial of each input, whose response is that of the linear model to it, or of
+    each output. What its affine part explains does not count.
+
+    Args:
+        linear: the linear model.
+        data: records.
+        found: its trajectory in each of them.
+    """
+    responses: dict[Literal["input", "output"], list[Array]] = {"input": [], "output": []}
+    errors = []
+    for record, trajectory in zip(data, found, strict=True):
+        u, y_hat = linear.scaler.normalise_u(record.u), trajectory.y[0].double().numpy()
+        counts = record.factors > 0
+        errors.append((linear.scaler.normalise_y(record.y) - y_hat)[counts])
+        start = "periodic" if record.start == "periodic" else "zero"
+        driven = torch.as_tensor(_powers(u)).to(trajectory.y).unsqueeze(1)
+        of_input = [linear.lfr.trajectory(each, None, start).y[0] for each in driven]
+        responses["input"].append(torch.stack(of_input).double().numpy()[:, counts])
+        responses["output"].append(_powers(y_hat)[:, counts])
+    error, explained = torch.as_tensor(np.concatenate(errors)), {}
+    for end, parts in responses.items():
+        columns = torch.as_tensor(np.concatenate(parts, axis=1)).mT
+        if len(error) < LEAST_ROWS * columns.shape[1]:
+            return None
+        R = torch.linalg.qr(torch.cat([columns, error.unsqueeze(1)], dim=1), mode="r").R
+        # Parts of |error|²: of the affine columns, of those of higher degree, and what is left.
+        affine = 2 * columns.shape[1] // (DEGREE + 1)
+        _, bent, left = R[:, -1].square().split([affine, columns.shape[1] - affine, 1])
+        explained[end] = float(bent.sum() / (bent.sum() + left))  # NaN if the model is exact
+    best = max(explained, key=lambda end: explained[end])
+    return best if explained[best] >= AT_ONE_END else None
+
+
+def _powers(signals: Float[Array, "T n"]) -> Float[Array, "powers T n"]:
+    """Chebyshev polynomials of each signal, alone in its channel, by rising degree."""
+    T, n = signals.shape
+    powers = np.zeros((DEGREE + 1, n, T, n))
+    for i in range(n):
+        powers[:, i, :, i] = chebyshev(signals[:, i, None], DEGREE).T
+    return powers.reshape(-1, T, n)
