@@ -160,7 +160,7 @@ def test_user_errors_are_one_message(
         run(monkeypatch, *(word.replace("RUN", str(run_folder)) for word in words))
     printed = capsys.readouterr()
     assert stop.value.code == 1
-    assert message.replace("RUN", str(run_folder)) in printed.err
+    assert message.replace("RUN", str(run_folder)) in " ".join(printed.err.split())  # unwrapped
     assert "Traceback" not in printed.err + printed.out
     assert (run_folder / "there.json").read_text() == "old"
 
