@@ -61,6 +61,7 @@ TESTS: dict[str, str] = {
     "least_squares/joint": "least_squares/joint",
     "least_squares/levenberg_marquardt": "least_squares/levenberg_marquardt",
     "least_squares/adam": "least_squares/adam",
+    "fitting/nonlinear_end": "fitting/starts",
     "fitting/trainer": "fitting/trainer fitting/snapshots",
     "fitting/snapshots": "fitting/snapshots",
     "fitting/state_file": "fitting/snapshots",
