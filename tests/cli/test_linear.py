@@ -176,7 +176,7 @@ def test_without_a_response_the_model_is_found_all_the_same(tmp_path: Path, monk
     assert (
         "note: no measured frequency response: 1 record(s) cannot tell" in capsys.readouterr().out
     )
-    assert found["notes"][0].startswith("no measured frequency response")
+    assert any(n.startswith("no measured frequency response") for n in found["notes"])
     assert found["scores"][0]["outputs"][0]["nrmse"] < 1e-6
     assert (tmp_path / "figures" / "frequency_response.png").is_file()
 
