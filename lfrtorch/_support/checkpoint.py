@@ -95,6 +95,15 @@ def read(
     return description, weights
 
 
+def _below(folder: Path, at: str, inside: Sequence[str]) -> list[str]:
+    """Checkpoints whose paths match a pattern."""
+    return [
+        str(path)
+        for path in sorted(folder.glob(at))
+        if any((path / name / DESCRIPTION).is_file() for name in ("", *inside))
+    ]
+
+
 def _located(folder: Path, inside: Sequence[str]) -> Path:
     """The folder that holds the description; refuse all else, code above all."""
     if folder.is_file():
@@ -112,11 +121,7 @@ def _located(folder: Path, inside: Sequence[str]) -> Path:
             f"there is no '{folder}'; give the folder of a run or of a saved model, a checkpoint."
         )
     if found is None:
-        below = [
-            str(path)
-            for path in sorted(folder.glob("*"))
-            if any((path / name / DESCRIPTION).is_file() for name in ("", *inside))
-        ]
+        below = next(filter(None, (_below(folder, at, inside) for at in ("*", "*/*"))), [])
         if below:
             raise InputError(
                 f"'{folder}' is not a checkpoint; give one of those in it: {', '.join(below[-5:])}."

@@ -37,7 +37,8 @@ def arguments(given: Sequence[str]) -> list[str]:
     if folder != "null":
         overrides = Path(folder) / ".hydra" / "overrides.yaml"
         if not overrides.is_file():
-            runs = sorted(str(p.parents[1]) for p in Path(folder).glob("*/.hydra/overrides.yaml"))
+            found = (Path(folder).glob(f"{at}/.hydra/overrides.yaml") for at in ("*", "*/*"))
+            runs = sorted(str(path.parents[1]) for paths in found for path in paths)
             raise InputError(
                 f"resume is '{folder}', which is not the folder of a run; give "
                 + (

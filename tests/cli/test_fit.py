@@ -433,7 +433,7 @@ def test_resume_takes_the_settings_of_the_run(tmp_path: Path):
 def test_resume_needs_a_run(tmp_path: Path):
     with pytest.raises(ValueError, match="not the folder of a run"):
         run_folder.arguments([f"resume={tmp_path}"])
-    for name in ("first", "second"):
+    for name in ("first", "tank/second"):
         (tmp_path / name / ".hydra").mkdir(parents=True)
         (tmp_path / name / ".hydra" / "overrides.yaml").touch()
     with pytest.raises(ValueError, match=r"one of the runs in it: .*first, .*second") as refused:
