@@ -43,7 +43,7 @@ LISTED = 3
 """Most records that have a note of their own."""
 
 LONGEST = 1 << 15
-"""Samples at the beginning of a record that are looked at."""
+"""Samples at the beginning of a record that are looked at; half of them determine any state."""
 
 FINER = 1.1
 """Each N that is tried, over the one before."""
@@ -108,7 +108,6 @@ def settled(
             errors = [
                 fitted_errors(model, beginning(without_coordinates(r)))[r.skip :] for r in train
             ]
-            errors = [e for e in errors if len(e) and np.isfinite(e).all()]
         skip = determining_samples(model, without_units(record), errors)
         if skip is None:
             lost.append(record)
@@ -135,12 +134,15 @@ def determining_samples(
     Returns:
         None if too few would be left.
     """
+    if record.samples > LONGEST and record.skip > LONGEST // 2:
+        return record.skip
     part = beginning(record)
     errors = errors or [fitted_errors(model, part)]
     weight = np.sqrt(part.weight) / model.scaler.y_scale
     U = _free_responses(model, part)
     T, ny, n = U.shape
-    R = _autocovariance([weight * e for e in errors], T)
+    # A model that diverges is scored, and its score says so: no errors of it, no free responses.
+    R = _autocovariance([weight * e for e in errors if np.isfinite(e).all()], T, ny)
     R[0] += FLOOR**2 * np.mean((weight * part.y) ** 2, axis=0) + np.finfo(float).tiny
     found, added, least = None, math.inf, math.inf
     N = max(record.skip, 1)
@@ -184,15 +186,19 @@ def _free_responses(model: Model, record: Record) -> Float[Array, "T ny n"]:
     identity = torch.eye(cell.nx).to(F).unsqueeze(0)
     free = H @ linear_recurrence(F, torch.zeros_like(F), identity)[:, :-1]
     weighted = np.sqrt(record.weight)[..., None] * free[0].double().numpy()
+    if not np.isfinite(weighted).all():
+        return np.zeros((*weighted.shape[:2], 0))
     U, s, _ = np.linalg.svd(weighted.reshape(-1, cell.nx), full_matrices=False)
     return U[:, s > SEEN * s[0]].reshape(*weighted.shape[:2], -1)
 
 
-def _autocovariance(errors: Sequence[Float[Array, "S ny"]], T: int) -> Float[Array, "T ny"]:
+def _autocovariance(
+    errors: Sequence[Float[Array, "S ny"]], T: int, ny: int
+) -> Float[Array, "T ny"]:
     """Of each output's errors about 0, at lags 0 to T - 1."""
-    total = np.zeros((T, errors[0].shape[1]))
+    total = np.zeros((T, ny))
     for e in errors:
         spectrum = np.abs(np.fft.rfft(e, 2 * len(e), axis=0)) ** 2
         found = np.fft.irfft(spectrum, 2 * len(e), axis=0)[: min(T, len(e))]
         total[: len(found)] += found
-    return total / sum(map(len, errors))
+    return total / max(1, sum(map(len, errors)))

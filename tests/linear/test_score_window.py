@@ -9,6 +9,7 @@ import pytest
 import lfrtorch
 from lfrtorch import Dataset, LinearModel, Record
 from lfrtorch._support.types import Array
+from lfrtorch.linear import score_window
 from lfrtorch.linear.score_window import determining_samples, with_score_windows
 
 pytestmark = pytest.mark.numeric
@@ -145,6 +146,25 @@ def test_an_exact_model_without_errors_and_one_without_states_to_see_are_scored(
     assert determining_samples(model.to_model(), clean, [0.0 * e]) is not None
     blind = replace(model, C=np.zeros((1, 2)))
     assert determining_samples(blind.to_model(), record) == 1
+
+
+def test_of_long_records_the_beginning_is_looked_at(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(score_window, "LONGEST", 100)
+    model = second_order(0.9, 0.2)
+    record, e = measured(model, 300, 0.0, 0)
+    assert determining_samples(model.to_model(), replace(record, skip=200), [e]) == 200
+    found = determining_samples(model.to_model(), record, [e])
+    assert found == determining_samples(
+        model.to_model(), replace(record[:100], start="estimated"), [e]
+    )
+
+
+def test_a_model_that_diverges_is_scored():
+    record, _ = measured(second_order(0.9, 0.2), 300, 0.0, 0)
+    unstable = replace(second_order(0.9, 0.2), A=np.diag([40.0, 0.5])).to_model()
+    data = with_score_windows(Dataset("d", [record], [], [record]), unstable)
+    assert len(data.tests) == 1
+    assert not np.isfinite(lfrtorch.rmse(data.tests[0], unstable.simulate(data.tests[0])))
 
 
 def test_a_fit_chooses_on_samples_that_its_start_is_not_fitted_to():
