@@ -224,8 +224,12 @@ def linear_model(
     scan: OrderScan | None = None
     if settings.nx == "auto":
         orders = range(1, settings.nx_max + 1)
-        scan = scan_orders(data, orders, validation=validation, **settings.linear)
+        scan = scan_orders(
+            data, orders, validation=validation, watch=observer.say, **settings.linear
+        )
         observer.say(scan.table())
+        for note in scan.notes:
+            observer.say(f"note: {note}")
         # Rounding may differ from machine to machine, and the order must not.
         chosen = int(ranks.first(torch.tensor(scan.chosen)))
         linear = scan.models[scan.orders.index(chosen)]

@@ -3,25 +3,8 @@
 nz and nw are crossed at the middle number of neurons; then all numbers of neurons are tried at the
 nz and nw chosen. Every model is fitted from several starts for a part of the usual iterations.
 
-The choice is the one-standard-error rule: the fewest parameters whose error is within one standard
-error of the best. All models are scored on the same samples and share their noise, which says
-nothing of one against another; what tells two apart is the difference of their squared errors, and
-the standard error is that of its mean. That difference is correlated in time, so its means over ten
-blocks are taken as independent: they are if a block is long against the system's memory.
-The usual form, with the standard error of the best model's own error, is blind if noise is
-large: a mean square above it by 1.4 %, three standard errors of the difference over 2600 samples,
-is half of one of its own. Of two models that are equally good the smaller is taken in 83 % of
-cases. What chance does to starts, and what more iterations would do, is in neither.
-
-Long records tell apart what is not worth a parameter (on the Silverbox 25 neurons are better than 5
-by 0.6 % and two standard errors), so a model within 1 % of the best does as well, as in the scan of
-linear orders.
-
-References:
-    Hastie, Tibshirani and Friedman, "The Elements of Statistical Learning", 2nd ed., 2009, section
-    7.10 (the rule).
-    Schmeiser, "Batch size effects in the analysis of simulation output", Operations Research 30(3),
-    1982 (10 to 30 blocks).
+The fewest parameters that do as well as the best are chosen: ``_support.paired_blocks`` says what
+that is. What chance does to starts, and what more iterations would do, is not in it.
 """
 
 from __future__ import annotations
@@ -30,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from math import ceil, inf, isfinite, nan, sqrt
+from math import inf, isfinite, nan, sqrt
 from typing import Any
 
 import numpy as np
@@ -39,6 +22,13 @@ import torch
 from lfrtorch._support import tables
 from lfrtorch._support.checks import integer, renamed
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.paired_blocks import (
+    as_good,
+    blocked_mean,
+    in_blocks,
+    squares_in_blocks,
+    standard_errors_above,
+)
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array, Integers
@@ -48,7 +38,6 @@ from lfrtorch.fitting.trainer import StartDivergesError, Stop, StoppedError, Tra
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.order_scan import MARGIN
 from lfrtorch.linear.score_window import is_open, settled
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, as_records
@@ -63,9 +52,6 @@ SEEDS = (0, 1000, 2000, 3000)
 
 ITERATIONS = 50
 """Iterations of each start: a quarter of those of a fit."""
-
-BLOCKS = 10
-"""Least number of blocks of time, over all records."""
 
 LEGEND = """\
 validation: rms error over that of the output. above best: in standard errors of the difference.
@@ -135,12 +121,8 @@ class SizeSearch:
     @property
     def chosen(self) -> Candidate:
         """The one with the fewest net parameters within one standard error, or 1 %, of the best."""
-        limit = (1.0 + MARGIN) * min(c.error for c in self.candidates)
-        near = [
-            c
-            for c, far in zip(self.candidates, self.above, strict=True)
-            if far <= 1.0 or c.error <= limit
-        ]
+        good = as_good([c.squares for c in self.candidates], self.counts)
+        near = [c for c, enough in zip(self.candidates, good, strict=True) if enough]
         return min(near, key=lambda c: (c.parameters_net, c.error))
 
     @property
@@ -310,52 +292,6 @@ def search_sizes(
     return search
 
 
-def standard_errors_above(squares: Sequence[Array] | Array, counts: Integers) -> Array:
-    """How far the mean squares of several models are above the least of them.
-
-    Args:
-        squares: sums of squared errors of each model in each block of time; infinite if one
-            diverges.
-        counts: samples of each block.
-
-    Shape:
-        squares: (C, B), counts: (B,) -> (C,), in standard errors of the difference.
-    """
-    sums = np.asarray(squares)
-    best = int(np.argmin(sums.sum(axis=1)))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        difference, error = blocked_mean(sums - sums[best], counts)
-        above = np.where(difference == 0.0, 0.0, difference / error)
-    return np.where(np.isfinite(above), above, inf)
-
-
-def blocked_mean(sums: Array, counts: Integers) -> tuple[Array, Array]:
-    """The mean of a signal that has these sums over blocks of time, and its standard error.
-
-    Shape:
-        sums: (..., B), counts: (B,) -> (...), (...).
-    """
-    B, samples = len(counts), counts.sum()
-    mean = sums.sum(axis=-1) / samples
-    rest = sums - mean[..., None] * counts
-    return mean, np.sqrt(B / (B - 1.0) * (rest**2).sum(axis=-1)) / samples
-
-
-def in_blocks(signals: Sequence[Array]) -> list[Array]:
-    """Signals (T,) cut into blocks of about equal length, ``BLOCKS`` of them or a few more."""
-    samples = sum(map(len, signals))
-    if samples < BLOCKS:
-        raise InputError(
-            f"the validation records have {samples} scored samples; sizes are chosen with "
-            f"{BLOCKS} at least. Give longer records, or set the sizes."
-        )
-    return [
-        block
-        for signal in signals
-        for block in np.array_split(signal, ceil(BLOCKS * len(signal) / samples))
-    ]
-
-
 class _Judge:
     """Scores models on the validation records; those of the first process count."""
 
@@ -370,10 +306,7 @@ class _Judge:
         """Sums of the squared relative errors over each block, (B,), the mean of the outputs."""
         with np.errstate(over="ignore", invalid="ignore"):
             errors = [(r.y - model.simulate(r))[r.skip :] / self._scale for r in self._records]
-            blocks = in_blocks([np.mean(error**2, axis=1) for error in errors])
-            sums = np.array([block.sum() for block in blocks])
-        sums = self._ranks.first(torch.from_numpy(sums)).numpy()
-        return sums if np.isfinite(sums).all() else np.full(len(sums), inf)
+        return self._ranks.first(torch.from_numpy(squares_in_blocks(errors))).numpy()
 
     def candidate(self, sizes: Sizes, model: Model, seconds: float, squares: Array) -> Candidate:
         """What is known of a model with these errors."""

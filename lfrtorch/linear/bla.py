@@ -278,8 +278,8 @@ def _stable(data: list[Record] | FRF, nx: int, settings: _Settings) -> LinearMod
     notes += _notes(problem, estimate, found)
     if max_iter and found.iterations >= max_iter:
         notes.append(f"the search was stopped after {max_iter} iterations: raise max_iter.")
-    model = _physical(found, scaler, about)
-    model = model.transformed(*_transformation(problem, found.matrices, balanced=balanced))
+    model = physical(found, scaler, about)
+    model = model.transformed(*transformation(problem, found.matrices, balanced=balanced))
     rmse = found.rmse
     if found.constant is not None:
         model = replace(model, y_offset=model.y_offset + scaler.y_scale * found.constant)
@@ -417,7 +417,7 @@ def _best(
     searches: list[tuple[SubspaceEstimate, Search]] = []
     for _, estimate, matrices in field if max_iter > FIRST_STEPS else field[:1]:
         try:
-            search = problem.search(_scaled(problem, matrices, balanced=balanced))
+            search = problem.search(scaled(problem, matrices, balanced=balanced))
         except ValueError:  # the data hardly move some states: their scaling is a rounding error
             search = problem.search(matrices)
         searches.append((estimate, search.advance(min(FIRST_STEPS, max_iter))))
@@ -466,7 +466,7 @@ def _notes(problem: LinearLeastSquares, estimate: SubspaceEstimate, found: Refin
     return notes
 
 
-def _physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearModel:
+def physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearModel:
     """The model in physical units, with its covariance."""
     nx = len(found.A)
     by_u, by_y = 1.0 / scaler.u_scale, scaler.y_scale[:, None]
@@ -486,14 +486,14 @@ def _physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearMode
     )
 
 
-def _scaled(problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool) -> Matrices:
+def scaled(problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool) -> Matrices:
     """The system with states of unit standard deviation, in balanced coordinates if wanted."""
     A, B, C, D = matrices
-    T, inverse = _transformation(problem, matrices, balanced=balanced)
+    T, inverse = transformation(problem, matrices, balanced=balanced)
     return T @ A @ inverse, T @ B, C @ inverse, D
 
 
-def _transformation(
+def transformation(
     problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool
 ) -> tuple[Array, Array]:
     """T and T⁻¹ (nx, nx) that give states of unit deviation, in balanced coordinates if wanted."""

@@ -1,9 +1,19 @@
-"""Order of the BLA: a scan over nx, scored on records that are not fitted."""
+"""Order of the BLA: a scan over nx, scored on records that are not fitted.
+
+The fewest states are taken that do as well as the best, see ``_support.paired_blocks``. Where the
+validation records are short against the system's memory, or unlike the training records, they say
+little of an order: the scores are then those of a cross-validation in time over both. Each of FOLDS
+stretches is left out of a fit to the rest, and scored in a simulation of its whole record.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -11,16 +21,32 @@ import numpy as np
 from lfrtorch._support import tables
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.paired_blocks import BLOCKS, MARGIN, as_good, in_blocks, squares_in_blocks
+from lfrtorch._support.tables import number, quantity
+from lfrtorch._support.threads import each_alone
+from lfrtorch._support.types import Array
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.order_fits import OrderFits, Window
+from lfrtorch.linear.requirements import check_length, check_signals, excited_directions
+from lfrtorch.linear.score_window import settled
 from lfrtorch.metrics import rms
-from lfrtorch.records import Record, Scaler, as_records
+from lfrtorch.records import Record, Scaler, as_records, without_coordinates
 
 ORDERS = range(1, 13)
 
-MARGIN = 0.01
-"""A lower order is taken if its validation score exceeds the best by at most this part."""
+PATIENCE = 3
+"""The scan ends if so many orders in a row bring less than 1 %."""
+
+FOLDS = 5
+"""Stretches of a cross-validation."""
+
+MEMORIES = 20
+"""Validation records are short if they have fewer scored samples than so many time constants."""
+
+UNLIKE = 1.5
+"""They are unlike the training records if the errors there differ by more than this factor."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +54,16 @@ class OrderScan:
     """Linear models of several orders, and the order that is chosen.
 
     Args:
-        models: one for each order.
-        scores: of each model. With validation records the rms of the simulation error over them,
-            each output relative to its rms. Without them the error over the fitted data, times
-            √(1 + p ln M / M) for p parameters and M equations (minimum description length).
+        models: one for each order; that of the order chosen is a full estimate.
+        scores: of each order. With validation records the rms of the simulation error over them,
+            each output relative to its rms; in a cross-validation over them and the training
+            records. Without them the error over the fitted data, times √(1 + p ln M / M) for p
+            parameters and M equations (minimum description length).
         validated: whether validation records give the scores.
-        chosen: the lowest order whose validation score is within 1 % of the best; without
-            validation records the order of the best score.
+        chosen: the lowest order whose score is within one standard error, or 1 %, of the best;
+            without validation records the order of the best score.
+        lengths: the error over the fitted data with that factor, whatever the scores are.
+        notes: why the scores are those of a cross-validation, and what orders were left out.
 
     Example:
         >>> scan = lfrtorch.scan_orders(record, range(1, 3))
@@ -46,6 +75,8 @@ class OrderScan:
     scores: tuple[float, ...]
     validated: bool
     chosen: int
+    lengths: tuple[float, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def orders(self) -> tuple[int, ...]:
@@ -83,15 +114,20 @@ def scan_orders(
     orders: Sequence[int] = ORDERS,
     *,
     validation: Record | Sequence[Record] = (),
+    watch: Callable[[str], None] = lambda _: None,
     **options: Any,
 ) -> OrderScan:
     """Best linear approximations of several orders, and the lowest that is good enough.
 
+    The scan ends where the input excites fewer directions than an order has, where the data are too
+    few, and if several orders in a row bring nothing.
+
     Args:
         data: as for ``estimate_bla``.
-        orders: the values of nx; those that need more data than there are are left out, and those
-            below the number of integrators, if there are others.
+        orders: the values of nx; those below the number of integrators are left out, if there are
+            others.
         validation: records that choose the order.
+        watch: called with a line after each order.
         options: of ``estimate_bla``.
 
     Raises:
@@ -113,28 +149,198 @@ def scan_orders(
     least = options.get("integrators", 0) * len(outputs)
     orders = [nx for nx in orders if nx >= least] or orders
     judges = as_records(validation) if validation else []
+    records = [] if isinstance(data, FRF) else [without_coordinates(r) for r in as_records(data)]
+    if records:
+        check_signals(records)
+    given = data if isinstance(data, FRF) else records
+    fits = OrderFits.of(given, max(orders), options)
+    fit = partial(estimate_bla, given, **options) if fits is None else fits.fit
+    how = "validation" if judges else "MDL"
     models: list[LinearModel] = []
+    lengths: list[float] = []
+    errors: list[list[Array]] = []
+    notes: list[str] = []
+
+    def held_back(model: LinearModel) -> list[Array]:
+        return _errors(judges, Scaler.of(judges).y_scale, model)
+
+    def score(model: LinearModel, clock: float) -> bool:
+        """Enter and tell the model's errors; whether the last orders brought nothing."""
+        if judges:
+            errors.append(held_back(model))
+        scores = _rms(errors) or lengths
+        assert model.fit is not None
+        watch(
+            f"order {model.nx}: fitted {number(model.fit.rmse)}, {how} {number(scores[-1])}, "
+            f"{quantity(time.perf_counter() - clock, 's')}"
+        )
+        return _settled(scores)
+
     for nx in sorted(set(orders)):
+        clock = time.perf_counter()
         try:
-            models.append(estimate_bla(data, nx, **options))
+            if records:
+                check_length(records, nx)
+            if models and (narrow := _narrow(records, nx)):
+                notes.append(narrow)
+                break
+            models.append(fit(nx))
+            if judges and len(models) == 1:  # the same samples for all orders
+                judges, _ = settled(models[0].to_model(), judges, records)
+                how = how if judges else "MDL"
         except ValueError:
             if not models:
                 raise
             break
-    if judges:
-        scale = Scaler.of(judges).y_scale
-        scores = [_validation(model, judges, scale) for model in models]
-    else:
-        scores = [_description_length(model, data) for model in models]
-    best = min(scores)
-    limit = best * (1 + MARGIN) if judges else best
-    chosen = next(m.nx for m, s in zip(models, scores, strict=True) if s <= limit)
-    return OrderScan(tuple(models), tuple(scores), bool(judges), chosen)
+        lengths.append(_description_length(models[-1], given))
+        if score(models[-1], clock):
+            break
+    doubt = ""
+    if records and judges and fits is not None:
+        doubt = _doubt(models[_first(errors, lengths)], records, judges)
+    if doubt:
+        notes.append(f"{doubt}: the order is chosen by cross-validation over both.")
+        how, errors = "cross-validation", []
+        held_back = _Folds(models[0], records, judges, max(m.nx for m in models), options).errors
+        for model in models:
+            if score(model, time.perf_counter()):
+                break
+        models, lengths = models[: len(errors)], lengths[: len(errors)]
+    first = _first(errors, lengths)
+    if fits is not None:
+        models[first] = estimate_bla(given, models[first].nx, **options)
+    scores = _rms(errors) or lengths
+    return OrderScan(
+        tuple(models), tuple(scores), bool(judges), models[first].nx, tuple(lengths), tuple(notes)
+    )
 
 
-def _validation(model: LinearModel, records: list[Record], scale: np.ndarray) -> float:
-    errors = [((r.y - model.simulate(r)) / scale)[r.skip :] for r in records]
-    return float(rms(np.concatenate(errors)))
+def _rms(errors: Sequence[Sequence[Array]]) -> list[float]:
+    """Of all errors of each model; infinite if one is not finite."""
+    found = [float(rms(np.concatenate(each))) for each in errors]
+    return [value if np.isfinite(value) else inf for value in found]
+
+
+def _settled(scores: Sequence[float]) -> bool:
+    """Whether the last few orders bring less than the margin."""
+    earlier, last = scores[:-PATIENCE], scores[-PATIENCE:]
+    return bool(earlier) and min(last) > min(earlier) / (1.0 + MARGIN)
+
+
+def _narrow(records: list[Record], nx: int) -> str:
+    """A note if the input excites too few directions for an order."""
+    if not records:
+        return ""
+    excited, wanted = excited_directions(records, nx)
+    if excited == wanted:
+        return ""
+    return (
+        f"orders from {nx} on are left out: the input excites {excited} of the {wanted} "
+        f"directions that order {nx} has (one a frequency and phase)."
+    )
+
+
+def _first(errors: Sequence[Sequence[Array]], lengths: Sequence[float]) -> int:
+    """The first model that does as well as the best; without errors that of the least length."""
+    if not errors:
+        return int(np.argmin(lengths))
+    if sum(map(len, errors[0])) < BLOCKS:
+        return int(np.argmin(_rms(errors)))
+    counts = np.array([len(block) for block in in_blocks([e[:, 0] for e in errors[0]])])
+    return int(np.argmax(as_good([squares_in_blocks(each) for each in errors], counts)))
+
+
+def _errors(records: Sequence[Record], scale: Array, model: LinearModel) -> list[Array]:
+    """Relative errors of a simulation of each record, (T, ny), after its ``skip``."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return [((r.y - model.simulate(r)) / scale)[r.skip :] for r in records]
+
+
+def _doubt(model: LinearModel, train: list[Record], judges: list[Record]) -> str:
+    """Why the validation records say little of an order; empty if they say enough."""
+    scored = sum(record.samples - record.skip for record in judges)
+    memory = -1.0 / np.log(np.clip(np.abs(model.poles).max(), 1e-6, 1.0 - 1e-9))
+    if scored < MEMORIES * memory:
+        return (
+            f"validation has {scored} scored samples, {number(scored / memory)} time constants "
+            "of the linear model"
+        )
+    scale = Scaler.of(train).y_scale
+    here, there = _rms([_errors(some, scale, model) for some in (train, judges)])
+    if not here / UNLIKE < there < here * UNLIKE:
+        return f"the linear error on validation is {number(there / here)} times that on training"
+    return ""
+
+
+class _Folds:
+    """Errors of fits that leave out a stretch of time each, in that stretch."""
+
+    def __init__(
+        self,
+        model: LinearModel,
+        train: list[Record],
+        judges: list[Record],
+        most: int,
+        options: Mapping[str, Any],
+    ) -> None:
+        records = _united(train, judges)
+        self._records = settled(model.to_model(), records, train)[0] or records
+        self._scale = Scaler.of(self._records).y_scale
+        whole = [(r.skip, r.samples) for r in self._records]
+        ends = np.cumsum([0] + [last - first for first, last in whole])
+        cuts = np.linspace(0, ends[-1], FOLDS + 1).astype(int)
+        self._left_out: list[list[Window]] = []
+        self._fits: list[OrderFits] = []
+        chosen = {name: options.get(name, True) for name in ("offset", "feedthrough")}
+        for begin, end in pairwise(cuts):
+            # In samples of each record; of one that has none the two are the same.
+            out = [
+                (int(np.clip(first + begin - at, first, last)),
+                 int(np.clip(first + end - at, first, last)))
+                for (first, last), at in zip(whole, ends, strict=False)
+            ]  # fmt: skip
+            rest = [
+                [window for window in ((first, a), (b, last)) if window[1] > window[0]]
+                for (first, last), (a, b) in zip(whole, out, strict=True)
+            ]
+            self._left_out.append(out)
+            self._fits.append(OrderFits.of_windows(self._records, rest, most=most, **chosen))
+
+    def errors(self, model: LinearModel) -> list[Array]:
+        """Relative errors in each stretch, of fits that begin at the model."""
+        return [
+            error for some in each_alone(partial(self._of, model), range(FOLDS)) for error in some
+        ]
+
+    def _of(self, model: LinearModel, fold: int) -> list[Array]:
+        windows = self._left_out[fold]
+        try:
+            found = self._fits[fold].fit(model.nx, near=model)
+        except ValueError:
+            return [np.full((b - a, len(model.outputs)), inf) for a, b in windows if b > a]
+        with np.errstate(over="ignore", invalid="ignore"):
+            return [
+                ((record.y - found.simulate(record)) / self._scale)[a:b]
+                for record, (a, b) in zip(self._records, windows, strict=True)
+                if b > a
+            ]
+
+
+def _united(train: list[Record], judges: list[Record]) -> list[Record]:
+    """Training and validation records; one that goes on from another, and scores the rest, is one
+    with it."""
+    found = list(train)
+    for judge in map(without_coordinates, judges):
+        for i, record in enumerate(found):
+            T = record.samples
+            if judge.skip >= T and all(
+                np.array_equal(a[:T], b) for a, b in ((judge.u, record.u), (judge.y, record.y))
+            ):
+                found[i] = replace(judge, skip=record.skip)
+                break
+        else:
+            found.append(judge)
+    return found
 
 
 def _description_length(model: LinearModel, data: Record | Sequence[Record] | FRF) -> float:

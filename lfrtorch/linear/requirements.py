@@ -53,8 +53,8 @@ def check_spectral_data(data: SpectralData, nx: int) -> None:
         )
 
 
-def excitation_notes(records: list[Record], nx: int) -> list[str]:
-    """A note if the input moves in too few directions to tell all parameters apart."""
+def excited_directions(records: list[Record], nx: int) -> tuple[int, int]:
+    """Directions in which the input moves, and those that a model of the order has."""
     nu = records[0].u.shape[1]
     wanted = 2 * nx + 1
     windows = [
@@ -65,10 +65,15 @@ def excitation_notes(records: list[Record], nx: int) -> list[str]:
     rows = np.concatenate([w.reshape(len(w), -1) for w in windows])
     rows = rows / np.maximum(rms(rows, axis=0), 1e-300)
     size = np.linalg.eigvalsh(rows.T @ rows)
-    rank = int((size > NARROW * size[-1]).sum())
-    if rank == nu * wanted:
+    return int((size > NARROW * size[-1]).sum()), nu * wanted
+
+
+def excitation_notes(records: list[Record], nx: int) -> list[str]:
+    """A note if the input moves in too few directions to tell all parameters apart."""
+    excited, wanted = excited_directions(records, nx)
+    if excited == wanted:
         return []
     return [
-        f"the input is too narrow: it excites {rank} of the {nu * wanted} directions that "
+        f"the input is too narrow: it excites {excited} of the {wanted} directions that "
         f"order {nx} has; between its frequencies the model is a guess."
     ]

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 import torch
 from jaxtyping import Complex128, Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lfrtorch._support.types import Array, Complex
@@ -21,7 +22,12 @@ from lfrtorch.least_squares.gauge import Reduction, reduction
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
-from lfrtorch.linear.resolvent import response_jacobian, solve_resolvent, solve_resolvents
+from lfrtorch.linear.resolvent import (
+    frequency_response,
+    response_jacobian,
+    solve_resolvent,
+    solve_resolvents,
+)
 from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_spectra
 
@@ -36,10 +42,13 @@ class ResponseFit:
         data: what is fitted.
         known: whether the weights are the inverse variances of the errors.
         feedthrough: whether D is a parameter; it is 0 otherwise.
+        starts: how many of the last inputs are those of initial states, whose D is 0.
     """
 
-    def __init__(self, data: SpectralData, *, known: bool, feedthrough: bool = True) -> None:
-        self.data, self.known, self.feedthrough = data, known, feedthrough
+    def __init__(
+        self, data: SpectralData, *, known: bool, feedthrough: bool = True, starts: int = 0
+    ) -> None:
+        self.data, self.known, self.feedthrough, self.starts = data, known, feedthrough, starts
 
     def most_candidates(self, nx: int) -> int:
         """How many subspace estimates are refined: one if an iteration takes long."""
@@ -48,11 +57,19 @@ class ResponseFit:
 
     def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
         """Subspace estimates of A and C."""
+        return from_spectra(*self.equal_noise(self.data.Y), nx)
+
+    def equal_noise(self, Y: Complex) -> tuple[Complex, Complex, Complex]:
+        """z, U and Y (F, ny, m) with lines whose errors are of about the same size."""
         root = np.ones(len(self.data.z))
         if self.data.weight is not None:
             root = np.sqrt(self.data.weight.mean(axis=(1, 2)))
         root = root[:, None, None]
-        return from_spectra(self.data.z, root * self.data.U, root * self.data.Y, nx)
+        return self.data.z, root * self.data.U, root * Y
+
+    def errors(self, matrices: Matrices) -> Complex:
+        """Y - G U, (F, ny, m)."""
+        return self.data.Y - frequency_response(*matrices, self.data.z) @ self.data.U
 
     def with_input_matrices(self, A: Array, C: Array) -> tuple[float, Matrices]:
         """Cost and system with the best B and D for A and C: G is linear in them."""
@@ -60,15 +77,17 @@ class ResponseFit:
         matrices = A, np.zeros((nx, nu)), C, np.zeros((ny, nu))
         X, L = solve_resolvents(*matrices[:3], self.data.z)
         of_B = nx * nx + np.arange(nx * nu)
-        of_D = nx * (nx + nu + ny) + np.arange(ny * nu)
-        columns = np.concatenate([of_B, of_D]) if self.feedthrough else of_B
+        free = self._free_feedthrough
+        of_D = nx * (nx + nu + ny) + np.flatnonzero(free)
+        columns = np.concatenate([of_B, of_D])
         J = _real(self.data.weighted(response_jacobian(X, L, self.data.U, columns))).numpy()
         r = _real(self.data.weighted(self.data.Y)).numpy()
         if not np.isfinite(J).all():
             return np.inf, matrices
         size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
         best = scipy.linalg.lstsq(J / size, r, check_finite=False)[0] / size
-        D = best[nx * nu :].reshape(ny, nu) if self.feedthrough else matrices[3]
+        D = matrices[3]
+        D[free] = best[nx * nu :]
         matrices = A, best[: nx * nu].reshape(nx, nu), C, D
         return float(np.sum((r - J @ best) ** 2)), matrices
 
@@ -80,9 +99,17 @@ class ResponseFit:
     def search(self, matrices: Matrices) -> Search:
         """A search over A, B, C, D that starts from the given ones."""
         problem = ResponseProblem(
-            self.data, len(matrices[0]), LARGEST_POLE, feedthrough=self.feedthrough
+            self.data, len(matrices[0]), LARGEST_POLE, free_feedthrough=self._free_feedthrough
         )
         return Search(problem, torch.as_tensor(np.concatenate([m.ravel() for m in matrices])))
+
+    @property
+    def _free_feedthrough(self) -> NDArray[np.bool_]:
+        """Which entries of D (ny, nu) are parameters."""
+        nu, ny = self.data.U.shape[1], self.data.Y.shape[1]
+        free = np.full((ny, nu), self.feedthrough)
+        free[:, nu - self.starts :] = False
+        return free
 
     def improbability(self, search: Search) -> float:
         """The cost: spectra have no initial states."""
@@ -110,19 +137,24 @@ class ResponseProblem:
         data: what is fitted.
         nx: order.
         largest_pole: limit for the radius of poles. Default: no limit.
-        feedthrough: whether the entries of D may change.
+        free_feedthrough: which entries of D may change, (ny, nu). Default: all.
     """
 
     def __init__(
-        self, data: SpectralData, nx: int, largest_pole: float = np.inf, *, feedthrough: bool = True
+        self,
+        data: SpectralData,
+        nx: int,
+        largest_pole: float = np.inf,
+        *,
+        free_feedthrough: NDArray[np.bool_] | None = None,
     ) -> None:
         self.data, self.largest_pole = data, largest_pole
         nu, ny = data.U.shape[1], data.Y.shape[1]
         self.shapes = (nx, nx), (nx, nu), (ny, nx), (ny, nu)
         self._fixed: Tensor | None = None
-        if not feedthrough:
+        if free_feedthrough is not None and not free_feedthrough.all():
             self._fixed = torch.zeros(nx * (nx + nu + ny) + ny * nu, dtype=torch.bool)
-            self._fixed[nx * (nx + nu + ny) :] = True
+            self._fixed[nx * (nx + nu + ny) :] = torch.as_tensor(~free_feedthrough.ravel())
         self._latest: tuple[Tensor, Complex] | None = None
         self._reduced: Reduction | None = None
 

@@ -90,12 +90,7 @@ def spectral_data_of_records(
         u, y, record = each.u, each.y, each.record
         N = record.period or len(u)
         U, Y = (np.fft.rfft(s.reshape(-1, N, s.shape[1]).mean(0), axis=0) / N for s in (u, y))
-        # A line stands for itself and its conjugate; lines 0 and N / 2 are their own.
-        twice = np.full((len(U), 1), 2.0)
-        twice[0] = 1.0
-        if N % 2 == 0:
-            twice[-1] = 1.0
-        weight = np.max(record.weight) * twice * len(u) / total
+        weight = np.max(record.weight) * _twice(N) * len(u) / total
         if record.line_weight is not None:
             weight = weight * record.line_weight[:: len(u) // N]
         root = np.sqrt(weight)
@@ -116,6 +111,51 @@ def spectral_data_of_records(
     size = np.abs(U).max(axis=(1, 2))
     excited = size > SILENT * size.max(initial=0.0)
     return SpectralData(z[excited], U[excited], Y[excited])
+
+
+def spectral_data_of_parts(
+    parts: Sequence[tuple[Array, Array]], weights: Sequence[float], *, offset: bool
+) -> SpectralData:
+    """Spectra of stretches of signals, each from an initial state of its own, as of inputs.
+
+    A stretch is one period of a periodic signal whose state jumps between its end and its
+    beginning. The jump is the response to an impulse in the last sample, so that the impulse's
+    column of B is the jump, and D has none. By Parseval's theorem the sum of squared errors is the
+    mean square of the simulation errors from the best initial states.
+
+    Args:
+        parts: normalised inputs (T, nu) and outputs (T, ny).
+        weights: of their squared errors.
+        offset: whether each output may have a constant: line 0 is left out.
+
+    Returns:
+        Spectra of one experiment with nu inputs and one more for each part.
+    """
+    R, total = len(parts), sum(len(u) for u, _ in parts)
+    zs, Us, Ys = [], [], []
+    for r, ((u, y), weight) in enumerate(zip(parts, weights, strict=True)):
+        N = len(u)
+        U, Y = (np.fft.rfft(s, axis=0) / N for s in (u, y))
+        z = np.exp(2j * np.pi * np.arange(len(U)) / N)
+        impulses = np.zeros((len(z), R), dtype=complex)
+        impulses[:, r] = z / np.sqrt(N)
+        kept = slice(int(offset), None)
+        root = np.sqrt(weight * _twice(N) * N / total)
+        zs.append(z[kept])
+        Us.append((root * np.hstack([U, impulses]))[kept])
+        Ys.append((root * Y)[kept])
+    return SpectralData(
+        np.concatenate(zs), np.concatenate(Us)[:, :, None], np.concatenate(Ys)[:, :, None]
+    )
+
+
+def _twice(N: int) -> Array:
+    """How many lines each line (F, 1) of N samples stands for: itself and its conjugate."""
+    twice = np.full((N // 2 + 1, 1), 2.0)
+    twice[0] = 1.0  # lines 0 and N / 2 are their own
+    if N % 2 == 0:
+        twice[-1] = 1.0
+    return twice
 
 
 def _line_0(

@@ -82,48 +82,93 @@ def from_spectra(
         U, Y: spectra, scaled so that all errors of Y have the same variance.
         nx: order.
     """
-    ny, m = Y.shape[1:]
-    half = np.angle(z) / 2
+    # Several outputs tell states apart better than further powers of z: order 12 with 3 outputs is
+    # found on a tenth of the axis to 1e-14 by 5 block rows, to 1e-6 by 13.
+    fewest = -(-nx // Y.shape[1]) + 1
+    # Few lines carry few block rows, which must still tell nx states apart.
+    most = _most_rows(U, Y)
+    wanted = (fewest, *(multiple * (nx + 1) for multiple in SPECTRAL_HORIZONS))
+    rows = [q for q in sorted({min(q, most) for q in wanted}) if q >= fewest]
+    found = (subspace.estimate(nx) for q in rows for subspace in _subspaces(z, U, Y, q))
+    return [estimate for estimate in found if estimate is not None]
+
+
+class SpectralSubspace(NamedTuple):
+    """Directions that hold estimates of every order, from one decomposition.
+
+    Args:
+        directions: of the outputs that the inputs do not explain, the main one first.
+        singular_values: of them.
+        size: of the outputs.
+        whiten: what their noise was divided by.
+        warp: of the frequency axis.
+        ny: outputs.
+    """
+
+    directions: Array
+    singular_values: Array
+    size: float
+    whiten: Array
+    warp: float
+    ny: int
+
+    def estimate(self, nx: int) -> SubspaceEstimate | None:
+        """The estimate of an order, ``None`` if the map of the axis has no inverse there."""
+        observability = _main(self.directions, self.singular_values, nx)
+        A_axis, C = _shift(self.whiten @ observability, self.ny)
+        a, eye = self.warp, np.eye(nx)
+        try:  # A = (A_axis + a I) (I + a A_axis)⁻¹ takes the bilinear map back
+            A = np.linalg.solve((eye + a * A_axis).T, (A_axis + a * eye).T).T
+        except np.linalg.LinAlgError:
+            return None
+        s = self.singular_values / self.size
+        return _stable(np.asarray(A, dtype=np.float64), C, s)
+
+
+def spectral_subspaces(
+    z: Complex128[Complex, " F"],
+    U: Complex128[Complex, "F nu m"],
+    Y: Complex128[Complex, "F ny m"],
+    most: int,
+) -> list[SpectralSubspace]:
+    """Subspaces for the orders up to ``most``, or what these lines carry; see ``from_spectra``."""
+    rows = {min(multiple * (most + 1), _most_rows(U, Y)) for multiple in SPECTRAL_HORIZONS}
+    return [each for q in sorted(rows) if q > 1 for each in _subspaces(z, U, Y, q)]
+
+
+def _most_rows(U: Complex, Y: Complex) -> int:
+    """Block rows that these lines carry."""
+    return 2 * len(U) * U.shape[2] // (U.shape[1] + Y.shape[1])
+
+
+def _subspaces(z: Complex, U: Complex, Y: Complex, q: int) -> list[SpectralSubspace]:
+    """Those of q block rows, on several frequency axes, with and without equal noise."""
+    ny, half = Y.shape[1], np.angle(z) / 2
     power = (np.abs(Y) ** 2).sum(axis=(1, 2))
     centres = [np.median(half), np.average(half, weights=power if power.any() else None)]
     warps = [0.0, *(np.clip(np.tan(np.pi / 4 - c), -0.99, 0.99) for c in centres)]
-    estimates = []
-    # Several outputs tell states apart better than further powers of z: order 12 with 3 outputs is
-    # found on a tenth of the axis to 1e-14 by 5 block rows, to 1e-6 by 13.
-    fewest = -(-nx // ny) + 1
-    # Few lines carry few block rows, which must still tell nx states apart.
-    most = 2 * len(z) * m // (U.shape[1] + ny)
-    wanted = (fewest, *(multiple * (nx + 1) for multiple in SPECTRAL_HORIZONS))
-    for q in sorted({min(q, most) for q in wanted}):
-        if q < fewest:
-            continue
-        for a in warps:
-            axis = (z - a) / (1.0 - a * z)
-            powers = axis ** np.arange(q)[:, None]
-            stacked = [
-                (powers[:, None, :, None] * S.swapaxes(0, 1)).reshape(q * S.shape[1], -1)
-                for S in (U, Y)
-            ]
-            rows = np.vstack(stacked)
-            # L = [L_uu 0; L_yu L_yy]: L_yy is the part of the outputs that is orthogonal to the
-            # inputs, and spans the observability matrix.
-            L = _lower(np.hstack([np.real(rows), np.imag(rows)]))
-            first = q * U.shape[1]
-            noise = np.real(powers @ powers.conj().T)  # covariance of white errors in Y
-            noise += 1e-14 * np.trace(noise) * np.eye(q)
-            for root in (np.eye(q), np.linalg.cholesky(noise)):
-                # The inverse root gives all rows the same noise; it is undone on the subspace.
-                whiten = np.kron(root, np.eye(ny))
-                outputs = scipy.linalg.solve_triangular(whiten, L[first:], lower=True)
-                observability, s = _observability(outputs, slice(first, None), nx)
-                A_axis, C = _shift(whiten @ observability, ny)
-                eye = np.eye(nx)
-                try:  # A = (A_axis + a I) (I + a A_axis)⁻¹ takes the bilinear map back
-                    A = np.linalg.solve((eye + a * A_axis).T, (A_axis + a * eye).T).T
-                except np.linalg.LinAlgError:
-                    continue
-                estimates.append(_stable(A, C, s))
-    return estimates
+    found = []
+    for a in warps:
+        axis = (z - a) / (1.0 - a * z)
+        powers = axis ** np.arange(q)[:, None]
+        stacked = [
+            (powers[:, None, :, None] * S.swapaxes(0, 1)).reshape(q * S.shape[1], -1)
+            for S in (U, Y)
+        ]
+        rows = np.vstack(stacked)
+        # L = [L_uu 0; L_yu L_yy]: L_yy is the part of the outputs that is orthogonal to the
+        # inputs, and spans the observability matrix.
+        L = _lower(np.hstack([np.real(rows), np.imag(rows)]))
+        first = q * U.shape[1]
+        noise = np.real(powers @ powers.conj().T)  # covariance of white errors in Y
+        noise += 1e-14 * np.trace(noise) * np.eye(q)
+        for root in (np.eye(q), np.linalg.cholesky(noise)):
+            # The inverse root gives all rows the same noise; it is undone on the subspace.
+            whiten = np.asarray(np.kron(root, np.eye(ny)), dtype=np.float64)
+            outputs = scipy.linalg.solve_triangular(whiten, L[first:], lower=True)
+            directions, s, size = _directions(outputs, slice(first, None))
+            found.append(SpectralSubspace(directions, s, size, whiten, float(a), ny))
+    return found
 
 
 def from_signals(
@@ -150,9 +195,9 @@ def from_signals(
         L = _lower(np.vstack([U[i * nu :], U[: i * nu], Y[: i * ny], Y[i * ny :]]))
         inputs, past_u, past = i * nu, 2 * i * nu, i * (2 * nu + ny)
         for instruments in (past, past_u):
-            observability, s = _observability(L[past:], slice(inputs, instruments), nx)
-            A, C = _shift(observability, ny)
-            estimates.append(_stable(A, C, s))
+            directions, s, size = _directions(L[past:], slice(inputs, instruments))
+            A, C = _shift(_main(directions, s, nx), ny)
+            estimates.append(_stable(A, C, s / size))
     return estimates
 
 
@@ -175,11 +220,15 @@ def _lower(rows: Array) -> Array:
     return L
 
 
-def _observability(outputs: Array, seen: slice, nx: int) -> tuple[Array, Array]:
-    """Scaled main directions of the columns ``seen``, and their relative singular values."""
+def _directions(outputs: Array, seen: slice) -> tuple[Array, Array, float]:
+    """Main directions of the columns ``seen``, their singular values, and the outputs' size."""
     U, s, _ = np.linalg.svd(outputs[:, seen])
-    size = max(float(np.linalg.norm(outputs)), np.finfo(float).tiny)
-    return U[:, :nx] * np.sqrt(np.pad(s, (0, max(0, nx - len(s))))[:nx]), s / size
+    return U, s, max(float(np.linalg.norm(outputs)), np.finfo(float).tiny)
+
+
+def _main(directions: Array, s: Array, nx: int) -> Array:
+    """The first nx directions, scaled."""
+    return directions[:, :nx] * np.sqrt(np.pad(s, (0, max(0, nx - len(s))))[:nx])
 
 
 def _shift(observability: Array, ny: int) -> tuple[Array, Array]:

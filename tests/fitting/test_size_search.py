@@ -9,21 +9,13 @@ import numpy as np
 import pytest
 import torch
 from reference import random_cell
-from scipy.signal import lfilter
 
+from lfrtorch._support.paired_blocks import BLOCKS
 from lfrtorch._support.tables import number
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Polynomial
-from lfrtorch.fitting.size_search import (
-    BLOCKS,
-    Candidate,
-    SizeSearch,
-    blocked_mean,
-    in_blocks,
-    search_sizes,
-    standard_errors_above,
-)
+from lfrtorch.fitting.size_search import Candidate, SizeSearch, search_sizes
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import StoppedError
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -147,51 +139,6 @@ def test_degree_takes_the_place_of_neurons():
 # --- the rule ---------------------------------------------------------------------------------
 
 
-def sums(signals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    blocks = [in_blocks([signal]) for signal in signals]
-    return (
-        np.array([[block.sum() for block in each] for each in blocks]),
-        np.array([len(block) for block in blocks[0]]),
-    )
-
-
-def test_standard_error_is_right_for_errors_that_are_correlated():
-    rng = np.random.default_rng(0)
-    means, errors, alone = [], [], []
-    for _ in range(1000):
-        e = lfilter([math.sqrt(1 - 0.81)], [1, -0.9], rng.standard_normal(2200))
-        squares = np.asarray(e)[200:] ** 2
-        mean, error = blocked_mean(*sums([squares]))
-        means.append(mean[0])
-        errors.append(error[0])
-        alone.append(squares.std() / math.sqrt(len(squares)))
-    # 1000 draws: 2 %; blocks of 20 correlation times of the squares: 5 %.
-    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(means), rel=0.1)
-    assert np.mean(alone) < 0.4 * np.std(means)  # samples taken as independent
-
-
-def test_of_two_equal_models_the_smaller_is_taken_in_83_of_100_cases():
-    rng = np.random.default_rng(1)
-    above = [
-        standard_errors_above(rng.chisquare(50, (2, BLOCKS)), np.full(BLOCKS, 50))[0]
-        for _ in range(2000)
-    ]
-    # (1 + P(|t| < 1)) / 2 of Student's t with 9 degrees of freedom; 4 standard deviations.
-    assert np.mean(np.array(above) <= 1.0) == pytest.approx(0.828, abs=0.034)
-
-
-def test_noise_that_models_share_does_not_hide_which_is_better():
-    rng = np.random.default_rng(2)
-    T, excess = 2600, 0.118
-    noise, own = rng.standard_normal((2, T))
-    squares, counts = sums([noise**2, (noise + excess * own) ** 2])
-    above = standard_errors_above(squares, counts)
-    assert above[0] == 0.0
-    assert above[1] > 2.0
-    mean, error = blocked_mean(squares, counts)
-    assert mean[1] < mean[0] + error[0]  # the usual form cannot tell
-
-
 def tried(net: int, mean: float, error: float) -> Candidate:
     """A model whose squared errors in the blocks have this mean and standard error."""
     ramp = np.linspace(-1.0, 1.0, BLOCKS)
@@ -211,23 +158,6 @@ def tried(net: int, mean: float, error: float) -> Candidate:
 def test_the_fewest_parameters_that_do_as_well_are_chosen(mean: float, error: float, chosen: int):
     models = tried(10, 1.0, 0.0), tried(25, 1.0001, 0.0), tried(5, mean, error)
     assert SizeSearch(models, np.ones(BLOCKS, int)).chosen.sizes == {"nn": chosen}
-
-
-def test_blocks_cover_every_record():
-    signals = [np.arange(70.0), np.arange(35.0), np.arange(3.0)]
-    blocks = in_blocks(signals)
-    assert [len(block) for block in blocks] == [10] * 7 + [9, 9, 9, 8] + [3]
-    assert np.array_equal(np.concatenate(blocks), np.concatenate(signals))
-    assert [len(block) for block in in_blocks([np.ones(5)] * 20)] == [5] * 20
-    with pytest.raises(ValueError, match="have 9 scored samples"):
-        in_blocks([np.ones(9)])
-
-
-def test_a_model_that_diverges_is_infinitely_far_above_the_best():
-    above = standard_errors_above(
-        np.array([[np.inf] * 10, [2.0] * 10, [2.0] * 10]), np.ones(10, int)
-    )
-    assert above.tolist() == [np.inf, 0.0, 0.0]
 
 
 # --- what goes wrong --------------------------------------------------------------------------

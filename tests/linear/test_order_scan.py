@@ -1,6 +1,7 @@
 """The scan over orders finds the one that was planted, and says what it rests on."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from lfrtorch.linear import order_scan
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel
-from lfrtorch.linear.order_scan import MARGIN, OrderScan, scan_orders
+from lfrtorch.linear.order_scan import FOLDS, PATIENCE, OrderScan, scan_orders
 from lfrtorch.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
@@ -34,9 +35,10 @@ def scan() -> OrderScan:
 
 
 def fake(monkeypatch: pytest.MonkeyPatch, models: Sequence[LinearModel]):
-    """The fits of a scan are those models, whatever the data."""
+    """The fits of a scan are those models, whatever the data, and validation is trusted."""
     of_order = {model.nx: model for model in models}
     monkeypatch.setattr(order_scan, "estimate_bla", lambda data, nx, **_: of_order[nx])
+    monkeypatch.setattr(order_scan.OrderFits, "of", lambda *_: None)
 
 
 def model_of(nx: int, rmse: float, nu: int = 1, ny: int = 1) -> LinearModel:
@@ -90,13 +92,32 @@ def test_score_on_validation_is_the_relative_simulation_error(monkeypatch):
 )
 def test_lowest_order_within_the_margin_of_the_best_is_chosen(scores, chosen, monkeypatch):
     """Of validation; a description length has a term for the order as it is."""
-    assert MARGIN == 0.01
     record = record_of(PLANTED, 0)
     fake(monkeypatch, [model_of(nx + 1, score) for nx, score in enumerate(scores)])
-    monkeypatch.setattr(order_scan, "_validation", lambda model, *_: model.fit.rmse)
+
+    def errors(_records, _scale, model):  # of the same size everywhere, whatever the block
+        return [np.full((100, 1), model.fit.rmse)]
+
+    monkeypatch.setattr(order_scan, "_errors", errors)
     assert scan_orders(record, [1, 2, 3], validation=record).chosen == chosen
     monkeypatch.setattr(order_scan, "_description_length", lambda model, _: model.fit.rmse)
     assert scan_orders(record, [1, 2, 3]).chosen == int(np.argmin(scores)) + 1
+
+
+def test_order_within_one_standard_error_of_the_best_is_chosen(monkeypatch):
+    """The difference of the squares, block by block, is what counts."""
+    record, models = record_of(PLANTED, 0), [model_of(nx, 0.1) for nx in (1, 2)]
+    fake(monkeypatch, models)
+    blocks = np.repeat(np.arange(10.0), 10)[:, None]
+
+    def errors_with(spread):
+        squares = {1: 1.05 + spread * (blocks - 4.5), 2: np.ones_like(blocks)}
+        return lambda _records, _scale, model: [np.sqrt(squares[model.nx])]
+
+    monkeypatch.setattr(order_scan, "_errors", errors_with(0.06))  # 0.05 is 0.9 standard errors
+    assert scan_orders(record, [1, 2], validation=record).chosen == 1
+    monkeypatch.setattr(order_scan, "_errors", errors_with(0.04))
+    assert scan_orders(record, [1, 2], validation=record).chosen == 2
 
 
 def test_description_length_counts_parameters_and_equations(monkeypatch):
@@ -125,7 +146,7 @@ def test_response_can_be_scanned():
 def test_orders_that_the_data_do_not_reach_for_are_left_out():
     u = np.random.default_rng(0).normal(size=60)
     # 4 (nx + 1) samples a window, 2 rows for each: enough columns up to order 4.
-    found = scan_orders(Record(u, np.roll(u, 1)), range(1, 20), max_iter=0)
+    found = scan_orders(Record(u, np.roll(u, 1)), range(1, 20), refine="prediction", max_iter=0)
     assert found.orders == (1, 2, 3, 4)
     with pytest.raises(ValueError, match="needs one of"):
         estimate_bla(Record(u, np.roll(u, 1)), len(found.orders) + 1)
@@ -149,6 +170,7 @@ def test_orders_are_fitted_once_and_in_their_order(monkeypatch):
         return model_of(nx, 0.1)
 
     monkeypatch.setattr(order_scan, "estimate_bla", fit)
+    monkeypatch.setattr(order_scan.OrderFits, "of", lambda *_: None)
     found = scan_orders(record_of(PLANTED, 0), (3, 1, 2, 3))
     assert asked == [1, 2, 3]
     assert found.orders == (1, 2, 3)
@@ -165,3 +187,88 @@ def test_orders_must_be_given():
         scan_orders(record, [1], validation=frf)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="constant in all records"):
         scan_orders(Record(np.ones(100), np.ones(100)), [1, 2])
+
+
+# --- which orders, and on what ------------------------------------------------------------------
+
+
+def driven(seed: int, T: int = 400, noise: float = 0.05) -> Record:
+    """The planted system from rest."""
+    A, B, C, D = PLANTED
+    rng = np.random.default_rng(seed)
+    u, x, y = rng.normal(size=(T, 1)), np.zeros(3), np.zeros((T, 1))
+    for k in range(T):
+        y[k] = C @ x + D @ u[k]
+        x = A @ x + B @ u[k]
+    return Record(u, y + noise * y.std() * rng.normal(size=y.shape), 10.0, skip=20)
+
+
+def test_each_order_is_told_and_the_scan_ends_where_orders_bring_nothing():
+    lines: list[str] = []
+    found = scan_orders(driven(0), range(1, 13), validation=driven(1, 800), watch=lines.append)
+    assert found.chosen == 3
+    assert found.notes == ()
+    assert found.orders == tuple(range(1, 3 + PATIENCE + 1))
+    assert [line.split(":")[0] for line in lines] == [f"order {nx}" for nx in found.orders]
+    assert "validation 0.05" in lines[2]
+    # The model chosen is the full estimate.
+    assert found.best.fit is not None
+    assert found.best.fit.rmse == pytest.approx(estimate_bla(driven(0), 3).fit.rmse)  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_an_order_that_the_input_cannot_carry_is_left_out():
+    """A multisine of two lines excites four directions, and a model of order 2 has five."""
+    t = np.arange(400)
+    u = np.sin(2 * np.pi * t / 20) + np.sin(2 * np.pi * t / 8)
+    record = Record(u, np.convolve(u, [0.0, 1.0, 0.5])[:400], 10.0, skip=20)
+    found = scan_orders(record, range(1, 7))
+    assert found.orders == (1,)
+    assert found.notes[0].startswith("orders from 2 on are left out: the input excites 4 of the 5")
+
+
+def test_an_order_that_leaves_nothing_but_integrators_is_left_out():
+    record = driven(0, 300)
+    position = Record(record.u, np.cumsum(record.y, axis=0), 10.0, start="estimated", skip=20)
+    found = scan_orders(position, [1, 2, 3], integrators=2, max_iter=0)
+    assert found.orders == (2, 3)
+
+
+def part(record: Record, end: int, skip: int) -> Record:
+    """A record cut in time: it is simulated from the beginning and scored after ``skip``."""
+    return replace(record[:end], start="estimated", skip=skip)
+
+
+@pytest.mark.parametrize("why", ["short", "unlike"])
+def test_a_poor_validation_part_is_replaced_by_folds_over_all(why: str):
+    record = driven(0, 700)
+    train, validation = part(record, 300, 20), part(record, 340 if why == "short" else 700, 300)
+    if why == "unlike":  # a load that comes late
+        y = validation.y + 0.5 * validation.y.std() * (np.arange(700) >= 300)[:, None]
+        validation = replace(validation, y=y)
+    lines: list[str] = []
+    found = scan_orders(train, range(1, 5), validation=validation, watch=lines.append)
+    reason = {"short": "validation has 40 scored samples", "unlike": "the linear error on val"}
+    assert found.notes[0].startswith(reason[why])
+    assert len(found.notes[0]) <= 160 - len("note: ")
+    crossed = [line for line in lines if "cross-validation" in line]
+    assert [line.split(":")[0] for line in crossed] == [f"order {nx}" for nx in found.orders]
+    if why == "short":
+        assert found.chosen == 3
+        assert found.scores[2] == pytest.approx(0.05, rel=0.1)
+
+
+def test_folds_score_each_sample_once_from_its_whole_record():
+    record = driven(0, 500)
+    train, validation, other = part(record, 300, 20), part(record, 500, 300), driven(1, 200)
+    model = estimate_bla(train, 3)
+    folds = order_scan._Folds(model, [train, other], [validation], 3, {})
+    assert len(folds._left_out) == FOLDS
+    scored = [np.zeros(500, int), np.zeros(200, int)]
+    for fold in folds._left_out:
+        for counts, (first, last) in zip(scored, fold, strict=True):
+            counts[first:last] += 1
+    assert [counts[:20].sum() for counts in scored] == [0, 0]
+    assert all((counts[20:] == 1).all() for counts in scored)
+    errors = folds.errors(model)
+    assert sum(map(len, errors)) == 480 + 180
+    assert np.concatenate(errors).std() == pytest.approx(0.05, rel=0.1)

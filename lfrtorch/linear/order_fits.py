@@ -1,0 +1,280 @@
+"""Linear models of several orders, each started from those below it and from one subspace.
+
+A full estimate takes a dozen subspace estimates of its order and refines them to the last digit. A
+scan of orders shares the work: the spectra, and one decomposition that holds estimates of all
+orders. A model of a lower order, and as many more states as describe its errors best, is a start
+that is at least as good as that model, so that the error fitted falls with the order.
+
+Records that are not periodic are fitted by their spectra, too, from initial states that are free at
+the first scored sample: see ``spectral_data_of_parts``. The sum of squares is that of a simulation.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from lfrtorch._support.threads import spread_by_hand
+from lfrtorch._support.types import Array
+from lfrtorch.linear.bla import physical, scaled, transformation
+from lfrtorch.linear.frf import FRF, estimate_frf
+from lfrtorch.linear.model import LinearFit, LinearModel
+from lfrtorch.linear.refinement import Matrices, Refined, Search
+from lfrtorch.linear.requirements import check_spectral_data
+from lfrtorch.linear.response_fit import ResponseFit
+from lfrtorch.linear.spectral_data import (
+    spectral_data_of_parts,
+    spectral_data_of_records,
+    spectral_data_of_response,
+)
+from lfrtorch.linear.subspace import SpectralSubspace, spectral_subspaces
+from lfrtorch.metrics import rms
+from lfrtorch.records import Record, Scaler, without_coordinates
+
+Window = tuple[int, int]
+"""First sample, and the one after the last."""
+
+MOST_PARTS = 8
+"""Initial states are unknowns: of more records this many are fitted, evenly spaced."""
+
+STARTS, FIRST_STEPS, FINALISTS, MOST_STEPS = 4, 8, 2, 80
+"""Starts that are refined, iterations after which the best few go on, and their last one."""
+
+NEAR_STEPS = 24
+"""The last one from a model that is near the minimum."""
+
+SETTLED, STRIDE = 1e-4, 8
+"""The search ends if so many iterations lower the cost by less than this part."""
+
+SHORTEST = 4
+"""Samples that a part has at least, in multiples of nx + 1."""
+
+
+class OrderFits:
+    """The fits of several orders to the same data.
+
+    Args:
+        problem: the least-squares problem.
+        scaler: from its units to physical ones.
+        about: what the data are: the rate and the channels of the models.
+        criterion: name of its error.
+        train: records whose mean error gives the offset of the output; none for a response.
+        offset: whether it has one.
+        most: highest order.
+        max_iter: iterations of a search.
+    """
+
+    def __init__(
+        self,
+        problem: ResponseFit,
+        scaler: Scaler,
+        about: FRF | Record,
+        criterion: str,
+        train: Sequence[tuple[Record, Sequence[Window]]],
+        *,
+        offset: bool,
+        most: int,
+        max_iter: int,
+    ) -> None:
+        self.problem, self._scaler, self._about = problem, scaler, about
+        self._criterion, self._train, self._offset = criterion, train, offset
+        self._max_iter = max_iter
+        inputs = problem.data.U.shape[1] - problem.starts
+        self._driven = ResponseFit(
+            replace(problem.data, U=problem.data.U[:, :inputs]), known=problem.known
+        )
+        self._most = most
+        self._found: dict[int, Matrices] = {}
+
+    @cached_property
+    def _subspaces(self) -> list[SpectralSubspace]:
+        return spectral_subspaces(*self.problem.equal_noise(self.problem.data.Y), self._most)
+
+    @classmethod
+    def of(cls, data: Sequence[Record] | FRF, most: int, options: Mapping[str, Any]) -> Self | None:
+        """The fits of what ``estimate_bla`` takes, ``None`` if it has to fit them one by one."""
+        known = {"refine", "weight", "offset", "feedthrough", "coordinates", "max_iter"}
+        given = {name: value for name, value in options.items() if value is not None}
+        refine = given.get("refine")
+        if refine == "prediction" or any(given[name] for name in given.keys() - known):
+            return None
+        offset, through = given.get("offset", True), given.get("feedthrough", True)
+        common: dict[str, Any] = {"offset": offset, "most": most}
+        common["max_iter"] = given.get("max_iter", MOST_STEPS)
+        if isinstance(data, FRF) or refine == "frequency":
+            about = data if isinstance(data, FRF) else estimate_frf(data)
+            spectra, scaler, known_, _ = spectral_data_of_response(
+                about, given.get("weight"), offset=offset
+            )
+            problem = ResponseFit(spectra, known=known_, feedthrough=through)
+            return cls(problem, scaler, about, "frequency", (), **common)
+        records = [without_coordinates(record) for record in data]
+        scaler = Scaler.of(records, offset=offset)
+        spectra = spectral_data_of_records([scaler.normalise(r) for r in records], offset=offset)
+        if spectra is None:
+            windows = [[(record.skip, record.samples)] for record in records]
+            return cls.of_windows(records, windows, **common, feedthrough=through)
+        problem = ResponseFit(spectra, known=False, feedthrough=through)
+        whole = [(record, [(0, record.samples)]) for record in records]
+        return cls(problem, scaler, records[0], "simulation", whole, **common)
+
+    @classmethod
+    def of_windows(
+        cls,
+        records: Sequence[Record],
+        windows: Sequence[Sequence[Window]],
+        *,
+        offset: bool,
+        feedthrough: bool,
+        most: int,
+        max_iter: int = MOST_STEPS,
+    ) -> Self:
+        """The fits of parts of records, each from an initial state of its own."""
+        scaler = Scaler.of(records, offset=offset)
+        parts, weights = [], []
+        for record, own in zip(records, windows, strict=True):
+            normalised = scaler.normalise(record)
+            for first, last in own:
+                parts.append((normalised.u[first:last], normalised.y[first:last]))
+                weights.append(float(np.max(record.weight)))
+        longest = max(len(u) for u, _ in parts)
+        enough = min(longest, SHORTEST * (most + 1))
+        kept = [i for i, (u, _) in enumerate(parts) if len(u) >= enough]
+        kept = [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, MOST_PARTS).astype(int))]
+        spectra = spectral_data_of_parts(
+            [parts[i] for i in kept], [weights[i] for i in kept], offset=offset
+        )
+        problem = ResponseFit(spectra, known=False, feedthrough=feedthrough, starts=len(kept))
+        whole = list(zip(records, windows, strict=True))
+        return cls(
+            problem, scaler, records[0], "simulation", whole,
+            offset=offset, most=most, max_iter=max_iter,
+        )  # fmt: skip
+
+    @spread_by_hand()
+    def fit(self, nx: int, near: LinearModel | None = None) -> LinearModel:
+        """The model of an order.
+
+        Args:
+            nx: the order; if the ones below were fitted before, it starts from them, too.
+            near: a model to start from instead of all others.
+
+        Raises:
+            ValueError: fewer equations than unknowns, or no stable start.
+        """
+        clock = time.perf_counter()
+        check_spectral_data(self.problem.data, nx)
+        starts = self._starts(nx) if near is None else [self._near(near)]
+        last = MOST_STEPS if near is None else NEAR_STEPS
+        searches = [self._search(matrices) for matrices in starts]
+        found = [self.problem.refined(searches[0])]
+        for search in searches:
+            self._advance(search, FIRST_STEPS)
+        searches = sorted(searches, key=lambda search: search.state.cost)[:FINALISTS]
+        for search in searches:
+            self._advance(search, last)
+        found += [self.problem.refined(search) for search in searches]
+        models = [self._model(each, clock) for each in found]
+        # A free initial state may bring a mode that explains drift and fails in a simulation; the
+        # start has it less than the minimum.
+        errors = [self._error(model) for model in models]
+        best = int(np.argmin(errors))
+        self._found[nx] = found[best].matrices
+        model = models[best]
+        if near is None:
+            first = self._subspaces[0]
+            assert model.fit is not None
+            values = tuple(map(float, first.singular_values / first.size))
+            model = replace(model, fit=replace(model.fit, singular_values=values))
+        return model
+
+    def _near(self, model: LinearModel) -> Matrices:
+        return self.problem.with_input_matrices(model.A, model.C / self._scaler.y_scale[:, None])[1]
+
+    def _starts(self, nx: int) -> list[Matrices]:
+        """Starts of finite cost, the best first."""
+        pairs = [
+            pair
+            for below in (nx - 2, nx - 1)
+            if below in self._found
+            for pair in self._extended(self._found[below], nx - below)
+        ]
+        estimates = [subspace.estimate(nx) for subspace in self._subspaces]
+        pairs += [(e.A, e.C) for e in estimates if e is not None and len(e.A) == nx]
+        found = [self.problem.with_input_matrices(A, C) for A, C in pairs]
+        ranked = sorted((each for each in found if np.isfinite(each[0])), key=lambda each: each[0])
+        return [matrices for _, matrices in ranked[:STARTS]]
+
+    def _extended(self, below: Matrices, more: int) -> list[tuple[Array, Array]]:
+        """A and C of a model with ``more`` states that describe its errors."""
+        errors = self.problem.equal_noise(self.problem.errors(below))
+        estimates = [each.estimate(more) for each in spectral_subspaces(*errors, more)]
+        A, _, C, _ = below
+        zeros = np.zeros((len(A), more))
+        return [
+            (np.block([[A, zeros], [zeros.T, e.A]]), np.hstack([C, e.C]))
+            for e in estimates
+            if e is not None
+        ]
+
+    def _search(self, matrices: Matrices) -> Search:
+        try:
+            return self.problem.search(scaled(self.problem, matrices, balanced=True))
+        except ValueError:  # the data hardly move some states: their scaling is a rounding error
+            return self.problem.search(matrices)
+
+    def _advance(self, search: Search, steps: int) -> None:
+        steps = min(steps, self._max_iter)
+        while not search.state.reason and search.state.iteration < steps:
+            before = search.state.cost
+            search.advance(min(steps, search.state.iteration + STRIDE))
+            if search.state.cost > (1.0 - SETTLED) * before:
+                break
+
+    def _model(self, found: Refined, clock: float) -> LinearModel:
+        """In physical units, without what belongs to the initial states."""
+        found = self._without_starts(found)
+        model = physical(found, self._scaler, self._about)
+        model = model.transformed(*transformation(self._driven, found.matrices, balanced=True))
+        rmse = found.rmse
+        if self._train:  # the squares of all lines are those of a sample
+            rmse *= float(np.sqrt(self.problem.data.Y.size / len(model.outputs)))
+            if self._offset:
+                mean = self._errors(model).mean(axis=0)
+                model = replace(model, y_offset=model.y_offset + mean)
+        spent = time.perf_counter() - clock
+        fit = LinearFit(self._criterion, rmse, found.iterations, found.reason, spent)
+        return replace(model, fit=fit)
+
+    def _errors(self, model: LinearModel) -> Array:
+        """Errors of a simulation in the windows, physical units, (samples, ny)."""
+        found = []
+        for record, windows in self._train:
+            errors = record.y - model.simulate(record)
+            found += [errors[first:last] for first, last in windows]
+        return np.concatenate(found)
+
+    def _error(self, model: LinearModel) -> float:
+        """What a model is chosen by: the rms of its simulation; of a response the criterion."""
+        if not self._train:
+            assert model.fit is not None
+            return model.fit.rmse
+        return float(rms(self._errors(model) / self._scaler.y_scale))
+
+    def _without_starts(self, found: Refined) -> Refined:
+        """The system without the inputs that make its initial states."""
+        _, B, _, D = found.matrices
+        inputs = B.shape[1] - self.problem.starts
+        kept = [np.ones_like(m, dtype=bool) for m in found.matrices]
+        for matrix in (kept[1], kept[3]):
+            matrix[:, inputs:] = False
+        entries = np.concatenate([matrix.ravel() for matrix in kept])
+        covariance = found.covariance
+        if covariance is not None:
+            covariance = covariance[np.ix_(entries, entries)]
+        return replace(found, B=B[:, :inputs], D=D[:, :inputs], covariance=covariance)

@@ -1,0 +1,91 @@
+"""Errors of several models in blocks of time: what tells two of them apart, and what does not."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from lfrtorch._support.paired_blocks import (
+    BLOCKS,
+    as_good,
+    blocked_mean,
+    in_blocks,
+    squares_in_blocks,
+    standard_errors_above,
+)
+
+pytestmark = pytest.mark.numeric
+
+
+def sums(signals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    blocks = [in_blocks([signal]) for signal in signals]
+    return (
+        np.array([[block.sum() for block in each] for each in blocks]),
+        np.array([len(block) for block in blocks[0]]),
+    )
+
+
+def test_standard_error_is_right_for_errors_that_are_correlated():
+    rng = np.random.default_rng(0)
+    means, errors, alone = [], [], []
+    for _ in range(1000):
+        e = lfilter([math.sqrt(1 - 0.81)], [1, -0.9], rng.standard_normal(2200))
+        squares = np.asarray(e)[200:] ** 2
+        mean, error = blocked_mean(*sums([squares]))
+        means.append(mean[0])
+        errors.append(error[0])
+        alone.append(squares.std() / math.sqrt(len(squares)))
+    # 1000 draws: 2 %; blocks of 20 correlation times of the squares: 5 %.
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(means), rel=0.1)
+    assert np.mean(alone) < 0.4 * np.std(means)  # samples taken as independent
+
+
+def test_of_two_equal_models_the_smaller_is_taken_in_83_of_100_cases():
+    rng = np.random.default_rng(1)
+    above = [
+        standard_errors_above(rng.chisquare(50, (2, BLOCKS)), np.full(BLOCKS, 50))[0]
+        for _ in range(2000)
+    ]
+    # (1 + P(|t| < 1)) / 2 of Student's t with 9 degrees of freedom; 4 standard deviations.
+    assert np.mean(np.array(above) <= 1.0) == pytest.approx(0.828, abs=0.034)
+
+
+def test_noise_that_models_share_does_not_hide_which_is_better():
+    rng = np.random.default_rng(2)
+    T, excess = 2600, 0.118
+    noise, own = rng.standard_normal((2, T))
+    squares, counts = sums([noise**2, (noise + excess * own) ** 2])
+    above = standard_errors_above(squares, counts)
+    assert above[0] == 0.0
+    assert above[1] > 2.0
+    mean, error = blocked_mean(squares, counts)
+    assert mean[1] < mean[0] + error[0]  # the usual form cannot tell
+
+
+def test_blocks_cover_every_record():
+    signals = [np.arange(70.0), np.arange(35.0), np.arange(3.0)]
+    blocks = in_blocks(signals)
+    assert [len(block) for block in blocks] == [10] * 7 + [9, 9, 9, 8] + [3]
+    assert np.array_equal(np.concatenate(blocks), np.concatenate(signals))
+    assert [len(block) for block in in_blocks([np.ones(5)] * 20)] == [5] * 20
+    with pytest.raises(ValueError, match="have 9 scored samples"):
+        in_blocks([np.ones(9)])
+
+
+def test_a_model_that_diverges_is_infinitely_far_above_the_best():
+    above = standard_errors_above(
+        np.array([[np.inf] * 10, [2.0] * 10, [2.0] * 10]), np.ones(10, int)
+    )
+    assert above.tolist() == [np.inf, 0.0, 0.0]
+
+
+def test_errors_that_are_not_finite_are_infinite_and_no_model_is_as_good():
+    errors = [np.ones((20, 2)), np.full((10, 2), 2.0)]
+    sums = squares_in_blocks(errors)
+    assert sums.sum() == 20 + 4 * 10  # the mean of the outputs
+    errors[1][3, 1] = np.nan
+    lost = squares_in_blocks(errors)
+    assert np.isinf(lost).all()
+    counts = np.array([len(block) for block in in_blocks([e[:, 0] for e in errors])])
+    assert as_good([lost, sums], counts).tolist() == [False, True]
