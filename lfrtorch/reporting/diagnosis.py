@@ -29,6 +29,10 @@ LONGEST, SHORTEST = 1024, 64
 LAGS = 12
 """Least memory of a filter that is fitted in time, to records too short for segments."""
 
+SHIFTS = 0.276, 0.382, 0.618, 0.724
+"""Parts of the records by which errors are shifted to see what is explained by chance: no fractions
+of few periods."""
+
 BEGINNING = 0.05
 """Part of a record that is its beginning."""
 
@@ -205,7 +209,9 @@ def coherent_part(
 def filtered_part(signals: Sequence[Array], errors: Sequence[Array], lags: int) -> float | None:
     """Part of the errors' power that filters of a finite memory explain, by least squares.
 
-    It is the adjusted R², of the output of which most is explained.
+    What they explain by chance is taken off: the mean of what they explain of the errors shifted in
+    time, which is far more for slow errors than for white ones. With several outputs the largest
+    part counts.
 
     Args:
         signals, errors: see :func:`coherent_part`.
@@ -216,21 +222,24 @@ def filtered_part(signals: Sequence[Array], errors: Sequence[Array], lags: int) 
     """
     if lags < LAGS:
         return None
-    n = signals[0].shape[1]
     memory = np.concatenate(
         [
-            np.lib.stride_tricks.sliding_window_view(x, lags, axis=0).reshape(-1, n * lags)
+            np.lib.stride_tricks.sliding_window_view(x, lags, axis=0).reshape(-1, x.shape[1] * lags)
             for x in signals
         ]
     )
     left = np.concatenate([e[lags - 1 :] for e in errors])
     memory, left = memory - memory.mean(axis=0), left - left.mean(axis=0)
-    fitted = memory @ np.linalg.lstsq(memory, left, rcond=None)[0]
+    U, s, _ = np.linalg.svd(memory, full_matrices=False)
+    U = U[:, s > 1e-9 * max(s[0], np.finfo(float).tiny)]
     total = np.sum(left**2, axis=0)
-    freedom = len(left) - 1
-    adjusted = freedom / max(1, freedom - n * lags)
-    parts = 1.0 - adjusted * np.sum((left - fitted) ** 2, axis=0) / np.where(total > 0, total, 1.0)
-    return float(np.clip(np.where(total > 0, parts, 0.0).max(), 0.0, 1.0))
+    total = np.where(total > 0, total, 1.0)
+    explained, *chance = (
+        np.sum((U.T @ np.roll(left, round(part * len(left)), axis=0)) ** 2, axis=0) / total
+        for part in (0.0, *SHIFTS)
+    )
+    by_chance = np.minimum(np.mean(chance, axis=0), 1.0 - 1e-9)
+    return float(np.clip(np.max((explained - by_chance) / (1.0 - by_chance)), 0.0, 1.0))
 
 
 def falling(result: FitResult) -> float:

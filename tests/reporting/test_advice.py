@@ -14,7 +14,13 @@ from lfrtorch.fitting.trainer import FitResult, Progress, RestartSummary
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import advice
 from lfrtorch.reporting.advice import Evidence, advise
-from lfrtorch.reporting.diagnosis import coherent_part, evidence, falling, noise_of_periods
+from lfrtorch.reporting.diagnosis import (
+    coherent_part,
+    evidence,
+    falling,
+    filtered_part,
+    noise_of_periods,
+)
 from lfrtorch.reporting.simulations import Response
 
 pytestmark = pytest.mark.numeric
@@ -176,6 +182,9 @@ def test_a_linear_filter_of_the_input_is_seen_in_the_error():
     # Filters fitted in time: 300 samples and 37 lags leave a standard deviation of 0.06.
     assert coherent_part([u[:300]], [both[:300]]) == pytest.approx(0.5, abs=0.2)
     assert coherent_part([u[:300]], [noise[:300]]) == pytest.approx(0.0, abs=0.2)
+    # An error as slow as the input is explained in part by chance.
+    slow, other = (scipy.signal.lfilter([1.0], [1.0, -0.97], x, axis=0) for x in (u, noise))
+    assert filtered_part([slow[:300]], [other[:300]], 37) == pytest.approx(0.0, abs=0.25)
     parts = [u[:300], u[300:600]], [filtered[:300], filtered[300:600]]
     assert coherent_part(*parts) == pytest.approx(1.0, abs=0.1)
     assert coherent_part([u], [0.0 * noise]) == 0.0
