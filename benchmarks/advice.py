@@ -127,7 +127,7 @@ CASES: dict[str, Callable[[Path], Signals]] = {
     "cart": lambda root: measured(cart, 0, 4, 1000, root),
 }
 
-HELD_OUT = "Nothing chooses the iterate, and overfitting would not show"
+HELD_OUT = "Overfitting would not show"
 NO_MORE = "Noise-limited", "The system is linear at this level"
 """Advice that says not to go on."""
 

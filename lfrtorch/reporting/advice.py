@@ -229,8 +229,8 @@ def nothing_held_out(e: Evidence) -> Advice | None:
     if e.validation is not None or e.linear_validation is not None or e.train is None:
         return None
     return Advice(
-        "Nothing chooses the iterate, and overfitting would not show: hold out a part for "
-        "validation (validation=0.2).",
+        "Overfitting would not show: hold out a part (validation=0.2) to choose iterations and "
+        "sizes, then fit all with them.",
         f"{e.parameters} parameters are fitted to {e.samples} samples",
     )
 
