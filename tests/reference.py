@@ -155,11 +155,17 @@ def random_cell(
 
 
 def polynomial_cell(
-    nz: int, nw: int, degree: int, *, radius: float = 0.5, dtype: torch.dtype = torch.float64
+    nz: int,
+    nw: int,
+    degree: int,
+    *,
+    seed: int = 0,
+    radius: float = 0.5,
+    dtype: torch.dtype = torch.float64,
 ) -> LFRCell:
     """Cell with two inputs, outputs and states, and a polynomial of a z of about unit size."""
     static = Polynomial(nz, nw, degree)
-    cell = random_cell(2, 2, 2, nz, nw, static=static, radius=radius, feedback=0.05)
+    cell = random_cell(2, 2, 2, nz, nw, seed=seed, static=static, radius=radius, feedback=0.05)
     with torch.no_grad():
         cell.Cz.mul_(0.3)
         cell.Dzu.mul_(0.3)

@@ -196,6 +196,7 @@ def _compiled(
     # A leading axis, for one model or one a record.
     weights = [m if m.ndim == 3 else m.unsqueeze(0) for m in (*lti, *matrices)]
     weights += [v if v.ndim == 3 else v[None, None] for v in vectors]
+    weights = [w.expand(len(weights[0]), -1, -1) for w in weights]  # zeros in the place of others
     met_within = MET_ROUNDING * torch.finfo(u.dtype).eps
     arguments = [to_numpy(u), *map(to_numpy, weights), ACTIVATION_CODES[activation], growth]
     spread(simulate_record, R, *arguments, met_within, *(signal.numpy() for signal in near))

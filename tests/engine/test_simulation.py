@@ -22,6 +22,8 @@ from lfrtorch.engine.simulation import (
     simulate,
     steady_state,
 )
+from lfrtorch.engine.simulation_kernel import simulate_record
+from lfrtorch.least_squares.joint import stacked
 
 pytestmark = pytest.mark.numeric
 
@@ -92,6 +94,17 @@ def test_polynomial_is_compiled_and_the_plain_loop(
     trajectory = simulate(cell, u, x0)
     assert trajectory.y.dtype == dtype
     assert_same(trajectory, reference.simulate(cell, u, x0), 1000 * torch.finfo(dtype).eps)
+
+
+def test_polynomials_of_a_batch_do_not_mix(monkeypatch: pytest.MonkeyPatch):
+    # Not compiled, the kernel does not read beyond an array without an error.
+    monkeypatch.setattr("lfrtorch.engine.simulation.simulate_record", simulate_record.py_func)
+    cells = [polynomial_cell(2, 2, 3, seed=seed) for seed in range(3)]
+    u, x0 = normal(3, 6, 2), normal(3, 2, seed=1)
+    together = simulate(stacked(cells, repeat=1), u, x0)
+    for r, cell in enumerate(cells):
+        alone = simulate(cell, u[r : r + 1], x0[r : r + 1])
+        assert_same(Trajectory(*(s[r : r + 1] for s in together)), alone, 1e-12)
 
 
 def test_steady_state_of_a_polynomial_is_the_last_of_very_many_periods():
