@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from copy import deepcopy
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, cast
 
 import torch
@@ -116,13 +116,24 @@ def _identified(
     linear, order_scan = linear_model(
         dataset.train, settings, dataset.validation, observer=observer, ranks=ranks
     )
-    settings, known = replace(settings, nx=linear.nx), dataset.notes
-    dataset = with_score_windows(dataset, linear.to_model())
-    for note in dataset.notes[len(known) :]:
-        observer.say(f"note: {note}")
-    sizes = choose_sizes(dataset, settings, linear, observer=observer, ranks=ranks, stop=stop)
+    settings, asked = replace(settings, nx=linear.nx), settings
+    whole, dataset = dataset, _windowed(dataset, linear, observer)
+    sizes = choose_sizes(
+        dataset,
+        asked,
+        linear,
+        observer=observer,
+        ranks=ranks,
+        stop=stop,
+    )
     if sizes is not None:
-        settings = replace(settings, **sizes.chosen.sizes)
+        settings = replace(settings, starts=_searched_starts(asked), **sizes.chosen.sizes)
+        if settings.nx != linear.nx:
+            observer.say(
+                f"nx: {settings.nx}, as the NL-LFR makes use of more states than the linear model"
+            )
+            linear = estimate_bla(dataset.train, cast(int, settings.nx), **settings.linear)
+            dataset = _windowed(whole, linear, observer, dataset.notes)
     models = starting_models(dataset.train, settings, linear)
     if settings.init_from is not None and settings.starts > 1:
         observer.say("note: starts is 1: the fit starts from the model of init_from alone")
@@ -155,6 +166,22 @@ def _identified(
     )
     observer.end(result)
     return scored_run(dataset, settings, linear, result, order_scan=order_scan, size_search=sizes)
+
+
+def _windowed(
+    dataset: Dataset, linear: LinearModel, observer: Observer, said: Sequence[str] = ()
+) -> Dataset:
+    """The records with the windows that a linear model gives their scores; tells new notes."""
+    found = with_score_windows(dataset, linear.to_model())
+    for note in found.notes:
+        if note not in (*dataset.notes, *said):
+            observer.say(f"note: {note}")
+    return found
+
+
+def _searched_starts(settings: Settings) -> int:
+    """Starts of a model of sizes that are searched: with one it would be a matter of luck."""
+    return max(2, settings.starts)
 
 
 def _most_averaged(models: Sequence[Model], average: int, observer: Observer) -> int:
@@ -255,22 +282,31 @@ def choose_sizes(
     ranks: Ranks,
     stop: Stop | None,
 ) -> SizeSearch | None:
-    """The search for the sizes that are ``"auto"``; None if none is."""
+    """The search for the sizes that are ``"auto"``; None if none but nx is.
+
+    If nx is one of them, the order of the linear model is the least: an NL-LFR may make use of
+    states that a linear model does not.
+    """
     if not settings.searched:
         return None
     grid = settings.sizes_search
     trainer: Any = settings.trainer
     iterations = math.ceil(grid.iterations * trainer.limit)
-    several = replace(settings, starts=max(2, min(settings.starts, grid.starts)))
+    several = replace(settings, starts=min(_searched_starts(settings), max(2, grid.starts)))
+    estimate = cache(partial(estimate_bla, dataset.train, **settings.linear))
 
     def start(tried: dict[str, Any], seed: int) -> Model:
-        return starting_model(dataset.train, replace(settings, **tried), linear, seed)
+        nx = tried.get("nx", linear.nx)
+        begin = linear if nx == linear.nx else estimate(nx)
+        return starting_model(dataset.train, replace(settings, **tried), begin, seed)
 
     observer.say(f"sizes: {len(several.seeds)} starts of {iterations} iterations for each model")
     tried = {
         name: getattr(grid if name in settings.searched else settings, name)
         for name in settings.size_names
     }
+    if settings.nx == "auto":
+        tried["nx"] = [linear.nx, *(nx for nx in grid.nx if linear.nx < nx <= settings.nx_max)]
     search = search_sizes(
         start,
         dataset.train,

@@ -73,7 +73,10 @@ def test_chosen_sizes_are_returned_and_what_was_asked_for_stays(dataset: Dataset
     assert run.order_scan is not None
     assert run.size_search is not None
     assert run.settings.sizes == run.model.sizes
-    assert run.settings.nx == run.order_scan.chosen == run.linear.nx
+    assert run.settings.nx == run.linear.nx >= run.order_scan.chosen
+    assert len(run.fit.starts) == run.settings.starts == 2
+    # The first model tried has the linear model's states.
+    assert run.size_search.candidates[0].sizes["nx"] == run.order_scan.chosen
     assert run.settings.nn == run.size_search.chosen.sizes["nn"]
 
 
@@ -192,7 +195,7 @@ def test_starts_that_are_kept_go_on(dataset: Dataset, tmp_path: Path):
 def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     identify(dataset, settings(nn="auto", sizes_search=SizesSearch(nn=(1, 3))), observer=Console())
     printed = capsys.readouterr().out
-    for text in ("BLA: order 1", "sizes: 2 starts of 1 iterations", "training samples", "4/4"):
+    for text in ("BLA: order 1", "sizes: 2 starts of 1 iterations", "training samples", "round 2"):
         assert text in printed
     identify(dataset, settings())
     assert capsys.readouterr().out == ""

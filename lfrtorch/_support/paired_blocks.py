@@ -52,6 +52,12 @@ def as_good(squares: Sequence[Array] | Array, counts: Integers) -> NDArray[np.bo
     return close | (standard_errors_above(squares, counts) <= 1.0)
 
 
+def no_progress(errors: Sequence[float], last: int) -> bool:
+    """Whether the last few of several rms errors are all not below the others by ``MARGIN``."""
+    earlier = errors[:-last]
+    return bool(earlier) and min(errors[-last:]) > min(earlier) / (1.0 + MARGIN)
+
+
 def standard_errors_above(squares: Sequence[Array] | Array, counts: Integers) -> Array:
     """How far the mean squares of several models are above the least of them.
 

@@ -67,12 +67,12 @@ def arguments(given: Sequence[str]) -> list[str]:
 
 
 def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:
-    """The configuration with the sizes that the run to go on with chose from the data."""
+    """The configuration with the sizes and starts that the run to go on with chose."""
     if cfg.resume is None or not (folder / CONFIG).is_file():
         return cfg
     before = OmegaConf.load(folder / CONFIG)
     names = [n for n in ("nx", "nz", "nw", "nn", "degree") if cfg[n] == "auto"]
-    chosen = {name: OmegaConf.select(before, name) for name in names}
+    chosen = {name: OmegaConf.select(before, name) for name in [*names, *["starts"] * bool(names)]}
     return cast(DictConfig, OmegaConf.merge(cfg, chosen))
 
 

@@ -34,6 +34,8 @@ class SizesSearch:
     """What is tried for the sizes that are ``"auto"``.
 
     Args:
+        nx: the numbers of states to try above the linear model's order, up to ``nx_max``, if nx and
+            another size are ``"auto"``; they come first.
         nz, nw, nn, degree: the numbers to try. nz and nw are crossed, then nn or degree follows.
         starts: random starts of each candidate: those of the fit, at least 2, at most this many.
         iterations: part of the iterations of the fit that each start gets.
@@ -43,6 +45,7 @@ class SizesSearch:
         (5, 10)
     """
 
+    nx: Sequence[int] = (2, 3, 4, 6, 8, 10, 12)
     nz: Sequence[int] = (1, 2)
     nw: Sequence[int] = (1, 2)
     nn: Sequence[int] = (5, 10, 15, 25)
@@ -60,7 +63,8 @@ class Settings:
     """How a model is identified; see :func:`lfrtorch.identify`.
 
     Args:
-        nx: states. ``"auto"``: the lowest order up to ``nx_max`` that does as well as the best.
+        nx: states. ``"auto"``: the lowest order up to ``nx_max`` whose linear model does as well as
+            the best, and more if an NL-LFR makes use of them and another size is ``"auto"``, too.
             Required, unless ``init_from`` brings it.
         nx_max: highest order that ``nx="auto"`` tries.
         nz, nw: inputs and outputs of the static nonlinearity; ``"auto"`` searches for them.
@@ -75,7 +79,7 @@ class Settings:
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
-        starts: random starts, of which the best is kept.
+        starts: random starts, of which the best is kept; at least 2 if sizes are searched.
         seed: of the first start; the others have seed + 1000, seed + 2000, ...
         init_from: a model to go on from, in place of ``init``; its sizes replace those given here.
         sizes_search: what is tried for the sizes that are ``"auto"``.

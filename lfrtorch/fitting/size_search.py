@@ -1,6 +1,8 @@
 """Sizes of the static nonlinearity: a small search, scored on records that are not fitted.
 
-nz and nw are crossed at the middle number of neurons; then all numbers of neurons are tried at the
+If nx is searched, too, it is first: from the linear model's order up, at the most inputs of the
+static map and the middle number of neurons, until two orders in a row bring less than 1 %. Then nz
+and nw are crossed at the middle number of neurons; then all numbers of neurons are tried at the
 nz and nw chosen. Every model is fitted from several starts for a part of the usual iterations.
 
 The fewest parameters that do as well as the best are chosen: ``_support.paired_blocks`` says what
@@ -26,6 +28,7 @@ from lfrtorch._support.paired_blocks import (
     as_good,
     blocked_mean,
     in_blocks,
+    no_progress,
     squares_in_blocks,
     standard_errors_above,
 )
@@ -49,6 +52,9 @@ NZ, NW, NN = (1, 2), (1, 2), (5, 10, 15, 25)
 
 SEEDS = (0, 1000, 2000, 3000)
 """Seeds of the starts of each model."""
+
+PATIENCE = 2
+"""Orders in a row that bring less than 1 % end the search for nx."""
 
 ITERATIONS = 50
 """Iterations of each start: a quarter of those of a fit."""
@@ -167,7 +173,7 @@ class SizeSearch:
 
 def size_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
     """Head and rows of a table of the models tried, by rising number of net parameters."""
-    sizes = [name for name in ("nz", "nw", "nn", "degree") if entries and name in entries[0]]
+    sizes = [name for name in ("nx", "nz", "nw", "nn", "degree") if entries and name in entries[0]]
     numbers = ["parameters", "parameters_net", "seconds", "error", "error_std", "ratio"]
     numbers.append("standard_errors_above")
     rows = [
@@ -189,6 +195,7 @@ def search_sizes(
     train: Record | Sequence[Record],
     validation: Record | Sequence[Record],
     *,
+    nx: int | Sequence[int] | None = None,
     nz: int | Sequence[int] = NZ,
     nw: int | Sequence[int] = NW,
     nn: int | Sequence[int] = NN,
@@ -208,6 +215,7 @@ def search_sizes(
             ``lambda sizes, seed: initialise(bla, train, **sizes, seed=seed)``.
         train: records that are fitted.
         validation: records that choose among iterates, starts and sizes.
+        nx: states to try, if ``start`` takes them among the sizes.
         nz, nw, nn: sizes to try; one number is a size that is known.
         degree: of a polynomial, in the place of nn.
         linear: the model that errors are compared with.
@@ -232,7 +240,8 @@ def search_sizes(
         >>> search.chosen.sizes["nn"] in (2, 4)
         True
     """
-    given = {"nz": nz, "nw": nw} | ({"nn": nn} if degree is None else {"degree": degree})
+    given = {} if nx is None else {"nx": nx}
+    given |= {"nz": nz, "nw": nw} | ({"nn": nn} if degree is None else {"degree": degree})
     tried = {name: _sizes(name, values) for name, values in given.items()}
     if not seeds:
         raise InputError("seeds is empty; give one for each start, for example (0, 1000).")
@@ -282,8 +291,17 @@ def search_sizes(
         return SizeSearch(tuple(found), judge.counts)
 
     *outer, last = tried.values()
-    chosen = searched(*outer, [last[len(last) // 2]]).chosen.sizes
-    search = searched([chosen["nz"]], [chosen["nw"]], last)
+    middle = [last[len(last) // 2]]
+    if nx is not None:
+        ladder, nzs, nws = outer
+        for number in ladder:
+            searched([number], nzs[-1:], nws[:1], middle)
+            if no_progress([c.error for c in found], PATIENCE):
+                break
+        best = SizeSearch(tuple(found), judge.counts).chosen
+        outer = [[best.sizes["nx"]], nzs, nws]
+    chosen = searched(*outer, middle).chosen.sizes
+    search = searched(*([chosen[name]] for name in [*tried][:-1]), last)
     if not isfinite(search.chosen.error):
         raise InputError(
             "all models that were tried diverge on the validation records; give training data at "

@@ -21,7 +21,13 @@ import numpy as np
 from lfrtorch._support import tables
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.paired_blocks import BLOCKS, MARGIN, as_good, in_blocks, squares_in_blocks
+from lfrtorch._support.paired_blocks import (
+    BLOCKS,
+    as_good,
+    in_blocks,
+    no_progress,
+    squares_in_blocks,
+)
 from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import each_alone
 from lfrtorch._support.types import Array
@@ -174,7 +180,7 @@ def scan_orders(
             f"order {model.nx}: fitted {number(model.fit.rmse)}, {how} {number(scores[-1])}, "
             f"{quantity(time.perf_counter() - clock, 's')}"
         )
-        return _settled(scores)
+        return no_progress(scores, PATIENCE)
 
     for nx in sorted(set(orders)):
         clock = time.perf_counter()
@@ -219,12 +225,6 @@ def _rms(errors: Sequence[Sequence[Array]]) -> list[float]:
     """Of all errors of each model; infinite if one is not finite."""
     found = [float(rms(np.concatenate(each))) for each in errors]
     return [value if np.isfinite(value) else inf for value in found]
-
-
-def _settled(scores: Sequence[float]) -> bool:
-    """Whether the last few orders bring less than the margin."""
-    earlier, last = scores[:-PATIENCE], scores[-PATIENCE:]
-    return bool(earlier) and min(last) > min(earlier) / (1.0 + MARGIN)
 
 
 def _narrow(records: list[Record], nx: int) -> str:

@@ -460,17 +460,19 @@ def test_sizes_are_searched_for(csv: Path, tmp_path: Path, capsys: pytest.Captur
     fit.run(cfg, tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     tried = metrics["sizes_search"]
-    assert [(t["nz"], t["nw"], t["nn"]) for t in tried][:2] == [(1, 1, 3), (2, 1, 3)]
+    assert (tried[0]["nz"], tried[0]["nw"], tried[0]["nn"]) == (2, 1, 3)
     (chosen,) = (t for t in tried if t["chosen"])
     saved = OmegaConf.load(tmp_path / "config.yaml")
-    assert metrics["sizes"] == {"nx": saved.nx} | {n: chosen[n] for n in ("nz", "nw", "nn")}
+    assert metrics["sizes"] == {n: chosen[n] for n in ("nx", "nz", "nw", "nn")}
+    assert saved.starts == metrics["starts"] == 2
     assert metrics["parameters_net"] == chosen["parameters_net"]
     assert chosen["ratio"] < 0.5
     assert (saved.nz, saved.nn) == (chosen["nz"], chosen["nn"])
     assert (cfg.nx, cfg.nn) == ("auto", "auto")  # what was asked for stays
     printed = capsys.readouterr().out
     assert "2 starts of 5 iterations for each model" in printed
-    assert f"nz {chosen['nz']}, nw 1, nn {chosen['nn']}: {chosen['parameters']} par" in printed
+    sizes = f"nx {chosen['nx']}, nz {chosen['nz']}, nw 1, nn {chosen['nn']}"
+    assert f"{sizes}: {chosen['parameters']} par" in printed
     assert printed.count("  chosen\n") == 2  # the order, and these
 
 

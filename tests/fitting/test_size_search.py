@@ -90,6 +90,21 @@ def test_a_second_input_of_the_map_is_found():
     assert found.notes == ("nz 2 is the largest tried; a larger one may do better.",)
 
 
+def test_states_come_first_until_two_orders_bring_nothing():
+    planted = train, _, bla = plant(2, 1)
+    models = {nx: bla if nx == 2 else estimate_bla(train, nx) for nx in (1, 2, 3, 4)}
+
+    def start(sizes: Any, seed: int) -> Model:
+        sizes = dict(sizes)
+        return initialise(models[sizes.pop("nx")], train, **sizes, seed=seed)
+
+    found = search(planted, start=start, nx=(1, 2, 3, 4, 5), nn=3, seeds=(0,))
+    tried = [tuple(c.sizes.values()) for c in found.candidates]
+    assert tried[:4] == [(1, 2, 1, 3), (2, 2, 1, 3), (3, 2, 1, 3), (4, 2, 1, 3)]
+    assert {sizes[0] for sizes in tried[4:]} == {2}  # nz and nw are crossed at two states
+    assert found.chosen.sizes == {"nx": 2, "nz": 2, "nw": 1, "nn": 3}
+
+
 def test_numbers_are_those_of_the_models(single: SizeSearch):
     found = single
     train, (record,), bla = plant(1, 1)
