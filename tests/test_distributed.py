@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch._support.reasons import Reason
+from lfrtorch.cli.command import start as start_command
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.multistart import fit
@@ -132,7 +132,7 @@ def _train(folder: Path, rank: int) -> None:
     os.chdir(folder)
     sys.argv = ["train.py", *SETTINGS, "trainer.max_iter=3"]
     with (folder.parent / f"{rank}.out").open("w") as out, redirect_stdout(out):
-        import_module("train").launch()
+        start_command("fit")
 
 
 # --- the same fit ---------------------------------------------------------------------------

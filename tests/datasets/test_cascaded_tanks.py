@@ -87,7 +87,7 @@ def test_refused_arguments(arguments, match):
 
 
 def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no 'Cascaded_Tanks/Cascaded.*root=DIR"):
+    with pytest.raises(FileNotFoundError, match=r"(?s)no 'Cascaded_Tanks/Cascaded.*root=DIR"):
         cascaded_tanks.load(root=tmp_path)
 
 

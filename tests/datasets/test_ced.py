@@ -102,7 +102,7 @@ def test_refused_arguments(arguments, match):
 
 
 def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no 'CED/DATAUNIF.MAT'.*root=DIR"):
+    with pytest.raises(FileNotFoundError, match=r"(?s)no 'CED/DATAUNIF.MAT'.*root=DIR"):
         ced.load(root=tmp_path)
 
 

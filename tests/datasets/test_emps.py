@@ -102,7 +102,7 @@ def test_refused_arguments(arguments, match):
 def test_a_missing_file_is_one_message(numbered):
     for file in reversed(FILES):
         (numbered / file).unlink()
-        with pytest.raises(FileNotFoundError, match=rf"no '{file}'.*root=DIR"):
+        with pytest.raises(FileNotFoundError, match=rf"(?s)no '{file}'.*root=DIR"):
             emps.load(root=numbered)
 
 

@@ -94,7 +94,7 @@ def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered
 
 
 def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no 'Silverbox/Silver.*root=DIR"):
+    with pytest.raises(FileNotFoundError, match=r"(?s)no 'Silverbox/Silver.*root=DIR"):
         silverbox.load(root=tmp_path)
 
 

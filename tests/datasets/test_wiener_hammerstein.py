@@ -79,7 +79,7 @@ def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered
 
 
 def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no 'WienerHammerBenchMark/Wiener.*root=DIR"):
+    with pytest.raises(FileNotFoundError, match=r"(?s)no 'WienerHammerBenchMark/Wiener.*root=DIR"):
         wiener_hammerstein.load(root=tmp_path)
 
 

@@ -210,7 +210,7 @@ def test_gradient(nz: int, nw: int, ny: int, monkeypatch: pytest.MonkeyPatch):
 
 def test_records_that_are_not_periodic(spring):
     data, bla = spring
-    with pytest.raises(ValueError, match=r"start='zero'; inference works .*init=zero_output"):
+    with pytest.raises(ValueError, match=r"start='zero'; inference needs .*init=zero_output"):
         infer(bla, [data[0], data[1][:]], **ONE)
 
 
