@@ -25,7 +25,7 @@ MOST_MEASURED = 500_000
 
 
 Views = dict[str, dict[str, str]]
-"""Of records, by their names: captions by the names of their figures."""
+"""Captions by the names of records, then of figures."""
 
 
 def of_run(

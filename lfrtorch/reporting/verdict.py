@@ -2,7 +2,7 @@
 
 The models share a record's noise, so what tells them apart is the difference of their squared
 errors, and the standard error of its mean over blocks of time, as in the search for sizes
-(:mod:`lfrtorch.fitting.size_search`). A difference is clear if it is beyond Student's quantile, or
+(:func:`lfrtorch.search_sizes`). A difference is clear if it is beyond Student's quantile, or
 if one error is twice the other: one burst of a model that runs away has a large standard error,
 and is no chance. A difference below 5 % of the error is none.
 """
