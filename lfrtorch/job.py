@@ -117,15 +117,8 @@ def _identified(
         dataset.train, settings, dataset.validation, observer=observer, ranks=ranks
     )
     settings, asked = replace(settings, nx=linear.nx), settings
-    whole, dataset = dataset, _windowed(dataset, linear, observer)
-    sizes = choose_sizes(
-        dataset,
-        asked,
-        linear,
-        observer=observer,
-        ranks=ranks,
-        stop=stop,
-    )
+    whole, dataset = dataset, windowed(dataset, linear.to_model(), observer)
+    sizes = choose_sizes(dataset, asked, linear, observer=observer, ranks=ranks, stop=stop)
     if sizes is not None:
         settings = replace(settings, starts=_searched_starts(asked), **sizes.chosen.sizes)
         if settings.nx != linear.nx:
@@ -133,7 +126,7 @@ def _identified(
                 f"nx: {settings.nx}, as the NL-LFR makes use of more states than the linear model"
             )
             linear = estimate_bla(dataset.train, cast(int, settings.nx), **settings.linear)
-            dataset = _windowed(whole, linear, observer, dataset.notes)
+            dataset = windowed(whole, linear.to_model(), observer, dataset.notes)
     models = starting_models(dataset.train, settings, linear)
     if settings.init_from is not None and settings.starts > 1:
         observer.say("note: starts is 1: the fit starts from the model of init_from alone")
@@ -168,11 +161,17 @@ def _identified(
     return scored_run(dataset, settings, linear, result, order_scan=order_scan, size_search=sizes)
 
 
-def _windowed(
-    dataset: Dataset, linear: LinearModel, observer: Observer, said: Sequence[str] = ()
+def windowed(
+    dataset: Dataset, model: Model, observer: Observer, said: Sequence[str] = ()
 ) -> Dataset:
-    """The records with the windows that a linear model gives their scores; tells new notes."""
-    found = with_score_windows(dataset, linear.to_model())
+    """The records with the windows that a model gives their scores; tells new notes.
+
+    Args:
+        dataset, model: see :func:`lfrtorch.linear.score_window.with_score_windows`.
+        observer: who is told.
+        said: notes that are known already.
+    """
+    found = with_score_windows(dataset, model)
     for note in found.notes:
         if note not in (*dataset.notes, *said):
             observer.say(f"note: {note}")

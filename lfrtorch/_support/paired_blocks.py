@@ -53,7 +53,7 @@ def as_good(squares: Sequence[Array] | Array, counts: Integers) -> NDArray[np.bo
 
 
 def no_progress(errors: Sequence[float], last: int) -> bool:
-    """Whether the last few of several rms errors are all not below the others by ``MARGIN``."""
+    """Whether none of the last few rms errors is below the earlier ones by ``MARGIN``."""
     earlier = errors[:-last]
     return bool(earlier) and min(errors[-last:]) > min(earlier) / (1.0 + MARGIN)
 

@@ -25,8 +25,8 @@ from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import program
 from lfrtorch.cli.simulate import opened
-from lfrtorch.job import check_channels
-from lfrtorch.linear.score_window import with_score_windows
+from lfrtorch.cli.words import Terminal
+from lfrtorch.job import check_channels, windowed
 from lfrtorch.reporting import scores as report
 
 
@@ -51,10 +51,7 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
         print(f"note: '{folder}' has no folder linear/, so no linear model is scored")
     elif bla is not None and dataset.linear:
         print("note: the linear model is that of all training records; a run has one a test")
-    known = dataset.notes
-    dataset = with_score_windows(dataset, model if bla is None else bla.to_model())
-    for note in dataset.notes[len(known) :]:
-        print(f"note: {note}")
+    dataset = windowed(dataset, model if bla is None else bla.to_model(), Terminal(cfg))
     scores = report.evaluation(model, bla, dataset, command=command)
     print(f"\n{report.table(scores, dataset.published)}")
     if cfg.out is not None:

@@ -33,11 +33,11 @@ from lfrtorch.cli.config import configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
-from lfrtorch.cli.words import Terminal, translated
+from lfrtorch.cli.words import Terminal
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
-from lfrtorch.job import linear_model
-from lfrtorch.linear.score_window import fitted, with_score_windows
+from lfrtorch.job import linear_model, windowed
+from lfrtorch.linear.score_window import fitted
 from lfrtorch.metrics import rms
 from lfrtorch.reporting import figures as run_figures
 from lfrtorch.reporting import linear_plots
@@ -54,18 +54,14 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     frf, notes = response(cfg, dataset.train)
     # A fit to the response takes the one that the figures show.
     data = frf if frf and cfg.bla.refine == "frequency" else dataset.train
-    model, scan = linear_model(
-        data, settings, dataset.validation, observer=Terminal(cfg), ranks=Ranks()
-    )
-    known = dataset.notes
-    dataset = with_score_windows(dataset, model.to_model())
-    for note in dataset.notes[len(known) :]:
-        print(f"note: {note}")
+    terminal = Terminal(cfg)
+    model, scan = linear_model(data, settings, dataset.validation, observer=terminal, ranks=Ranks())
+    dataset = windowed(dataset, model.to_model(), terminal)
     cfg.nx = model.nx
     assert model.fit is not None
     for note in notes:
         if note not in model.fit.notes:
-            print(tables.in_lines(f"note: {translated(note, cfg)}"))
+            terminal.say(f"note: {note}")
 
     found = numbers(model, dataset, frf, scan)
     found |= {

@@ -24,7 +24,7 @@ from lfrtorch.files.table import BLOCK, Clock, Table
 _REAL, _TIMES = "biuf", "M"
 
 _RECORD = 32
-"""Samples of a vector that tells the axis of time; a shorter one may have a number a channel."""
+"""Samples of a vector that tells the axis of time; a shorter one may hold gains of channels."""
 
 _FREQUENCY = re.compile(
     r"f_?s(amp|ampling|ample)?|s_?rate|sampl(e|ing)[ _-]?(rate|freq|frequency)", re.IGNORECASE

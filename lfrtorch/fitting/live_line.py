@@ -34,7 +34,7 @@ def is_live(stream: TextIO | None) -> bool:
 
 
 class LiveLine:
-    """A line that the next text replaces; nothing where no line can be rewritten.
+    """A line that the next text replaces; nothing is shown if the stream cannot rewrite a line.
 
     Args:
         stream: where to write. Default: standard output.
@@ -99,7 +99,7 @@ class LiveLine:
 
 
 class ProgressLine:
-    """A line that follows the iterations of a fit; where none can be, a line now and then.
+    """A line that follows a fit, or a line now and then if the stream cannot rewrite one.
 
     Args:
         every: iterations between lines if none can be rewritten; ``None`` for none at all.
@@ -129,7 +129,7 @@ class ProgressLine:
             self._say()
 
     def close(self) -> None:
-        """End the line; where there is none, show the last iteration."""
+        """End the line; if the stream cannot rewrite one, show the last iteration."""
         self._line.close()
         self._say()
 

@@ -69,7 +69,7 @@ class Candidate:
     """A model that was tried: what it costs and what it buys.
 
     Args:
-        sizes: nz, nw, and nn or degree.
+        sizes: nz, nw, and nn or degree; nx if it was searched, too.
         parameters, parameters_net: all, and without the gauge directions.
         seconds: the search took for it.
         error, error_std: rms of the simulation error over the validation records, each output

@@ -1,4 +1,4 @@
-"""Integrators in a linear model: poles at z = 1 exactly, one in a row or two at each output.
+"""Integrators in a linear model: one or two poles at z = 1, exactly, behind each output.
 
 The output of a system that integrates is y = G(z) u with G = G₁(z) / (z - 1), where G₁ is stable.
 So G₁ is the system from u to the difference v(k) = y(k + 1) - y(k), which the methods for stable
@@ -6,10 +6,11 @@ systems find, and the integrator is put back behind it:
 
     x+ = A x + B u,   s+ = s + C x + D u,   y = s.
 
-A difference makes noise blue that was white in y, and white what the system has integrated, as the
-errors that friction makes. The error of the difference is a moving average 1 - λ z⁻¹ of white noise
-if both are there. Both signals are filtered by 1 / (1 - λ z⁻¹), which whitens the error and leaves
-G₁ as it is: with λ = 0 the fit is to the difference, with λ near 1 to the output itself.
+The difference turns white noise of y into blue noise, and errors that the system has integrated,
+such as those of friction, into white noise. With both of them the error of the difference is a
+moving average 1 - λ z⁻¹ of white noise. Both signals are filtered by 1 / (1 - λ z⁻¹), which whitens
+the error and leaves G₁ as it is: with λ = 0 the fit is to the difference, with λ near 1 to the
+output itself.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ def differenced(
 
     Args:
         record: u (T, nu) and y (T, ny).
-        integrators: how often the output is differenced; the record gets as much shorter, and the
-            start of its state is unknown.
+        integrators: how often the output is differenced; each time takes one sample off, and the
+            start state is unknown.
         pole: λ.
         feedthrough: whether v(k) = y(k) - y(k - 1), so that the input acts on the output at once.
     """

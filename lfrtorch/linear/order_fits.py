@@ -49,7 +49,7 @@ NEAR_STEPS = 24
 """The last one from a model that is near the minimum."""
 
 SETTLED, STRIDE = 1e-4, 8
-"""The search ends if so many iterations lower the cost by less than this part."""
+"""The search ends if STRIDE iterations lower the cost by less than the part SETTLED."""
 
 SHORTEST = 4
 """Samples that a part has at least, in multiples of nx + 1."""

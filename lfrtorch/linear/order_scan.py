@@ -43,16 +43,18 @@ from lfrtorch.records import Record, Scaler, as_records, without_coordinates
 ORDERS = range(1, 13)
 
 PATIENCE = 3
-"""The scan ends if so many orders in a row bring less than 1 %."""
+"""The scan ends after this number of orders in a row that bring less than 1 %."""
 
 FOLDS = 5
 """Stretches of a cross-validation."""
 
 MEMORIES = 20
-"""Validation records are short if they have fewer scored samples than so many time constants."""
+"""Validation records are short if their scored samples are fewer than this number of time
+constants."""
 
 UNLIKE = 1.5
-"""They are unlike the training records if the errors there differ by more than this factor."""
+"""Validation and training records are unlike if the errors of the linear model on them differ by
+more than this factor: what is seen on one says little of the other."""
 
 
 @dataclass(frozen=True)
@@ -147,13 +149,8 @@ def scan_orders(
            2 ...
            3 ...
     """
-    if not len(orders):
-        raise InputError("orders is empty; give at least one, for example range(1, 13).")
-    for nx in orders:
-        integer("orders", nx, 1)
     outputs = data.outputs if isinstance(data, FRF) else as_records(data)[0].outputs
-    least = options.get("integrators", 0) * len(outputs)
-    orders = [nx for nx in orders if nx >= least] or orders
+    orders = _rising(orders, options.get("integrators", 0) * len(outputs))
     judges = as_records(validation) if validation else []
     records = [] if isinstance(data, FRF) else [without_coordinates(r) for r in as_records(data)]
     if records:
@@ -182,7 +179,7 @@ def scan_orders(
         )
         return no_progress(scores, PATIENCE)
 
-    for nx in sorted(set(orders)):
+    for nx in orders:
         clock = time.perf_counter()
         try:
             if records:
@@ -219,6 +216,16 @@ def scan_orders(
     return OrderScan(
         tuple(models), tuple(scores), bool(judges), models[first].nx, tuple(lengths), tuple(notes)
     )
+
+
+def _rising(orders: Sequence[int], least: int) -> list[int]:
+    """The orders, each once; without those below the least, if there are others."""
+    if not len(orders):
+        raise InputError("orders is empty; give at least one, for example range(1, 13).")
+    for nx in orders:
+        integer("orders", nx, 1)
+    rising = sorted(set(orders))
+    return [nx for nx in rising if nx >= least] or rising
 
 
 def _rms(errors: Sequence[Sequence[Array]]) -> list[float]:

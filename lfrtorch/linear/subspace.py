@@ -98,11 +98,11 @@ class SpectralSubspace(NamedTuple):
 
     Args:
         directions: of the outputs that the inputs do not explain, the main one first.
-        singular_values: of them.
-        size: of the outputs.
-        whiten: what their noise was divided by.
-        warp: of the frequency axis.
-        ny: outputs.
+        singular_values: of the directions.
+        size: norm of the outputs, to which singular values are relative.
+        whiten: what the noise of the outputs was divided by.
+        warp: parameter a of the bilinear map of the frequency axis.
+        ny: number of outputs.
     """
 
     directions: Array

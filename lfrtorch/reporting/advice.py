@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from lfrtorch._support.tables import number, percent
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.linear.order_scan import UNLIKE
 
 NOISE_LIMITED = 1.1
 """Training error over the noise up to which the model's own share, √(1.1² - 1), is below half of
@@ -27,10 +28,6 @@ parameters has no error below it."""
 FALLING = 0.02
 """Part by which the error must have fallen over a tenth of the iterations, at the pace of the last
 ones, to count as still falling: as many iterations again would bring 18 % at that pace."""
-
-UNLIKE = 1.5
-"""Error of the linear model on validation over that in training, or its inverse, from which on the
-parts are unlike: what is seen on one says little of the other."""
 
 OVERFIT = 1.5
 """Growth from training to validation of the NL-LFR's error over that of the linear model's, which

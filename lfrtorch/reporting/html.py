@@ -125,7 +125,7 @@ def render(
 def comparisons(responses: Sequence[Response]) -> list[str]:
     """How far the NL-LFR came, beside the linear model: a line for each of a few tests.
 
-    Where there is no test it is said of the validation records, or else of the training ones.
+    Without tests the lines are on the validation records, or else on the training records.
     """
     uses = ("test", "validation", "train")
     use = next(use for use in uses if any(response.use == use for response in responses))

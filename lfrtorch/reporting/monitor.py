@@ -30,8 +30,8 @@ class TensorBoard:
 
     Args:
         folder: of the event file.
-        record: record whose output and static map are drawn, usually the validation record; left
-            out for scalars alone.
+        record: record whose output and static map are drawn, usually the validation record.
+            Default: scalars alone.
         y_linear: output of the linear model on it, (T, ny), for the error beside ours.
         every: iterations between figures; they cost about half a second.
         finalist: whether nothing is written before the last round of a fit from several starts, so

@@ -30,14 +30,14 @@ NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
 """What a verdict says is to be used."""
 
 SAME = 0.05
-"""Difference of two errors, of the linear model's, that is not worth a choice."""
+"""Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
 CLEAR = 2.0
 """Ratio of two errors that is no chance, whatever its standard error."""
 
 CONFIDENCE = 0.975
-"""Probability of the quantile that a difference must exceed, one-sided; of several records each
-has its part of the rest."""
+"""Probability of the quantile that a difference must exceed, one-sided; the rest is divided among
+the records that are compared one by one."""
 
 EXPLAINS_NOTHING = 0.9
 """Error over the output's standard deviation from which on a model is of no use."""

@@ -25,7 +25,7 @@ EXPLAINED, LEFT = 0.9, 0.6
 most LEFT of what they leave of the force, and EXPLAINED or more is explained."""
 
 LEVELS = 16
-"""An input of at most so many values changes direction with its own steps."""
+"""Steps of an input that has at most this number of values turn the motion: no sign of friction."""
 
 
 def reacting(u: Array, y: Array) -> Array:
