@@ -139,9 +139,10 @@ class Polynomial(Module):
         ]
         number = {factors: n for n, factors in enumerate(monomials)}
         self.growth = [(number[factors[:-1]], factors[-1]) for factors in monomials[1:]]
-        """(m, j) of every monomial but the constant: it is monomial m, before it, times z_j."""
+        """A pair (m, j) for each monomial but the constant, which is monomial m times z_j."""
         self.slopes: list[tuple[int, int, int, int]] = []
-        """(n, j, e, m) for every ∂(monomial n)/∂z_j that is not zero: e times monomial m."""
+        """Entries (n, j, e, m). The derivative of monomial n by z_j is e times monomial m. It is 0
+        without an entry."""
         for n, factors in enumerate(monomials):
             for j in sorted(set(factors)):
                 i = factors.index(j)
