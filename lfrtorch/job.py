@@ -203,6 +203,7 @@ def scored_run(
     """All records simulated and scored, with verdict and advice."""
     test_linear = linear_models_of_tests(dataset, settings)
     simulations = respond(result.model, linear, dataset, test_linear)
+    verdict = judge(result, simulations)
     found = evidence(
         result,
         simulations,
@@ -212,8 +213,8 @@ def scored_run(
         ridge=settings.ridge != 0.0,
         search=size_search,
         trainer=settings.trainer,
+        verdict=verdict,
     )
-    verdict = judge(result, simulations)
     numbers = metrics(
         result,
         linear,

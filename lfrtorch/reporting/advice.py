@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from lfrtorch._support.tables import number, percent
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.order_scan import UNLIKE
+from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict
 
 NOISE_LIMITED = 1.1
 """Training error over the noise up to which the model's own share, √(1.1² - 1), is below half of
@@ -111,6 +112,8 @@ class Evidence:
         ridge: whether there was one.
         louder: largest test input over the largest in training, by test.
         diverged: records on which the NL-LFR diverges.
+        tests: the NL-LFR's error over the linear model's on all tests together.
+        verdict: on the fit, which advice must agree with.
     """
 
     train: float | None
@@ -137,6 +140,26 @@ class Evidence:
     ridge: bool = False
     louder: Mapping[str, float] = field(default_factory=dict)
     diverged: Sequence[str] = ()
+    tests: float | None = None
+    verdict: Verdict | None = None
+
+    @property
+    def better(self) -> bool:
+        """Whether the verdict says that the NL-LFR is the better model."""
+        return self.verdict is not None and self.verdict.kind == Kind.BETTER
+
+    @property
+    def neither(self) -> bool:
+        """Whether the verdict says that neither model is usable."""
+        return self.verdict is not None and self.verdict.use == NEITHER
+
+    @property
+    def lost_on_tests(self) -> bool:
+        """Whether the tests have nothing of the gain over the linear model."""
+        error, linear_error, _ = self.judged
+        if self.tests is None or error is None or not linear_error or self.better:
+            return False
+        return error <= USELESS * linear_error and self.tests > USELESS
 
     @property
     def judged(self) -> tuple[float | None, float | None, str]:
@@ -226,8 +249,8 @@ def nothing_held_out(e: Evidence) -> Advice | None:
     if e.validation is not None or e.linear_validation is not None or e.train is None:
         return None
     return Advice(
-        "Overfitting would not show: hold out a part (validation=0.2) to choose iterations and "
-        "sizes, then fit all with them.",
+        ("Hold" if e.lost_on_tests else "Overfitting would not show: hold")
+        + " out a part (validation=0.2) to choose iterations and sizes, then fit all with them.",
         f"{e.parameters} parameters are fitted to {e.samples} samples",
     )
 
@@ -240,6 +263,30 @@ def validation_is_unlike(e: Evidence) -> Advice | None:
         "The validation part is unlike the training part: choose other parts, or cross-validate.",
         f"error of the linear model: validation {percent(e.linear_validation)}, "
         f"training {percent(e.linear_train)}",
+    )
+
+
+def neither_usable(e: Evidence) -> Advice | None:
+    """Inputs that do not explain the outputs, whatever the model."""
+    if not e.neither or e.diverged:
+        return None
+    return Advice(
+        "The inputs explain little of the outputs: look at the columns, delays and units, and for "
+        "other inputs (lfrtorch preview).",
+        f"training error {percent(e.train)}, of the linear model {percent(e.linear_train)}",
+    )
+
+
+def gain_is_lost(e: Evidence) -> Advice | None:
+    """A gain over the linear model that the tests have not."""
+    if not e.lost_on_tests or e.parts_differ:
+        return None
+    error, linear_error, which = e.judged
+    return Advice(
+        f"The gain on {which} is lost on the tests: they are unlike, or the model is overfit; "
+        "choose other parts, or measure longer.",
+        f"error over the linear model's: {which} {percent((error or 0.0) / (linear_error or 1.0))}"
+        f", tests {percent(e.tests)}",
     )
 
 
@@ -303,16 +350,18 @@ def linear_part_incomplete(e: Evidence) -> Advice | None:
 def hardly_better(e: Evidence) -> Advice | None:
     """No gain over the linear model, of which no states are missing."""
     error, linear_error, which = e.judged
-    if e.parts_differ or (e.linear is not None and e.linear > LINEAR):
+    if e.parts_differ or e.neither or (e.linear is not None and e.linear > LINEAR):
         return None
     if error is None or not linear_error or error <= USELESS * linear_error:
         return None
     gain = f"{which} error {percent(error)}, of the linear model {percent(linear_error)}"
     if e.linear_train and e.noise and e.linear_train <= NOISE_LIMITED * e.noise:
-        if e.linear_train < SOUND * e.noise:
+        if e.better or e.linear_train < SOUND * e.noise:
             return None
         return Advice("The system is linear at this level: the linear model is enough.", gain)
     if e.searched:
+        if e.better:
+            return None
         return Advice(
             "Hardly better than the linear model at any size searched: the system is linear at "
             "this level, or the rest is no static map of a few signals.",
@@ -324,8 +373,11 @@ def hardly_better(e: Evidence) -> Advice | None:
     if not e.continued and e.started < 8:
         change = {"starts": 8, **change}
     return Advice(
-        "Hardly better than the linear model: the system is linear at this level, or the search "
-        f"or the sizes are too small: {_written(change)}.",
+        f"The gain on {which} is small; a longer search or larger sizes may have more: "
+        f"{_written(change)}."
+        if e.better
+        else "Hardly better than the linear model: the system is linear at this level, or the "
+        f"search or the sizes are too small: {_written(change)}.",
         gain,
         change,
     )
@@ -336,6 +388,8 @@ def outputs_left_out(e: Evidence) -> Advice | None:
     error, linear_error, which = e.judged
     behind = {name: ratio for name, ratio in e.outputs.items() if ratio > USELESS}
     if not behind or error is None or not linear_error or error > USELESS * linear_error:
+        return None
+    if e.lost_on_tests:
         return None
     ratios = _listed([f"{number(ratio)} times on '{name}'" for name, ratio in behind.items()])
     change: dict[str, Any] = {name: e.sizes.get(name, 0) + 1 for name in ("nw", "nz")}
@@ -349,7 +403,7 @@ def outputs_left_out(e: Evidence) -> Advice | None:
 def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
     """An error that is neither noise nor linear: the static map is too small."""
     error, linear_error, _ = e.judged
-    if e.linear is not None and e.linear > LINEAR:
+    if e.lost_on_tests or (e.linear is not None and e.linear > LINEAR):
         return None
     if error is None or (linear_error and error > USELESS * linear_error):
         return None
@@ -446,7 +500,9 @@ def noise_unknown(e: Evidence) -> Advice | None:
 
 RULES = (
     diverges,
+    neither_usable,
     validation_is_unlike,
+    gain_is_lost,
     nothing_held_out,
     starts_in_a_transient,
     at_the_noise,

@@ -19,6 +19,7 @@ from lfrtorch.metrics import rms
 from lfrtorch.records import Record
 from lfrtorch.reporting.advice import Evidence
 from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.verdict import Verdict
 
 AVERAGES = 8
 """Segments for each regressor that a coherence is estimated from, at least."""
@@ -57,6 +58,7 @@ def evidence(
     ridge: bool = False,
     search: SizeSearch | None = None,
     trainer: Trainer | None = None,
+    verdict: Verdict | None = None,
 ) -> Evidence:
     """The numbers that advice rests on.
 
@@ -69,6 +71,7 @@ def evidence(
         ridge: whether it had one.
         search: for the sizes, if validation chose them.
         trainer: of the fit. Default: Levenberg-Marquardt.
+        verdict: on the fit, which advice agrees with.
     """
     train, validation, tests = (
         [response for response in responses if response.use == use]
@@ -83,6 +86,8 @@ def evidence(
     linear, nonlinear = explained_parts(train)
     peak = _peak(train, result.model.scaler.u_offset)
     transient, free = (None, None) if bla is None else _transient(train, scale, bla)
+    test = _error([r.error for r in tests], scale)
+    linear_test = _error([r.linear_error for r in tests], scale)
     return Evidence(
         train=_error([r.error for r in train], scale),
         linear_train=_error([r.linear_error for r in train], scale),
@@ -113,6 +118,8 @@ def evidence(
             for test in tests
         },
         diverged=[r.record.name for r in responses if r.use != "train" and r.diverged],
+        tests=test / linear_test if test and linear_test else None,
+        verdict=verdict,
     )
 
 

@@ -195,8 +195,9 @@ def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
         )
     else:
         kind, use = Kind.LINEAR, LINEAR_MODEL
+        clearly = "clearly " * (whole.ratio < 1.0 - SAME)
         text = (
-            f"Not better than the linear model: on {whole.name} the error is "
+            f"Not {clearly}better than the linear model: on {whole.name} the error is "
             f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of the linear "
             "model's"
         )

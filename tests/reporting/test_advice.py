@@ -22,6 +22,7 @@ from lfrtorch.reporting.diagnosis import (
     noise_of_periods,
 )
 from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict
 
 pytestmark = pytest.mark.numeric
 
@@ -43,6 +44,11 @@ GOOD = Evidence(
     louder={"test": 1.0},
 )
 """A fit of which nothing is to be said but that nonlinear behaviour is left."""
+
+
+def verdict(kind: Kind, use: str = "linear model") -> Verdict:
+    return Verdict(kind, "", use)
+
 
 SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
 
@@ -84,6 +90,8 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
             "starts=8, nx=4, nn=20, nz=2, nw=2",
         ),
         (advice.at_the_noise, {"train": 0.0105, "validation": 0.011}, "nothing to gain"),
+        (advice.neither_usable, {"verdict": verdict(Kind.LINEAR, NEITHER)}, "look at the columns"),
+        (advice.gain_is_lost, {"tests": 1.5}, "measure longer"),
     ],
 )
 def test_a_rule_speaks_if_its_number_says_so(rule, change, said):
@@ -167,6 +175,39 @@ def test_a_model_that_diverges_everywhere_has_advice():
         item.text for item in advise(Evidence(None, 0.2, None, 0.2, starts=(), diverged=["a", "b"]))
     ]
     assert texts[0].startswith("The model is not usable yet")
+
+
+@pytest.mark.parametrize("searched", [True, False])
+def test_what_the_verdict_calls_better_is_not_called_hardly_better(searched: bool):
+    small = replace(GOOD, validation=0.19, started=1, searched=searched)
+    quiet = {"linear_train": 0.0105, "linear_validation": 0.0105, "validation": 0.01}
+    for change in ({}, quiet):
+        said = str(advice.hardly_better(replace(small, **change)))
+        assert "linear at this level" in said
+        seen = replace(small, verdict=verdict(Kind.BETTER, "NL-LFR"), **change)
+        found = str(advice.hardly_better(seen))
+        assert "linear at this level" not in found
+        assert "Hardly better" not in found
+
+
+def test_no_system_is_called_linear_where_neither_model_is_usable():
+    useless = replace(GOOD, train=0.95, linear_train=0.97, validation=0.98, linear_validation=1.0)
+    useless = replace(useless, noise=None, verdict=verdict(Kind.LINEAR, NEITHER))
+    texts = [item.text for item in advise(useless)]
+    assert texts[0].startswith("The inputs explain little")
+    assert not any("linear at this level" in text for text in texts)
+
+
+def test_a_gain_that_the_tests_have_not_asks_for_no_larger_map():
+    lost = replace(GOOD, tests=1.5, outputs={"y1": 0.95, "y2": 0.1})
+    texts = [item.text for item in advise(lost)]
+    assert texts[0].startswith("The gain on validation is lost on the tests")
+    assert not any("nw=" in text for text in texts)
+    shown = replace(lost, validation=None, linear_validation=None)
+    assert not any("Overfitting would not show" in item.text for item in advise(shown))
+    for change in ({"tests": 0.5}, {"verdict": verdict(Kind.BETTER, "NL-LFR")}):
+        texts = [item.text for item in advise(replace(lost, **change))]
+        assert texts[0].startswith("Some outputs gain nothing")
 
 
 def test_a_linear_filter_of_the_input_is_seen_in_the_error():
