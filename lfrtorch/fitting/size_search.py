@@ -1,9 +1,10 @@
 """Sizes of the static nonlinearity: a small search, scored on records that are not fitted.
 
-If nx is searched, too, it is first: from the linear model's order up, at the most inputs of the
-static map and the middle number of neurons, until two orders in a row bring less than 1 %. Then nz
-and nw are crossed at the middle number of neurons; then all numbers of neurons are tried at the
-nz and nw chosen. Every model is fitted from several starts for a part of the usual iterations.
+If nx is searched, too, it is first: from the linear model's order up, at the most inputs and the
+fewest outputs of the static map and the middle number of neurons, until two orders in a row bring
+less than 1 %. Then nz and nw are crossed at the middle number of neurons; then all numbers of
+neurons are tried at the nz and nw chosen. Every model is fitted from several starts for a part of
+the usual iterations.
 
 The fewest parameters that do as well as the best are chosen: ``_support.paired_blocks`` says what
 that is. What chance does to starts, and what more iterations would do, is not in it.
@@ -294,8 +295,8 @@ def search_sizes(
     middle = [last[len(last) // 2]]
     if nx is not None:
         ladder, nzs, nws = outer
-        for number in ladder:
-            searched([number], nzs[-1:], nws[:1], middle)
+        for order in ladder:
+            searched([order], nzs[-1:], nws[:1], middle)
             if no_progress([c.error for c in found], PATIENCE):
                 break
         best = SizeSearch(tuple(found), judge.counts).chosen

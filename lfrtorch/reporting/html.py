@@ -261,15 +261,12 @@ def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
             moments = _moments(x)
             factor, unit = engineering([moments[1]], channel.unit)
             channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
-    records = []
-    used = [(response.use, response.record) for response in responses]
-    for use, r in (*used, *dataset.unscored):
-        count = (
-            NOT_SCORED
-            if (use, r) in dataset.unscored
-            else of_samples(r.samples - r.skip, r.samples)
-        )
-        records.append([r.name, USES.get(use, use), r.source, r.start, count, r.period])
+    counted = [(response.use, response.record, len(response.scored)) for response in responses]
+    counted += [(use, record, 0) for use, record in dataset.unscored]
+    records = [
+        [r.name, USES.get(use, use), r.source, r.start, of_samples(count, r.samples), r.period]
+        for use, r, count in counted
+    ]
     return {
         "summary": summary,
         "notes": dataset.notes,
@@ -318,19 +315,12 @@ def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict
     unit = outputs[0].unit if len({channel.unit for channel in outputs}) == 1 else ""
     factor, unit = engineering([start[name] for start in ended for name in errors], unit)
     starts = [
-        [
-            *(s[k] for k in ("seed", "reason", "iterations")),
-            *(times(factor, s[k]) for k in errors),
-        ]
+        [s["seed"], s["reason"], s["iterations"], *(times(factor, s[name]) for name in errors)]
         for s in ended
     ]
     label = f" ({unit})" if unit else ""
-    head = [
-        "seed",
-        "why it ended",
-        "iterations",
-        *(f"{name}{label}" for name in ("training", *errors[1:])),
-    ]
+    head = ["seed", "why it ended", "iterations"]
+    head += [f"{name}{label}" for name in ("training", *errors[1:])]
     judge = "validation" if validated else "training"
     summary = (
         f"{fit['reason'].capitalize()}; kept iteration {metrics['chosen_iteration']} of "
