@@ -179,8 +179,8 @@ def _gap(
             f"all, the first before {table.where(int(grid.gaps[0]))}"
         )
     return InputError(
-        f"'{table.path}': {', and '.join(said)}; gaps='split' takes every stretch between for a "
-        "record of its own, or fill the gaps."
+        f"'{table.path}': {', and '.join(said)}.\nFill the gaps, or gaps='split' takes every "
+        "stretch between them for a record of its own."
     )
 
 

@@ -461,7 +461,7 @@ def _notes(problem: LinearLeastSquares, estimate: SubspaceEstimate, found: Refin
     if slowest > AT_THE_LIMIT:
         notes.append(
             f"the slowest pole has radius {radius(slowest)}: data that drift or integrate ask for "
-            "one, and so does an order above what they carry; look at the data, or lower nx."
+            "one, or an order above what they carry; look at the data, or lower nx."
         )
     return notes
 

@@ -37,6 +37,9 @@ sees how the records differ."""
 USELESS = 0.9
 """Error over the linear model's from which on the NL-LFR is hardly better."""
 
+UNEXPLAINED = 0.7
+"""Training error from which on half of the outputs' power has no explanation."""
+
 LINEAR = 0.25
 """Part of the error's power that is linear in the inputs: 0.48 of Bouc-Wen at an order one too low,
 0.01 at the right one; 0.97 and 0.08 of Silverbox."""
@@ -267,13 +270,22 @@ def validation_is_unlike(e: Evidence) -> Advice | None:
 
 
 def neither_usable(e: Evidence) -> Advice | None:
-    """Inputs that do not explain the outputs, whatever the model."""
-    if not e.neither or e.diverged:
+    """Inputs that do not explain the outputs, whatever the model, or only those in training."""
+    if not e.neither or e.diverged or e.train is None or not e.linear_train:
+        return None
+    evidence = f"training error {percent(e.train)}, of the linear model {percent(e.linear_train)}"
+    if min(e.train, e.linear_train) > UNEXPLAINED:
+        return Advice(
+            "The inputs explain little of the outputs: look at the columns, delays and units, and "
+            "for other inputs (lfrtorch preview).",
+            evidence,
+        )
+    if e.parts_differ:  # said there
         return None
     return Advice(
-        "The inputs explain little of the outputs: look at the columns, delays and units, and for "
-        "other inputs (lfrtorch preview).",
-        f"training error {percent(e.train)}, of the linear model {percent(e.linear_train)}",
+        "The models hold in training alone: the other parts are unlike or too short, or begin in "
+        "another state (start='estimated').",
+        evidence,
     )
 
 

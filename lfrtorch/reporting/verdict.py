@@ -205,8 +205,9 @@ def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
         used = whole.nrmse if use == NL_LFR else whole.linear_nrmse
         if used >= EXPLAINS_NOTHING:
             text = (
-                f"Neither model is usable: on {whole.name} the errors are {percent(whole.nrmse)} "
-                f"(NL-LFR) and {percent(whole.linear_nrmse)} (linear) of the output"
+                f"Neither model is usable: on {whole.name} the output's errors are "
+                f"{percent(whole.nrmse)} (NL-LFR) and {percent(whole.linear_nrmse)} (linear) "
+                "of its deviation"
             )
             return Verdict(kind, f"{text}.", NEITHER, evidence)
     advice = "; use the linear model" if use == LINEAR_MODEL else ""

@@ -50,6 +50,8 @@ def verdict(kind: Kind, use: str = "linear model") -> Verdict:
     return Verdict(kind, "", use)
 
 
+UNUSABLE = verdict(Kind.LINEAR, NEITHER)
+
 SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
 
 
@@ -90,7 +92,12 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
             "starts=8, nx=4, nn=20, nz=2, nw=2",
         ),
         (advice.at_the_noise, {"train": 0.0105, "validation": 0.011}, "nothing to gain"),
-        (advice.neither_usable, {"verdict": verdict(Kind.LINEAR, NEITHER)}, "look at the columns"),
+        (advice.neither_usable, {"verdict": UNUSABLE}, "hold in training alone"),
+        (
+            advice.neither_usable,
+            {"verdict": UNUSABLE, "train": 0.95, "linear_train": 0.97, "linear_validation": 0.98},
+            "look at the columns",
+        ),
         (advice.gain_is_lost, {"tests": 1.5}, "measure longer"),
     ],
 )
@@ -192,7 +199,7 @@ def test_what_the_verdict_calls_better_is_not_called_hardly_better(searched: boo
 
 def test_no_system_is_called_linear_where_neither_model_is_usable():
     useless = replace(GOOD, train=0.95, linear_train=0.97, validation=0.98, linear_validation=1.0)
-    useless = replace(useless, noise=None, verdict=verdict(Kind.LINEAR, NEITHER))
+    useless = replace(useless, noise=None, verdict=UNUSABLE)
     texts = [item.text for item in advise(useless)]
     assert texts[0].startswith("The inputs explain little")
     assert not any("linear at this level" in text for text in texts)
