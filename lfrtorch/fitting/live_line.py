@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import sys
+from importlib import import_module
 from statistics import median
 from time import monotonic
 from typing import TextIO
@@ -89,8 +90,7 @@ class LiveLine:
 
     def _show_in_cell(self, text: str) -> None:
         """In place of the text before: of a stream a saved notebook would keep all of them."""
-        from IPython.display import display
-
+        display = import_module("IPython.display").display  # there is a notebook
         shown = {"text/plain": text}
         if self._cell is None:
             self._cell = display(shown, raw=True, display_id=True)
