@@ -387,7 +387,7 @@ def test_gaps_are_refused_with_their_place(tmp_path):
     timed(path, np.arange(300) / 100, slice(50, 60))
     message = refused("10 sample.* in 1 place.*line 52 in column 'y'", path, use=TIMED)
     assert "gaps='split'" in message
-    assert max(map(len, message.splitlines())) <= 160
+    assert max(map(len, message.replace(str(path), "a.csv").splitlines())) <= 160
     timed(path, np.delete(np.arange(300), [100, 101, 102, 200]) / 100)
     refused(r"2 gap\(s\) of 4 sample\(s\) in all, the first before line 102", path, use=TIMED)
     np.savez(tmp_path / "a.npz", u=np.arange(60.0), y=np.where(np.arange(60) == 7, np.nan, 1))

@@ -605,7 +605,7 @@ class Race:
 
 
 def test_candidates_that_are_alike_or_hopeless_are_not_searched(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(bla, "_scaled", lambda problem, matrices, balanced: matrices)
+    monkeypatch.setattr(bla, "scaled", lambda problem, matrices, balanced: matrices)
     race, estimate = Race(), cast(Any, SimpleNamespace(A=[0]))
     candidates: Any = [
         bla._Candidate(cost, estimate, cast(Any, cost))
@@ -619,7 +619,7 @@ def test_candidates_that_are_alike_or_hopeless_are_not_searched(monkeypatch: pyt
 
 
 def test_candidates_that_went_to_one_minimum_end_the_race(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(bla, "_scaled", lambda problem, matrices, balanced: matrices)
+    monkeypatch.setattr(bla, "scaled", lambda problem, matrices, balanced: matrices)
     race, estimate = Race(minimum=0.5), cast(Any, SimpleNamespace(A=[0]))
     candidates: Any = [
         bla._Candidate(cost, estimate, cast(Any, cost)) for cost in (1.0, 2.0, 3.0, 4.0, 5.0)
