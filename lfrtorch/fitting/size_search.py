@@ -6,7 +6,7 @@ less than 1 %. Then nz and nw are crossed at the middle number of neurons; then 
 neurons are tried at the nz and nw chosen. Every model is fitted from several starts for a part of
 the usual iterations.
 
-The fewest parameters that do as well as the best are chosen: ``_support.paired_blocks`` says what
+The fewest parameters that do as well as the best are chosen: ``lfrtorch.paired_blocks`` says what
 that is. What chance does to starts, and what more iterations would do, is not in it.
 """
 
@@ -25,14 +25,6 @@ import torch
 from lfrtorch._support import tables
 from lfrtorch._support.checks import integer, renamed
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.paired_blocks import (
-    as_good,
-    blocked_mean,
-    in_blocks,
-    no_progress,
-    squares_in_blocks,
-    standard_errors_above,
-)
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array, Integers
@@ -44,6 +36,14 @@ from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.score_window import is_open, settled
 from lfrtorch.model import Model
+from lfrtorch.paired_blocks import (
+    as_good,
+    blocked_mean,
+    in_blocks,
+    no_progress,
+    squares_in_blocks,
+    standard_errors_above,
+)
 from lfrtorch.records import Record, Scaler, as_records
 
 Sizes = dict[str, Any]

@@ -1,6 +1,6 @@
 """Order of the BLA: a scan over nx, scored on records that are not fitted.
 
-The fewest states are taken that do as well as the best, see ``_support.paired_blocks``. Where the
+The fewest states are taken that do as well as the best, see ``lfrtorch.paired_blocks``. Where the
 validation records are short against the system's memory, or unlike the training records, they say
 little of an order: the scores are then those of a cross-validation in time over both. Each of FOLDS
 stretches is left out of a fit to the rest, and scored in a simulation of its whole record.
@@ -21,13 +21,6 @@ import numpy as np
 from lfrtorch._support import tables
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.paired_blocks import (
-    BLOCKS,
-    as_good,
-    in_blocks,
-    no_progress,
-    squares_in_blocks,
-)
 from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import each_alone
 from lfrtorch._support.types import Array
@@ -38,6 +31,13 @@ from lfrtorch.linear.order_fits import OrderFits, Window
 from lfrtorch.linear.requirements import check_length, check_signals, excited_directions
 from lfrtorch.linear.score_window import settled
 from lfrtorch.metrics import rms
+from lfrtorch.paired_blocks import (
+    BLOCKS,
+    as_good,
+    in_blocks,
+    no_progress,
+    squares_in_blocks,
+)
 from lfrtorch.records import Record, Scaler, as_records, without_coordinates
 
 ORDERS = range(1, 13)

@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import t
 
-from lfrtorch._support.paired_blocks import BLOCKS, blocked_mean, in_blocks
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.tables import number, percent
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.metrics import nrmse, rms
+from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
 from lfrtorch.reporting.simulations import Response
 
 NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"

@@ -10,7 +10,6 @@ import pytest
 import torch
 from reference import random_cell
 
-from lfrtorch._support.paired_blocks import BLOCKS
 from lfrtorch._support.tables import number
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.engine.lfr import LFR
@@ -22,6 +21,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
+from lfrtorch.paired_blocks import BLOCKS
 from lfrtorch.records import Channel, Record, Scaler
 
 OPTIMISER = LevenbergMarquardt(max_iter=10)

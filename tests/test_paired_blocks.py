@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lfrtorch._support.paired_blocks import (
+from lfrtorch.paired_blocks import (
     BLOCKS,
     as_good,
     blocked_mean,
