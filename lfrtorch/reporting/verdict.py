@@ -32,6 +32,9 @@ NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
 SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
+EQUAL = 5e-4
+"""Difference that three digits do not show, its standard error included."""
+
 CLEAR = 2.0
 """Ratio of two errors that is no chance, whatever its standard error."""
 
@@ -193,6 +196,10 @@ def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
             f"Better than the linear model: on {whole.name} the NL-LFR's error is "
             f"{of_linear(whole.ratio)}"
         )
+    elif abs(whole.ratio - 1.0) + whole.ratio_std < EQUAL:
+        kind, use = Kind.LINEAR, LINEAR_MODEL
+        kept = "the fit kept its start, and " * (result.chosen_iteration == 0)
+        text = f"As the linear model: {kept}on {whole.name} the errors are the same"
     else:
         kind, use = Kind.LINEAR, LINEAR_MODEL
         clearly = "clearly " * (whole.ratio < 1.0 - SAME)
@@ -275,14 +282,16 @@ def _compared(errors: Sequence[_Errors], among: int = 1) -> Compared:
     )
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         difference, error = blocked_mean(squares - linear, counts)
-    ratio = math.sqrt(squares.sum() / linear.sum()) if linear.any() else 1.0
+        ratio = math.sqrt(squares.sum() / linear.sum()) if linear.any() else 1.0
+        # The linear model's mean square is 1: d ratio = d (squares - ratio² linear) / (2 ratio).
+        _, spread = blocked_mean(squares - ratio**2 * linear, counts)
     power = float(np.dot([e.power for e in errors], samples)) or math.nan
     first = errors[0].response
     several = f"{len(errors)} {_use(first)} records"
     return Compared(
         name=_name(first) if len(errors) == 1 else several,
         ratio=ratio,
-        ratio_std=float(error) / (2.0 * ratio) if ratio > 0 else 0.0,
+        ratio_std=float(spread) / (2.0 * ratio) if ratio > 0 else 0.0,
         deviations=float(difference / error) if error > 0 else 0.0,
         clear=float(t.ppf(1.0 - (1.0 - CONFIDENCE) / max(1, among), len(counts) - 1)),
         nrmse=math.sqrt(sum(e.squares.sum() for e in errors) / power),

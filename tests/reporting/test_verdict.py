@@ -46,7 +46,7 @@ BURST = np.where(np.arange(1000) // 20 == 30, 25.0, 0.2)
          [response("test", 0.5, name="a"), response("test", 0.8, name="b")]),
         ("better", "NL-LFR", "green", "on validation", [response("validation", 0.5)]),
         # Better on validation, which chose the iterate, and not on the test.
-        ("linear", "linear model", "amber", "100 ± 0 %",
+        ("linear", "linear model", "amber", "As the linear model: on test the errors are the same",
          [response("validation", 0.5), response("test", 1.0)]),
         # Better by less than what is worth a choice, and worse by as little.
         ("linear", "linear model", "amber", "use the linear model", [response("test", 0.97)]),
@@ -78,6 +78,28 @@ def test_a_difference_is_judged_by_its_standard_error():
     more = [response("test", 0.0, noise=0.93, name="n" * k) for k in range(1, 30)]
     assert judge(result(), [TRAIN, few]).kind == Kind.LINEAR
     assert judge(result(), [TRAIN, many, *more]).kind == Kind.BETTER
+
+
+@pytest.mark.parametrize("part", [0.1, 0.8, 3.0])
+def test_the_standard_error_is_how_far_the_ratio_varies(part: float):
+    rng = np.random.default_rng(5)
+    still = np.zeros((1000, 1))
+    found = []
+    for _ in range(200):
+        shared, own = rng.standard_normal((2, 1000, 1))
+        y = rng.standard_normal((1000, 1))
+        parts = y + shared, y + part * (0.8 * shared + 0.6 * own)
+        found.append(judge(result(), [Response(Record(still, y), "test", *parts)]).evidence)
+    ratios, errors = (np.array([each[key] for each in found]) for key in ("ratio", "ratio_std"))
+    # 200 draws tell a standard deviation to 5 %, and ten blocks have a bias of 3 %.
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(ratios.std(), rel=0.2)
+
+
+def test_a_fit_that_kept_its_start_is_as_the_linear_model():
+    almost = response("test", 1.0 + 1e-9)
+    assert "the fit kept its start" in judge(result(chosen=0), [TRAIN, almost]).text
+    other = judge(result(chosen=0), [TRAIN, response("test", 0.97, noise=0.2)])
+    assert other.text.startswith("Not better than the linear model")
 
 
 def test_one_of_many_records_is_worse_by_chance():
