@@ -24,6 +24,7 @@ class Reason(StrEnum):
     ALL_ITERATIONS = "maximum number of iterations"
     ALL_EPOCHS = "maximum number of epochs"
     NO_ITERATIONS = "no iterations asked for"
+    START_DIVERGES = "diverges at the start"
     OTHERS_BETTER = "others were better"
     INTERRUPTED = "interrupted"
     PROCESS_LOST = "a process was lost"

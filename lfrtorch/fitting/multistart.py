@@ -45,6 +45,7 @@ from lfrtorch.fitting.trainer import (
     Progress,
     RestartSummary,
     Round,
+    StartDivergesError,
     Stop,
     StoppedError,
     Trainer,
@@ -133,7 +134,7 @@ def fit(
         the best first, and ``averaged`` says of how many the model is the mean.
 
     Raises:
-        ValueError: no model, one that diverges on the training records at the start, validation
+        ValueError: no model, none that is stable on the training records at the start, validation
             records that all have too few samples, fewer records than processes, another number of
             lists of monitors, or models to average that have no network.
         ProcessLostError, StoppedError: before there was an iterate to keep.
@@ -179,6 +180,12 @@ def fit(
         Fit(model, train, validation, **options, keep=snapshots.keeper(number))
         for number, model in enumerate(starts)
     ]
+    if all(one.diverges for one in fits):
+        which = "the model diverges" if len(fits) == 1 else "all models diverge"
+        raise StartDivergesError(
+            f"{which} on the training records at the start; start from a stable model, or use "
+            "the linear model alone (lfrtorch linear)."
+        )
     snapshots.restore(fits)
     unseen = [r for some in (validation, selection) if some for r in as_records(some)]
     judge = _Judge(fits, unseen if selection else [], unseen)
@@ -430,7 +437,7 @@ def advance_in_step(
 def _drop_others(field: list[Fit], kept: list[Fit]) -> list[Fit]:
     """The starts that are kept; the others end."""
     for fit in field:
-        if not any(fit is other for other in kept):
+        if not (fit.diverges or any(fit is other for other in kept)):
             fit.note_end(Reason.OTHERS_BETTER)
     return kept
 

@@ -32,7 +32,7 @@ _KEPT = ("best", "_chosen", "_first", "_score", "_seconds", "_durations")
 
 
 class StartDivergesError(InputError):
-    """The model diverges on the training records at the start."""
+    """All models diverge on the training records at the start."""
 
 
 class TrainerState(Protocol):
@@ -253,11 +253,6 @@ class Fit:
             vector_to_parameters(ranks.first(weights), model.lfr.parameters())
         self.problem = SimulationProblem.of(model, train, ridge=ridge, ranks=ranks)
         self.judge = SimulationProblem.judge(model, validation) if validation else None
-        if not math.isfinite(self.problem.cost(self.problem.residual(self.problem.theta))):
-            raise StartDivergesError(
-                "the model diverges on the training records at the start; start from a stable "
-                "model."
-            )
         self.state: Any = None
         """The trainer's; None before the first call of ``advance``."""
         self.history: list[Progress] = []
@@ -268,6 +263,16 @@ class Fit:
         self._first = self._score = math.inf
         self._seconds = 0.0
         self._durations: list[float] = []
+        if not math.isfinite(self.problem.cost(self.problem.residual(self.problem.theta))):
+            self.note_end(Reason.START_DIVERGES)
+            self.history.append(
+                Progress(0, self.trainer.limit, math.inf, math.nan, 0.0, False, {}, math.inf)
+            )
+
+    @property
+    def diverges(self) -> bool:
+        """Whether the model diverges on the training records at the start: there is no search."""
+        return self.reason == Reason.START_DIVERGES
 
     @property
     def kept(self) -> Progress:
@@ -277,8 +282,8 @@ class Fit:
     @property
     def over(self) -> bool:
         """Whether there is no more to come."""
-        if not self.history:
-            return False
+        if not self.history or self.diverges:
+            return self.diverges
         return bool(self.state.reason) or self.state.iteration >= self.trainer.limit
 
     def note_end(self, reason: str, detail: str = "") -> None:
@@ -323,7 +328,8 @@ class Fit:
         """Put the best iterate into the model, and let go of memory."""
         self.problem.write(self._theta_best)
         self.problem.release()
-        self.keep(self, True)
+        if not self.diverges:
+            self.keep(self, True)
 
     def save(self, path: Path) -> None:
         """Write the state of the fit to a file, from which ``restore`` goes on to the same bits."""

@@ -16,6 +16,7 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import Round, advance_in_step, fit
+from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import Fit, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -83,6 +84,26 @@ def test_results_do_not_depend_on_threads():
         for one, alike in zip(expected, other, strict=True):
             assert (one.number, one.iterations) == (alike.number, alike.iterations)
             assert one.validation == pytest.approx(alike.validation, rel=1e-6)
+
+
+@pytest.mark.parametrize("average", [1, 3])
+def test_a_start_that_diverges_at_once_leaves_the_others_as_they_are(average: int, tmp_path):
+    found = []
+    for spoilt in (False, True):
+        models, train, validation = several(3)
+        if spoilt:
+            with torch.no_grad():
+                models[0].lfr.cell.A.mul_(50.0)
+        optimiser = LevenbergMarquardt(max_iter=8)
+        options: dict[str, Any] = {"trainer": optimiser, "average": average}
+        options["snapshots"] = Snapshots(tmp_path / str(spoilt), every=0.0)
+        own = models if spoilt else models[1:]
+        found.append(fit(own, train, validation, **options))
+    alone, beside = found
+    assert torch.equal(theta(alone.model), theta(beside.model))
+    lost = beside.starts[-1]
+    assert (lost.number, lost.iterations, lost.reason) == (0, 0, Reason.START_DIVERGES)
+    assert math.isinf(lost.train)
 
 
 def test_one_start_is_a_fit():

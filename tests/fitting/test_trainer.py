@@ -1,6 +1,7 @@
 """The one training loop: what it keeps, when it stops, and a planted model found again."""
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -352,8 +353,12 @@ def test_start_that_diverges_is_refused():
         model.lfr.cell.A.mul_(5.0)
     start = theta(model)
     for optimiser in (LevenbergMarquardt(), Adam()):
-        with pytest.raises(ValueError, match="diverges on the training records at the start"):
+        with pytest.raises(
+            ValueError, match=r"diverges on the training records at the start.*linear"
+        ):
             fit(model, train, trainer=optimiser)
+        with pytest.raises(ValueError, match="all models diverge"):
+            fit([model, deepcopy(model)], train, trainer=optimiser)
         assert torch.equal(theta(model), start)
 
 
