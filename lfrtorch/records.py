@@ -57,6 +57,18 @@ class Channel(NamedTuple):
         return f"{self.name} ({self.unit})" if self.unit else self.name
 
 
+def common_unit(channels: Sequence[Channel]) -> str:
+    """The unit of a number on all of the channels; none if they have several.
+
+    Example:
+        >>> from lfrtorch.records import Channel, common_unit
+        >>> common_unit([Channel("x", "m"), Channel("y", "m")])
+        'm'
+    """
+    units = {channel.unit for channel in channels}
+    return units.pop() if len(units) == 1 else ""
+
+
 @dataclass(frozen=True, eq=False)
 class Record:
     """One measurement: input, output, and how it is to be simulated and scored.

@@ -94,10 +94,10 @@ def times(factor: float, value: float | None) -> float | None:
     return None if value is None else factor * value
 
 
-def quantities(values: Sequence[float | None], unit: str) -> list[str]:
+def quantities(values: Sequence[float | None], unit: str, digits: int = DIGITS) -> list[str]:
     """Numbers with their unit, all with the same SI prefix; without a unit the numbers alone."""
     factor, unit = engineering(values, unit)
-    return [f"{number(times(factor, v))} {unit}".rstrip() for v in values]
+    return [f"{number(times(factor, v), digits)} {unit}".rstrip() for v in values]
 
 
 def quantity(value: float | None, unit: str) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from difflib import get_close_matches
 
 from hydra import compose, initialize_config_dir
@@ -19,6 +20,18 @@ from lfrtorch.cli.words import GROUPS
 
 SWEEPS = {"-m", "--multirun"}
 """Options that make several runs of several values."""
+
+
+def take_words(command: str, whole: Callable[[Sequence[str]], list[str]] = list) -> None:
+    """Check the command line, and leave it to Hydra with quotes around what it cannot read without.
+
+    Args:
+        command: see :func:`check_words`.
+        whole: adds what the words stand for, as the settings of the run in ``resume=DIR``.
+    """
+    given = sys.argv[1:]
+    sys.argv[1:] = [quoted(word) for word in whole(given)]
+    check_words(command, given, sys.argv[1:])
 
 
 def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> None:

@@ -87,7 +87,7 @@ def loaded(cfg: DictConfig) -> Dataset:
     """The records; what is to be known of them is printed, and kept for the report."""
     dataset: Dataset = instantiate(cfg.data)
     measured = [record for record in dataset.train if record.source == "file"]
-    notes = (*dataset.notes, *(notes_on(measured) if measured else ()))
+    notes = (*dataset.notes, *(notes_on(measured, given=cfg.get("bla")) if measured else ()))
     for note in notes:
         print(in_lines(f"note: {translated(note, cfg)}"))
     return replace(dataset, notes=notes)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
 from pathlib import Path
 
 import hydra
@@ -19,10 +18,9 @@ import lfrtorch
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch.cli import CONF
-from lfrtorch.cli.composition import check_words
+from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import loaded, require_data
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import program
 from lfrtorch.cli.simulate import opened
 from lfrtorch.cli.words import Terminal
@@ -80,6 +78,5 @@ def main(cfg: DictConfig) -> None:
 def launch() -> None:
     """The command."""
     with user_errors():
-        sys.argv[1:] = [quoted(word) for word in sys.argv[1:]]
-        check_words("evaluate", sys.argv[1:])
+        take_words("evaluate")
     main()

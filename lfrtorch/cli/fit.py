@@ -27,11 +27,10 @@ from omegaconf import DictConfig, OmegaConf
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.reasons import Reason
 from lfrtorch.cli import CONF
-from lfrtorch.cli.composition import check_words
+from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import configured, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError, Termination
-from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import (
     CONFIG,
     SNAPSHOTS,
@@ -180,9 +179,7 @@ def launch() -> None:
     if WORLD > 1 and {"-m", "--multirun"} & set(sys.argv):
         sys.exit("error: torchrun shares one fit; start several runs one after another.")
     with user_errors(os.environ.get("RANK", "0")):
-        given = sys.argv[1:]
-        sys.argv[1:] = [quoted(word) for word in arguments(given)]
-        check_words("config", given, sys.argv[1:])
+        take_words("config", arguments)
     if WORLD > 1 and os.environ["RANK"] != "0":
         sys.argv += WITHOUT_FILES
     main()

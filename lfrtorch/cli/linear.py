@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,10 +27,9 @@ from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.tables import in_percent
 from lfrtorch.analysis.poles import frequency_and_damping, remark
 from lfrtorch.cli import CONF
-from lfrtorch.cli.composition import check_words
+from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import configured, loaded
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
 from lfrtorch.cli.words import Terminal
 from lfrtorch.dataset import Dataset
@@ -279,7 +277,5 @@ def main(cfg: DictConfig) -> None:
 def launch() -> None:
     """The command, with the settings of the run in ``resume=DIR`` before its words."""
     with user_errors():
-        given = sys.argv[1:]
-        sys.argv[1:] = [quoted(word) for word in arguments(given)]
-        check_words("linear", given, sys.argv[1:])
+        take_words("linear", arguments)
     main()

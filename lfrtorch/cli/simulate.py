@@ -5,7 +5,6 @@ lfrtorch simulate checkpoint=runs/run/DATE data.path=new.csv out=predicted.csv
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,10 +23,9 @@ from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.cli import CONF
-from lfrtorch.cli.composition import check_words
+from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.linear import finite
-from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.words import translated
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import Block, FileStream
@@ -158,7 +156,7 @@ def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
         f"the input {channel.name} goes {tables.number(peak)} standard deviations of the training "
         "input away from its mean: the model extrapolates there"
         for channel, peak in zip(model.inputs, result.peaks, strict=True)
-        if peak > FAR
+        if peak > FAR and model.sizes["nz"]  # a linear model is the same at all amplitudes
     ]
     scores, settled = result.scores, result.settled
     with np.errstate(invalid="ignore"):
@@ -342,6 +340,5 @@ def main(cfg: DictConfig) -> None:
 def launch() -> None:
     """The command."""
     with user_errors():
-        sys.argv[1:] = [quoted(word) for word in sys.argv[1:]]
-        check_words("simulate", sys.argv[1:])
+        take_words("simulate")
     main()

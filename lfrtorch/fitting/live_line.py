@@ -11,8 +11,13 @@ from statistics import median
 from time import monotonic
 from typing import TextIO
 
+from lfrtorch._support.tables import quantities
 from lfrtorch.fitting.trainer import Progress, Round
 from lfrtorch.model import Model
+from lfrtorch.records import common_unit
+
+DIGITS = 4
+"""Significant digits of errors, of which an iteration often moves the fourth alone."""
 
 
 def is_notebook(stream: TextIO | None) -> bool:
@@ -120,7 +125,7 @@ class ProgressLine:
 
     def __call__(self, model: Model, progress: Progress) -> None:
         """Show the progress."""
-        text = progress_text(progress, model.outputs[0].unit)
+        text = progress_text(progress, common_unit(model.outputs))
         self._line.show(text)
         if self._line.live or self.every is None:
             return
@@ -156,9 +161,10 @@ def progress_text(progress: Progress, unit: str) -> str:
 
 def errors(train: float, validation: float, unit: str, *, best: bool = False) -> list[str]:
     """The errors on training and, if there is one, validation; a star marks the best so far."""
-    parts = [f"train {train:.3e} {unit}".rstrip()]
+    shown = quantities([train, validation], unit, DIGITS)
+    parts = [f"train {shown[0]}"]
     if not math.isnan(validation):
-        parts.append(f"validation {validation:.3e} {unit}".rstrip() + ("*" if best else ""))
+        parts.append(f"validation {shown[1]}" + ("*" if best else ""))
     return parts
 
 
@@ -231,12 +237,13 @@ class StartsLine:
         judged = [(s.selection, s.validation, s.train) for s in ended.starts]
         found = [next(e for e in each if not math.isnan(e)) for each in judged]
         numbers = {"best": found[0], "median": median(found), "worst": max(found)}
+        shown = quantities(list(numbers.values()), self.unit, DIGITS)
         text = (
             f"round {ended.number} of {ended.count}: {len(found)} start(s) to iteration "
             f"{max(s.iterations for s in ended.starts)}, "
-            + ", ".join(f"{name} {value:.3e}" for name, value in numbers.items())
+            + ", ".join(f"{name} {value}" for name, value in zip(numbers, shown, strict=True))
         )
-        self._line.say(f"{text} {self.unit}".rstrip() + f", {ended.seconds:.0f} s")
+        self._line.say(f"{text}, {ended.seconds:.0f} s")
 
     def close(self) -> None:
         """End the line, if there is one."""

@@ -55,7 +55,7 @@ from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
 from lfrtorch.linear.score_window import settled
 from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.records import Record, as_records, common_unit
 
 ROUNDS = (1 / 16, 1 / 8)
 """Parts of the iterations after which the worse half is left."""
@@ -260,7 +260,7 @@ def line_of(
     """The line that follows a fit on a terminal or in a notebook; nothing is seen elsewhere."""
     if len(models) == 1:
         return ProgressLine(every=None)
-    unit = models[0].outputs[0].unit
+    unit = common_unit(models[0].outputs)
     return StartsLine(len(models), unit, iterations=iterations_of(planned), rounds=False)
 
 

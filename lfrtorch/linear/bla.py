@@ -277,7 +277,10 @@ def _stable(data: list[Record] | FRF, nx: int, settings: _Settings) -> LinearMod
     estimate, found = _best(problem, _candidates(problem, nx), max_iter, balanced=balanced)
     notes += _notes(problem, estimate, found)
     if max_iter and found.iterations >= max_iter:
-        notes.append(f"the search was stopped after {max_iter} iterations: raise max_iter.")
+        notes.append(
+            f"the search was stopped after {max_iter} iterations: "
+            f"use estimate_bla(max_iter={2 * max_iter})."
+        )
     model = physical(found, scaler, about)
     model = model.transformed(*transformation(problem, found.matrices, balanced=balanced))
     rmse = found.rmse

@@ -407,7 +407,9 @@ def _local_polynomial(
         "a multisine tell them apart (period=N)."
     ]
     if any(record.samples - record.skip > spectra.N for record in data):
-        notes.append(f"the records were cut to the shortest one, {spectra.N} samples.")
+        notes.append(
+            f"frequency response: the records were cut to the shortest one, {spectra.N} samples."
+        )
     if not determined.all():
         notes.append(f"{np.sum(~determined)} line(s) are left out: the inputs do not determine G.")
     return FRF(

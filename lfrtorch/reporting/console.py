@@ -13,6 +13,7 @@ from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
+from lfrtorch.records import common_unit
 
 
 class Console(Observer):
@@ -40,7 +41,7 @@ class Console(Observer):
             self._line = ProgressLine()
             return Watching([[self._line]], lambda _: None)
         planned = schedule(count, settings.trainer.limit, settings.average)
-        unit = models[0].outputs[0].unit
+        unit = common_unit(models[0].outputs)
         self._line = lines = StartsLine(count, unit, iterations=iterations_of(planned))
         return Watching([[lines]] * count, lines.round)
 

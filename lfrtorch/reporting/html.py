@@ -34,6 +34,7 @@ from lfrtorch.fitting.size_search import LEGEND, size_table
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rms
+from lfrtorch.records import common_unit
 from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.scores import NOT_SCORED, finalists, neurons, of_samples
 from lfrtorch.reporting.simulations import Response
@@ -309,10 +310,9 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
 
 def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict[str, Any]:
     fit, ranking = metrics["fit"], metrics["ranking"]
-    outputs = result.model.outputs
     ended, others = finalists(metrics)
     errors = ("train", "validation", "selection")
-    unit = outputs[0].unit if len({channel.unit for channel in outputs}) == 1 else ""
+    unit = common_unit(result.model.outputs)
     factor, unit = engineering([start[name] for start in ended for name in errors], unit)
     starts = [
         [s["seed"], s["reason"], s["iterations"], *(times(factor, s[name]) for name in errors)]

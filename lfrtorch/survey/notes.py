@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -77,13 +77,18 @@ class Note(NamedTuple):
     text: str
 
 
-def examine(found: Survey, u: Array, y: Array) -> list[Note]:
+def examine(
+    found: Survey, u: Array, y: Array, *, skipped: int = 0, given: Mapping[str, Any] | None = None
+) -> list[Note]:
     """Notes on a measurement; none on one that was made well.
 
     Args:
         found: its survey.
         u, y: its signals (T, nu) and (T, ny), NaN for a missing sample. Without inputs all signals
             count as outputs, and there are no notes on how these follow from inputs.
+        skipped: samples of the record before these, which count in the numbers of samples.
+        given: arguments of :func:`lfrtorch.estimate_bla` that are set: what they do already is not
+            advised.
 
     Example:
         >>> from lfrtorch.survey.measurement import survey_measurement
@@ -92,18 +97,24 @@ def examine(found: Survey, u: Array, y: Array) -> list[Note]:
         >>> examine(survey_measurement(u, y), u, y)[0].kind
         'constant u1'
     """
-    notes = [*_levels(found, u, y)]
+    notes = [*_levels(found, u, y, skipped)]
     u, y = u[found.whole], y[found.whole]
     if len(y) >= ENOUGH:
         notes += _excitation(found, u)
-        notes += _relations(found, u, y)
+        notes += _relations(found, u, y, given or {})
     return notes
 
 
-def notes_on(records: Record | Sequence[Record]) -> list[str]:
+def notes_on(
+    records: Record | Sequence[Record], *, given: Mapping[str, Any] | None = None
+) -> list[str]:
     """What will hurt a model of the records, and what to do about it, a sentence each.
 
     If there are several records, a sentence names the one it is about.
+
+    Args:
+        records: those that are fitted; what they skip is not looked at.
+        given: see :func:`examine`.
 
     Raises:
         ValueError: no records, or records of different channels.
@@ -113,7 +124,7 @@ def notes_on(records: Record | Sequence[Record]) -> list[str]:
         >>> short = lfrtorch.Record(np.random.default_rng(0).standard_normal(50), np.arange(50.0))
         >>> for note in notes_on(short):
         ...     print(note)
-        the record has 50 samples, which is short: ...
+        50 samples are few to fit: ...
     """
     data = as_records(records)
     by_kind: dict[str, list[tuple[str, str]]] = {}
@@ -122,7 +133,7 @@ def notes_on(records: Record | Sequence[Record]) -> list[str]:
         found = survey_measurement(
             r.u[scored], r.y[scored], r.fs, inputs=r.inputs, outputs=r.outputs, period=r.period
         )
-        for kind, text in examine(found, r.u[scored], r.y[scored]):
+        for kind, text in examine(found, r.u[scored], r.y[scored], skipped=r.skip, given=given):
             if kind.startswith("integrates") and r.start == "estimated":
                 continue  # a fit says it, if its model does not integrate
             by_kind.setdefault(kind, []).append((r.name, text))
@@ -133,7 +144,7 @@ def notes_on(records: Record | Sequence[Record]) -> list[str]:
     return sentences
 
 
-def _levels(found: Survey, u: Array, y: Array) -> Iterator[Note]:
+def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
     """Missing samples, constant, stuck, clipped and coarse signals, a short record."""
     roles = bool(found.inputs)
     T = len(y)
@@ -163,8 +174,9 @@ def _levels(found: Survey, u: Array, y: Array) -> Iterator[Note]:
         yield Note(
             "still",
             f"{_listed(found.inputs)} {'is' if len(found.inputs) == 1 else 'are'} constant in "
-            f"{100 * still[1] / T:.0f} % of the record (samples {still[0]} to {sum(still)}): "
-            "little is learnt there; cut it off, or excite the system all the time.",
+            f"{100 * still[1] / T:.0f} % of the record (samples "
+            f"{skipped + still[0]} to {skipped + sum(still)}): little is learnt there; cut it "
+            "off, or excite the system all the time.",
         )
     for one, signal in zip(found.outputs, y.T, strict=True):
         name, kind = one.channel.name, "output " if roles else ""
@@ -194,10 +206,11 @@ def _levels(found: Survey, u: Array, y: Array) -> Iterator[Note]:
                 f"{one.step / np.sqrt(12):.2g} is the least; use more of the converter's range.",
             )
     if T < SHORT:
+        after = f" after the {skipped} that are skipped" if skipped else ""
         yield Note(
             "short",
-            f"the record has {T} samples, which is short: a small nonlinear model has 50 to 100 "
-            "parameters; measure longer.",
+            f"{T} samples{after} are few to fit: a small nonlinear model has 50 to 100 parameters; "
+            "measure longer.",
         )
 
 
@@ -258,7 +271,7 @@ def _excitation(found: Survey, u: Array) -> Iterator[Note]:
                 )
 
 
-def _relations(found: Survey, u: Array, y: Array) -> Iterator[Note]:
+def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> Iterator[Note]:
     """How outputs (T, ny) without gaps follow inputs (T, nu): order, delay, drift."""
     between = {
         (i, j): pair
@@ -277,23 +290,26 @@ def _relations(found: Survey, u: Array, y: Array) -> Iterator[Note]:
             )
             return
     counts = [integrators(u, channel) for channel in y.T]
-    noisy = "" if any(counts) else ", and refine='prediction' if it is noisy"
+    changes = ["feedthrough=False"] if given.get("feedthrough", True) else []
+    if given.get("refine") != "prediction" and not any(counts):
+        changes.append("refine='prediction' if it is noisy")
     moving = [one for one, signal in zip(found.inputs, u.T, strict=True) if np.ptp(signal) > 0]
     for one, part in zip(moving, reacting(u, y), strict=True):
-        if part:
+        if part and changes:
             yield Note(
                 f"feedback {one.channel.name}",
                 f"input '{one.channel.name}' reacts to the output: a controller closes the loop "
-                f"and noise biases a model; use feedthrough=False{noisy}.",
+                f"and noise biases a model; use {', and '.join(changes)}.",
             )
     for i, output in enumerate(found.outputs):
         pairs = {j: pair for (k, j), pair in between.items() if k == i}
         name, integrates = output.channel.name, counts[i]
         if integrates:
+            known = "" if given.get("integrators") else f"integrators={integrates} and "
             yield Note(
                 f"integrates {name}",
-                f"output '{name}' integrates: use integrators={integrates} and "
-                "start='estimated'; it has no steady state.",
+                f"output '{name}' integrates: use {known}start='estimated'; "
+                "it has no steady state.",
             )
         force = next((j for j in range(u.shape[1]) if rubs(u[:, j], y[:, i])), None)
         if force is not None:

@@ -217,6 +217,9 @@ def test_the_linear_model_of_a_run(folder: Path, monkeypatch, capsys):
     run(monkeypatch, folder, "checkpoint=run", "data.path=inputs.csv", "out=x.npz")
     assert np.array_equal(columns(folder / "x.npz")["y2_hat"], linear.simulate(U)[:, 1])
     assert "at 50 Hz, nx 3\n" in capsys.readouterr().out
+    csv(folder / "loud.csv", u1=99.0 * U[:, 0], u2=U[:, 1])
+    run(monkeypatch, folder, "checkpoint=run/linear", "data.path=loud.csv", "out=y.csv")
+    assert "extrapolates" not in capsys.readouterr().out
 
 
 # --- the start ------------------------------------------------------------------------------

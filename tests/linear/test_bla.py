@@ -517,7 +517,9 @@ def test_error_of_periodic_records_is_that_of_their_deviations():
 
 def test_search_that_was_cut_short_says_so():
     record = record_of(random_system(4), "periodic", noise=0.5)
-    assert "stopped after 1 iterations: raise max_iter" in notes_of(record, 3, max_iter=1)
+    assert "stopped after 1 iterations: use estimate_bla(max_iter=2)" in notes_of(
+        record, 3, max_iter=1
+    )
     assert "stopped" not in notes_of(record, 3, max_iter=0)
 
 

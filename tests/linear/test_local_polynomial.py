@@ -142,7 +142,9 @@ def test_records_share_the_response_and_not_the_transient():
         records.append(Record(u, dlsim(system, u), FS, skip=300, name=f"r{r}"))
     both = estimate_frf(records)
     assert both.experiments == 2
-    assert both.notes[-1] == "the records were cut to the shortest one, 1400 samples."
+    assert both.notes[-1] == (
+        "frequency response: the records were cut to the shortest one, 1400 samples."
+    )
     assert np.abs(both.G - true_frf(system, both)).mean() < 5e-3 * np.abs(both.G).mean()
 
 

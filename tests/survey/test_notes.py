@@ -223,7 +223,9 @@ def test_inputs_that_are_the_same(u):
 
 
 def test_short(u):
-    assert "has 200 samples" in found(u[:200], lag(u[:200]))["short"]
+    assert found(u[:200], lag(u[:200]))["short"].startswith("200 samples are few")
+    (note,) = notes_on(Record(u[:200], lag(u[:200]), skip=20))
+    assert note.startswith("180 samples after the 20 that are skipped are few")
     assert set(found(u[:3], u[:3])) == {"short"}
 
 
@@ -315,6 +317,9 @@ def test_feedback_of_a_system_that_forgets(rng):
         y[k] = x + 0.5 * rng.standard_normal()
         x = 0.9 * x + 0.1 * u[k]
     assert "feedthrough=False, and refine='prediction'" in found(u, y)["feedback"]
+    (note,) = notes_on(Record(u, y), given={"feedthrough": False})
+    assert note.endswith("use refine='prediction' if it is noisy.")
+    assert notes_on(Record(u, y), given={"feedthrough": False, "refine": "prediction"}) == []
 
 
 def test_unrelated(u, rng):
@@ -337,6 +342,7 @@ def test_notes_of_records(u):
 def test_a_start_that_is_estimated_needs_no_advice(u):
     record = Record(u, lfilter([0, 1], [1, -1], u))
     assert "start='estimated'" in notes_on(record)[0]
+    assert "use start='estimated'" in notes_on(record, given={"integrators": 1})[0]
     assert notes_on(replace(record, start="estimated")) == []
 
 
