@@ -248,6 +248,10 @@ def linear_model(
     ranks: Ranks,
 ) -> tuple[LinearModel, OrderScan | None]:
     """The best linear approximation, and the scan that chose its order if nx is ``"auto"``."""
+    if not isinstance(data, FRF) and not data:
+        raise InputError(
+            "no record is left to fit; give a smaller validation and test, or more of train."
+        )
     scan: OrderScan | None = None
     if settings.nx == "auto":
         orders = range(1, settings.nx_max + 1)
@@ -368,7 +372,14 @@ def check_channels(model: Model, record: Record) -> None:
         ("outputs", model.outputs, record.outputs),
     ):
         if channels != found:
+            own = {c.name: c.unit for c in channels}
+            unlike = any(c.name not in own for c in found) or len(found) != len(own)
             raise InputError(
                 f"the model has the {side} {', '.join(map(str, channels))} and the data "
-                f"{', '.join(map(str, found))}; give data of the same channels."
+                f"{', '.join(map(str, found))}; "
+                + (
+                    "give data of the same channels."
+                    if unlike
+                    else f"if it is so, give units={own}."
+                )
             )

@@ -1,8 +1,8 @@
 """A trained model on a dataset: checkpoint and records -> table of scores.
 
 lfrtorch evaluate checkpoint=runs/boucwen/DATE +bench=boucwen
-lfrtorch evaluate checkpoint=DIR data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750
-"""  # noqa: E501
+lfrtorch evaluate checkpoint=runs/run/DATE data=file data.path=new.csv
+"""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
 from lfrtorch._support.atomic import refuse_existing, whole_file
@@ -21,11 +21,18 @@ from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import loaded, require_data
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.run_folder import program
+from lfrtorch.cli.run_folder import CONFIG, program
 from lfrtorch.cli.simulate import opened
 from lfrtorch.cli.words import Terminal
+from lfrtorch.files.load import EVERYTHING, listed_files
 from lfrtorch.job import check_channels, windowed
 from lfrtorch.reporting import scores as report
+
+FILES = "lfrtorch.load_records"
+"""What reads files of one's own."""
+
+DIVIDES = "data.validation", "data.test"
+"""Words that divide them by use."""
 
 
 def evaluate(cfg: DictConfig, command: str = "") -> None:
@@ -42,6 +49,8 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
             refuse_existing(cfg.out, "overwrite=true")
     folder = str(cfg.checkpoint)
     model, bla = opened(folder), linear_beside(folder)
+    if cfg.data._target_ == FILES:
+        from_files(cfg, model, command)
     dataset = loaded(cfg)
     for record in (*dataset.tests, *dataset.validation, *dataset.selection):
         check_channels(model, record)
@@ -57,6 +66,42 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
         with whole_file(cfg.out) as file:
             file.write_text(json.dumps(found, indent=2, allow_nan=False) + "\n")
         print(f"\nScores in {cfg.out}")
+
+
+def from_files(cfg: DictConfig, model: lfrtorch.Model, command: str) -> None:
+    """Complete the data: the model's channels; all records are tests if the run saw none of them.
+
+    Args:
+        cfg: changed in place.
+        model: that is scored.
+        command: whose words come before.
+    """
+    for side, channels in (("inputs", model.inputs), ("outputs", model.outputs)):
+        if cfg.data[side] is None:
+            cfg.data[side] = [channel.name for channel in channels]
+    divided = any(word.startswith(f"{name}=") for word in shlex.split(command) for name in DIVIDES)
+    if divided or not cfg.data.path or fitted(cfg.checkpoint, cfg.data.path):
+        return
+    cfg.data.test = EVERYTHING
+    print("note: all samples are scored; data.test=0.2 scores the last fifth alone")
+
+
+def fitted(checkpoint: str, path: str | list[str]) -> bool:
+    """Whether the run that made the checkpoint has one of the files among its own."""
+    folder = Path(checkpoint)
+    for config in (folder / CONFIG, folder.parent / CONFIG):
+        if config.is_file():
+            own = OmegaConf.select(OmegaConf.load(config), "data.path")
+            return own is not None and not resolved(own).isdisjoint(resolved(path))
+    return False
+
+
+def resolved(path: str | list[str]) -> set[Path]:
+    """The files of paths and patterns; none if they are gone."""
+    try:
+        return {file.resolve() for file in listed_files(path, "data.path")}
+    except FileNotFoundError:
+        return set()
 
 
 def linear_beside(checkpoint: str) -> lfrtorch.LinearModel | None:

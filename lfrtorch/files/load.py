@@ -36,6 +36,9 @@ Use = float | str | Path | Sequence[str | Path] | None
 Start = Literal["zero", "estimated", "periodic"]
 Period = int | Literal["auto"] | None
 
+EVERYTHING = "all"
+"""Value of ``test`` that takes all records."""
+
 _WARM_UP = 0.05  # of a record: default of skip
 _LONGEST_TRANSIENT = 1 / 3  # of a record; beyond it, leaving it out costs more than it helps
 _LEFT_OUT = "left out, as it is too short"
@@ -90,7 +93,7 @@ def load_records(
             names of records of ``path``, which are those of the files without extension; or other
             files, as for ``path``. 0 for none.
         test: records that are scored, likewise: of a fraction the last part, of a number the last
-            records.
+            records. ``"all"``: every record, for a model that is there; nothing is left to fit.
         start: ``"zero"`` (at rest), ``"estimated"`` (amid the measurement), or ``"periodic"``:
             every record is cut to whole periods in steady state.
         period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
@@ -128,6 +131,9 @@ def load_records(
     )
     paths = listed_files(path, "path")
     left = reader.read(paths)
+    if test == EVERYTHING:
+        tests = [whole.record for whole in left]
+        return Dataset(_name(paths), [], [], tests, notes=reader.notes)
     tests, left, tested = _taken("test", test, left, reader)
     chosen, left, validated = _taken("validation", validation, left, reader)
     if not left:
@@ -398,6 +404,8 @@ def _taken(
         raise InputError(
             f"{option}={count} takes the last {count} of the {len(wholes)} record(s) there are, "
             "which leaves none for training; give more files, or a fraction below 1."
+            + f" To score a model on all of it: test={EVERYTHING!r}."
+            * (option == "test")
         )
     return [whole.record for whole in wholes[-count:]], wholes[:-count], 0.0
 

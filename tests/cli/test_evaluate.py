@@ -132,6 +132,19 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
     table = capsys.readouterr().out.split("Simulation RMSE")
     assert table[1].split("\nnext: ")[0].strip() == table[2].split("\n\nScores in")[0].strip()
 
+    new = tmp_path / "new.csv"
+    new.write_text(csv.read_text())
+    for path, words, note, samples in (
+        (new, [], True, "570 of 600"),
+        (new, ["data.test=0.5"], False, "300 of 600"),
+        (csv, [], False, "120 of 600"),
+    ):
+        about = f"checkpoint={folder / 'model'}", "data=file", f"data.path={path}", "data.fs=10"
+        run(monkeypatch, *about, *words)
+        printed = capsys.readouterr().out
+        assert ("note: all samples are scored" in printed) is note
+        assert samples in printed
+
 
 @pytest.mark.parametrize(
     ("words", "message"),

@@ -189,6 +189,10 @@ def test_records_by_name_and_by_file(runs):
     assert [r.samples for r in (*data.train, *data.validation)] == [30, 60]
 
 
+def test_all_records_are_tests(runs):
+    assert used(load_records(str(runs), **USE, test="all")) == ([], [], [*range(60, 72)])
+
+
 def test_equal_names_get_their_folders(tmp_path, signals):
     paths = [write(tmp_path / folder / "x.csv", signals) for folder in "abc"]
     data = load_records(paths[:2], **USE, test=0)
