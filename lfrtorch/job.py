@@ -366,20 +366,17 @@ def linear_models_of_tests(dataset: Dataset, settings: Settings) -> dict[str, Li
 
 
 def check_channels(model: Model, record: Record) -> None:
-    """Refuse data of other channels than the model's with a ValueError."""
+    """Refuse data of other channels than the model's with a ValueError; a unit may be unknown."""
     for side, channels, found in (
         ("inputs", model.inputs, record.inputs),
         ("outputs", model.outputs, record.outputs),
     ):
-        if channels != found:
-            own = {c.name: c.unit for c in channels}
-            unlike = any(c.name not in own for c in found) or len(found) != len(own)
+        alike = [
+            own.name == other.name and (own.unit == other.unit or not (own.unit and other.unit))
+            for own, other in zip(channels, found, strict=False)
+        ]
+        if len(channels) != len(found) or not all(alike):
             raise InputError(
                 f"the model has the {side} {', '.join(map(str, channels))} and the data "
-                f"{', '.join(map(str, found))}; "
-                + (
-                    "give data of the same channels."
-                    if unlike
-                    else f"if it is so, give units={own}."
-                )
+                f"{', '.join(map(str, found))}; give data of the same channels."
             )

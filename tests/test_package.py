@@ -93,7 +93,9 @@ def test_installed_wheel_runs_from_file_to_new_outputs(installed: Path, tmp_path
         y[k] = 0.7 * y[k - 1] + 0.3 * np.tanh(2.0 * u[k - 1])
     np.savetxt(tmp_path / "x.csv", np.c_[u, y], delimiter=",", header="u,y", comments="")
     data = "data=file", "data.path=x.csv", "data.inputs=[u]", "data.outputs=[y]", "data.fs=10"
-    preview = command(installed, tmp_path, "preview", "x.csv", "--inputs", "u", "--outputs", "y")
+    preview = command(
+        installed, tmp_path, "preview", "x.csv", "data.inputs=[u]", "data.outputs=[y]"
+    )
     assert "signal" in preview
     assert "Linear model of order 1" in command(installed, tmp_path, "linear", *data, "nx=1")
     run = "nx=1", "nz=1", "nn=3", "trainer.max_iter=5", "hydra.run.dir=run"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ from omegaconf import DictConfig, OmegaConf
 import lfrtorch
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
-from lfrtorch._support.tables import in_percent
+from lfrtorch._support.tables import in_lines, in_percent, percent
+from lfrtorch._support.types import Array
 from lfrtorch.analysis.poles import frequency_and_damping, remark
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
@@ -40,6 +41,7 @@ from lfrtorch.metrics import rms
 from lfrtorch.reporting import figures as run_figures
 from lfrtorch.reporting import linear_plots
 from lfrtorch.reporting.scores import of_samples
+from lfrtorch.reporting.verdict import EXPLAINS_NOTHING
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
@@ -66,7 +68,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
         "notes": list(dict.fromkeys([*dataset.notes, *notes, *model.fit.notes])),
         "command": command,
     }
-    print(f"\n{table(found)}")
+    print(f"\n{in_lines(found['verdict']['text'])}\n\n{table(found)}")
     model.save(folder / "linear")
     text = json.dumps(found, indent=2, allow_nan=False)
     with whole_file(folder / "linear.json") as fresh:
@@ -134,6 +136,7 @@ def numbers(
             "seconds": fit.seconds,
         },
         "scores": scores,
+        "verdict": verdict(scores),
         "poles": frequency_and_damping(model.poles, model.fs),
         "zeros": {
             name: frequency_and_damping(z, model.fs)
@@ -185,11 +188,53 @@ def score(model: lfrtorch.LinearModel | None, record: lfrtorch.Record, use: str)
                 "output": channel.name,
                 "unit": channel.unit,
                 "rmse": finite(rmse[i]),
+                "std": finite(deviation[i]),
                 "nrmse": finite(rmse[i] / deviation[i]) if deviation[i] > 0 else None,
             }
             for i, channel in enumerate(record.outputs)
         ],
     }
+
+
+def verdict(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Whether the model explains what was not fitted: its worst output on the tests.
+
+    Without tests that are scored it is judged on validation, and else on training.
+    """
+    errors = {use: relative_errors(scores, use) for use in ("test", "validation", "train")}
+    judged = next((use for use, found in errors.items() if found), None)
+    if judged is None:
+        return {"usable": None, "text": "Not judged: nothing is scored."}
+    name, error = max(errors[judged].items(), key=lambda item: item[1])
+    usable = error < EXPLAINS_NOTHING
+    output = "the output" if len(errors[judged]) == 1 else f"'{name}'"
+    size = f"{percent(error)} of the standard deviation of {output}"
+    if not math.isfinite(error):
+        size = f"without bound at {output}"
+    where = "training" if judged == "train" else judged
+    text = f"{'' if usable else 'Not usable: '}on {where} the linear model's error is {size}"
+    fitted_error = errors["train"].get(name)
+    if not usable and judged != "train" and fitted_error is not None:
+        text += f" (in training {percent(fitted_error)})"
+    return {
+        "usable": usable,
+        "text": f"{text[0].upper()}{text[1:]}.",
+        "on": judged,
+        "output": name,
+        "nrmse": finite(error),
+    }
+
+
+def relative_errors(scores: Sequence[Mapping[str, Any]], use: str) -> dict[str, float]:
+    """Of each output that moves the error over the standard deviation, all records of a use."""
+    powers: dict[str, Array] = {}
+    for s in scores:
+        for o in s["outputs"]:
+            if s["use"] == use and s["scored"] and o["std"]:
+                error = math.inf if o["rmse"] is None else o["rmse"]
+                own = s["scored"] * np.square([error, o["std"]])
+                powers[o["output"]] = powers.get(o["output"], np.zeros(2)) + own
+    return {name: float(np.sqrt(error / own)) for name, (error, own) in powers.items()}
 
 
 def uncertainty(model: lfrtorch.LinearModel, frf: lfrtorch.FRF | None) -> list[dict[str, Any]]:

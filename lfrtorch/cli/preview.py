@@ -75,7 +75,7 @@ def launch(words: Sequence[str] | None = None) -> None:
         if not options.paths:
             raise InputError("no file is named; give its path, or data.path=FILE.")
         if options.fs is not None:
-            number("--fs", options.fs, positive=True)
+            number("data.fs", options.fs, positive=True)
         paths = matching(options.paths)
         for path in paths:
             show(path, options, figure_path(options.out, path, len(paths)))
@@ -158,9 +158,11 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
     words = OmegaConf.create({"bla": OmegaConf.load(BLA), "data": OmegaConf.load(FILE)})
     sentences += [translated(note.text, words) for note in examine(found, u, y)]
     if found.fs is None:
-        remarks.append("no sampling frequency: give --fs; frequencies are in cycles/sample")
+        remarks.append("no sampling frequency: give data.fs=HZ; frequencies are in cycles/sample")
     if not roles.inputs:
-        remarks.append("no --inputs and --outputs: what lies between them is not looked at")
+        remarks.append(
+            "without data.inputs and data.outputs what lies between them is not looked at"
+        )
     print(f"{path}: {len(signals)} samples{'' if found.fs is None else f' at {found.fs:.6g} Hz'}")
     for remark in remarks:
         print(f"  {remark}")
@@ -183,14 +185,14 @@ def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]
     Raises:
         ValueError: a column that is not there or has two uses, or none of numbers.
     """
-    inputs = table.find(options.inputs, "--inputs") if options.inputs else ()
-    outputs = table.find(options.outputs, "--outputs") if options.outputs else ()
-    time = table.find(options.time, "--time") if options.time is not None else ()
+    inputs = table.find(options.inputs, "data.inputs") if options.inputs else ()
+    outputs = table.find(options.outputs, "data.outputs") if options.outputs else ()
+    time = table.find(options.time, "data.time") if options.time is not None else ()
     named = [*inputs, *outputs, *time]
     twice = [table.headers[i] for i in dict.fromkeys(named) if named.count(i) > 1]
     if twice or len(time) > 1:
         raise InputError(
-            f"'{table.path}': {', '.join(map(repr, twice)) or '--time'} stands for several; "
+            f"'{table.path}': {', '.join(map(repr, twice)) or 'data.time'} stands for several; "
             "give every column one use, and one column of times."
         )
     heads, remarks = {}, list(table.notes)

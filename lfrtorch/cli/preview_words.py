@@ -8,14 +8,15 @@ from pathlib import Path
 
 ABOUT = """Look at measurements before any fit: a table, what will hurt a model, and a figure.
 
-    lfrtorch preview x.csv --inputs force --outputs displacement --fs 750
-    lfrtorch preview 'runs/*.mat' --inputs u --outputs y
+    lfrtorch preview x.csv
+    lfrtorch preview x.csv data.inputs=[force] data.outputs=[displacement] data.fs=750
+    lfrtorch preview data=file data.path='runs/*.mat' 'data.inputs=[Force (N)]' data.outputs=[acc]
 
-    lfrtorch preview data.path=x.mat 'data.inputs=[Force (N)]' data.outputs=[acc]
+The words are those of the other commands; a path may stand without data.path.
 
-A file is any that data.path takes; the words data.path, data.inputs, data.outputs, data.fs and
-data.time of the other commands are understood. Without --inputs and --outputs all columns of
-numbers are shown, and nothing is said of what lies between them.
+  data.inputs, data.outputs   names of columns, or numbers from 0. Without them all columns of
+                              numbers are shown, and nothing is said of what lies between them
+  data.fs, data.time          Hz, or the column of the time. Default: found
 """
 
 
@@ -25,10 +26,11 @@ def parser() -> argparse.ArgumentParser:
         prog=sys.argv[0], description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     found.add_argument("paths", nargs="*", metavar="PATH", help="file, or pattern in quotes")
-    found.add_argument("--inputs", nargs="+", default=[], metavar="NAME", type=column)
-    found.add_argument("--outputs", nargs="+", default=[], metavar="NAME", type=column)
-    found.add_argument("--fs", type=float, metavar="HZ", help="sampling frequency")
-    found.add_argument("--time", type=column, metavar="COLUMN", help="of times; found if not given")
+    # Their names before they were words of data.
+    for option in ("--inputs", "--outputs"):
+        found.add_argument(option, nargs="+", default=[], type=column, help=argparse.SUPPRESS)
+    found.add_argument("--fs", type=float, help=argparse.SUPPRESS)
+    found.add_argument("--time", type=column, help=argparse.SUPPRESS)
     found.add_argument("--out", type=Path, metavar="FIGURE.png", help="default: FILE_preview.png")
     return found
 

@@ -279,11 +279,17 @@ def _beside(
     return found, reasons
 
 
+def unusable_time(table: Table, used: Sequence[int]) -> str:
+    """Why a column that is named as time is none; empty if there is no such column."""
+    _, reasons = _beside(table, used, named=True)
+    return reasons[0] if reasons else ""
+
+
 def _suggested(table: Table, columns: Sequence[int]) -> str:
     """The column that may be time, or why none is, as the end of a message."""
-    _, reasons = _beside(table, columns, named=True)
-    if reasons:
-        return f"; {reasons[0]}"
+    reason = unusable_time(table, columns)
+    if reason:
+        return f"; {reason}"
     # A counter of samples is a grid of 1 Hz.
     grids = [(c, g) for c, g in _beside(table, columns, named=False)[0] if g.fs != 1]
     if not grids:

@@ -11,7 +11,7 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.files.formats import BLOCK, open_table
-from lfrtorch.files.measurement import find_rate
+from lfrtorch.files.measurement import find_rate, unusable_time
 from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.files.time_stamps import UnevenError, in_seconds, sampling
 from lfrtorch.records import Channel
@@ -109,6 +109,12 @@ class FileStream:
     def _sampled(self) -> tuple[tuple[int, ...], str]:
         """The column of time that the file has, and what it says of its sampling."""
         rate = find_rate(self.table, [*self.u, *self.y])
+        reason = "" if rate else unusable_time(self.table, [*self.u, *self.y])
+        if reason:
+            raise InputError(
+                f"'{self.table.path}': {reason}; resample the signals to an even grid, or give "
+                f"fs={self.fs:g} if the column is wrong."
+            )
         if rate is None:
             return (), f"nothing says how it is sampled; the model's {self.fs:g} Hz are taken"
         if not rate.stamps and abs(rate.fs / self.fs - 1) > SAME:

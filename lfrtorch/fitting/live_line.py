@@ -236,7 +236,11 @@ class StartsLine:
             return
         judged = [(s.selection, s.validation, s.train) for s in ended.starts]
         found = [next(e for e in each if not math.isnan(e)) for each in judged]
-        numbers = {"best": found[0], "median": median(found), "worst": max(found)}
+        numbers = {"best": found[0]}
+        if len(found) > 2:
+            numbers["median"] = median(found)
+        if len(found) > 1:
+            numbers["worst"] = max(found)
         shown = quantities(list(numbers.values()), self.unit, DIGITS)
         text = (
             f"round {ended.number} of {ended.count}: {len(found)} start(s) to iteration "

@@ -100,7 +100,7 @@ def examine(
     notes = [*_levels(found, u, y, skipped)]
     u, y = u[found.whole], y[found.whole]
     if len(y) >= ENOUGH:
-        notes += _excitation(found, u)
+        notes += _excitation(found, u, skipped)
         notes += _relations(found, u, y, given or {})
     return notes
 
@@ -206,15 +206,14 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
                 f"{one.step / np.sqrt(12):.2g} is the least; use more of the converter's range.",
             )
     if T < SHORT:
-        after = f" after the {skipped} that are skipped" if skipped else ""
         yield Note(
             "short",
-            f"{T} samples{after} are few to fit: a small nonlinear model has 50 to 100 parameters; "
-            "measure longer.",
+            f"{T} samples{_after(skipped)} are few to fit: a small nonlinear model has 50 to 100 "
+            "parameters; measure longer.",
         )
 
 
-def _excitation(found: Survey, u: Array) -> Iterator[Note]:
+def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
     """What inputs in a stretch (T, nu) without gaps excite, and how fast it was sampled."""
     T, fs, unit = len(u), found.fs or 1.0, _unit(found)
     for one, signal in zip(found.inputs, u.T, strict=True):
@@ -254,8 +253,9 @@ def _excitation(found: Survey, u: Array) -> Iterator[Note]:
     if period is not None and period < T < 2 * period:
         yield Note(
             "periods",
-            f"the record has {T / period:.2f} periods of {period} samples: less than two tell no "
-            "noise from distortion; measure more, or cut it to one in steady state.",
+            f"the record has {T / period:.2f} periods of {period} samples{_after(skipped)}: less "
+            "than two tell no noise from distortion; measure more, or cut it to one in steady "
+            "state.",
         )
     for i in range(u.shape[1]):
         for j in range(i):
@@ -409,6 +409,10 @@ def _frequencies(signal: Array) -> int:
     excited = power > LINE * power.max()
     groups = np.sum(np.diff(excited.astype(np.int8), prepend=0) == 1)
     return int(max(groups, np.ceil(np.sum(excited) / LOBE)))
+
+
+def _after(skipped: int) -> str:
+    return f" after the {skipped} that are skipped" if skipped else ""
 
 
 def _listed(signals: Sequence[SignalSurvey]) -> str:

@@ -76,6 +76,8 @@ def test_one_command_gives_table_figures_and_checkpoint(
     for name in ("frequency_response", "poles_and_zeros", "order_scan", "test"):
         assert (tmp_path / "figures" / f"{name}.png").is_file()
     assert (tmp_path / "config.yaml").is_file()
+    assert found["verdict"]["usable"]
+    assert "\nOn test the linear model's error is" in printed.out
     for line in ("  chosen", "BLA: order 2", "note: noise: not told apart", "% of std", "x/a"):
         assert line in printed.out
     assert (found["nx"], found["scan"]["chosen"]) == (2, 2)
@@ -118,6 +120,27 @@ def test_numbers_are_those_of_the_system(csv: Path, tmp_path: Path, monkeypatch)
     assert all(0 < r["std"] < 0.1 for r in found["response_std"])
     assert found["frf"]["method"] == "local_polynomial"
     assert found["scan"] is None
+
+
+def test_a_model_that_explains_nothing_is_called_so():
+    def entry(use: str, rmse: float | None, std: float, output: str = "x") -> dict:
+        return {"use": use, "scored": 50, "outputs": [{"output": output, "rmse": rmse, "std": std}]}
+
+    train, good = entry("train", 0.2, 2.0), entry("test", 1.0, 4.0)
+    assert linear.verdict([train, good])["text"] == (
+        "On test the linear model's error is 25.0 % of the standard deviation of the output."
+    )
+    found = linear.verdict([train, entry("validation", 0.1, 2.0), entry("test", 5.0, 2.0)])
+    assert (found["usable"], found["nrmse"]) == (False, 2.5)
+    assert found["text"].startswith("Not usable: on test ")
+    assert found["text"].endswith(
+        "250 % of the standard deviation of the output (in training 10.0 %)."
+    )
+    assert linear.verdict([train])["on"] == "train"
+    assert not linear.verdict([good, entry("test", None, 1.0, "y")])["usable"]
+    still = entry("test", 0.1, 0.0)  # in which nothing happens
+    assert linear.verdict([train, still])["on"] == "train"
+    assert linear.verdict([still])["usable"] is None
 
 
 @pytest.mark.numeric

@@ -74,7 +74,7 @@ def refused(capsys, *words: str | Path) -> str:
 
 @pytest.mark.numeric
 def test_one_command_gives_table_notes_and_figure(file: Path, run):
-    out = run(file, "--inputs", "force", "--outputs", "level")
+    out = run(file, "data.inputs=[force]", "data.outputs=[level]")
     assert f"{file}: {T} samples at 50 Hz" in out
     assert "'time' is taken for the time, 50 Hz" in out
     head, rule, force, level = out.splitlines()[3:7]
@@ -116,7 +116,7 @@ def test_numbers_of_the_table(signals):
 @pytest.mark.usefixtures("undrawn")
 def test_without_roles_all_columns_are_shown(file: Path, run):
     out = run(file, "--out", "sub/look.svg")
-    assert "no --inputs and --outputs: what lies between them is not looked at" in out
+    assert "without data.inputs and data.outputs what lies between them is not" in out
     assert "- 'level' has its largest value 0.3" in out
     assert (file.parent / "sub" / "look.svg").read_text().lstrip().startswith("<?xml")
     assert not list(file.parent.glob("*.png"))
@@ -124,16 +124,16 @@ def test_without_roles_all_columns_are_shown(file: Path, run):
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_other_columns_are_outputs(file: Path, run):
-    assert "outputs: level, all other columns" in run(file, "--inputs", "1")
-    assert "inputs: force, all other columns" in run(file, "--outputs", "level")
+    assert "outputs: level, all other columns" in run(file, "data.inputs=[1]")
+    assert "inputs: force, all other columns" in run(file, "data.outputs=[level]")
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_another_sampling_frequency_than_the_times_say(file: Path, run):
-    out = run(file, "--inputs", "force", "--fs", "750")
+    out = run(file, "data.inputs=[force]", "data.fs=750")
     assert "- fs looks like 50 Hz, not 750, by the times in 'time'; correct one of them." in out
     assert "at 750 Hz" in out
-    assert "fs looks" not in run(file, "--inputs", "force", "--fs", "50")
+    assert "fs looks" not in run(file, "data.inputs=[force]", "data.fs=50")
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -141,7 +141,7 @@ def test_times_in_milliseconds(tmp_path: Path, signals, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
     columns = signals | {"time": 1000 * signals["time"]}
     assert "at 50 Hz" in run(written(tmp_path / "a.csv", columns, time="ms"))
-    out = run(written(tmp_path / "b.csv", columns), "--fs", "50")
+    out = run(written(tmp_path / "b.csv", columns), "data.fs=50")
     assert "unless they are in milliseconds" in " ".join(out.split())
 
 
@@ -152,7 +152,7 @@ def test_sample_numbers_and_uneven_times(tmp_path: Path, signals, run, monkeypat
     del numbered["time"]
     out = run(written(tmp_path / "a.csv", numbered))
     assert "'n' is taken for sample numbers" in out
-    assert "no sampling frequency: give --fs" in out
+    assert "no sampling frequency: give data.fs=HZ" in out
     steps = np.random.default_rng(1).uniform(0.5, 1.5, T) / FS
     out = run(written(tmp_path / "b.csv", signals | {"time": np.cumsum(steps)}))
     assert "- the time column 'time' is not evenly spaced: its steps go from" in out
@@ -163,14 +163,16 @@ def test_sample_numbers_and_uneven_times(tmp_path: Path, signals, run, monkeypat
         in out
     )
     assert "at 50 Hz" in out
-    out = run(written(tmp_path / "d.csv", signals), "--time", "force")
+    out = run(written(tmp_path / "d.csv", signals), "data.time=force")
     assert "- the time column 'force' does not rise" in out
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_several_files_and_patterns(file: Path, signals, run):
     savemat(file.parent / "other.mat", {"force": signals["force"], "level": signals["force"]})
-    out = run(file.parent / "*.*", file, "--inputs", "force", "--outputs", "level", "--fs", 50)
+    out = run(
+        file.parent / "*.*", file, "data.inputs=[force]", "data.outputs=[level]", "data.fs=50"
+    )
     assert out.count("Figure in") == 2
     assert {p.name for p in file.parent.glob("*.png")} == {"lab_preview.png", "other_preview.png"}
     run(file, file.parent / "other.mat", "--out", "x.png")
@@ -199,7 +201,7 @@ def test_all_variables_of_a_file_of_arrays_are_listed(tmp_path: Path, signals, r
     assert "acc 2 × 2000 signals acc1 .. acc2" in listed
     assert "Fs 1 × 1 sampling frequency, 50 Hz" in listed
     assert any(line.startswith("rig 1 × 4 nothing: it has no numbers") for line in listed)
-    out = run(tmp_path / "a.mat", "--inputs", "F", "--outputs", "acc[1]")
+    out = run(tmp_path / "a.mat", "data.inputs=[F]", "data.outputs=[acc[1]]")
     assert {line.split()[0] for line in out.splitlines() if " output " in line} == {"acc2"}
 
 
@@ -222,11 +224,11 @@ def test_a_column_of_text_is_left_out(tmp_path: Path, run, monkeypatch):
 @pytest.mark.usefixtures("undrawn")
 def test_only_the_beginning_of_a_long_file_is_read(file: Path, run, monkeypatch):
     monkeypatch.setattr(preview, "LARGEST", 3 * 700)
-    out = run(file, "--inputs", "force", "--outputs", "level")
+    out = run(file, "data.inputs=[force]", "data.outputs=[level]")
     assert "the first 700 samples are read, and no more" in out
     assert f"{file}: 700 samples" in out
     monkeypatch.setattr(preview, "LARGEST", 3 * T)
-    assert "no more" not in run(file, "--inputs", "force", "--outputs", "level")
+    assert "no more" not in run(file, "data.inputs=[force]", "data.outputs=[level]")
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -242,7 +244,7 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
         ("data.inputs=a,b", "for several values write data.inputs=[a,b]."),
         (f"data.path={file}", "data.path is given twice"),
         ("data.inputs=[a", "is not understood"),
-        ("data.fs=-3", "--fs is -3; give a positive number"),
+        ("data.fs=-3", "data.fs is -3; give a positive number"),
     ):
         assert message in refused(capsys, file, word)
     assert "no file is named" in refused(capsys, "data.fs=3")
@@ -252,14 +254,14 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--inputs", "mass"], "has no column 'mass', named in --inputs"),
+        (["--inputs", "mass"], "has no column 'mass', named in data.inputs"),
         (["--inputs", "force", "--outputs", "force"], "'force (N)' stands for several"),
         (
             ["--inputs", "force", "level", "--time", "time"],
             "no column is left for the outputs; it has",
         ),
         (["--out", "x.csv"], "--out is 'x.csv'; give a name that ends with .png"),
-        (["--fs", "-3"], "--fs is -3.0; give a positive number"),
+        (["--fs", "-3"], "data.fs is -3.0; give a positive number"),
         (["nothing*.csv"], "no file matches 'nothing*.csv'"),
         (["gone.csv"], "there is no file 'gone.csv'"),
     ],
@@ -303,5 +305,5 @@ def test_help_says_how_to_use_it(tmp_path: Path):
         [sys.executable, str(ROOT / "scripts" / "preview.py"), "--help"],
         capture_output=True, text=True, check=True, cwd=tmp_path,
     )  # fmt: skip
-    for word in ("--inputs", "--outputs", "--fs", "--time", "--out", "PATH"):
+    for word in ("data.inputs", "data.outputs", "data.fs", "data.time", "--out", "PATH"):
         assert word in done.stdout

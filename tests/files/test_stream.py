@@ -188,4 +188,6 @@ def test_the_rate_that_the_file_says_is_the_models(tmp_path: Path):
         assert bool(stream.times) == ("t" in found)
     savemat(path, signals | {"fs": 400.0})
     refused("as 'fs' in the file says, and the model runs at 750 Hz", path, find_time=True)
+    savemat(path, signals | {"t": TIMES[::-1]})
+    refused("the column 't' does not rise", path, find_time=True)
     read(path)
