@@ -75,7 +75,9 @@ def simulate_estimated(
     probable = rest
     for _ in range(PASSES):
         prior = white * variance(probable).nan_to_num(0.0, 0.0).sqrt()[:, None, None]
-        probable = _fitted_start(cell, u, y, weight, prior, probable)
+        last, probable = probable, _fitted_start(cell, u, y, weight, prior, probable)
+        if torch.equal(probable.x[:, 0], last.x[:, 0]):
+            break  # all passes that follow would find the same
     least = improbability(squares).nan_to_num(math.inf)
     better = known & (improbability(probable).nan_to_num(math.inf) < least)
     pairs = zip(probable, squares, strict=True)

@@ -174,7 +174,10 @@ class ModuleJacobian:
         if isinstance(static, Stacked):
             self.static, self.by_record = static.base, 0
             self.weights = dict(zip(static.names, weights.values(), strict=True))
-        self.J = self._at_every_sample(jacrev(self._map, argnums=1))
+        if self.static is None:
+            self.J = z.new_zeros(*z.shape, 0)
+        else:
+            self.J = self._at_every_sample(jacrev(self._map, argnums=1))
 
     def _map(self, weights: Weights, z: Tensor) -> Tensor:
         return z if self.static is None else functional_call(self.static, weights, (z,))

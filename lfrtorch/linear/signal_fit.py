@@ -40,9 +40,9 @@ LARGEST_ROWS = 50_000_000
 ROUNDING = 1e-12
 """Smallest variance of a state, relative to the largest: the inputs do not move it."""
 
-OBSERVERS = (0.0, 1e-4, 1e-2, 1.0)
+OBSERVERS = (1e-4, 1e-2, 1.0)
 """Variances of the state noise that the initial innovation models of a prediction-error fit assume,
-relative to those of the states and in units of the output noise."""
+besides none, relative to those of the states and in units of the output noise."""
 
 
 class SignalFit:
@@ -104,7 +104,8 @@ class SignalFit:
         """A search over A, B, C, D and K that starts from the given ones and the best of some K."""
         gains = [np.zeros((len(matrices[0]), self.ny))]
         if self._prediction:
-            gains = [self._observer(matrices, part) for part in OBSERVERS]
+            variances = self.state_deviation(matrices) ** 2
+            gains += [self._observer(matrices, part * variances) for part in OBSERVERS]
         problems = [self._problem(matrices, K) for K in gains]
         problem = min(problems, key=lambda p: p.cost(p.residual(p.theta)))
         return Search(problem, problem.theta)
@@ -228,10 +229,11 @@ class SignalFit:
         cell = linear_cell(A - K @ C, Bu, C, Dyu)
         for parameter in (cell.A, cell.Cy):
             parameter.requires_grad_(observed)
-        problem = SimulationProblem(LFR(cell), self._driven)
         if observed:
             measured = slice(nu, nu + ny) if self._prediction else None
             problem = _Stable(LFR(cell), self._driven, measured)
+        else:
+            problem = SimulationProblem(LFR(cell), self._driven)
         free = {"Bu": free_B, "Dyu": free_D}
         problem.fixed = torch.cat(
             [
@@ -244,13 +246,10 @@ class SignalFit:
         )
         return problem
 
-    def _observer(self, matrices: Matrices, part: float) -> Array:
-        """Kalman gain (nx, ny) for state noise of ``part`` of the variance of the states."""
+    def _observer(self, matrices: Matrices, variances: Array) -> Array:
+        """Kalman gain (nx, ny) for state noise of these variances."""
         A, _, C, _ = matrices
-        if part == 0.0:
-            return np.zeros((len(A), self.ny))
-        Q = part * np.diag(self.state_deviation(matrices) ** 2)
-        P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, np.eye(self.ny))
+        P = scipy.linalg.solve_discrete_are(A.T, C.T, np.diag(variances), np.eye(self.ny))
         return np.linalg.solve(C @ P @ C.T + np.eye(self.ny), C @ P @ A.T).T
 
     def _of_system(self, covariance: Array, C: Array, D: Array, K: Array) -> Array:
