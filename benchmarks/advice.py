@@ -3,8 +3,8 @@
     python benchmarks/advice.py [CASE ...] [--out FILE.jsonl]
 
 Each case is a measured or simulated record of some 1000 samples, cut into training, validation and
-a rest that no fit and no advice sees. Fits of several sizes are advised; each item that a program
-can follow is followed alone, and the error on the rest is compared with that before. Of measured
+a rest that no fit and no advice sees. Fits of several sizes are advised; each item that can be
+followed is followed alone, and the error on the rest is compared with that before. Of measured
 benchmarks the estimation data alone are read. Every fit is one line of the file; those that are
 there are not repeated.
 """
@@ -31,8 +31,14 @@ from lfrtorch._support import tables
 from lfrtorch._support.types import Array
 from lfrtorch.reporting.advice import Advice
 
-PARTS = 0.5, 0.2
-"""Training and validation, of the record."""
+PARTS = {"train": 0.5, "validation": 0.2}
+"""Of the record, one after the other."""
+
+OTHERS = {"validation": 0.2, "train": 0.5}
+"""The same samples in other parts."""
+
+TESTED = {"train": 0.4, "validation": 0.15, "test": 0.15}
+"""With a test."""
 
 SKIP, NX_MAX = 40, 4
 """Samples that a start state is estimated from and no score has, and the highest order tried."""
@@ -44,11 +50,17 @@ BASES: dict[str, dict[str, Any]] = {
     "small": {"nx": 2, "nz": 1, "nw": 1, "nn": 3, "max_iter": 12},
     "large": {"nx": 3, "nz": 2, "nw": 2, "nn": 16, "max_iter": 25},
     "unvalidated": {"nx": 2, "nz": 1, "nw": 1, "nn": 8, "max_iter": 15},
+    "largest": {"nx": 3, "nz": 2, "nw": 2, "nn": 30, "max_iter": 40},
+    "tested": {"nx": 3, "nz": 2, "nw": 2, "nn": 16, "max_iter": 25},
 }
-"""Settings of the fits that are advised; the last has no validation part."""
+"""Settings of the fits that are advised; the third has no validation part, the last a test."""
 
-SEARCH = lfrtorch.SizesSearch(nn=(4, 8), starts=2, iterations=0.8)
-"""What is tried if validation chooses the sizes, which is followed for the small fits alone."""
+ONLY = {"largest": "Overfit", "tested": "The gain on"}
+"""What is followed after these fits, which are there for that: how this advice begins."""
+
+SEARCHED = 10
+"""Iterations of a model if validation chooses the sizes, which is followed after the small fits and
+those that overfit alone."""
 
 Signals = tuple[Array, Array, int]
 """Input, output, and the period or 0."""
@@ -91,6 +103,11 @@ def saturating(u: Array) -> Array:
     return y
 
 
+def another_input(u: Array) -> Array:
+    """The same, driven by a signal that is not recorded."""
+    return saturating(lowpass(2.0 * np.random.default_rng(4).standard_normal(u.shape), 0.5))
+
+
 def boucwen(root: Path) -> Signals:
     """Hysteresis, in steady state; noise of 2 %."""
     del root
@@ -125,41 +142,51 @@ CASES: dict[str, Callable[[Path], Signals]] = {
     "linear, periodic": lambda _: simulated(resonance, 0.05, 5),
     "saturating": lambda _: simulated(saturating, 0.02),
     "cart": lambda root: measured(cart, 0, 4, 1000, root),
+    "another input": lambda _: simulated(another_input, 0.02),
 }
 
 HELD_OUT = "Overfitting would not show"
-NO_MORE = "Noise-limited", "The system is linear at this level"
+OTHER_PARTS = "The validation part is unlike", "The models hold in training alone", "The gain on"
+NO_MORE = "Noise-limited", "The system is linear at this level", "The inputs explain little"
 """Advice that says not to go on."""
 
 
-def parts(case: str, root: Path, validated: bool) -> tuple[lfrtorch.Dataset, lfrtorch.Record]:
-    """The data that a user has, and the rest."""
+def parts(
+    case: str, root: Path, cuts: dict[str, float]
+) -> tuple[lfrtorch.Dataset, lfrtorch.Record]:
+    """The data that a user has, in these parts of the record, and the rest."""
     u, y, period = CASES[case](root)
-    first, second = (round(part * len(u)) for part in np.cumsum(PARTS))
 
-    def record(name: str, samples: slice) -> lfrtorch.Record:
+    def record(name: str, begin: float, end: float = 1.0) -> lfrtorch.Record:
+        samples = slice(round(begin * len(u)), round(end * len(u)))
+        if period and name == "train" and "validation" in cuts and not begin:
+            whole = slice(samples.stop // period * period)
+            return lfrtorch.Record(u[whole], y[whole], name=name, start="periodic", period=period)
         return lfrtorch.Record(u[samples], y[samples], name=name, start="estimated", skip=SKIP)
 
-    rest = record("rest", slice(second, None))
-    if not validated:
-        return lfrtorch.Dataset(case, [record("train", slice(second))], [], []), rest
-    train, validation = record("train", slice(first)), record("validation", slice(first, second))
-    if period:
-        whole = record("train", slice(first // period * period))
-        train = replace(whole, start="periodic", skip=0, period=period)
-    return lfrtorch.Dataset(case, [train], [validation], []), rest
+    ends = np.cumsum([*cuts.values()])
+    found = {
+        name: [record(name, end - part, end)]
+        for (name, part), end in zip(cuts.items(), ends, strict=True)
+    }
+    validation, tests = found.get("validation", []), found.get("test", [])
+    return lfrtorch.Dataset(case, found["train"], validation, tests), record(
+        "rest", sum(PARTS.values())
+    )
 
 
 def settings(base: str) -> lfrtorch.Settings:
     """Those of a fit that is advised."""
     given = dict(BASES[base])
     trainer = lfrtorch.LevenbergMarquardt(max_iter=given.pop("max_iter"))
-    return lfrtorch.Settings(**given, trainer=trainer, nx_max=NX_MAX, sizes_search=SEARCH)
+    search = lfrtorch.SizesSearch(nn=(4, 8), starts=2, iterations=SEARCHED / trainer.max_iter)
+    return lfrtorch.Settings(**given, trainer=trainer, nx_max=NX_MAX, sizes_search=search)
 
 
 def attempts(case: str, base: str, root: Path) -> list[dict[str, Any]]:
     """A fit, and one for each item of its advice."""
-    data, rest = parts(case, root, base != "unvalidated")
+    cuts = {"unvalidated": {"train": sum(PARTS.values())}, "tested": TESTED}.get(base, PARTS)
+    data, rest = parts(case, root, cuts)
     asked, clock = settings(base), time.perf_counter()
     run = lfrtorch.identify(data, asked)
     before = lfrtorch.rmse(rest, run.model.simulate(rest))
@@ -177,9 +204,10 @@ def attempts(case: str, base: str, root: Path) -> list[dict[str, Any]]:
     ]
     for item in run.advice:
         clock = time.perf_counter()
-        changed = followed(item, case, asked, data, root)
-        if base != "small" and item.change and "auto" in item.change.values():
-            changed = None
+        changed = None
+        costly = base in ("large", "unvalidated") and searches(item)
+        if item.text.startswith(ONLY.get(base, "")) and not costly:
+            changed = followed(item, case, asked, data, root)
         after = None
         if changed is not None:
             again = lfrtorch.identify(*changed)
@@ -190,12 +218,19 @@ def attempts(case: str, base: str, root: Path) -> list[dict[str, Any]]:
     return found
 
 
+def searches(item: Advice) -> bool:
+    """Whether to follow it takes a search for sizes."""
+    return item.change is not None and "auto" in item.change.values()
+
+
 def followed(
     item: Advice, case: str, asked: lfrtorch.Settings, data: lfrtorch.Dataset, root: Path
 ) -> tuple[lfrtorch.Dataset, lfrtorch.Settings] | None:
-    """What a program makes of an item of advice; None if it can make nothing."""
+    """What is made of an item of advice; None if nothing can be."""
     if item.text.startswith(HELD_OUT):
-        return parts(case, root, True)[0], asked
+        return parts(case, root, PARTS)[0], asked
+    if item.text.startswith(OTHER_PARTS):
+        return parts(case, root, OTHERS)[0], asked
     return None if item.change is None else (data, replace(asked, **item.change))
 
 

@@ -1,52 +1,31 @@
 """What to try next after a fit, from numbers alone. Each rule names the numbers that it rests on.
 
-Errors are root mean squares relative to the standard deviation of the training outputs, so that
-outputs of any unit count alike.
+The numbers, and the thresholds that several rules share, are those of
+:mod:`lfrtorch.reporting.diagnosis`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from lfrtorch._support.tables import number, percent
-from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.linear.order_scan import UNLIKE
-from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict
-
-NOISE_LIMITED = 1.1
-"""Training error over the noise up to which the model's own share, √(1.1² - 1), is below half of
-the noise."""
+from lfrtorch.reporting.diagnosis import (
+    FALLING,
+    NOISE_LIMITED,
+    NONLINEAR,
+    OVERFIT,
+    SOUND,
+    USELESS,
+    Evidence,
+)
 
 BEYOND_NOISE = 1.5
 """Training error over the noise from which on the model's own share is above the noise."""
 
-SOUND = 0.8
-"""Training error over the noise below which the noise is not what it seems: a model of few
-parameters has no error below it."""
-
-FALLING = 0.02
-"""Part by which the error must have fallen over a tenth of the iterations, at the pace of the last
-ones, to count as still falling: as many iterations again would bring 18 % at that pace."""
-
-OVERFIT = 1.5
-"""Growth from training to validation of the NL-LFR's error over that of the linear model's, which
-sees how the records differ."""
-
-USELESS = 0.9
-"""Error over the linear model's from which on the NL-LFR is hardly better."""
-
 UNEXPLAINED = 0.7
 """Training error from which on half of the outputs' power has no explanation."""
-
-LINEAR = 0.25
-"""Part of the error's power that is linear in the inputs: 0.48 of Bouc-Wen at an order one too low,
-0.01 at the right one; 0.97 and 0.08 of Silverbox."""
-
-NONLINEAR = 0.1
-"""Part that squares and cubes of the outputs explain: 0.39 and 0.93 for the linear models of
-Bouc-Wen and Silverbox, 0.00 and 0.10 for good NL-LFRs."""
 
 TRANSIENT = 3.0
 """Error in the first twentieth of the scored samples over that in the rest."""
@@ -85,127 +64,6 @@ class Advice(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.text} ({self.evidence})"
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Numbers of a fit; None if one is not known.
-
-    Args:
-        train, linear_train: errors of the NL-LFR and of the linear model on the training records.
-        validation, linear_validation: on those that chose the iterate.
-        outputs: the NL-LFR's error over the linear model's by output, if there are several.
-        parameters, samples: of the model without gauge directions, and scored in training.
-        noise: of the outputs, known or from the differences between periods.
-        linear: part of the training error's power that a linear filter of the inputs explains.
-        nonlinear: part that squares and cubes of the outputs explain beyond that.
-        transient: error at the beginning of the training records over that in the rest.
-        free: part of the error's power at the beginning that a free response of the linear model
-            explains.
-        falling: part by which the error that chooses fell over a tenth of the iterations, at the
-            pace of the last ones; 0 if the search ended for another reason than its limit.
-        iterations: of the fit.
-        starts: errors of all starts that went to the end, the best first.
-        started: number of starts.
-        continued: whether the fit went on from a model, so that there are no other starts.
-        sizes: nx, nz, nw, and nn or degree.
-        searched: whether validation chose them.
-        largest: those that are the largest of a search.
-        trainer: the search.
-        ridge: whether there was one.
-        louder: largest test input over the largest in training, by test.
-        diverged: records on which the NL-LFR diverges.
-        tests: the NL-LFR's error over the linear model's on all tests together.
-        verdict: on the fit, which advice must agree with.
-    """
-
-    train: float | None
-    linear_train: float | None
-    validation: float | None = None
-    linear_validation: float | None = None
-    outputs: Mapping[str, float] = field(default_factory=dict)
-    parameters: int = 0
-    samples: int = 0
-    noise: float | None = None
-    linear: float | None = None
-    nonlinear: float | None = None
-    transient: float | None = None
-    free: float | None = None
-    falling: float = 0.0
-    iterations: int = 0
-    starts: Sequence[float] = ()
-    started: int = 1
-    continued: bool = False
-    sizes: Mapping[str, int] = field(default_factory=dict)
-    searched: bool = False
-    largest: Sequence[str] = ()
-    trainer: Any = field(default_factory=LevenbergMarquardt)
-    ridge: bool = False
-    louder: Mapping[str, float] = field(default_factory=dict)
-    diverged: Sequence[str] = ()
-    tests: float | None = None
-    verdict: Verdict | None = None
-
-    @property
-    def better(self) -> bool:
-        """Whether the verdict says that the NL-LFR is the better model."""
-        return self.verdict is not None and self.verdict.kind == Kind.BETTER
-
-    @property
-    def neither(self) -> bool:
-        """Whether the verdict says that neither model is usable."""
-        return self.verdict is not None and self.verdict.use == NEITHER
-
-    @property
-    def lost_on_tests(self) -> bool:
-        """Whether the tests have nothing of the gain over the linear model."""
-        error, linear_error, _ = self.judged
-        if self.tests is None or error is None or not linear_error or self.better:
-            return False
-        return error <= USELESS * linear_error and self.tests > USELESS
-
-    @property
-    def judged(self) -> tuple[float | None, float | None, str]:
-        """Errors of the NL-LFR and the linear model on validation, else on training; and which."""
-        if self.validation is None:
-            return self.train, self.linear_train, "training"
-        return self.validation, self.linear_validation, "validation"
-
-    @property
-    def overfit(self) -> float | None:
-        """Growth of the error from training to validation over that of the linear model."""
-        errors = self.train, self.linear_train, self.validation, self.linear_validation
-        if not all(errors):
-            return None
-        train, linear_train, validation, linear_validation = (error or 0.0 for error in errors)
-        # What grows for the linear model as well lies in the records.
-        return validation / train / max(1.0, linear_validation / linear_train)
-
-    @property
-    def noise_limited(self) -> bool:
-        """Whether the training error is noise, the search at its end, and validation agrees."""
-        if not self.noise or self.train is None or self.falling > FALLING:
-            return False
-        if not SOUND * self.noise <= self.train <= NOISE_LIMITED * self.noise:
-            return False
-        return self.overfit is None or self.overfit <= OVERFIT
-
-    @property
-    def unlike(self) -> float | None:
-        """The linear model's error on validation over that in training."""
-        if not self.linear_train or self.linear_validation is None:
-            return None
-        return self.linear_validation / self.linear_train
-
-    @property
-    def structured(self) -> bool:
-        """Whether the training error has a part that noise has not."""
-        return (self.linear or 0.0) > LINEAR or (self.nonlinear or 0.0) > NONLINEAR
-
-    @property
-    def parts_differ(self) -> bool:
-        """Whether validation and training records are unlike."""
-        return self.unlike is not None and not 1.0 / UNLIKE <= self.unlike <= UNLIKE
 
 
 def advise(evidence: Evidence) -> list[Advice]:
@@ -283,8 +141,8 @@ def neither_usable(e: Evidence) -> Advice | None:
     if e.parts_differ:  # said there
         return None
     return Advice(
-        "The models hold in training alone: the other parts are unlike or too short, or begin in "
-        "another state (start='estimated').",
+        "The models hold in training alone: the other parts are unlike, too short or at rest, or "
+        "begin in another state (start='estimated').",
         evidence,
     )
 
@@ -293,12 +151,11 @@ def gain_is_lost(e: Evidence) -> Advice | None:
     """A gain over the linear model that the tests have not."""
     if not e.lost_on_tests or e.parts_differ:
         return None
-    error, linear_error, which = e.judged
+    which = e.judged[2]
     return Advice(
         f"The gain on {which} is lost on the tests: they are unlike, or the model is overfit; "
         "choose other parts, or measure longer.",
-        f"error over the linear model's: {which} {percent((error or 0.0) / (linear_error or 1.0))}"
-        f", tests {percent(e.tests)}",
+        f"error over the linear model's: {which} {percent(e.gain)}, tests {percent(e.tests)}",
     )
 
 
@@ -329,26 +186,42 @@ def still_falling(e: Evidence) -> Advice | None:
 
 
 def overfits(e: Evidence) -> Advice | None:
-    """Validation much above training."""
-    if e.overfit is None or e.overfit <= OVERFIT or e.parts_differ:
+    """Validation much above training, or rising while training goes on."""
+    if e.parts_differ:
+        return None
+    if e.overfit is not None and e.overfit > OVERFIT:
+        evidence = (
+            f"validation error {percent(e.validation)}, training error {percent(e.train)}: "
+            f"{number(e.overfit)} times the growth of the linear model's"
+        )
+    elif e.overtrained:
+        evidence = (
+            f"after the kept iterate validation is at {number(e.risen)} times its error, and "
+            f"training fell to {percent(e.fell)}; {number(e.samples / max(1, e.parameters))} "
+            "samples a parameter"
+        )
+    else:
         return None
     change: dict[str, Any] = {}
+    if not e.searched and not e.continued:
+        change = _sizes_by_validation(e)
+        return Advice(
+            f"Overfit: let validation choose the sizes, Settings({_written(change)}), or take "
+            "more data.",
+            evidence,
+            change,
+        )
     if e.sizes.get("degree"):
         change = {"degree": max(2, e.sizes["degree"] - 1)}
     elif e.sizes.get("nn", 0) > 1:
         change = {"nn": e.sizes["nn"] // 2}
     smaller = _written(change) or "smaller sizes"
-    return Advice(
-        f"Overfit: {smaller}, {'a larger ridge' if e.ridge else 'ridge=1e-3'}, or more data.",
-        f"validation error {percent(e.validation)}, training error {percent(e.train)}: "
-        f"{number(e.overfit)} times the growth of the linear model's",
-        change or None,
-    )
+    return Advice(f"Overfit: {smaller}, or more data.", evidence, change or None)
 
 
 def linear_part_incomplete(e: Evidence) -> Advice | None:
     """An error that is linear in the inputs: states are missing."""
-    if e.linear is None or e.linear <= LINEAR:
+    if not e.states_missing:
         return None
     nx = e.sizes.get("nx", 0)
     order = f"nx={nx + 1}, nx={nx + 2} or nx='auto'" if nx else "a higher nx"
@@ -361,11 +234,9 @@ def linear_part_incomplete(e: Evidence) -> Advice | None:
 
 def hardly_better(e: Evidence) -> Advice | None:
     """No gain over the linear model, of which no states are missing."""
+    if not e.useless or e.parts_differ or e.neither or e.states_missing or e.overtrained:
+        return None
     error, linear_error, which = e.judged
-    if e.parts_differ or e.neither or (e.linear is not None and e.linear > LINEAR):
-        return None
-    if error is None or not linear_error or error <= USELESS * linear_error:
-        return None
     gain = f"{which} error {percent(error)}, of the linear model {percent(linear_error)}"
     if e.linear_train and e.noise and e.linear_train <= NOISE_LIMITED * e.noise:
         if e.better or e.linear_train < SOUND * e.noise:
@@ -397,27 +268,21 @@ def hardly_better(e: Evidence) -> Advice | None:
 
 def outputs_left_out(e: Evidence) -> Advice | None:
     """Outputs without gain, while others have one: the static map has too few outputs."""
-    error, linear_error, which = e.judged
     behind = {name: ratio for name, ratio in e.outputs.items() if ratio > USELESS}
-    if not behind or error is None or not linear_error or error > USELESS * linear_error:
-        return None
-    if e.lost_on_tests:
+    if not behind or e.gain is None or e.useless or e.lost_on_tests or e.overtrained:
         return None
     ratios = _listed([f"{number(ratio)} times on '{name}'" for name, ratio in behind.items()])
     change: dict[str, Any] = {name: e.sizes.get(name, 0) + 1 for name in ("nw", "nz")}
     return Advice(
         f"Some outputs gain nothing, or are linear: {_written(change)}.",
-        f"{which} error {ratios} that of the linear model, and less on the others",
+        f"{e.judged[2]} error {ratios} that of the linear model, and less on the others",
         change,
     )
 
 
 def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
     """An error that is neither noise nor linear: the static map is too small."""
-    error, linear_error, _ = e.judged
-    if e.lost_on_tests or (e.linear is not None and e.linear > LINEAR):
-        return None
-    if error is None or (linear_error and error > USELESS * linear_error):
+    if e.gain is None or e.useless or e.lost_on_tests or e.states_missing or e.overtrained:
         return None
     if e.noise and e.train is not None:
         if e.train <= BEYOND_NOISE * e.noise:
@@ -437,7 +302,7 @@ def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
 def best_start_alone(e: Evidence) -> Advice | None:
     """Starts that end far apart: a better minimum may not have been met."""
     found = sorted(e.starts)
-    if len(found) < 2 or found[0] <= 0 or found[1] <= ALONE * found[0]:
+    if len(found) < 2 or found[0] <= 0 or found[1] <= ALONE * found[0] or e.parts_differ:
         return None
     starts = 2 * max(e.started, 4)
     return Advice(
@@ -450,9 +315,8 @@ def best_start_alone(e: Evidence) -> Advice | None:
 
 def one_start(e: Evidence) -> Advice | None:
     """Nothing to compare the minimum with."""
-    error, linear_error, _ = e.judged
-    useless = error is not None and linear_error and error > USELESS * linear_error  # said there
-    if e.started > 1 or e.continued or useless or e.validation is None:
+    said = e.useless and not e.overtrained
+    if e.started > 1 or e.continued or said or e.validation is None or e.parts_differ:
         return None  # without validation the start that overfits most would be chosen
     return Advice(
         "Try several starts: starts=8.",
@@ -487,10 +351,9 @@ def largest_sizes(e: Evidence) -> Advice | None:
 
 def choose_sizes(e: Evidence) -> Advice | None:
     """Sizes that were guessed, and validation records that can choose them."""
-    if e.searched or e.continued or e.validation is None or e.parts_differ:
+    if e.searched or e.continued or e.validation is None or e.parts_differ or overfits(e):
         return None
-    static = "degree" if e.sizes.get("degree") else "nn"
-    change: dict[str, Any] = dict.fromkeys(["nx", "nz", "nw", static], "auto")
+    change = _sizes_by_validation(e)
     return Advice(
         f"Let validation choose the sizes: Settings({_written(change)}).",
         "the sizes were given",
@@ -553,6 +416,12 @@ def _larger(e: Evidence) -> dict[str, int]:
     if e.sizes.get("degree"):
         return {"degree": e.sizes["degree"] + 2, **sizes}
     return {"nn": 2 * e.sizes["nn"], **sizes} if e.sizes.get("nn") else sizes
+
+
+def _sizes_by_validation(e: Evidence) -> dict[str, str]:
+    """All sizes searched."""
+    static = "degree" if e.sizes.get("degree") else "nn"
+    return dict.fromkeys(["nx", "nz", "nw", static], "auto")
 
 
 def _written(change: Mapping[str, Any]) -> str:

@@ -1,12 +1,18 @@
-"""What the records, their simulations and the history of a fit say about its errors, in numbers."""
+"""What the records, their simulations and the history of a fit say about its errors, in numbers.
+
+Errors are root mean squares relative to the standard deviation of the training outputs, so that
+outputs of any unit count alike.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-import scipy
+from scipy.stats import f
 
 from lfrtorch._support.reasons import SPENT, Reason
 from lfrtorch._support.types import Array
@@ -14,25 +20,53 @@ from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.order_scan import UNLIKE
 from lfrtorch.linear.spectra import spectra_of_periods
 from lfrtorch.metrics import rms
+from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
 from lfrtorch.records import Record
-from lfrtorch.reporting.advice import Evidence
+from lfrtorch.reporting.explained import explained_parts
 from lfrtorch.reporting.simulations import Response
-from lfrtorch.reporting.verdict import Verdict
+from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict
 
-AVERAGES = 8
-"""Segments for each regressor that a coherence is estimated from, at least."""
+NOISE_LIMITED = 1.1
+"""Training error over the noise up to which the model's own share, √(1.1² - 1), is below half of
+the noise."""
 
-LONGEST, SHORTEST = 1024, 64
-"""Samples of a segment: as long as the memory of an error filter may be, and too few to tell."""
+SOUND = 0.8
+"""Training error over the noise below which the noise is not what it seems: a model of few
+parameters has no error below it."""
 
-LAGS = 12
-"""Least memory of a filter that is fitted in time, to records too short for segments."""
+FALLING = 0.02
+"""Part by which the error must have fallen over a tenth of the iterations, at the pace of the last
+ones, to count as still falling: as many iterations again would bring 18 % at that pace."""
 
-SHIFTS = 0.276, 0.382, 0.618, 0.724
-"""Parts of the records by which errors are shifted to see what is explained by chance: no fractions
-of few periods."""
+OVERFIT = 1.5
+"""Growth from training to validation of the NL-LFR's error over that of the linear model's, which
+sees how the records differ."""
+
+RISEN, FELL = 1.05, 0.99
+"""Validation error after the kept iterate over that of the kept one, and the training error at the
+end over that: beyond these the training error fell while validation rose."""
+
+FEW_SAMPLES = 10
+"""Samples a parameter up to which that is overfitting: with as many, p/M = 0.1, fitted white noise
+is √((1 + p/M) / (1 - p/M)) = 1.1 times as large on other samples. If there are more, the map is too
+small instead: with 11 and 21 a larger one was the better on the coupled drives and the tanks."""
+
+BY_CHANCE = 0.01
+"""Probability of the ratio of the linear model's errors up to which records are unlike."""
+
+USELESS = 0.9
+"""Error over the linear model's from which on the NL-LFR is hardly better."""
+
+LINEAR = 0.25
+"""Part of the error's power that is linear in the inputs: 0.48 of Bouc-Wen at an order one too low,
+0.01 at the right one; 0.97 and 0.08 of Silverbox."""
+
+NONLINEAR = 0.1
+"""Part that squares and cubes of the outputs explain: 0.39 and 0.93 for the linear models of
+Bouc-Wen and Silverbox, 0.00 and 0.10 for good NL-LFRs."""
 
 BEGINNING = 0.05
 """Part of a record that is its beginning."""
@@ -46,6 +80,153 @@ PARTS = 10
 STEADY = 4.0
 """Power of the differences between periods in a tenth of them over the median of all tenths, from
 which on they are no noise but a transient or a disturbance."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Numbers of a fit; None if one is not known.
+
+    Args:
+        train, linear_train: errors of the NL-LFR and of the linear model on the training records.
+        validation, linear_validation: on those that chose the iterate.
+        outputs: the NL-LFR's error over the linear model's by output, if there are several.
+        parameters, samples: of the model without gauge directions, and scored in training.
+        noise: of the outputs, known or from the differences between periods.
+        linear: part of the training error's power that a linear filter of the inputs explains.
+        nonlinear: part that squares and cubes of the outputs explain beyond that.
+        transient: error at the beginning of the training records over that in the rest.
+        free: part of the error's power at the beginning that a free response of the linear model
+            explains.
+        unlike_chance: probability of so large a ratio of the linear model's errors on validation
+            and in training by chance.
+        risen: middle one of the validation errors after the kept iterate over that of the kept one.
+        fell: training error at the end over that of the kept iterate.
+        falling: part by which the error that chooses fell over a tenth of the iterations, at the
+            pace of the last ones; 0 if the search ended for another reason than its limit.
+        iterations: of the fit.
+        starts: errors of all starts that went to the end, the best first.
+        started: number of starts.
+        continued: whether the fit went on from a model, so that there are no other starts.
+        sizes: nx, nz, nw, and nn or degree.
+        searched: whether validation chose them.
+        largest: those that are the largest of a search.
+        trainer: the search.
+        ridge: whether there was one.
+        louder: largest test input over the largest in training, by test.
+        diverged: records on which the NL-LFR diverges.
+        tests: the NL-LFR's error over the linear model's on all tests together.
+        verdict: on the fit, which advice must agree with.
+    """
+
+    train: float | None
+    linear_train: float | None
+    validation: float | None = None
+    linear_validation: float | None = None
+    outputs: Mapping[str, float] = field(default_factory=dict)
+    parameters: int = 0
+    samples: int = 0
+    noise: float | None = None
+    linear: float | None = None
+    nonlinear: float | None = None
+    transient: float | None = None
+    free: float | None = None
+    unlike_chance: float = 0.0
+    risen: float = 1.0
+    fell: float = 1.0
+    falling: float = 0.0
+    iterations: int = 0
+    starts: Sequence[float] = ()
+    started: int = 1
+    continued: bool = False
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    searched: bool = False
+    largest: Sequence[str] = ()
+    trainer: Any = field(default_factory=LevenbergMarquardt)
+    ridge: bool = False
+    louder: Mapping[str, float] = field(default_factory=dict)
+    diverged: Sequence[str] = ()
+    tests: float | None = None
+    verdict: Verdict | None = None
+
+    @property
+    def better(self) -> bool:
+        """Whether the verdict says that the NL-LFR is the better model."""
+        return self.verdict is not None and self.verdict.kind == Kind.BETTER
+
+    @property
+    def neither(self) -> bool:
+        """Whether the verdict says that neither model is usable."""
+        return self.verdict is not None and self.verdict.use == NEITHER
+
+    @property
+    def judged(self) -> tuple[float | None, float | None, str]:
+        """Errors of the NL-LFR and the linear model on validation, else on training; and which."""
+        if self.validation is None:
+            return self.train, self.linear_train, "training"
+        return self.validation, self.linear_validation, "validation"
+
+    @property
+    def gain(self) -> float | None:
+        """The NL-LFR's error over the linear model's, as judged; 0 without the latter."""
+        error, linear_error, _ = self.judged
+        if error is None:
+            return None
+        return error / linear_error if linear_error else 0.0
+
+    @property
+    def useless(self) -> bool:
+        """Whether the NL-LFR is hardly better than the linear model."""
+        return self.gain is not None and self.gain > USELESS
+
+    @property
+    def lost_on_tests(self) -> bool:
+        """Whether the tests have nothing of the gain over the linear model."""
+        if self.tests is None or self.gain is None or self.useless or self.better:
+            return False
+        return self.tests > USELESS
+
+    @property
+    def overfit(self) -> float | None:
+        """Growth of the error from training to validation over that of the linear model."""
+        errors = self.train, self.linear_train, self.validation, self.linear_validation
+        if not all(errors):
+            return None
+        train, linear_train, validation, linear_validation = (error or 0.0 for error in errors)
+        # What grows for the linear model as well lies in the records.
+        return validation / train / max(1.0, linear_validation / linear_train)
+
+    @property
+    def overtrained(self) -> bool:
+        """Whether validation rose after the kept iterate, as training went on with noise."""
+        many = self.samples <= FEW_SAMPLES * self.parameters
+        return many and self.risen >= RISEN and self.fell <= FELL and not self.states_missing
+
+    @property
+    def noise_limited(self) -> bool:
+        """Whether the training error is noise, the search at its end, and validation agrees."""
+        if not self.noise or self.train is None or self.falling > FALLING:
+            return False
+        if not SOUND * self.noise <= self.train <= NOISE_LIMITED * self.noise:
+            return False
+        return self.overfit is None or self.overfit <= OVERFIT
+
+    @property
+    def states_missing(self) -> bool:
+        """Whether the error has a part that is linear in the inputs."""
+        return (self.linear or 0.0) > LINEAR
+
+    @property
+    def structured(self) -> bool:
+        """Whether the training error has a part that noise has not."""
+        return self.states_missing or (self.nonlinear or 0.0) > NONLINEAR
+
+    @property
+    def parts_differ(self) -> bool:
+        """Whether validation and training records are unlike, and not by chance."""
+        if not self.linear_train or self.linear_validation is None:
+            return False
+        ratio = self.linear_validation / self.linear_train
+        return not 1.0 / UNLIKE <= ratio <= UNLIKE and self.unlike_chance <= BY_CHANCE
 
 
 def evidence(
@@ -84,6 +265,8 @@ def evidence(
     if noise is None and noise_rms is not None:
         noise = np.full(len(scale), noise_rms)
     linear, nonlinear = explained_parts(train)
+    here, there = ([r.linear_error / scale for r in part] for part in (train, validation))
+    risen, fell = after_kept(result)
     peak = _peak(train, result.model.scaler.u_offset)
     transient, free = (None, None) if bla is None else _transient(train, scale, bla)
     test = _error([r.error for r in tests], scale)
@@ -101,6 +284,9 @@ def evidence(
         nonlinear=nonlinear,
         transient=transient,
         free=free,
+        unlike_chance=chance_of_ratio(here, there),
+        risen=risen,
+        fell=fell,
         falling=falling(result),
         iterations=result.iterations,
         starts=_finished(result),
@@ -139,116 +325,6 @@ def noise_of_periods(records: Sequence[Record]) -> Array | None:
     return np.sqrt(power[1:, : records[0].y.shape[1]].sum(axis=0))
 
 
-def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | None]:
-    """Parts of the errors' power that linear filters would explain.
-
-    Returns:
-        What filters of the inputs explain, and what those of the squares and cubes of the simulated
-        outputs explain beyond: the first says that states are missing, the second that the static
-        map is too small. None if the records are too short, or a simulation diverges.
-    """
-    errors = [response.error for response in train]
-    inputs = [response.record.u[response.record.skip :] for response in train]
-    if any(response.diverged for response in train):
-        return None, None
-    outputs = [response.y_hat[response.record.skip :] for response in train]
-    every = np.concatenate(outputs)
-    centre, scale = every.mean(axis=0), every.std(axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    powers = [np.hstack([((y - centre) / scale) ** degree for degree in (2, 3)]) for y in outputs]
-    linear = coherent_part(inputs, errors)
-    both = [np.hstack(pair) for pair in zip(inputs, powers, strict=True)]
-    beyond = coherent_part(both, errors)
-    alike = coherent_part(inputs, errors, of=both[0].shape[1])  # by the same filters' memory
-    if beyond is None or alike is None:
-        return linear, None
-    return linear, max(0.0, beyond - alike)
-
-
-def coherent_part(
-    signals: Sequence[Array], errors: Sequence[Array], *, of: int | None = None
-) -> float | None:
-    """Part of the errors' power that linear filters of the signals explain, by Welch's method.
-
-    At each line, it is the multiple coherence times the error's power. The coherence is corrected
-    for its bias with n signals and K segments, as the adjusted R² is. With several outputs the
-    largest part counts. For records too short for that see :func:`filtered_part`.
-
-    Args:
-        signals: one array a record.
-        errors: those of the simulations, one array a record.
-        of: number of signals that the filters' memory is short enough for. Default: n.
-
-    Shape:
-        signals: (T, n), errors: (T, ny) each.
-
-    Returns:
-        0 to 1, or None if the records are too short.
-    """
-    n = signals[0].shape[1]
-    T, shortest = sum(map(len, errors)), min(map(len, errors))
-    most = T / (AVERAGES * (of or n))
-    N = 2 ** int(math.log2(max(1, min(LONGEST, most, shortest))))
-    if N < SHORTEST:
-        return filtered_part(signals, errors, min(int(most), shortest // 2))
-    S = np.zeros((N // 2 + 1, n + errors[0].shape[1], n + errors[0].shape[1]), complex)
-    for x, e in zip(signals, errors, strict=True):
-        both = np.hstack([x, e])
-        deviation = np.where(both.std(axis=0) > 0, both.std(axis=0), 1.0)
-        scaled = both / np.hstack([deviation[:n], np.ones(e.shape[1])])
-        _, _, Z = scipy.signal.stft(
-            scaled.T, nperseg=N, boundary=None, padded=False, detrend="constant"
-        )
-        S += np.einsum("ift,jft->fij", Z, Z.conj())
-    Sxx, Sxe = S[:, :n, :n], S[:, :n, n:]
-    power = np.real(np.diagonal(S, axis1=1, axis2=2))[:, n:]
-    # Lines that an input does not excite must not divide by their rounding errors.
-    largest = float(np.real(np.trace(Sxx, axis1=1, axis2=2)).max())
-    floor = np.eye(n) * max(1e-9 * largest, np.finfo(float).eps)
-    explained = np.einsum("fxe,fxe->fe", Sxe.conj(), np.linalg.solve(Sxx + floor, Sxe)).real
-    total = power.sum(axis=0)
-    K = T / N
-    left = np.minimum((power - explained) * K / (K - n), power)
-    part = np.where(total > 0, (power - left).sum(axis=0) / np.where(total > 0, total, 1.0), 0.0)
-    return float(np.clip(part.max(), 0.0, 1.0))
-
-
-def filtered_part(signals: Sequence[Array], errors: Sequence[Array], lags: int) -> float | None:
-    """Part of the errors' power that filters of a finite memory explain, by least squares.
-
-    What they explain by chance is taken off: the mean of what they explain of the errors shifted in
-    time, which is far more for slow errors than for white ones. With several outputs the largest
-    part counts.
-
-    Args:
-        signals, errors: see :func:`coherent_part`.
-        lags: samples of the memory.
-
-    Returns:
-        0 to 1, or None if the memory is too short.
-    """
-    if lags < LAGS:
-        return None
-    memory = np.concatenate(
-        [
-            np.lib.stride_tricks.sliding_window_view(x, lags, axis=0).reshape(-1, x.shape[1] * lags)
-            for x in signals
-        ]
-    )
-    left = np.concatenate([e[lags - 1 :] for e in errors])
-    memory, left = memory - memory.mean(axis=0), left - left.mean(axis=0)
-    U, s, _ = np.linalg.svd(memory, full_matrices=False)
-    U = U[:, s > 1e-9 * max(s[0], np.finfo(float).tiny)]
-    total = np.sum(left**2, axis=0)
-    total = np.where(total > 0, total, 1.0)
-    explained, *chance = (
-        np.sum((U.T @ np.roll(left, round(part * len(left)), axis=0)) ** 2, axis=0) / total
-        for part in (0.0, *SHIFTS)
-    )
-    by_chance = np.minimum(np.mean(chance, axis=0), 1.0 - 1e-9)
-    return float(np.clip(np.max((explained - by_chance) / (1.0 - by_chance)), 0.0, 1.0))
-
-
 def falling(result: FitResult) -> float:
     """Part by which the error that chooses fell over a tenth of the iterations, at the last pace.
 
@@ -266,6 +342,57 @@ def falling(result: FitResult) -> float:
     if not (math.isfinite(before) and before > 0) or lately > after:
         return 0.0
     return 1.0 - math.sqrt(after / before) ** (iterations / 10 / last)
+
+
+def after_kept(result: FitResult) -> tuple[float, float]:
+    """The errors after the kept iterate, over those of the kept one.
+
+    Returns:
+        The middle one of validation, and the last one of training. 1 and 1 if validation did not
+        choose, or if fewer than five iterations follow.
+    """
+    if not result.history:
+        return 1.0, 1.0
+    kept, *later = result.history[result.chosen_iteration :]
+    if len(later) < LAST or not kept.validation > 0 or not kept.train > 0:
+        return 1.0, 1.0
+    errors = [p.validation if math.isfinite(p.validation) else math.inf for p in later]
+    return float(np.median(errors)) / kept.validation, later[-1].train / kept.train
+
+
+def chance_of_ratio(here: Sequence[Array], there: Sequence[Array]) -> float:
+    """Probability that errors of one size differ by as much in power as these do, or by more.
+
+    An F test whose degrees of freedom are those that the powers of ten blocks of time show, of here
+    or there, whichever vary more: slow errors, or a few large ones, are few degrees of freedom.
+
+    Args:
+        here, there: errors of each record (T, ny).
+
+    Returns:
+        0 to 1; 1 if one side has fewer samples than blocks, or no error.
+
+    References:
+        Satterthwaite, "An approximate distribution of estimates of variance components",
+        Biometrics Bulletin 2(6), 1946 (equivalent degrees of freedom).
+    """
+    powers, samples, spread = [], [], 0.0
+    for errors in (here, there):
+        squares = [np.mean(error**2, axis=1) for error in errors]
+        if sum(map(len, squares)) < BLOCKS:
+            return 1.0
+        blocks = in_blocks(squares)
+        sums, counts = (np.array([of(block) for block in blocks]) for of in (np.sum, len))
+        power, error = blocked_mean(sums, counts)
+        if not 0 < power < math.inf:
+            return 1.0
+        powers.append(power)
+        samples.append(counts.sum())
+        spread = max(spread, counts.sum() * float(error / power) ** 2)  # of one sample
+    high, low = np.argsort(powers)[::-1]
+    freedom = 2.0 * np.array(samples) / max(spread, np.finfo(float).tiny)
+    one_side = f.sf(powers[high] / powers[low], freedom[high], freedom[low])
+    return min(1.0, 2.0 * float(one_side))
 
 
 def _error(errors: Sequence[Array], scale: Array) -> float | None:

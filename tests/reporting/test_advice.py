@@ -6,22 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.signal
 
 import lfrtorch
-from lfrtorch._support.reasons import Reason
-from lfrtorch.fitting.trainer import FitResult, Progress, RestartSummary
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 from lfrtorch.reporting import advice
-from lfrtorch.reporting.advice import Evidence, advise
+from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import (
-    coherent_part,
-    evidence,
-    falling,
-    filtered_part,
-    noise_of_periods,
+    Evidence,
 )
-from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict
 
 pytestmark = pytest.mark.numeric
@@ -50,6 +42,8 @@ def verdict(kind: Kind, use: str = "linear model") -> Verdict:
     return Verdict(kind, "", use)
 
 
+OVERTRAINED = {"risen": 1.3, "fell": 0.7, "samples": 400, "parameters": 80}
+
 UNUSABLE = verdict(Kind.LINEAR, NEITHER)
 
 SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
@@ -71,7 +65,9 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
             {"falling": 0.05, "trainer": lfrtorch.Adam()},
             "trainer=Adam(max_iter=400)",
         ),
-        (advice.overfits, {"validation": 0.05}, "nn=5, ridge=1e-3, or more data"),
+        (advice.overfits, {"validation": 0.05}, "nn=5, or more data"),
+        (advice.overfits, {"validation": 0.05, "searched": False}, "nn='auto'), or take more data"),
+        (advice.overfits, OVERTRAINED, "nn=5, or more data"),
         (advice.linear_part_incomplete, {"linear": 0.5}, "nx=4, nx=5 or nx='auto'"),
         (
             advice.hardly_better,
@@ -161,6 +157,31 @@ def test_what_spoils_the_linear_model_as_much_is_no_overfit():
     assert advice.overfits(replace(unlike, validation=0.027, linear_validation=0.27)) is None
 
 
+def test_where_training_goes_on_with_noise_nothing_larger_is_advised():
+    useless = {"validation": 0.19, "train": 0.15, "started": 1, "searched": False}
+    larger = ("Nonlinear behaviour is left", "Hardly better", "Some outputs gain nothing")
+    for fit in (GOOD, replace(GOOD, **useless), replace(GOOD, outputs={"y1": 0.95, "y2": 0.1})):
+        assert any(str(item).startswith(larger) for item in advise(fit))
+        items = advise(replace(fit, **OVERTRAINED))
+        assert sum(item.text.startswith("Overfit") for item in items) == 1
+        assert not any(str(item).startswith(larger) for item in items)
+        assert sum("auto" in item.text for item in items) <= 1
+    for other in (
+        {"samples": 4000},  # enough for the parameters
+        {"risen": 1.01},  # the search has come to rest
+        {"fell": 1.0},  # training is at rest, too
+        {"linear": 0.5},  # states are missing
+        {"linear_validation": 0.5},  # the parts are unlike
+    ):
+        assert advice.overfits(replace(GOOD, **OVERTRAINED | other)) is None
+
+
+def test_starts_are_not_compared_on_parts_that_are_unlike():
+    unlike = replace(GOOD, linear_validation=0.5, started=1, starts=(0.02, 0.03))
+    assert advice.one_start(unlike) is None
+    assert advice.best_start_alone(unlike) is None
+
+
 def test_what_is_seen_on_unlike_parts_is_not_the_system():
     """The linear model is as good on a validation part of which it is no model."""
     unlike = replace(GOOD, linear_train=0.01, validation=0.98, linear_validation=0.98)
@@ -217,194 +238,17 @@ def test_a_gain_that_the_tests_have_not_asks_for_no_larger_map():
         assert texts[0].startswith("Some outputs gain nothing")
 
 
-def test_a_linear_filter_of_the_input_is_seen_in_the_error():
-    rng = np.random.default_rng(0)
-    u, noise = rng.standard_normal((4000, 1)), rng.standard_normal((4000, 1))
-    filtered = scipy.signal.lfilter([1.0], [1.0, -0.8], u, axis=0)
-    both = filtered / filtered.std() + noise
-    # Half of the power; Welch's bias is corrected to within 0.1 at 8 segments.
-    assert coherent_part([u], [both]) == pytest.approx(0.5, abs=0.1)
-    assert coherent_part([u], [noise]) == pytest.approx(0.0, abs=0.1)
-    assert coherent_part([u, u], [filtered, filtered]) == pytest.approx(1.0, abs=0.05)
-    assert coherent_part([u[:60]], [noise[:60]]) is None
-    # Filters fitted in time: 300 samples and 37 lags leave a standard deviation of 0.06.
-    assert coherent_part([u[:300]], [both[:300]]) == pytest.approx(0.5, abs=0.2)
-    assert coherent_part([u[:300]], [noise[:300]]) == pytest.approx(0.0, abs=0.2)
-    # An error as slow as the input is explained in part by chance.
-    slow, other = (scipy.signal.lfilter([1.0], [1.0, -0.97], x, axis=0) for x in (u, noise))
-    assert filtered_part([slow[:300]], [other[:300]], 37) == pytest.approx(0.0, abs=0.25)
-    parts = [u[:300], u[300:600]], [filtered[:300], filtered[300:600]]
-    assert coherent_part(*parts) == pytest.approx(1.0, abs=0.1)
-    assert coherent_part([u], [0.0 * noise]) == 0.0
-    assert coherent_part([0.0 * u], [noise]) == pytest.approx(0.0, abs=0.1)
-
-
-def test_noise_is_what_differs_between_periods():
-    rng = np.random.default_rng(1)
-    u = np.tile(rng.standard_normal(500), 4)
-    y = np.column_stack([u + 0.1 * rng.standard_normal(2000), 3 * u])
-    found = noise_of_periods([Record(u, y, period=500)])
-    assert found is not None
-    # 1500 degrees of freedom: 2 %; 4 σ.
-    assert found[0] == pytest.approx(0.1, rel=0.08)
-    assert found[1] < 1e-12
-    assert noise_of_periods([Record(u, y)]) is None
-    assert noise_of_periods([Record(u[:500], y[:500], start="periodic")]) is None
-
-
-def history(scores: list[float]) -> list[Progress]:
-    return [Progress(i, 100, s, s, 1.0, True, {}, s**2) for i, s in enumerate(scores)]
-
-
-@pytest.fixture(scope="module")
-def fitted() -> tuple[FitResult, list[Response]]:
-    """A first-order system with a wrong start, two outputs, the NL-LFR as its linear start."""
-    rng = np.random.default_rng(0)
-    u = rng.standard_normal((1200, 1))
-    y = np.asarray(scipy.signal.lfilter([0.0, 0.5], [1.0, -0.9], u, axis=0), dtype=np.float64)
-    y = np.hstack([y, 2 * y]) + 50.0 * 0.9 ** np.arange(1200)[:, None]
-    outputs = (Channel("a", "m"), Channel("b"))
-    train = Record(u[:800], y[:800], outputs=outputs, name="train")
-    test = Record(2 * u[800:], y[800:], outputs=outputs, name="loud")
-    bla = lfrtorch.estimate_bla(Record(u[100:800], y[100:800], outputs=outputs), nx=1)
-    model = lfrtorch.initialise(bla, train, nz=1, nw=1, nn=2)
-    starts = (
-        RestartSummary(0, 20, 1.0, np.nan, np.nan, "converged"),
-        RestartSummary(1, 20, 1.5, np.nan, np.nan, "converged"),
-        RestartSummary(2, 2, 1.2, np.nan, np.nan, Reason.OTHERS_BETTER),
-    )
-    result = FitResult(
-        model, history([4.0, 2.0, 1.0]), 2, 1.0, 1.0, "maximum number of iterations", starts
-    )
-    responses = [
-        Response(r, use, bla.simulate(r), model.simulate(r))
-        for r, use in ((train, "train"), (test, "test"))
-    ]
-    return result, responses
-
-
-def test_evidence_is_measured_on_the_records(fitted):
-    result, responses = fitted
-    bla = lfrtorch.estimate_bla(responses[0].record[100:], nx=1)
-    found = evidence(result, responses, noise_rms=0.1, bla=bla)
-    deviation = responses[0].record.y.std(axis=0)
-    assert found.noise == pytest.approx(np.sqrt(np.mean((0.1 / deviation) ** 2)))
-    expected = np.sqrt(np.mean(np.mean(responses[0].error ** 2, axis=0) / deviation**2))
-    assert found.train == pytest.approx(expected)
-    assert (found.validation, found.linear_validation) == (None, None)
-    assert found.transient is not None
-    assert found.transient > 10.0
-    assert found.free == pytest.approx(1.0, abs=0.2)
-    assert (found.parameters, found.samples) == (result.model.net_parameter_count, 800)
-    assert found.falling == 1.0 - 0.25**0.1  # of two iterations: a tenth of them, at their pace
-    assert list(found.starts) == [1.0, 1.5]
-    assert found.started == 3
-    assert set(found.outputs) == {"a", "b"}
-    offset = result.model.scaler.u_offset
-    test, train = (np.abs(r.record.u - offset).max() for r in responses[::-1])
-    assert found.louder == {"loud": pytest.approx(test / train)}
-    texts = [item.text for item in advise(found)]
-    assert any(text.startswith("The records do not begin at the model's rest") for text in texts)
-
-
-def test_a_diverging_simulation_is_evidence_and_no_error(fitted):
-    result, responses = fitted
-    lost = replace(responses[1], y_hat=np.full_like(responses[1].y_hat, np.inf))
-    found = evidence(result, [responses[0], lost])
-    assert found.diverged == ["loud"]
-    assert advice.diverges(found) is not None
-    first = replace(responses[0], y_hat=np.full_like(responses[0].y_hat, np.nan))
-    found = evidence(result, [first, lost])
-    assert (found.train, found.linear, found.nonlinear) == (None, None, None)
-    assert found.outputs == {}
-
-
-def test_a_search_that_converged_or_rose_is_not_still_falling(fitted):
-    result, _ = fitted
-    assert falling(replace(result, reason="converged: the cost no longer falls")) == 0.0
-    assert falling(replace(result, history=history([1.0, 0.5, 0.8]))) == 0.0
-    assert falling(replace(result, history=history([1.0]))) == 0.0
-    # 1 % at each of the last iterations but one, which is no better.
-    pace = falling(replace(result, history=history([*(0.99**k for k in range(100)), 0.99**99])))
-    assert 0.05 < pace < 1.0 - 0.99**10
-
-
-def system(samples: int = 2000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Input and output, both of about 1 rms, of a resonance."""
-    u = np.random.default_rng(seed).standard_normal((samples, 1))
-    return u, 0.36 * resonant(u)
-
-
-def resonant(u: np.ndarray) -> np.ndarray:
-    return np.asarray(scipy.signal.lfilter([0.0, 0.0, 1.0], [1.0, -1.2, 0.8], u, axis=0))
-
-
-@pytest.fixture(scope="module")
-def resonance() -> tuple[FitResult, lfrtorch.LinearModel]:
-    """A fit of it, and its linear model."""
-    record = Record(*system())
-    bla = lfrtorch.estimate_bla(record, nx=2)
-    model = lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4)
-    return FitResult(model, history([1.0, 1.0]), 1, 1.0, 1.0, Reason.COST_SETTLED), bla
-
-
-def told(resonance, *parts: tuple[str, np.ndarray, np.ndarray], **options) -> str:
-    """Advice for records of these uses with these errors of the NL-LFR and the linear model."""
-    result, bla = resonance
-    responses = []
-    for use, error, linear_error in parts:
-        u, y = system(len(error))
-        record = Record(u, y + error, name=use, **options)
-        responses.append(Response(record, use, record.y - linear_error, y))
-    return "\n".join(map(str, advise(evidence(result, responses, bla=bla))))
-
-
-WHITE = np.random.default_rng(7).standard_normal((2000, 1))
-
-
-def test_a_filtered_input_in_the_error_asks_for_states_and_white_noise_does_not(resonance):
-    filtered = 0.1 * scipy.signal.lfilter([0.3], [1.0, -0.95], system()[0], axis=0)
-    said = "The linear part is incomplete"
-    assert said in told(
-        resonance, ("train", filtered, filtered), ("validation", filtered, filtered)
-    )
-    for error in (0.1 * WHITE, 0.1 * system()[1] ** 2):
-        assert said not in told(resonance, ("train", error, error), ("validation", error, error))
-
-
-def test_squares_in_the_error_ask_for_a_larger_map_and_white_noise_does_not(resonance):
-    square = 0.05 * (system()[1] ** 2 - 1.0)
-    said = "Nonlinear behaviour is left"
-    for error, is_said in ((square, True), (0.05 * WHITE, False), (0.05 * system()[0], False)):
-        parts = [(use, error, 3 * error) for use in ("train", "validation")]
-        assert (said in told(resonance, *parts)) is is_said
-
-
-def test_a_free_response_is_a_wrong_start_and_a_loud_beginning_is_not(resonance):
-    free = resonant(np.eye(2000, 1)) + 0.01 * WHITE
-    loud = 0.01 * WHITE * np.where(np.arange(2000) < 60, 20.0, 1.0)[:, None]
-    said = "do not begin at the model's rest"
-    assert said in told(resonance, ("train", free, WHITE))
-    assert said not in told(resonance, ("train", loud, WHITE))
-    assert said not in told(resonance, ("train", free, WHITE), start="estimated")
-
-
-@pytest.mark.parametrize("noisy", [True, False])
-def test_what_differs_between_periods_is_noise_if_it_is_steady(noisy: bool, resonance):
-    result, bla = resonance
-    u = np.tile(system(1000)[0], (3, 1))
-    u, y, error = u[1000:], 0.36 * resonant(u)[1000:], 0.05 * WHITE  # in steady state
-    transient = 0.0 if noisy else 2.0 * 0.97 ** np.arange(2000)[:, None]
-    record = Record(u, y + error * noisy + transient, period=1000)
-    # An error that is as large as the differences would have it.
-    size = np.sqrt(np.mean(np.diff(record.y.reshape(2, 1000), axis=0) ** 2) / 2)
-    y_hat = y if noisy else record.y + size * WHITE
-    found = evidence(result, [Response(record, "train", 0.0 * y, y_hat)], bla=bla)
-    assert (advice.at_the_noise(found) is not None) is noisy
-
-
-def test_validation_like_the_training_is_not_called_unlike(resonance):
-    said = "The validation part is unlike"
-    for factor, is_said in ((1.0, False), (1.3, False), (2.2, True)):
-        parts = ("train", 0.1 * WHITE, 0.3 * WHITE), ("validation", WHITE, factor * 0.3 * WHITE)
-        assert (said in told(resonance, *parts)) is is_said
+@pytest.mark.parametrize(("samples", "nn", "is_said"), [(80, 16, True), (600, 3, False)])
+def test_a_fit_of_few_noisy_samples_is_overfit_and_one_of_many_is_not(samples, nn, is_said):
+    rng = np.random.default_rng(2)
+    u, y = rng.standard_normal(samples + 300), np.zeros(samples + 300)
+    for k in range(len(y) - 1):
+        y[k + 1] = 0.7 * y[k] + np.tanh(u[k])
+    y += 0.3 * rng.standard_normal(len(y))
+    train = Record(u[:samples], y[:samples], name="train")
+    validation = Record(u[samples:], y[samples:], name="validation", skip=20)
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=25)
+    settings = lfrtorch.Settings(nx=1, nz=1, nw=1, nn=nn, trainer=trainer)
+    run = lfrtorch.identify(lfrtorch.Dataset("noisy", [train], [validation], []), settings)
+    assert any(item.text.startswith("Overfit:") for item in run.advice) is is_said
+    assert not (is_said and any(item.text.startswith("Hardly better") for item in run.advice))

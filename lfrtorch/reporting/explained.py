@@ -1,0 +1,135 @@
+"""Which part of the errors of a simulation a filter would explain: what a model has left out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import scipy
+
+from lfrtorch._support.types import Array
+from lfrtorch.reporting.simulations import Response
+
+AVERAGES = 8
+"""Segments for each regressor that a coherence is estimated from, at least."""
+
+LONGEST, SHORTEST = 1024, 64
+"""Samples of a segment: as long as the memory of an error filter may be, and too few to tell."""
+
+LAGS = 12
+"""Least memory of a filter that is fitted in time, to records too short for segments."""
+
+SHIFTS = 0.276, 0.382, 0.618, 0.724
+"""Parts of the records by which errors are shifted to see what is explained by chance: no fractions
+of few periods."""
+
+
+def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | None]:
+    """Parts of the errors' power that linear filters would explain.
+
+    Returns:
+        What filters of the inputs explain, and what those of the squares and cubes of the simulated
+        outputs explain beyond: the first says that states are missing, the second that the static
+        map is too small. None if the records are too short, or a simulation diverges.
+    """
+    errors = [response.error for response in train]
+    inputs = [response.record.u[response.record.skip :] for response in train]
+    if any(response.diverged for response in train):
+        return None, None
+    outputs = [response.y_hat[response.record.skip :] for response in train]
+    every = np.concatenate(outputs)
+    centre, scale = every.mean(axis=0), every.std(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    powers = [np.hstack([((y - centre) / scale) ** degree for degree in (2, 3)]) for y in outputs]
+    linear = coherent_part(inputs, errors)
+    both = [np.hstack(pair) for pair in zip(inputs, powers, strict=True)]
+    beyond = coherent_part(both, errors)
+    alike = coherent_part(inputs, errors, of=both[0].shape[1])  # by the same filters' memory
+    if beyond is None or alike is None:
+        return linear, None
+    return linear, max(0.0, beyond - alike)
+
+
+def coherent_part(
+    signals: Sequence[Array], errors: Sequence[Array], *, of: int | None = None
+) -> float | None:
+    """Part of the errors' power that linear filters of the signals explain, by Welch's method.
+
+    At each line, it is the multiple coherence times the error's power. The coherence is corrected
+    for its bias with n signals and K segments, as the adjusted R² is. With several outputs the
+    largest part counts. For records too short for that see :func:`filtered_part`.
+
+    Args:
+        signals: one array a record.
+        errors: those of the simulations, one array a record.
+        of: number of signals that the filters' memory is short enough for. Default: n.
+
+    Shape:
+        signals: (T, n), errors: (T, ny) each.
+
+    Returns:
+        0 to 1, or None if the records are too short.
+    """
+    n = signals[0].shape[1]
+    T, shortest = sum(map(len, errors)), min(map(len, errors))
+    most = T / (AVERAGES * (of or n))
+    N = 2 ** int(math.log2(max(1, min(LONGEST, most, shortest))))
+    if N < SHORTEST:
+        return filtered_part(signals, errors, min(int(most), shortest // 2))
+    S = np.zeros((N // 2 + 1, n + errors[0].shape[1], n + errors[0].shape[1]), complex)
+    for x, e in zip(signals, errors, strict=True):
+        both = np.hstack([x, e])
+        deviation = np.where(both.std(axis=0) > 0, both.std(axis=0), 1.0)
+        scaled = both / np.hstack([deviation[:n], np.ones(e.shape[1])])
+        _, _, Z = scipy.signal.stft(
+            scaled.T, nperseg=N, boundary=None, padded=False, detrend="constant"
+        )
+        S += np.einsum("ift,jft->fij", Z, Z.conj())
+    Sxx, Sxe = S[:, :n, :n], S[:, :n, n:]
+    power = np.real(np.diagonal(S, axis1=1, axis2=2))[:, n:]
+    # Lines that an input does not excite must not divide by their rounding errors.
+    largest = float(np.real(np.trace(Sxx, axis1=1, axis2=2)).max())
+    floor = np.eye(n) * max(1e-9 * largest, np.finfo(float).eps)
+    explained = np.einsum("fxe,fxe->fe", Sxe.conj(), np.linalg.solve(Sxx + floor, Sxe)).real
+    total = power.sum(axis=0)
+    K = T / N
+    left = np.minimum((power - explained) * K / (K - n), power)
+    part = np.where(total > 0, (power - left).sum(axis=0) / np.where(total > 0, total, 1.0), 0.0)
+    return float(np.clip(part.max(), 0.0, 1.0))
+
+
+def filtered_part(signals: Sequence[Array], errors: Sequence[Array], lags: int) -> float | None:
+    """Part of the errors' power that filters of a finite memory explain, by least squares.
+
+    What they explain by chance is taken off: the mean of what they explain of the errors shifted in
+    time, which is far more for slow errors than for white ones. With several outputs the largest
+    part counts.
+
+    Args:
+        signals, errors: see :func:`coherent_part`.
+        lags: samples of the memory.
+
+    Returns:
+        0 to 1, or None if the memory is too short.
+    """
+    if lags < LAGS:
+        return None
+    memory = np.concatenate(
+        [
+            np.lib.stride_tricks.sliding_window_view(x, lags, axis=0).reshape(-1, x.shape[1] * lags)
+            for x in signals
+        ]
+    )
+    left = np.concatenate([e[lags - 1 :] for e in errors])
+    memory, left = memory - memory.mean(axis=0), left - left.mean(axis=0)
+    U, s, _ = np.linalg.svd(memory, full_matrices=False)
+    U = U[:, s > 1e-9 * max(s[0], np.finfo(float).tiny)]
+    total = np.sum(left**2, axis=0)
+    total = np.where(total > 0, total, 1.0)
+    explained, *chance = (
+        np.sum((U.T @ np.roll(left, round(part * len(left)), axis=0)) ** 2, axis=0) / total
+        for part in (0.0, *SHIFTS)
+    )
+    by_chance = np.minimum(np.mean(chance, axis=0), 1.0 - 1e-9)
+    return float(np.clip(np.max((explained - by_chance) / (1.0 - by_chance)), 0.0, 1.0))
