@@ -89,6 +89,17 @@ def engineering(values: Iterable[float | None], unit: str) -> tuple[float, str]:
     return 10.0**-power, PREFIXES[power] + unit
 
 
+def factor_of(unit: str) -> str:
+    """A unit as a factor of another, in brackets if it is a product or a quotient.
+
+    Example:
+        >>> from lfrtorch._support.tables import factor_of
+        >>> f"{factor_of('rad/s')}²/Hz", factor_of("m")
+        ('(rad/s)²/Hz', 'm')
+    """
+    return f"({unit})" if any(sign in unit for sign in "/ ·*^²") else unit
+
+
 def times(factor: float, value: float | None) -> float | None:
     """The product, if the value is known."""
     return None if value is None else factor * value

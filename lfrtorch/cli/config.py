@@ -88,8 +88,9 @@ def loaded(cfg: DictConfig) -> Dataset:
     dataset: Dataset = instantiate(cfg.data)
     measured = [record for record in dataset.train if record.source == "file"]
     notes = (*dataset.notes, *(notes_on(measured, given=cfg.get("bla")) if measured else ()))
+    notes = tuple(translated(note, cfg) for note in notes)
     for note in notes:
-        print(in_lines(f"note: {translated(note, cfg)}"))
+        print(in_lines(f"note: {note}"))
     return replace(dataset, notes=notes)
 
 

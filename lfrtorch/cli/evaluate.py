@@ -83,7 +83,7 @@ def from_files(cfg: DictConfig, model: lfrtorch.Model, command: str) -> None:
     if divided or not cfg.data.path or fitted(cfg.checkpoint, cfg.data.path):
         return
     cfg.data.test = EVERYTHING
-    print("note: all samples are scored; data.test=0.2 scores the last fifth alone")
+    print("note: whole records are scored; data.test=0.2 scores the last fifth alone")
 
 
 def fitted(checkpoint: str, path: str | list[str]) -> bool:

@@ -54,6 +54,7 @@ from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
+from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.run_files import write
 from lfrtorch.reporting.verdict import LINEAR_MODEL
 
@@ -91,8 +92,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             number = stop.asked or signal.SIGINT
             raise TerminatedError(f"{stopped}: nothing to keep", number) from None
         if files is not None:
-            advice = [a._replace(text=translated(a.text, cfg)) for a in found.advice]
-            found = replace(found, advice=advice)
+            found = in_words(found, cfg)
             print(found)
             config = OmegaConf.to_yaml(files.cfg, resolve=True)
             write(
@@ -118,6 +118,16 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
         print(go_on(folder))
     judged = found.metrics["validation"]["rmse"]
     return found.fit.history[found.fit.chosen_iteration].train if judged is None else judged
+
+
+def in_words(found: Run, cfg: DictConfig) -> Run:
+    """A run whose advice and notes name the words of the command line."""
+    advice = [a._replace(text=translated(a.text, cfg)) for a in found.advice]
+    linear = found.linear
+    if linear.fit is not None:
+        notes = tuple(translated(note, cfg) for note in linear.fit.notes)
+        linear = replace(linear, fit=replace(linear.fit, notes=notes))
+    return replace(found, advice=advice, linear=linear)
 
 
 class _Folder(Terminal):

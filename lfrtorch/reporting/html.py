@@ -124,7 +124,7 @@ def render(
 
 
 def comparisons(responses: Sequence[Response]) -> list[str]:
-    """How far the NL-LFR came, beside the linear model: a line for each of a few tests.
+    """How far the NL-LFR came, beside the linear model: a line for each output of a few tests.
 
     Without tests the lines are on the validation records, or else on the training records.
     """
@@ -132,11 +132,10 @@ def comparisons(responses: Sequence[Response]) -> list[str]:
     use = next(use for use in uses if any(response.use == use for response in responses))
     shown = []
     for response in (response for response in responses if response.use == use):
-        channels, name = _channels(response), response.record.name
-        if channels[0][0] == ALL or len(channels) == 1:
-            shown.append((name, channels[0][1], _errors(response, channels[0][2])))
-        else:
-            shown += [(f"{name}, {c}", unit, _errors(response, of)) for c, unit, of in channels]
+        channels = [channel for channel in _channels(response) if channel[0] != ALL]
+        for output, unit, of in channels:
+            name = response.record.name + (f", {output}" if len(channels) > 1 else "")
+            shown.append((name, unit, _errors(response, of)))
     scored = sorted((item for item in shown if item[2].ratio > 0), key=lambda item: item[2].ratio)
     if len(shown) <= FEW or not scored:
         return [_line(*item) for item in shown]

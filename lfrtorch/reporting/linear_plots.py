@@ -11,6 +11,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodF
 from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import factor_of
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
@@ -305,7 +306,8 @@ def _decibel(amplitude: ArrayLike) -> Array:
 
 def _unit_label(what: str, output: Channel, source: Channel) -> str:
     units: Sequence[str] = (output.unit, source.unit)
-    return f"{what} (dB{_reference('/'.join(u or '1' for u in units) if any(units) else '')})"
+    per = "/".join(factor_of(unit or "1") for unit in units)
+    return f"{what} (dB{_reference(per if any(units) else '')})"
 
 
 def _reference(unit: str) -> str:

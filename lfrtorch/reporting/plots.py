@@ -12,7 +12,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, NullLocator
 
-from lfrtorch._support.tables import engineering, quantity
+from lfrtorch._support.tables import engineering, factor_of, quantity
 from lfrtorch._support.types import Array
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.metrics import rms
@@ -147,7 +147,7 @@ def density(
             f, power = scipy.signal.welch(signal, record.fs, nperseg=segment)
             level = 10.0 * np.log10(np.maximum(power, np.finfo(float).tiny))
             ax.plot(f[1:], level[1:], color=colour, label=label)
-        unit = record.outputs[i].unit or "1"
+        unit = factor_of(record.outputs[i].unit or "1")
         per = f"{unit}²/Hz" if record.fs != 1.0 else f"{unit}²"
         ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {per})", xlim=(0, record.fs / 2))
         _legend(ax)

@@ -142,7 +142,7 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
         about = f"checkpoint={folder / 'model'}", "data=file", f"data.path={path}", "data.fs=10"
         run(monkeypatch, *about, *words)
         printed = capsys.readouterr().out
-        assert ("note: all samples are scored" in printed) is note
+        assert ("note: whole records are scored" in printed) is note
         assert samples in printed
 
 

@@ -218,8 +218,7 @@ def test_several_outputs_have_scores_of_their_own():
     assert page.text.count("maximum number of iterations") == 2
     assert "The best of 2 starts" in page.text
     lines = html_report.comparisons(same.responses)
-    assert [line.split(":")[0] for line in lines] == ["test"]
-    # Volts and metres have no error together.
+    assert [line.split(":")[0] for line in lines] == ["test, a", "test, b"]
     outputs = (Channel("a", "V"), Channel("b", "m"))
     mixed = [replace(r, record=replace(r.record, outputs=outputs)) for r in same.responses]
     lines = html_report.comparisons(mixed)
@@ -253,7 +252,7 @@ def test_a_linear_model_alone_is_shown(single: Run):
     single.bla.write(cell, single.result.model.scaler)
     result = replace(single.result, model=replace(single.result.model, lfr=LFR(cell)))
     page = Run(result, single.bla, single.dataset).page()
-    assert "Not better than the linear model" in page.text
+    assert "As the linear model: " in page.text
     assert "verdict amber" in page.classes
     assert "checkpoint=RUN/linear" in page.text
     assert "9 parameters, 5 without" in page.text
