@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from copy import deepcopy
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -31,6 +31,7 @@ from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
+from lfrtorch.linear.requirements import check_excitation
 from lfrtorch.linear.score_window import with_score_windows
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -120,7 +121,7 @@ def _identified(
     whole, dataset = dataset, windowed(dataset, linear.to_model(), observer)
     sizes = choose_sizes(dataset, asked, linear, observer=observer, ranks=ranks, stop=stop)
     if sizes is not None:
-        settings = replace(settings, starts=_searched_starts(asked), **sizes.chosen.sizes)
+        settings = replace(settings, seed=sizes.chosen.seed, **sizes.chosen.sizes)
         if settings.nx != linear.nx:
             observer.say(
                 f"nx: {settings.nx}, as the NL-LFR makes use of more states than the linear model"
@@ -176,11 +177,6 @@ def windowed(
         if note not in (*dataset.notes, *said):
             observer.say(f"note: {note}")
     return found
-
-
-def _searched_starts(settings: Settings) -> int:
-    """Starts of a model of sizes that are searched: with one it would be a matter of luck."""
-    return max(2, settings.starts)
 
 
 def _most_averaged(models: Sequence[Model], average: int, observer: Observer) -> int:
@@ -295,32 +291,33 @@ def choose_sizes(
         return None
     grid = settings.sizes_search
     trainer: Any = settings.trainer
-    iterations = math.ceil(grid.iterations * trainer.limit)
-    several = replace(settings, starts=min(_searched_starts(settings), max(2, grid.starts)))
-    estimate = cache(partial(estimate_bla, dataset.train, **settings.linear))
+    linears = {linear.nx: linear}
+    if settings.nx == "auto":
+        above = [nx for nx in grid.nx if linear.nx < nx <= settings.nx_max]
+        linears |= _larger(dataset.train, above, settings)
 
     def start(tried: dict[str, Any], seed: int) -> Model:
-        nx = tried.get("nx", linear.nx)
-        begin = linear if nx == linear.nx else estimate(nx)
+        begin = linears[tried.get("nx", linear.nx)]
         return starting_model(dataset.train, replace(settings, **tried), begin, seed)
 
-    observer.say(f"sizes: {len(several.seeds)} starts of {iterations} iterations for each model")
     tried = {
         name: getattr(grid if name in settings.searched else settings, name)
         for name in settings.size_names
     }
     if settings.nx == "auto":
-        tried["nx"] = [linear.nx, *(nx for nx in grid.nx if linear.nx < nx <= settings.nx_max)]
+        tried["nx"] = list(linears)
     search = search_sizes(
         start,
         dataset.train,
         dataset.validation,
         **tried,
         linear=linear,
-        seeds=several.seeds,
-        trainer=replace(trainer, max_iter=iterations),
+        seeds=settings.first_seeds(grid.starts),
+        finalists=grid.finalists,
+        trainer=replace(trainer, max_iter=math.ceil(grid.iterations * trainer.limit)),
         ridge=settings.ridge,
-        watch=lambda candidate: observer.say(str(candidate)),
+        monitor=observer.searching(),
+        watch=lambda ended: observer.say(str(ended)),
         ranks=ranks,
         stop=stop,
     )
@@ -328,6 +325,20 @@ def choose_sizes(
     for note in search.notes:
         observer.say(f"note: {note}")
     return search
+
+
+def _larger(
+    train: Sequence[Record], orders: Sequence[int], settings: Settings
+) -> dict[int, LinearModel]:
+    """Linear models of rising orders, as far as the records carry them."""
+    found: dict[int, LinearModel] = {}
+    for nx in orders:
+        try:
+            check_excitation(train, nx)
+            found[nx] = estimate_bla(train, nx, **settings.linear)
+        except ValueError:
+            break
+    return found
 
 
 def starting_models(

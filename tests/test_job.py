@@ -19,13 +19,18 @@ from lfrtorch import (
     Dataset,
     LevenbergMarquardt,
     Record,
+    Scaler,
     Settings,
     SizesSearch,
     identify,
 )
 from lfrtorch.cli import config, fit
+from lfrtorch.distributed import Ranks
+from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import StoppedError
+from lfrtorch.job import choose_sizes
+from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.reporting import Console, plots, write
 
 SHORT = LevenbergMarquardt(max_iter=4)
@@ -67,17 +72,42 @@ def test_the_job_scores_every_record_and_advises(dataset: Dataset):
 
 @pytest.mark.numeric
 def test_chosen_sizes_are_returned_and_what_was_asked_for_stays(dataset: Dataset):
-    asked = settings(nx="auto", nx_max=2, nn="auto", sizes_search=SizesSearch(nn=(1, 3)))
+    asked = settings(
+        nx="auto", nx_max=2, nn="auto", starts=1, sizes_search=SizesSearch(nn=(1, 3), starts=1)
+    )
     run = identify(dataset, asked)
     assert (asked.nx, asked.nn) == ("auto", "auto")
     assert run.order_scan is not None
     assert run.size_search is not None
     assert run.settings.sizes == run.model.sizes
     assert run.settings.nx == run.linear.nx >= run.order_scan.chosen
-    assert len(run.fit.starts) == run.settings.starts == 2
-    # The first model tried has the linear model's states.
-    assert run.size_search.candidates[0].sizes["nx"] == run.order_scan.chosen
-    assert run.settings.nn == run.size_search.chosen.sizes["nn"]
+    chosen = run.size_search.chosen
+    assert (run.settings.nn, run.settings.seed) == (chosen.sizes["nn"], chosen.seed)
+    # The fit goes the way of the model that was chosen.
+    way = [p.validation for p in run.fit.history[: chosen.iterations + 1]]
+    scale = Scaler.of(dataset.validation).y_scale.item()
+    assert min(way) == pytest.approx(chosen.error * scale, rel=1e-6)
+
+
+@pytest.mark.numeric
+def test_sizes_are_searched_as_far_as_short_records_carry():
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal(120), np.zeros(120)
+    for k in range(119):
+        y[k + 1] = 0.7 * y[k] + np.tanh(u[k])
+    parts = [Record(u[p], y[p], skip=5) for p in (slice(72), slice(72, 120))]
+    some = SizesSearch(nx=(3, 6), nz=(1,), nw=(1,), nn=(2,), finalists=1)  # 6 needs 84 samples
+    asked = settings(nx="auto", nn="auto", sizes_search=some)
+    k = np.arange(300)
+    tones = np.sin(0.3 * k) + np.cos(1.1 * k)  # which excite five directions, and order 3 has seven
+    slow = np.tanh(np.convolve(tones, [0.0, 0.6, 0.3])[:300])
+    toned = [Record(tones[p], slow[p], skip=5) for p in (slice(200), slice(200, 300))]
+    for (train, validation), orders in ((parts[:2], {1, 3}), (toned, {1})):
+        data = Dataset("mine", [train], [validation], [])
+        linear = estimate_bla(data.train, nx=1)
+        found = choose_sizes(data, asked, linear, observer=Observer(), ranks=Ranks(), stop=None)
+        assert found is not None
+        assert {c.sizes["nx"] for c in found.candidates} == orders
 
 
 def test_a_model_to_go_on_from_is_not_changed(dataset: Dataset):
@@ -195,7 +225,7 @@ def test_starts_that_are_kept_go_on(dataset: Dataset, tmp_path: Path):
 def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     identify(dataset, settings(nn="auto", sizes_search=SizesSearch(nn=(1, 3))), observer=Console())
     printed = capsys.readouterr().out
-    for text in ("BLA: order 1", "sizes: 2 starts of 1 iterations", "training samples", "round 2"):
+    for text in ("BLA: order 1", "round 1 of 2: 8 models to iteration 1", "training samples"):
         assert text in printed
     identify(dataset, settings())
     assert capsys.readouterr().out == ""

@@ -175,7 +175,7 @@ def fit(
     snapshots = Snapshots() if snapshots is None else snapshots
     halt = Event()
     options = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
-    options["stop"] = _any_of(halt, stop) if ranks is None or ranks.world == 1 else stop
+    options["stop"] = any_of(halt, stop) if ranks is None or ranks.world == 1 else stop
     fits = [
         Fit(model, train, validation, **options, keep=snapshots.keeper(number))
         for number, model in enumerate(starts)
@@ -195,7 +195,7 @@ def fit(
             line = line_of(starts, planned)
             watching = [[line]] * len(starts)
             ending.callback(line.close)
-        together = _Together(fits, watching or [()] * len(fits), halt)
+        together = Together(fits, watching or [()] * len(fits), halt)
         for number, (_, until) in enumerate(planned, start=1):
             if number <= len(snapshots.rounds):
                 field = _drop_others(field, [fits[i] for i in snapshots.rounds[number - 1]])
@@ -361,11 +361,12 @@ class _Judge:
         return next(number for number, other in enumerate(self.fits) if other is fit)
 
 
-def _any_of(halt: Event, stop: Stop | None) -> Stop:
+def any_of(halt: Event, stop: Stop | None) -> Stop:
+    """Stop if one of the two says so."""
     return lambda: halt.is_set() or (stop is not None and stop())
 
 
-class _Together:
+class Together:
     """The starts of one fit, and who watches them; ``halt`` is set if Ctrl-C ends one thread."""
 
     def __init__(
@@ -381,6 +382,7 @@ class _Together:
         """Go on with some of them to an iteration."""
         first = fits[0]
         in_step = isinstance(first.trainer, LevenbergMarquardt) and first.ranks.world == 1
+        in_step &= len({tuple(fit.model.sizes.items()) for fit in fits}) == 1
         try:
             if len(fits) > 1 and in_step and first.problem.theta.device.type != "cpu":
                 advance_in_step(fits, until, [self._monitors[id(fit)] for fit in fits])

@@ -37,6 +37,10 @@ class Observer:
     def say(self, text: str) -> None:
         """Take a sentence or a table, when it is known."""
 
+    def searching(self) -> Monitor | None:
+        """What sees every iteration of the search for sizes; None: a line on a terminal."""
+        return lambda model, progress: None
+
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
     ) -> Watching:
@@ -67,6 +71,11 @@ class LineObserver(Observer):
     def say(self, text: str) -> None:
         """Show its first line until there is more to say."""
         self._said.show(text.split("\n", 1)[0])
+
+    def searching(self) -> Monitor | None:
+        """Show a line."""
+        self._said.clear()
+        return None
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]

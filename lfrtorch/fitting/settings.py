@@ -31,14 +31,15 @@ SEED_STEP = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class SizesSearch:
-    """What is tried for the sizes that are ``"auto"``.
+    """What is tried for the sizes that are ``"auto"``, see :func:`lfrtorch.search_sizes`.
 
     Args:
         nx: the numbers of states to try above the linear model's order, up to ``nx_max``, if nx and
-            another size are ``"auto"``; they come first.
-        nz, nw, nn, degree: the numbers to try. nz and nw are crossed, then nn or degree follows.
-        starts: random starts of each candidate: those of the fit, at least 2, at most this many.
-        iterations: part of the iterations of the fit that each start gets.
+            another size are ``"auto"``.
+        nz, nw, nn, degree: the numbers to try.
+        starts: random starts of each size, at most.
+        finalists: models that get all iterations of the search; 8 times as many begin it.
+        iterations: part of the iterations of the fit that they get.
 
     Example:
         >>> lfrtorch.SizesSearch(nn=(5, 10), starts=2).nn
@@ -46,15 +47,17 @@ class SizesSearch:
     """
 
     nx: Sequence[int] = (2, 3, 4, 6, 8, 10, 12)
-    nz: Sequence[int] = (1, 2)
-    nw: Sequence[int] = (1, 2)
+    nz: Sequence[int] = (1, 2, 3)
+    nw: Sequence[int] = (1, 2, 3)
     nn: Sequence[int] = (5, 10, 15, 25)
     degree: Sequence[int] = (2, 3, 5)
     starts: int = 4
-    iterations: float = 0.25
+    finalists: int = 6
+    iterations: float = 0.375
 
     def __post_init__(self) -> None:
         integer("sizes_search.starts", self.starts, 1)
+        integer("sizes_search.finalists", self.finalists, 1)
         number("sizes_search.iterations", self.iterations, positive=True)
 
 
@@ -79,8 +82,9 @@ class Settings:
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
-        starts: random starts, of which the best is kept; at least 2 if sizes are searched.
-        seed: of the first start; the others have seed + 1000, seed + 2000, ...
+        starts: random starts, of which the best is kept.
+        seed: of the first start; the others have seed + 1000, seed + 2000, ... If sizes are
+            searched, the first start of the fit is the one that brought the sizes chosen.
         init_from: a model to go on from, in place of ``init``; its sizes replace those given here.
         sizes_search: what is tried for the sizes that are ``"auto"``.
         device, dtype: of the fit.
@@ -195,7 +199,11 @@ class Settings:
     @property
     def seeds(self) -> tuple[int, ...]:
         """Seeds of the starts; neighbouring values of ``seed`` have none in common."""
-        return tuple(self.seed + SEED_STEP * number for number in range(self.starts))
+        return self.first_seeds(self.starts)
+
+    def first_seeds(self, count: int) -> tuple[int, ...]:
+        """Seeds of so many starts."""
+        return tuple(self.seed + SEED_STEP * number for number in range(count))
 
     def static_map(self) -> dict[str, Any]:
         """The arguments of :func:`lfrtorch.initialise` that say which static map there is."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lfrtorch._support.errors import InputError
@@ -53,7 +55,7 @@ def check_spectral_data(data: SpectralData, nx: int) -> None:
         )
 
 
-def excited_directions(records: list[Record], nx: int) -> tuple[int, int]:
+def excited_directions(records: Sequence[Record], nx: int) -> tuple[int, int]:
     """Directions in which the input moves, and those that a model of the order has."""
     nu = records[0].u.shape[1]
     wanted = 2 * nx + 1
@@ -66,6 +68,16 @@ def excited_directions(records: list[Record], nx: int) -> tuple[int, int]:
     rows = rows / np.maximum(rms(rows, axis=0), 1e-300)
     size = np.linalg.eigvalsh(rows.T @ rows)
     return int((size > NARROW * size[-1]).sum()), nu * wanted
+
+
+def check_excitation(records: Sequence[Record], nx: int) -> None:
+    """Refuse an input that moves in fewer directions than a model of the order has."""
+    excited, wanted = excited_directions(records, nx)
+    if excited < wanted:
+        raise InputError(
+            f"the input excites {excited} of the {wanted} directions that order nx={nx} has (one a "
+            "frequency and phase): excite more lines, or lower nx."
+        )
 
 
 def excitation_notes(records: list[Record], nx: int) -> list[str]:

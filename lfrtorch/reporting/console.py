@@ -32,6 +32,9 @@ class Console(Observer):
         """Print it."""
         print(in_lines(text), flush=True)
 
+    def searching(self) -> None:
+        """Show a line."""
+
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
     ) -> Watching:

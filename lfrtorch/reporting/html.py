@@ -335,7 +335,8 @@ def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict
 def _search(tried: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The sizes that were tried."""
     head, rows = size_table(tried)
-    return {"head": head, "rows": rows, "legend": LEGEND.splitlines()}
+    count = f"{len(tried)} models were tried; the table has the chosen one and the last round."
+    return {"head": head, "rows": rows, "legend": [count, *LEGEND.splitlines()]}
 
 
 def _parameters(metrics: Mapping[str, Any], result: FitResult) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from lfrtorch._support.tables import number
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Polynomial
-from lfrtorch.fitting.size_search import Candidate, SizeSearch, search_sizes
+from lfrtorch.fitting.size_search import Candidate, SizeRound, SizeSearch, race, search_sizes
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import StoppedError
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -57,7 +57,7 @@ def search(planted: Planted, **options: Any) -> SizeSearch:
         return initialise(bla, train, **sizes, seed=seed)
 
     given: dict[str, Any] = {"start": start, "train": train, "validation": validation}
-    given |= {"nn": (1, 3, 6), "seeds": (0, 1000), "linear": bla, "trainer": OPTIMISER}
+    given |= {"nn": (1, 3, 6), "seeds": (0,), "linear": bla, "trainer": OPTIMISER}
     return search_sizes(**given | options)
 
 
@@ -69,40 +69,74 @@ def polynomial(planted: Planted, sizes: Any, seed: int) -> Model:
 
 @pytest.fixture(scope="module")
 def single() -> SizeSearch:
-    return search(plant(1, 1))
+    trainer = LevenbergMarquardt(max_iter=30)
+    return search(plant(1, 1), nz=(1, 2), nw=(1, 2), finalists=5, trainer=trainer)
 
 
 def test_planted_sizes_are_chosen(single: SizeSearch):
     found = single
     assert found.chosen.sizes == {"nz": 1, "nw": 1, "nn": 3}
-    # nz and nw crossed at the middle nn, then the other nn.
-    tried = [tuple(c.sizes.values()) for c in found.candidates]
-    assert tried == [(1, 1, 3), (1, 2, 3), (2, 1, 3), (2, 2, 3), (1, 1, 1), (1, 1, 6)]
+    # Each size once, and five of them to the end.
+    assert len({tuple(c.sizes.values()) for c in found.candidates}) == len(found.candidates) == 12
+    assert [c.rounds for c in found.candidates] == 5 * [2] + 7 * [1]
+    assert {c.iterations for c in found.candidates[5:]} == {10}
+    last = [c.error for c in found.candidates[:5]]
+    assert last == sorted(last)
     # What is left at the true sizes is the noise.
     assert found.chosen.error == pytest.approx(0.02, rel=0.1)
     assert found.chosen.ratio < 0.5
 
 
 def test_a_second_input_of_the_map_is_found():
-    found = search(plant(2, 1), nn=3, seeds=(0,))
+    found = search(plant(2, 1), nz=(1, 2), nw=(1, 2), nn=3)
     assert found.chosen.sizes == {"nz": 2, "nw": 1, "nn": 3}
     assert len(found.candidates) == 4
     assert found.notes == ("nz 2 is the largest tried; a larger one may do better.",)
 
 
-def test_states_come_first_until_two_orders_bring_nothing():
+def test_states_are_searched_with_the_other_sizes():
     planted = train, _, bla = plant(2, 1)
-    models = {nx: bla if nx == 2 else estimate_bla(train, nx) for nx in (1, 2, 3, 4)}
+    models = {nx: bla if nx == 2 else estimate_bla(train, nx) for nx in (1, 2, 3)}
 
     def start(sizes: Any, seed: int) -> Model:
         sizes = dict(sizes)
         return initialise(models[sizes.pop("nx")], train, **sizes, seed=seed)
 
-    found = search(planted, start=start, nx=(1, 2, 3, 4, 5), nn=3, seeds=(0,))
-    tried = [tuple(c.sizes.values()) for c in found.candidates]
-    assert tried[:4] == [(1, 2, 1, 3), (2, 2, 1, 3), (3, 2, 1, 3), (4, 2, 1, 3)]
-    assert {sizes[0] for sizes in tried[4:]} == {2}  # nz and nw are crossed at two states
+    found = search(planted, start=start, nx=(1, 2, 3), nz=(1, 2), nw=1, nn=3)
     assert found.chosen.sizes == {"nx": 2, "nz": 2, "nw": 1, "nn": 3}
+    assert {c.sizes["nx"] for c in found.candidates} == {1, 2, 3}
+
+
+def test_rounds_cost_about_the_same_and_halve_the_models():
+    assert race(1000, 6, 75) == [(48, 13), (24, 25), (6, 75)]  # 624, 288 and 300 iterations
+    assert race(30, 6, 75) == [(30, 13), (24, 25), (6, 75)]
+    assert race(8, 6, 75) == [(8, 25), (6, 75)]
+    assert race(5, 6, 75) == [(5, 75)]
+    assert race(48, 6, 2) == [(48, 1), (6, 2)]
+    assert race(48, 6, 0) == [(48, 0)]
+
+
+def test_more_starts_of_few_sizes_and_a_part_of_many():
+    few = search(plant(1, 1), nz=1, nw=1, nn=(1, 3), seeds=(0, 1000), finalists=1)
+    assert sorted((c.sizes["nn"], c.seed) for c in few.candidates) == [
+        (1, 0), (1, 1000), (3, 0), (3, 1000),
+    ]  # fmt: skip
+    nn = range(1, 12)
+    trainer = LevenbergMarquardt(max_iter=1)
+    part = search(plant(1, 1), nz=1, nw=1, nn=nn, seeds=(0, 1000), finalists=1, trainer=trainer)
+    assert len({c.sizes["nn"] for c in part.candidates}) == len(part.candidates) == 8
+    again = search(plant(1, 1), nz=1, nw=1, nn=nn, seeds=(0, 1000), finalists=1, trainer=trainer)
+    assert [c.sizes for c in again.candidates] == [c.sizes for c in part.candidates]
+
+
+def test_rounds_are_told():
+    told: list[SizeRound] = []
+    found = search(plant(1, 1), nz=1, nw=1, finalists=1, watch=told.append)
+    assert [(r.number, r.count, r.models, r.iterations) for r in told] == [
+        (1, 2, 3, 4), (2, 2, 1, 10),
+    ]  # fmt: skip
+    assert told[-1].best.error == found.candidates[0].error <= told[0].best.error
+    assert str(told[0]).startswith("sizes, round 1 of 2: 3 models to iteration 4, ")
 
 
 def test_numbers_are_those_of_the_models(single: SizeSearch):
@@ -111,7 +145,7 @@ def test_numbers_are_those_of_the_models(single: SizeSearch):
     linear = (record.y - bla.simulate(record))[record.skip :] / record.y.std()
     assert found.counts.sum() == record.samples - record.skip
     for candidate in found.candidates:
-        model = initialise(bla, train, **candidate.sizes)
+        model = initialise(bla, train, **candidate.sizes, seed=candidate.seed)
         assert candidate.parameters == model.parameter_count
         assert candidate.parameters_net == model.net_parameter_count
         mean = candidate.squares.sum() / found.counts.sum()
@@ -128,23 +162,25 @@ def test_table_marks_the_chosen_and_rises_in_parameters(
 ):
     found = single
     lines = found.table().splitlines()
-    assert lines[0].split()[:5] == ["nz", "nw", "nn", "parameters", "net"]
+    assert lines[0].split()[:6] == ["nz", "nw", "nn", "iterations", "parameters", "net"]
     rows = [line.split() for line in lines[2:-2]]
-    net = [int(row[4]) for row in rows]
+    net = [int(row[5]) for row in rows]
     assert net == sorted(net)
+    assert len(net) == 5  # those of the last round
     assert [row[:3] for row in rows if row[-1] == "chosen"] == [["1", "1", "3"]]
     assert found.notes == ()
     entries = found.entries()
     assert json.loads(json.dumps(entries)) == entries
     assert [e["nn"] for e in entries if e["chosen"]] == [3]
+    assert {e["seed"] for e in entries} == {0}
     assert min(e["standard_errors_above"] for e in entries) == 0.0
 
 
 def test_degree_takes_the_place_of_neurons():
     planted = plant(1, 1)
-    options: dict[str, Any] = {"nz": 1, "nw": 1, "degree": (1, 3), "seeds": (0,)}
+    options: dict[str, Any] = {"nz": 1, "nw": 1, "degree": (1, 3)}
     found = search(planted, start=partial(polynomial, planted), linear=None, **options)
-    assert [c.sizes["degree"] for c in found.candidates] == [3, 1]
+    assert {c.sizes["degree"] for c in found.candidates} == {1, 3}
     assert found.chosen.sizes == {"nz": 1, "nw": 1, "degree": 3}
     assert math.isnan(found.chosen.ratio)  # no linear model to compare with
     assert "linear" not in str(found.chosen)
@@ -158,7 +194,7 @@ def tried(net: int, mean: float, error: float) -> Candidate:
     """A model whose squared errors in the blocks have this mean and standard error."""
     ramp = np.linspace(-1.0, 1.0, BLOCKS)
     squares = mean + error * math.sqrt(BLOCKS) * ramp / ramp.std(ddof=1)
-    return Candidate({"nn": net}, net, net, 0.0, math.sqrt(mean), 0.0, math.nan, squares)
+    return Candidate({"nn": net}, 0, 1, 1, net, net, 0.0, math.sqrt(mean), 0.0, math.nan, squares)
 
 
 @pytest.mark.parametrize(
@@ -188,13 +224,11 @@ def test_a_candidate_that_diverges_is_listed_and_loses():
                 model.lfr.cell.A.copy_(10.0 * torch.eye(2))
         return model
 
-    options: Any = {"start": start, "nz": 1, "nw": 1, "seeds": (0,)}
-    lines: list[str] = []
-    found = search(plant(1, 1), nn=(2, 3), watch=lambda each: lines.append(str(each)), **options)
+    options: Any = {"start": start, "nz": 1, "nw": 1}
+    found = search(plant(1, 1), nn=(2, 3), **options)
     assert [math.isinf(c.error) for c in found.candidates] == [False, True]
     assert found.chosen.sizes["nn"] == 3
-    assert "diverges" in lines[1]
-    assert [line.split()[-1] for line in found.table().splitlines()[2:4]] == ["diverges", "chosen"]
+    assert str(found.candidates[1]) == "nz 1, nw 1, nn 2: diverges"
     with pytest.raises(ValueError, match="all models that were tried diverge on the validation"):
         search(plant(1, 1), nn=2, **options)
 
@@ -210,11 +244,12 @@ def test_a_model_that_explodes_on_validation_diverges():
         return model
 
     louder = Record(1e3 * record.u, 1e3 * record.y, skip=20)
-    options: Any = {"nz": 1, "nw": 1, "degree": (2, 3), "seeds": (0,)}
+    options: Any = {"nz": 1, "nw": 1, "degree": (2, 3)}
     options |= {"start": start, "trainer": LevenbergMarquardt(max_iter=0)}
     found = search((train, [louder], bla), **options)
-    tried = [(c.sizes["degree"], math.isinf(c.error)) for c in found.candidates]
-    assert tried == [(3, True), (2, False)]
+    assert {c.sizes["degree"]: math.isinf(c.error) for c in found.candidates} == {3: True, 2: False}
+    marks = {line.split()[2]: line.split()[-1] for line in found.table().splitlines()[2:4]}
+    assert marks == {"2": "chosen", "3": "diverges"}
     assert found.chosen.sizes["degree"] == 2
 
 
@@ -245,7 +280,7 @@ def test_the_first_process_decides():
         def first(self, part: torch.Tensor) -> torch.Tensor:
             return torch.ones_like(part) if part.numel() == BLOCKS else part
 
-    found = search(plant(2, 1), nw=1, nn=3, seeds=(0,), ranks=Other())
+    found = search(plant(2, 1), nz=(1, 2), nw=1, nn=3, ranks=Other())
     assert found.above.tolist() == [0.0, 0.0]
     assert found.chosen.sizes == {"nz": 1, "nw": 1, "nn": 3}
 
@@ -258,6 +293,7 @@ def test_the_first_process_decides():
         ({"nn": []}, "nn is empty"),
         ({"nw": "many"}, "nw is 'many'"),
         ({"seeds": ()}, "seeds is empty"),
+        ({"finalists": 0}, "finalists is 0"),
     ],
 )
 def test_bad_calls_are_refused(options: dict[str, Any], message: str):

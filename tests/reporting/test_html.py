@@ -156,11 +156,14 @@ def test_page_has_the_numbers_and_no_address_outside(single: Run):
 
 
 def test_sizes_that_were_tried(single: Run):
-    entry = {"nz": 1, "nw": 1, "parameters": 25, "parameters_net": 19, "seconds": 2.0}
+    entry = {"nz": 1, "nw": 1, "rounds": 3, "iterations": 75, "parameters": 25}
+    entry |= {"parameters_net": 19, "seconds": 2.0}
     entry |= {"error": 0.02, "error_std": 0.001, "ratio": 0.5, "standard_errors_above": 0.0}
     large = entry | {"nn": 9, "parameters_net": 37, "chosen": False}
-    page = single.page(search=[large, entry | {"nn": 3, "chosen": True, "error": 0.03}])
-    assert "1 1 3 25 19 2.00 0.0300 0.00100 0.500 0 chosen 1 1 9 25 37 2.00 0.0200" in page.text
+    left = large | {"nn": 30, "rounds": 2, "iterations": 25}
+    page = single.page(search=[large, left, entry | {"nn": 3, "chosen": True, "error": 0.03}])
+    assert "1 1 3 75 25 19 2.00 0.0300 0.00100 0.500 0 chosen 1 1 9 75 25 37 2.00" in page.text
+    assert "3 models were tried; the table has the chosen one and the last round." in page.text
     assert "Sizes" not in single.page().text
 
 
