@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from difflib import get_close_matches
+from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -77,6 +78,10 @@ def parsed(word: str) -> Override:
     try:
         return OverridesParser.create().parse_override(quoted(word))
     except HydraException:
+        path = Path(word)
+        if path.is_dir() or path.is_file():
+            name = "checkpoint=" if path.is_dir() else "data=file data.path="
+            raise InputError(f"'{word}' has no name; did you mean {name}{word}?") from None
         raise InputError(
             f"'{word}' is not understood; write NAME=VALUE, and quotes around the word if a space, "
             "a comma or a bracket stands in its value: \"NAME='VALUE'\"."

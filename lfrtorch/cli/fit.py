@@ -53,6 +53,7 @@ from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
+from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.run_files import write
@@ -72,7 +73,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
         ProcessLostError, TerminatedError: the fit ended early, and what it had found is written.
     """
     ranks = Ranks() if ranks is None else ranks
-    cfg = chosen_before(cfg, folder)
+    asked, cfg = cfg, chosen_before(cfg, folder)
     settings = configured(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
@@ -92,7 +93,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             number = stop.asked or signal.SIGINT
             raise TerminatedError(f"{stopped}: nothing to keep", number) from None
         if files is not None:
-            found = in_words(found, cfg)
+            found = in_words(replace(found, advice=unsearched(found.advice, asked)), cfg)
             print(found)
             config = OmegaConf.to_yaml(files.cfg, resolve=True)
             write(
@@ -118,6 +119,16 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
         print(go_on(folder))
     judged = found.metrics["validation"]["rmse"]
     return found.fit.history[found.fit.chosen_iteration].train if judged is None else judged
+
+
+def unsearched(advice: Sequence[Advice], asked: DictConfig) -> list[Advice]:
+    """Without advice to search for sizes that were: a run that goes on has them from before."""
+
+    def is_open(item: Advice) -> bool:
+        sizes = [name for name, value in (item.change or {}).items() if value == "auto"]
+        return not sizes or any(asked[name] != "auto" for name in sizes)
+
+    return [item for item in advice if is_open(item)]
 
 
 def in_words(found: Run, cfg: DictConfig) -> Run:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import glob
+import re
 import sys
 import textwrap
 from collections import Counter
@@ -63,15 +64,19 @@ USES = {
 }
 """Options by the words that other commands have for them."""
 
+SETTING = re.compile(r"[a-z_.]+=")
+"""What a word NAME=VALUE begins with."""
+
 
 def launch(words: Sequence[str] | None = None) -> None:
     """The command line."""
     given = sys.argv[1:] if words is None else words
-    data = [word for word in given if word.startswith("data.") and "=" in word]
-    options = parser().parse_args([w for w in given if w not in (*data, "data=file")])
+    data = [word for word in given if SETTING.match(word) and not Path(word).exists()]
+    options = parser().parse_args([word for word in given if word not in data])
     with user_errors():
         for word in data:
-            take(word, options)
+            if word != "data=file":
+                take(word, options)
         if not options.paths:
             raise InputError("no file is named; give its path, or data.path=FILE.")
         if options.fs is not None:

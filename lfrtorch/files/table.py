@@ -117,8 +117,8 @@ class Table(ABC):
             or not all(isinstance(w, str | int) and not isinstance(w, bool) for w in listed)
         ):
             raise InputError(
-                f"{option} is {wanted!r}; give names of columns or their numbers from 0. "
-                f"'{self.path}' has {self.listed}."
+                f"{option} is {wanted!r}; give {option}=[...], names of columns or their numbers "
+                f"from 0. '{self.path}' has {self.listed}."
             )
         return tuple(column for one in listed for column in self._find(one, option))
 

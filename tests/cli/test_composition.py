@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 
 from lfrtorch import InputError
@@ -48,6 +51,14 @@ def test_an_unknown_word_is_refused_in_one_line(command: str, words: list[str], 
     assert message in text
     assert "\n" not in text
     assert "HYDRA_FULL_ERROR" not in text
+
+
+def test_a_path_without_a_name_gets_one(tmp_path: Path):
+    file = tmp_path / "x.csv"
+    file.touch()
+    for path, meant in ((file, "data=file data.path="), (tmp_path, "checkpoint=")):
+        with pytest.raises(InputError, match=re.escape(f"did you mean {meant}{path}?")):
+            check_words("evaluate", [str(path)])
 
 
 @pytest.mark.parametrize(

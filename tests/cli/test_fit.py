@@ -38,6 +38,7 @@ from lfrtorch import InputError
 from lfrtorch.cli import config, errors, fit, interrupts, run_folder, words
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
+from lfrtorch.reporting.advice import Advice
 
 
 @pytest.fixture
@@ -428,6 +429,16 @@ def test_resume_takes_the_settings_of_the_run(tmp_path: Path):
     assert found[:-1] == ["+bench=boucwen", "trainer.max_iter=60", *given]
     parser = OverridesParser.create()
     assert parser.parse_override(found[-1]).value() == str(saved)
+
+
+def test_a_run_that_goes_on_has_searched_its_sizes():
+    search = Advice("Let validation choose.", "", {"nx": "auto", "nn": "auto"})
+    other = Advice("Try several starts.", "", {"starts": 8})
+    for asked, left in (
+        (["nx=auto", "nn=auto"], [other]),
+        (["nx=auto"], [search, other]),
+    ):
+        assert fit.unsearched([search, other], configuration(*asked)) == left
 
 
 def test_resume_needs_a_run(tmp_path: Path):

@@ -241,6 +241,7 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
     assert "Füllstand" in run(f"data.path=[{other}]", "data.outputs=[Füllstand (a)]")
     for word, message in (
         ("data.start=zero", "preview does not read data.start; it takes data.path, data.inputs"),
+        ("nx=2", "preview does not read nx; it takes"),
         ("data.inputs=a,b", "for several values write data.inputs=[a,b]."),
         (f"data.path={file}", "data.path is given twice"),
         ("data.inputs=[a", "is not understood"),

@@ -624,7 +624,7 @@ def test_find(tmp_path):
     refused(table, 3, "no column number 3.*3 column")
     refused(table, -1, "no column number -1")
     for nothing in ([], None, [1.5], True, [True]):
-        refused(table, nothing, "inputs is .*give names of columns or their numbers.*'v'")
+        refused(table, nothing, r"inputs is .*give inputs=\[...\], names of columns.*'v'")
 
 
 def test_a_name_that_is_nearly_right(tmp_path):
