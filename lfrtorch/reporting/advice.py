@@ -17,15 +17,13 @@ from lfrtorch.reporting.diagnosis import (
     NONLINEAR,
     OVERFIT,
     SOUND,
+    UNEXPLAINED,
     USELESS,
     Evidence,
 )
 
 BEYOND_NOISE = 1.5
 """Training error over the noise from which on the model's own share is above the noise."""
-
-UNEXPLAINED = 0.7
-"""Training error from which on half of the outputs' power has no explanation."""
 
 TRANSIENT = 3.0
 """Error in the first twentieth of the scored samples over that in the rest."""
@@ -69,12 +67,12 @@ class Advice(NamedTuple):
 def advise(evidence: Evidence) -> list[Advice]:
     """All that the numbers suggest, the most useful first.
 
-    At the noise there is no advice on how to make the model larger or the search longer.
+    At the noise, and where the inputs explain little, there is no advice on sizes and search.
     """
     return [
         found
         for rule in RULES
-        if not (evidence.noise_limited and rule in WHERE_NOT_NOISE)
+        if not ((evidence.noise_limited or evidence.unexplained) and rule in ON_THE_MODEL)
         and (found := rule(evidence)) is not None
     ]
 
@@ -132,13 +130,13 @@ def neither_usable(e: Evidence) -> Advice | None:
     if not e.neither or e.diverged or e.train is None or not e.linear_train:
         return None
     evidence = f"training error {percent(e.train)}, of the linear model {percent(e.linear_train)}"
-    if min(e.train, e.linear_train) > UNEXPLAINED:
+    if e.unexplained:
         return Advice(
             "The inputs explain little of the outputs: look at the columns, delays and units, and "
             "for other inputs (lfrtorch preview).",
             evidence,
         )
-    if e.parts_differ:  # said there
+    if e.parts_differ or e.train > UNEXPLAINED:  # said there, or not even that
         return None
     return Advice(
         "The models hold in training alone: the other parts are unlike, too short or at rest, or "
@@ -396,7 +394,7 @@ RULES = (
 )
 """All of them, the most useful first."""
 
-WHERE_NOT_NOISE = (
+ON_THE_MODEL = (
     still_falling,
     overfits,
     linear_part_incomplete,

@@ -60,6 +60,9 @@ BY_CHANCE = 0.01
 USELESS = 0.9
 """Error over the linear model's from which on the NL-LFR is hardly better."""
 
+UNEXPLAINED = 0.7
+"""Training error from which on half of the outputs' power has no explanation."""
+
 LINEAR = 0.25
 """Part of the error's power that is linear in the inputs: 0.48 of Bouc-Wen at an order one too low,
 0.01 at the right one; 0.97 and 0.08 of Silverbox."""
@@ -177,6 +180,13 @@ class Evidence:
     def useless(self) -> bool:
         """Whether the NL-LFR is hardly better than the linear model."""
         return self.gain is not None and self.gain > USELESS
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether neither model explains the training outputs, nor would one of more states."""
+        if not self.neither or self.train is None or not self.linear_train:
+            return False
+        return min(self.train, self.linear_train) > UNEXPLAINED and not self.states_missing
 
     @property
     def lost_on_tests(self) -> bool:

@@ -223,7 +223,14 @@ def test_no_system_is_called_linear_where_neither_model_is_usable():
     useless = replace(useless, noise=None, verdict=UNUSABLE)
     texts = [item.text for item in advise(useless)]
     assert texts[0].startswith("The inputs explain little")
-    assert not any("linear at this level" in text for text in texts)
+    assert [text.partition(":")[0] for text in texts[1:]] == [
+        "It is unknown whether the remaining error is noise"
+    ]
+    usable = replace(useless, started=1, searched=False)
+    assert advise(usable) == advise(useless)
+    assert len(advise(replace(usable, verdict=verdict(Kind.LINEAR)))) > 2
+    first, *_ = advise(replace(usable, linear=0.5))
+    assert first.text.startswith("The linear part is incomplete")
 
 
 def test_a_gain_that_the_tests_have_not_asks_for_no_larger_map():
