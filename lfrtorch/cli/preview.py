@@ -19,7 +19,7 @@ from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.types import Array
+from lfrtorch._support.types import Array, Integers
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import parsed
 from lfrtorch.cli.errors import user_errors
@@ -54,6 +54,15 @@ class Roles(NamedTuple):
     outputs: tuple[int, ...]
     time: int | None
 
+
+class Gaps(NamedTuple):
+    """Samples that follow a gap in the times, and how many are missing in each."""
+
+    first: Integers
+    missing: Integers
+
+
+NO_GAPS = Gaps(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 USES = {
     "data.path": "paths",
@@ -141,12 +150,12 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
     roles, remarks = chosen(table, options)
     wanted = [*roles.inputs, *roles.outputs]
     signals, more = read(table, wanted if roles.time is None else [*wanted, roles.time])
-    fs, sentences = options.fs, []
+    fs, sentences, gaps = options.fs, [], NO_GAPS
     for name, said in table.rates.items():
         remarks.append(f"{name!r} says {said:.6g} Hz")
         fs = said if fs is None else fs
     if roles.time is not None:
-        fs, remark, sentences = clock(signals[:, -1], table.columns[roles.time], fs)
+        fs, remark, sentences, gaps = clock(signals[:, -1], table.columns[roles.time], fs)
         remarks.append(remark)
         signals = signals[:, :-1]
     if more:
@@ -180,7 +189,7 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
     if not sentences:
         print("Nothing found that would hurt a model.")
     with whole_file(figure) as fresh:
-        survey_figure(found, signals, path.name).savefig(fresh, dpi=110)
+        survey_figure(found, spread(signals, gaps), path.name).savefig(fresh, dpi=110)
     print(f"\nFigure in {figure}\n")
 
 
@@ -248,17 +257,26 @@ def clocks(table: Table, heads: Mapping[int, Array]) -> tuple[int, ...]:
     return tuple(i for *_, i in sorted(ranked))
 
 
-def clock(times: Array, channel: Channel, fs: float | None) -> tuple[float | None, str, list[str]]:
-    """The sampling frequency, what a column of times was taken for, and what is wrong with it."""
+def spread(signals: Array, gaps: Gaps) -> Array:
+    """Signals (T, n) with NaN for the samples that are missing, unless these are too many."""
+    if gaps.missing.sum() > LARGEST:
+        return signals
+    return np.insert(signals, np.repeat(gaps.first, gaps.missing), np.nan, axis=0)
+
+
+def clock(
+    times: Array, channel: Channel, fs: float | None
+) -> tuple[float | None, str, list[str], Gaps]:
+    """The sampling frequency, what a column of times was taken for, what is wrong, and its gaps."""
     name = f"'{channel.name}'"
     try:
         grid = sampling(in_seconds(filled(times), channel))
     except UnevenError as error:
         said = f"the time column {name} {error}; resample the signals to an even grid."
-        return fs, f"{name} is taken for the time", [said]
+        return fs, f"{name} is taken for the time", [said], NO_GAPS
     if grid.fs == 1 and not is_time(channel):
-        return fs, f"{name} is taken for sample numbers", []
-    sentences = []
+        return fs, f"{name} is taken for sample numbers", [], NO_GAPS
+    sentences, gaps = [], Gaps(grid.gaps, grid.missing)
     if grid.gaps.size:
         sentences.append(
             f"the times in {name} have {grid.gaps.size} gap(s) of {grid.missing.sum()} sample(s) "
@@ -267,13 +285,13 @@ def clock(times: Array, channel: Channel, fs: float | None) -> tuple[float | Non
         )
     remark = f"{name} is taken for the time, {grid.fs:.6g} Hz"
     if fs is None or abs(fs / grid.fs - 1) < max(RATE, grid.uncertainty):
-        return fs or grid.fs, remark, sentences
+        return fs or grid.fs, remark, sentences, gaps
     unit = next((u for f, u in THOUSANDS.items() if abs(fs / grid.fs / f - 1) < RATE), None)
     sentences.append(
         f"fs looks like {grid.fs:.6g} Hz, not {fs:g}, by the times in {name}"
         + (f", unless they are in {unit}." if unit else "; correct one of them.")
     )
-    return fs, remark, sentences
+    return fs, remark, sentences, gaps
 
 
 def filled(times: Array) -> Array:

@@ -167,6 +167,12 @@ def test_sample_numbers_and_uneven_times(tmp_path: Path, signals, run, monkeypat
     assert "- the time column 'force' does not rise" in out
 
 
+def test_gaps_in_time_are_drawn():
+    gaps = preview.Gaps(np.array([2, 3]), np.array([1, 2]))
+    drawn = preview.spread(np.arange(4.0)[:, None], gaps)[:, 0]
+    assert np.array_equal(np.flatnonzero(np.isnan(drawn)), [2, 4, 5])
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_several_files_and_patterns(file: Path, signals, run):
     savemat(file.parent / "other.mat", {"force": signals["force"], "level": signals["force"]})
