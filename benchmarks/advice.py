@@ -59,8 +59,8 @@ ONLY = {"largest": "Overfit", "tested": "The gain on"}
 """What is followed after these fits, which are there for that: how this advice begins."""
 
 SEARCHED = 10
-"""Iterations of a model if validation chooses the sizes, which is followed after the small fits and
-those that overfit alone."""
+"""Iterations of a model if validation chooses the sizes, which is followed after the small fits
+alone."""
 
 Signals = tuple[Array, Array, int]
 """Input, output, and the period or 0."""
@@ -147,7 +147,11 @@ CASES: dict[str, Callable[[Path], Signals]] = {
 
 HELD_OUT = "Overfitting would not show"
 OTHER_PARTS = "The validation part is unlike", "The models hold in training alone", "The gain on"
-NO_MORE = "Noise-limited", "The system is linear at this level", "The inputs explain little"
+NO_MORE = (
+    "Noise-limited",
+    "The system is linear at this level",
+    "The inputs explain little of the outputs",
+)
 """Advice that says not to go on."""
 
 
@@ -205,8 +209,7 @@ def attempts(case: str, base: str, root: Path) -> list[dict[str, Any]]:
     for item in run.advice:
         clock = time.perf_counter()
         changed = None
-        costly = base in ("large", "unvalidated") and searches(item)
-        if item.text.startswith(ONLY.get(base, "")) and not costly:
+        if item.text.startswith(ONLY.get(base, "")) and (base == "small" or not searches(item)):
             changed = followed(item, case, asked, data, root)
         after = None
         if changed is not None:

@@ -201,14 +201,6 @@ def overfits(e: Evidence) -> Advice | None:
     else:
         return None
     change: dict[str, Any] = {}
-    if not e.searched and not e.continued:
-        change = _sizes_by_validation(e)
-        return Advice(
-            f"Overfit: let validation choose the sizes, Settings({_written(change)}), or take "
-            "more data.",
-            evidence,
-            change,
-        )
     if e.sizes.get("degree"):
         change = {"degree": max(2, e.sizes["degree"] - 1)}
     elif e.sizes.get("nn", 0) > 1:
@@ -349,9 +341,10 @@ def largest_sizes(e: Evidence) -> Advice | None:
 
 def choose_sizes(e: Evidence) -> Advice | None:
     """Sizes that were guessed, and validation records that can choose them."""
-    if e.searched or e.continued or e.validation is None or e.parts_differ or overfits(e):
+    if e.searched or e.continued or e.validation is None or e.parts_differ:
         return None
-    change = _sizes_by_validation(e)
+    static = "degree" if e.sizes.get("degree") else "nn"
+    change: dict[str, Any] = dict.fromkeys(["nx", "nz", "nw", static], "auto")
     return Advice(
         f"Let validation choose the sizes: Settings({_written(change)}).",
         "the sizes were given",
@@ -414,12 +407,6 @@ def _larger(e: Evidence) -> dict[str, int]:
     if e.sizes.get("degree"):
         return {"degree": e.sizes["degree"] + 2, **sizes}
     return {"nn": 2 * e.sizes["nn"], **sizes} if e.sizes.get("nn") else sizes
-
-
-def _sizes_by_validation(e: Evidence) -> dict[str, str]:
-    """All sizes searched."""
-    static = "degree" if e.sizes.get("degree") else "nn"
-    return dict.fromkeys(["nx", "nz", "nw", static], "auto")
 
 
 def _written(change: Mapping[str, Any]) -> str:

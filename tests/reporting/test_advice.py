@@ -66,7 +66,6 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
             "trainer=Adam(max_iter=400)",
         ),
         (advice.overfits, {"validation": 0.05}, "nn=5, or more data"),
-        (advice.overfits, {"validation": 0.05, "searched": False}, "nn='auto'), or take more data"),
         (advice.overfits, OVERTRAINED, "nn=5, or more data"),
         (advice.linear_part_incomplete, {"linear": 0.5}, "nx=4, nx=5 or nx='auto'"),
         (
@@ -165,7 +164,6 @@ def test_where_training_goes_on_with_noise_nothing_larger_is_advised():
         items = advise(replace(fit, **OVERTRAINED))
         assert sum(item.text.startswith("Overfit") for item in items) == 1
         assert not any(str(item).startswith(larger) for item in items)
-        assert sum("auto" in item.text for item in items) <= 1
     for other in (
         {"samples": 4000},  # enough for the parameters
         {"risen": 1.01},  # the search has come to rest
