@@ -43,6 +43,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 TESTS: dict[str, str] = {
     "records": "records stream",
+    "engine/feedback_recurrence": "engine/feedback_recurrence engine/sensitivity",
     "engine/linear_recurrence": "engine/linear_recurrence engine/newton engine/sensitivity",
     "engine/newton": "engine/newton",
     "engine/simulation": "engine/simulation model engine/newton engine/nonlinearity",

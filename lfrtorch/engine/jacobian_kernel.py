@@ -49,20 +49,16 @@ def jacobian_rows(
     d_w = np.zeros((nw, n_weights), rows.dtype)
     # S(k+1) = M(k) X(k) and dy(k) = N(k) X(k) with X = [S; direct terms of w], M = [F Bw] and
     # N = [H Dyw], padded with zeros to whole tiles.
-    depth = _TILE * (-(-(nx + nw) // _TILE))
-    M, N = (
-        np.zeros((_TILE * (-(-nx // _TILE)), depth), rows.dtype),
-        np.zeros((ny, depth), rows.dtype),
-    )
-    _copy(Bw, M, nx)
-    _copy(Dyw, N, nx)
-    X, X_next = np.zeros((depth, c1 - c0), rows.dtype), np.zeros((depth, c1 - c0), rows.dtype)
+    M, X, X_next = tiled(nx, nw, c1 - c0, rows.dtype)
+    N = np.zeros((ny, M.shape[1]), rows.dtype)
+    copy_to(Bw, M, nx)
+    copy_to(Dyw, N, nx)
     for i in range(nx):
         for c in range(c1 - c0):
             X[i, c] = S[i, c0 + c]
     for k in range(B):
-        _add_slope(A, M, J, k, Cz)
-        _add_slope(Cy, N, J, k, Cz)
+        add_slope(A, M, J, k, Cz)
+        add_slope(Cy, N, J, k, Cz)
         for q in range(nw):
             for n in range(len(z_own)):
                 X[nx + q, z_own[n, 0]] = J[k, q, z_own[n, 1]] * v[k, z_own[n, 2]]
@@ -75,7 +71,7 @@ def jacobian_rows(
             else:
                 for c in range(s0, s1):
                     X[nx + q, c - c0] = by_weight[k, q, c - first]
-        _state_rows(M, X, X_next)
+        state_rows(M, X, X_next)
         _output_rows(N, X, rows, k, c0)
         for n in range(len(x_own)):
             X_next[x_own[n, 1], x_own[n, 0]] += v[k, x_own[n, 2]]
@@ -96,9 +92,17 @@ def jacobian_rows(
 _TILE = 4
 
 
+@njit(nogil=True)
+def tiled(nx, nw, columns, dtype):
+    """M of nx rows and X, X_next of nx + nw, all zero and padded to whole tiles."""
+    depth = _TILE * (-(-(nx + nw) // _TILE))
+    M = np.zeros((_TILE * (-(-nx // _TILE)), depth), dtype)
+    return M, np.zeros((depth, columns), dtype), np.zeros((depth, columns), dtype)
+
+
 # Loops for assignments of slices and masks: the latter take numba seconds to compile.
 @njit(nogil=True)
-def _copy(source, target, column):
+def copy_to(source, target, column):
     """target[:, column:] = source."""
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
@@ -120,7 +124,7 @@ def _by_weight(Ww, slope, h, z, k, q, d_w, first):
 
 
 @njit(nogil=True, inline="always")
-def _add_slope(constant, M, J, k, Cz):
+def add_slope(constant, M, J, k, Cz):
     """M[:, :nx] = constant + M[:, nx:] J(k) Cz."""
     n, nx = constant.shape
     for i in range(n):
@@ -147,7 +151,7 @@ def _between(entries, c0, c1):
 
 
 @njit(nogil=True, fastmath={"contract"})
-def _state_rows(M, X, out):
+def state_rows(M, X, out):
     """out[:len(M)] = M @ X, tile by tile: 16 coefficients stay in registers."""
     for i in range(0, len(M), 4):
         ya, yb, yc, yd = out[i], out[i + 1], out[i + 2], out[i + 3]

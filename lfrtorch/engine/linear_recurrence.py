@@ -73,7 +73,7 @@ def _recur(r, F, g, s):
                     a += F[r, k, i, j] * s[r, k, j, c]
                 s[r, k + 1, i, c] = a
         if k % 256 == 255:
-            _flush(s[r, k + 1])
+            flush(s[r, k + 1])
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -87,11 +87,11 @@ def _recur_back(r, F, g, s):
                     a += F[r, k, j, i] * s[r, k + 1, j, c]
                 s[r, k, i, c] = a
         if k % 256 == 255:
-            _flush(s[r, k])
+            flush(s[r, k])
 
 
 @njit(nogil=True)
-def _flush(s):
+def flush(s):
     """A fading state would reach denormal numbers, a hundred times slower, and stay there."""
     for i in range(s.shape[0]):
         for c in range(s.shape[1]):

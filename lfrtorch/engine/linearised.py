@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -9,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.static_jacobian import linearise_static
 
 PASS = 1 << 14
@@ -30,7 +30,7 @@ def linearise(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Linearised:
     return linearise_at(weights, linearise_static(cell.static, z, of_static(weights)).J)
 
 
-def linearise_at(weights: dict[str, Tensor], J: Float[Tensor, "R T nw nz"]) -> Linearised:
+def linearise_at(weights: Mapping[str, Tensor], J: Float[Tensor, "R T nw nz"]) -> Linearised:
     """F = A + Bw J Cz and H = Cy + Dyw J Cz, with J = ∂w/∂z.
 
     Both are linear in J: its entries times one constant matrix give [F; H]. That is one large
@@ -60,12 +60,3 @@ def spectral_radius(matrices: Float[Tensor, "*axes n n"]) -> Float[Tensor, "*axe
     finite = torch.isfinite(matrices).all(dim=-1).all(dim=-1)
     radii = torch.linalg.eigvals(torch.where(finite[..., None, None], matrices, 0.0)).abs().amax(-1)
     return torch.where(finite, radii, torch.nan)
-
-
-def monodromy(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx nx"]:
-    """Transition matrix over a whole record: the product of all F(k)."""
-    Phi = torch.eye(cell.nx).to(z).expand(len(z), cell.nx, cell.nx)
-    for part in z.split(max(1, PASS // len(z)), dim=1):
-        F = linearise(cell, part).F
-        Phi = linear_recurrence(F, torch.zeros_like(F), Phi)[:, -1]
-    return Phi

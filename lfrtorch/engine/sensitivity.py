@@ -33,13 +33,9 @@ from torch import Tensor
 
 from lfrtorch._support.threads import spread, workers
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.feedback_recurrence import backwards, forwards, transition
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
-from lfrtorch.engine.linear_recurrence import (
-    adjoint_recurrence,
-    has_kernels,
-    linear_recurrence,
-    to_numpy,
-)
+from lfrtorch.engine.linear_recurrence import has_kernels, linear_recurrence, to_numpy
 from lfrtorch.engine.linearised import PASS, Linearised, linearise_at, of_static
 from lfrtorch.engine.parameter_layout import DirectTerms, layout
 from lfrtorch.engine.simulation import Trajectory
@@ -183,28 +179,26 @@ class Linearisation:
         self, d_theta: Float[Tensor, "*records P"], d_x0: Float[Tensor, "R nx"] | None = None
     ) -> Float[Tensor, "R T ny"]:
         """dy of a change dθ and of the initial state."""
+        start = self.state if d_x0 is None else d_x0
+        if self.periodic:
+            *_, (_, end) = self._changes(d_theta, start)
+            Phi, _ = self._transition
+            start = fixed_point(Phi, end.unsqueeze(-1)).squeeze(-1)
+        return torch.cat([d_y for d_y, _ in self._changes(d_theta, start)], dim=1)
+
+    def _changes(
+        self, d_theta: Float[Tensor, "*records P"], s: Float[Tensor, "R nx"]
+    ) -> Iterator[tuple[Float[Tensor, "R _ ny"], Float[Tensor, "R nx"]]]:
+        """Changes of the outputs in each block, and of the state after it."""
         d_x, d_z, d_y, d_static = self.layout.matrices(d_theta)
-        Bw, Dyw = self.weights["Bw"], self.weights["Dyw"]
-        R, nx = self.state.shape
-        s = (self.state if d_x0 is None else d_x0).unsqueeze(-1)
-        if self.periodic:  # a first column for dθ, then one for each initial state
-            s = torch.cat([s, torch.eye(nx).to(s).expand(R, nx, nx)], dim=-1)
-        outputs = []
+        W = self.weights
         for block in self._blocks():
-            d_w = _apply(block.static.J, block.v @ d_z.mT) + block.static.tangent(d_static)
-            g = d_w.new_zeros(*d_w.shape[:2], nx, s.shape[-1])
-            # Only dθ drives the recurrence; the other columns are the response to an initial state.
-            g[..., 0] = block.v @ d_x.mT + d_w @ Bw.mT
-            states = linear_recurrence(block.linearised.F, g, s)
-            s = states[:, -1]
-            d_out = (block.linearised.H.unsqueeze(-1) * states[:, :-1].unsqueeze(2)).sum(3)
-            d_out[..., 0] += block.v @ d_y.mT + d_w @ Dyw.mT
-            outputs.append(d_out)
-        d_out = torch.cat(outputs, dim=1)
-        if not self.periodic:
-            return d_out.squeeze(-1)
-        d_initial = fixed_point(s[..., 1:], s[..., :1])
-        return d_out[..., 0] + (d_out[..., 1:] @ d_initial.unsqueeze(1)).squeeze(-1)
+            J, v = block.static.J, block.v
+            d_w = _apply(J, v @ d_z.mT) + block.static.tangent(d_static)
+            states = forwards(W, J, v @ d_x.mT + d_w @ W["Bw"].mT, s)
+            s, states = states[:, -1], states[:, :-1]
+            d_w += _apply(J, states @ W["Cz"].mT)
+            yield states @ W["Cy"].mT + v @ d_y.mT + d_w @ W["Dyw"].mT, s
 
     @torch.no_grad()
     def adjoint(self, e: Float[Tensor, "R T ny"]) -> Adjoint:
@@ -231,29 +225,33 @@ class Linearisation:
         λ(0) is what a change of the initial state does to the outputs. It needs the samples up to
         where that change has faded, and no more.
         """
-        Phi, blocks = torch.eye(self.state.shape[1]).to(self.state).expand(len(e), -1, -1), []
-        for block in self._blocks():
-            blocks.append(block.time)
-            F = block.linearised.F
-            Phi = linear_recurrence(F, torch.zeros_like(F), Phi)[:, -1]
-            if Phi.abs().amax() < FADED:
-                break
+        Phi, times = self._transition
         end = self.state
-        for time in reversed(blocks):
+        for time in reversed(times):
             block = self._whole or self._block(slice(0, len(e)), time)
             end = self._costates(block, e, end)[:, 0]
         return fixed_point(Phi.mT, end.unsqueeze(-1)).squeeze(-1)
+
+    @cached_property
+    def _transition(self) -> tuple[Float[Tensor, "R nx nx"], list[slice]]:
+        """The product of all F(k), and the blocks that an initial state takes to fade."""
+        R, nx = self.state.shape
+        Phi, times = torch.eye(nx).to(self.state).expand(R, nx, nx), []
+        for block in self._blocks():
+            times.append(block.time)
+            Phi = transition(self.weights, block.static.J, Phi)
+            if Phi.abs().amax() < FADED:
+                break
+        return Phi, times
 
     def _costates(
         self, block: _Block, e: Float[Tensor, "R T ny"], end: Float[Tensor, "R nx"]
     ) -> Float[Tensor, "R _ nx"]:
         """λ(k) = F(k)ᵀ λ(k+1) + H(k)ᵀ e(k) in a block, from λ at its end."""
-        Dyw, Cz = self.weights["Dyw"], self.weights["Cz"]
+        W, J = self.weights, block.static.J
         e = e[:, block.time]
-        g = e @ self.weights["Cy"] + _apply(block.static.J.mT, e @ Dyw) @ Cz  # Hᵀ e
-        return adjoint_recurrence(block.linearised.F, g.unsqueeze(-1), end.unsqueeze(-1)).squeeze(
-            -1
-        )
+        g = e @ W["Cy"] + _apply(J.mT, e @ W["Dyw"]) @ W["Cz"]  # Hᵀ e
+        return backwards(W, J, g, end)
 
     def _blocks(self, *, backwards: bool = False) -> Iterator[_Block]:
         """All records, block by block in time, or at once if they are few."""

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from lfrtorch._support.threads import spread
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.feedback_recurrence import monodromy
 from lfrtorch.engine.linear_recurrence import has_kernels, to_numpy
-from lfrtorch.engine.linearised import monodromy, spectral_radius
+from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.newton import newton_states
 from lfrtorch.engine.nonlinearity import is_network, is_polynomial
 from lfrtorch.engine.simulation_kernel import ACTIVATION_CODES, simulate_record

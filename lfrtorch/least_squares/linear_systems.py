@@ -207,4 +207,9 @@ def _triangularise(job: int, pieces: Sequence[Tensor], parts: list[Tensor]) -> N
 
 
 def _square(job: int, pieces: Sequence[Tensor], parts: list[Tensor]) -> None:
-    parts[job] = pieces[job].mT @ pieces[job]
+    piece = pieces[job]
+    if piece.device.type == "cpu":  # numpy computes one triangle, torch both
+        array = piece.numpy()
+        parts[job] = torch.from_numpy(array.T @ array)
+    else:
+        parts[job] = piece.mT @ piece

@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linearised import linearise, monodromy, spectral_radius
+from lfrtorch.engine.feedback_recurrence import monodromy
+from lfrtorch.engine.linearised import linearise, spectral_radius
 from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Polynomial
 from lfrtorch.engine.simulation import (
     PERIODIC_TOLERANCE,
@@ -281,7 +282,7 @@ def test_slopes_are_the_derivatives_of_one_step():
 
 @pytest.mark.parametrize("samples", [1 << 14, 3])
 def test_monodromy_is_the_product_with_the_last_step_leftmost(samples: int, monkeypatch):
-    monkeypatch.setattr("lfrtorch.engine.linearised.PASS", samples)
+    monkeypatch.setattr("lfrtorch.engine.feedback_recurrence.PASS", samples)
     cell, z = random_cell(1, 1, 3, 2, 2), normal(2, 7, 2)
     F = linearise(cell, z).F
     for r in range(2):

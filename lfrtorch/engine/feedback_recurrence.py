@@ -1,0 +1,163 @@
+"""Recurrences of the linearised model, of which no F(k) is formed: F(k) = A + Bw J(k) Cz.
+
+J(k) has nw nz entries and F(k) has nx². A step of one column costs nx (nx + nz + nw) products, and
+the memory that it passes is that of J, the drive and the states. With 20 states the products of
+``linear_recurrence`` and the F that they need took four times as long.
+
+Machine code serves the CPU; any other device forms F and goes through ``linear_recurrence``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lfrtorch._support.threads import spread
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.jacobian_kernel import add_slope, copy_to, state_rows, tiled
+from lfrtorch.engine.linear_recurrence import (
+    adjoint_recurrence,
+    flush,
+    has_kernels,
+    linear_recurrence,
+    to_numpy,
+)
+from lfrtorch.engine.linearised import PASS, linearise_at, of_static
+from lfrtorch.engine.static_jacobian import linearise_static
+
+Weights = Mapping[str, Tensor]
+
+
+def forwards(
+    weights: Weights,
+    J: Float[Tensor, "R T nw nz"],
+    g: Float[Tensor, "R T nx"],
+    s0: Float[Tensor, "R nx"],
+) -> Float[Tensor, "R T+1 nx"]:
+    """All states of s(k+1) = F(k) s(k) + g(k), s(0) = s0."""
+    if not has_kernels(J):
+        F = linearise_at(weights, J).F
+        return linear_recurrence(F, g.unsqueeze(-1), s0.unsqueeze(-1)).squeeze(-1)
+    s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
+    s[:, 0] = s0
+    spread(_forwards, len(g), *_matrices(weights), to_numpy(J), to_numpy(g), s.numpy())
+    return s
+
+
+def backwards(
+    weights: Weights,
+    J: Float[Tensor, "R T nw nz"],
+    g: Float[Tensor, "R T nx"],
+    end: Float[Tensor, "R nx"],
+) -> Float[Tensor, "R T+1 nx"]:
+    """All costates of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end."""
+    if not has_kernels(J):
+        F = linearise_at(weights, J).F
+        return adjoint_recurrence(F, g.unsqueeze(-1), end.unsqueeze(-1)).squeeze(-1)
+    s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
+    s[:, -1] = end
+    spread(_backwards, len(g), *_matrices(weights), to_numpy(J), to_numpy(g), s.numpy())
+    return s
+
+
+def transition(
+    weights: Weights, J: Float[Tensor, "R T nw nz"], Phi: Float[Tensor, "R nx m"]
+) -> Float[Tensor, "R nx m"]:
+    """F(T-1) ... F(0) Φ."""
+    if not has_kernels(J):
+        F = linearise_at(weights, J).F
+        return linear_recurrence(F, torch.zeros_like(F), Phi)[:, -1]
+    Phi = Phi.clone(memory_format=torch.contiguous_format)
+    spread(_transition, len(Phi), *_matrices(weights), to_numpy(J), Phi.numpy())
+    return Phi
+
+
+def monodromy(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx nx"]:
+    """Transition matrix over a whole record: the product of all F(k)."""
+    weights = {name: p.detach() for name, p in cell.named_parameters()}
+    Phi = torch.eye(cell.nx).to(z).expand(len(z), cell.nx, cell.nx)
+    for part in z.split(max(1, PASS // len(z)), dim=1):
+        J = linearise_static(cell.static, part, of_static(weights)).J
+        Phi = transition(weights, J, Phi)
+    return Phi
+
+
+def _matrices(weights: Weights) -> list[NDArray]:
+    """A, Bw and Cz with a leading axis: one model, or one a record."""
+    found = (weights[name] for name in ("A", "Bw", "Cz"))
+    return [to_numpy(m if m.ndim == 3 else m.unsqueeze(0)) for m in found]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _forwards(r, A, Bw, Cz, J, g, s):
+    m = min(r, len(A) - 1)  # which model
+    AT, BwT, Cz, J, g, s = A[m].T.copy(), Bw[m].T.copy(), Cz[m], J[r], g[r], s[r]
+    nw, nx = BwT.shape
+    for k in range(len(g)):
+        now, after = s[k], s[k + 1]
+        for i in range(nx):
+            after[i] = g[k, i]
+        for j in range(nx):
+            for i in range(nx):
+                after[i] += AT[j, i] * now[j]
+        for j in range(len(Cz)):
+            z = s.dtype.type(0)
+            for i in range(nx):
+                z += Cz[j, i] * now[i]
+            for q in range(nw):
+                w = J[k, q, j] * z
+                for i in range(nx):
+                    after[i] += BwT[q, i] * w
+        if k % 256 == 255:
+            flush(s[k + 1 : k + 2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _backwards(r, A, Bw, Cz, J, g, s):
+    m = min(r, len(A) - 1)
+    A, BwT, Cz, J, g, s = A[m], Bw[m].T.copy(), Cz[m], J[r], g[r], s[r]
+    nw, nx = BwT.shape
+    for k in range(len(g) - 1, -1, -1):
+        now, before = s[k + 1], s[k]
+        for i in range(nx):
+            before[i] = g[k, i]
+        for j in range(nx):
+            for i in range(nx):
+                before[i] += A[j, i] * now[j]
+        for q in range(nw):
+            w = s.dtype.type(0)
+            for i in range(nx):
+                w += BwT[q, i] * now[i]
+            for j in range(len(Cz)):
+                z = J[k, q, j] * w
+                for i in range(nx):
+                    before[i] += Cz[j, i] * z
+        if k % 256 == 255:
+            flush(s[k : k + 1])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _transition(r, A, Bw, Cz, J, Phi):
+    m = min(r, len(A) - 1)
+    A, Bw, Cz, J, Phi = A[m], Bw[m], Cz[m], J[r], Phi[r]
+    nx, columns = Phi.shape
+    # M(k) = [F(k) Bw], and zeros in the place of the drive.
+    M, X, X_next = tiled(nx, Bw.shape[1], columns, Phi.dtype)
+    copy_to(Bw, M, nx)
+    copy_to(Phi, X, 0)
+    for k in range(len(J)):
+        add_slope(A, M, J, k, Cz)
+        state_rows(M, X, X_next)
+        X, X_next = X_next, X
+        if k % 256 == 255:
+            flush(X[:nx])
+            if not X[:nx].any():
+                break
+    for i in range(nx):
+        for c in range(columns):
+            Phi[i, c] = X[i, c]
