@@ -42,6 +42,9 @@ from lfrtorch.reporting.scores import metrics
 from lfrtorch.reporting.simulations import respond
 from lfrtorch.reporting.verdict import judge
 
+SEARCHED_STARTS = 2
+"""Least number of starts of a model whose sizes were searched: the first is the search's."""
+
 SLOW_SAMPLES = 5000
 """Training samples from which a static map that is not compiled is worth a note."""
 
@@ -121,7 +124,8 @@ def _identified(
     whole, dataset = dataset, windowed(dataset, linear.to_model(), observer)
     sizes = choose_sizes(dataset, asked, linear, observer=observer, ranks=ranks, stop=stop)
     if sizes is not None:
-        settings = replace(settings, seed=sizes.chosen.seed, **sizes.chosen.sizes)
+        chosen, starts = sizes.chosen, max(SEARCHED_STARTS, asked.starts)
+        settings = replace(settings, seed=chosen.seed, starts=starts, **chosen.sizes)
         if settings.nx != linear.nx:
             observer.say(
                 f"nx: {settings.nx}, as the NL-LFR makes use of more states than the linear model"

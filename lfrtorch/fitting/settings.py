@@ -82,7 +82,7 @@ class Settings:
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
-        starts: random starts, of which the best is kept.
+        starts: random starts, of which the best is kept; at least 2 if sizes are searched.
         seed: of the first start; the others have seed + 1000, seed + 2000, ... If sizes are
             searched, the first start of the fit is the one that brought the sizes chosen.
         init_from: a model to go on from, in place of ``init``; its sizes replace those given here.

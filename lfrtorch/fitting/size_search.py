@@ -168,10 +168,15 @@ class SizeSearch:
 
     @property
     def chosen(self) -> Candidate:
-        """The one with the fewest net parameters within one standard error, or 1 %, of the best."""
+        """The one with the fewest net parameters within one standard error, or 1 %, of the best.
+
+        Or one that has fewer parameters than that one, and a smaller error.
+        """
         good = as_good([c.squares for c in self.candidates], self.counts)
         near = [c for c, enough in zip(self.candidates, good, strict=True) if enough]
-        return min(near, key=lambda c: (c.parameters_net, c.error))
+        limit = min(near, key=lambda c: (c.parameters_net, c.error)).error
+        below = [c for c in self.candidates if c.error <= limit]
+        return min(below, key=lambda c: (c.parameters_net, c.error))
 
     @property
     def largest(self) -> tuple[str, ...]:

@@ -476,7 +476,7 @@ def test_sizes_are_searched_for(csv: Path, tmp_path: Path, capsys: pytest.Captur
     saved = OmegaConf.load(tmp_path / "config.yaml")
     assert metrics["sizes"] == {n: chosen[n] for n in ("nx", "nz", "nw", "nn")}
     assert saved.seed == chosen["seed"]
-    assert saved.starts == 1
+    assert saved.starts == metrics["starts"] == 2
     assert metrics["parameters_net"] == chosen["parameters_net"]
     assert chosen["ratio"] < 0.5
     assert (saved.nz, saved.nn) == (chosen["nz"], chosen["nn"])

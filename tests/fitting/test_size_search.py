@@ -211,6 +211,12 @@ def test_the_fewest_parameters_that_do_as_well_are_chosen(mean: float, error: fl
     assert SizeSearch(models, np.ones(BLOCKS, int)).chosen.sizes == {"nn": chosen}
 
 
+def test_a_smaller_model_with_a_smaller_error_is_chosen():
+    # 20 is within one standard error of the best; 10 is not, and is better than 20.
+    models = tried(30, 1.0, 0.0), tried(20, 1.3, 0.4), tried(10, 1.2, 0.1)
+    assert SizeSearch(models, np.ones(BLOCKS, int)).chosen.sizes == {"nn": 10}
+
+
 # --- what goes wrong --------------------------------------------------------------------------
 
 
