@@ -90,7 +90,8 @@ def each_alone(
             _workers.reset(token)
 
     if min(len(items), workers()) <= 1:
-        return [alone(item) for item in items]
+        with spread_by_hand():
+            return [alone(item) for item in items]
     with spread_by_hand(), ThreadPoolExecutor(workers(), "lfrtorch-alone", _one_thread) as pool:
         begun = [pool.submit(alone, item) for item in items]
         try:

@@ -21,7 +21,7 @@ import numpy as np
 
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
-from lfrtorch.linear.bla import physical, scaled, transformation
+from lfrtorch.linear.bla import ALIKE, physical, scaled, transformation
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Matrices, Refined, Search
@@ -42,13 +42,13 @@ Window = tuple[int, int]
 MOST_PARTS = 8
 """Initial states are unknowns: of more records this many are fitted, evenly spaced."""
 
-STARTS, FIRST_STEPS, FINALISTS, MOST_STEPS = 4, 8, 2, 80
+STARTS, FIRST_STEPS, FINALISTS, MOST_STEPS = 4, 4, 2, 80
 """Starts that are refined, iterations after which the best few go on, and their last one."""
 
-NEAR_STEPS = 24
+NEAR_STEPS = 12
 """The last one from a model that is near the minimum."""
 
-SETTLED, STRIDE = 1e-4, 8
+SETTLED, STRIDE = 1e-4, 4
 """The search ends if STRIDE iterations lower the cost by less than the part SETTLED."""
 
 SHORTEST = 4
@@ -90,6 +90,7 @@ class OrderFits:
         )
         self._most = most
         self._found: dict[int, Matrices] = {}
+        self._y_offset = scaler.y_offset
 
     @cached_property
     def _subspaces(self) -> list[SpectralSubspace]:
@@ -157,47 +158,63 @@ class OrderFits:
         )  # fmt: skip
 
     @spread_by_hand()
-    def fit(self, nx: int, near: LinearModel | None = None) -> LinearModel:
-        """The model of an order.
-
-        Args:
-            nx: the order; if the ones below were fitted before, it starts from them, too.
-            near: a model to start from instead of all others.
+    def fit(self, nx: int) -> LinearModel:
+        """The model of an order; if the ones below were fitted before, it starts from them, too.
 
         Raises:
             ValueError: fewer equations than unknowns, or no stable start.
         """
         clock = time.perf_counter()
         check_spectral_data(self.problem.data, nx)
-        starts = self._starts(nx) if near is None else [self._near(near)]
-        last = MOST_STEPS if near is None else NEAR_STEPS
-        searches = [self._search(matrices) for matrices in starts]
+        searches = [self._search(matrices) for matrices in self._starts(nx)]
         found = [self.problem.refined(searches[0])]
         for search in searches:
             self._advance(search, FIRST_STEPS)
-        searches = sorted(searches, key=lambda search: search.state.cost)[:FINALISTS]
-        for search in searches:
-            self._advance(search, last)
-        found += [self.problem.refined(search) for search in searches]
-        models = [self._model(each, clock) for each in found]
-        # A free initial state may bring a mode that explains drift and fails in a simulation; the
-        # start has it less than the minimum.
-        errors = [self._error(model) for model in models]
-        best = int(np.argmin(errors))
-        self._found[nx] = found[best].matrices
-        model = models[best]
-        if near is None:
-            first = self._subspaces[0]
-            assert model.fit is not None
-            values = tuple(map(float, first.singular_values / first.size))
-            model = replace(model, fit=replace(model.fit, singular_values=values))
-        return model
+        first, *others = sorted(searches, key=lambda search: search.state.cost)
+        same = (1.0 + SETTLED) * first.state.cost
+        finalists = [first, *(search for search in others if search.state.cost > same)]
+        for search in finalists[:FINALISTS]:
+            self._advance(search, MOST_STEPS)
+            found.append(self.problem.refined(search))
+        best, model, _ = self._best(found, clock, self._y_offset)
+        self._found[nx], self._y_offset = best.matrices, model.y_offset
+        subspace = self._subspaces[0]
+        assert model.fit is not None
+        values = tuple(map(float, subspace.singular_values / subspace.size))
+        return replace(model, fit=replace(model.fit, singular_values=values))
+
+    @spread_by_hand()
+    def fit_near(self, model: LinearModel) -> tuple[LinearModel, list[Array]]:
+        """The model of the minimum near another one, and its errors over each whole record.
+
+        Raises:
+            ValueError: fewer equations than unknowns, or no stable start.
+        """
+        clock = time.perf_counter()
+        check_spectral_data(self.problem.data, model.nx)
+        search = self._search(self._near(model))
+        found = [self.problem.refined(search)]
+        self._advance(search, NEAR_STEPS)
+        found.append(self.problem.refined(search))
+        return self._best(found, clock, model.y_offset)[1:]
+
+    def _best(
+        self, found: Sequence[Refined], clock: float, y_offset: Array
+    ) -> tuple[Refined, LinearModel, list[Array]]:
+        """The system of least simulation error, or least criterion of a response; its errors.
+
+        A free initial state may bring a mode that explains drift and fails in a simulation; the
+        start of a search has it less than its minimum.
+        """
+        models = [self._model(each, clock, y_offset) for each in found]
+        best = int(np.argmin([error for _, _, error in models]))
+        return found[best], *models[best][:2]
 
     def _near(self, model: LinearModel) -> Matrices:
         return self.problem.with_input_matrices(model.A, model.C / self._scaler.y_scale[:, None])[1]
 
     def _starts(self, nx: int) -> list[Matrices]:
-        """Starts of finite cost, the best first."""
+        """Starts of finite cost, the best first; of those that are alike one."""
         pairs = [
             pair
             for below in (nx - 2, nx - 1)
@@ -208,7 +225,13 @@ class OrderFits:
         pairs += [(e.A, e.C) for e in estimates if e is not None and len(e.A) == nx]
         found = [self.problem.with_input_matrices(A, C) for A, C in pairs]
         ranked = sorted((each for each in found if np.isfinite(each[0])), key=lambda each: each[0])
-        return [matrices for _, matrices in ranked[:STARTS]]
+        costs = [0.0, *(cost for cost, _ in ranked)]
+        apart = [
+            matrices
+            for (cost, matrices), last in zip(ranked, costs, strict=False)
+            if cost > ALIKE * last
+        ]
+        return (apart or [matrices for _, matrices in ranked])[:STARTS]
 
     def _extended(self, below: Matrices, more: int) -> list[tuple[Array, Array]]:
         """A and C of a model with ``more`` states that describe its errors."""
@@ -236,35 +259,34 @@ class OrderFits:
             if search.state.cost > (1.0 - SETTLED) * before:
                 break
 
-    def _model(self, found: Refined, clock: float) -> LinearModel:
-        """In physical units, without what belongs to the initial states."""
+    def _model(
+        self, found: Refined, clock: float, y_offset: Array
+    ) -> tuple[LinearModel, list[Array], float]:
+        """In physical units, without what belongs to the initial states; its errors in each record,
+        (T, ny), and what it is chosen by.
+
+        The states that records begin from depend on the offset of the output, so that a guess of it
+        comes first, and is corrected by the mean of the errors.
+        """
         found = self._without_starts(found)
         model = physical(found, self._scaler, self._about)
         model = model.transformed(*transformation(self._driven, found.matrices, balanced=True))
-        rmse = found.rmse
-        if self._train:  # the squares of all lines are those of a sample
+        rmse = error = found.rmse
+        if self._train:
+            model = replace(model, y_offset=y_offset)
+        errors = [record.y - model.simulate(record) for record, _ in self._train]
+        if errors:  # the squares of all lines are those of a sample
             rmse *= float(np.sqrt(self.problem.data.Y.size / len(model.outputs)))
+            pairs = zip(errors, self._train, strict=True)
+            fitted = np.concatenate([e[a:b] for e, (_, windows) in pairs for a, b in windows])
             if self._offset:
-                mean = self._errors(model).mean(axis=0)
+                mean = fitted.mean(axis=0)
                 model = replace(model, y_offset=model.y_offset + mean)
+                fitted, errors = fitted - mean, [each - mean for each in errors]
+            error = float(rms(fitted / self._scaler.y_scale))
         spent = time.perf_counter() - clock
         fit = LinearFit(self._criterion, rmse, found.iterations, found.reason, spent)
-        return replace(model, fit=fit)
-
-    def _errors(self, model: LinearModel) -> Array:
-        """Errors of a simulation in the windows, physical units, (samples, ny)."""
-        found = []
-        for record, windows in self._train:
-            errors = record.y - model.simulate(record)
-            found += [errors[first:last] for first, last in windows]
-        return np.concatenate(found)
-
-    def _error(self, model: LinearModel) -> float:
-        """What a model is chosen by: the rms of its simulation; of a response the criterion."""
-        if not self._train:
-            assert model.fit is not None
-            return model.fit.rmse
-        return float(rms(self._errors(model) / self._scaler.y_scale))
+        return replace(model, fit=fit), errors, error
 
     def _without_starts(self, found: Refined) -> Refined:
         """The system without the inputs that make its initial states."""

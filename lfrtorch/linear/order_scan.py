@@ -33,6 +33,7 @@ from lfrtorch.linear.score_window import settled
 from lfrtorch.metrics import rms
 from lfrtorch.paired_blocks import (
     BLOCKS,
+    MARGIN,
     as_good,
     in_blocks,
     no_progress,
@@ -204,7 +205,15 @@ def scan_orders(
     if doubt:
         notes.append(f"{doubt}: the order is chosen by cross-validation over both.")
         how, errors = "cross-validation", []
-        held_back = _Folds(models[0], records, judges, max(m.nx for m in models), options).errors
+        kept = _worthwhile(models)
+        if left := [model.nx for model in models if model.nx not in kept]:
+            notes.append(
+                f"orders {left} are left out of it: they fit less than {MARGIN:.0%} better than "
+                "those below."
+            )
+        lengths = [each for each, m in zip(lengths, models, strict=True) if m.nx in kept]
+        models = [model for model in models if model.nx in kept]
+        held_back = _Folds(models[0], records, judges, models[-1].nx, options).errors
         for model in models:
             if score(model, time.perf_counter()):
                 break
@@ -232,6 +241,17 @@ def _rms(errors: Sequence[Sequence[Array]]) -> list[float]:
     """Of all errors of each model; infinite if one is not finite."""
     found = [float(rms(np.concatenate(each))) for each in errors]
     return [value if np.isfinite(value) else inf for value in found]
+
+
+def _worthwhile(models: Sequence[LinearModel]) -> list[int]:
+    """The first order, and each that fits better than those below by ``MARGIN``."""
+    kept, best = [], inf
+    for model in models:
+        assert model.fit is not None
+        if not kept or model.fit.rmse < best / (1.0 + MARGIN):
+            kept.append(model.nx)
+            best = model.fit.rmse
+    return kept
 
 
 def _narrow(records: list[Record], nx: int) -> str:
@@ -322,15 +342,11 @@ class _Folds:
     def _of(self, model: LinearModel, fold: int) -> list[Array]:
         windows = self._left_out[fold]
         try:
-            found = self._fits[fold].fit(model.nx, near=model)
+            errors = self._fits[fold].fit_near(model)[1]
         except ValueError:
             return [np.full((b - a, len(model.outputs)), inf) for a, b in windows if b > a]
-        with np.errstate(over="ignore", invalid="ignore"):
-            return [
-                ((record.y - found.simulate(record)) / self._scale)[a:b]
-                for record, (a, b) in zip(self._records, windows, strict=True)
-                if b > a
-            ]
+        pairs = zip(errors, windows, strict=True)
+        return [(each / self._scale)[a:b] for each, (a, b) in pairs if b > a]
 
 
 def _united(train: list[Record], judges: list[Record]) -> list[Record]:

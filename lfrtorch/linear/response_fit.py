@@ -23,8 +23,10 @@ from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.resolvent import (
+    driven_jacobian,
     frequency_response,
     response_jacobian,
+    solve_driven,
     solve_resolvent,
     solve_resolvents,
 )
@@ -99,7 +101,11 @@ class ResponseFit:
     def search(self, matrices: Matrices) -> Search:
         """A search over A, B, C, D that starts from the given ones."""
         problem = ResponseProblem(
-            self.data, len(matrices[0]), LARGEST_POLE, free_feedthrough=self._free_feedthrough
+            self.data,
+            len(matrices[0]),
+            LARGEST_POLE,
+            free_feedthrough=self._free_feedthrough,
+            together=self.starts > 0,
         )
         return Search(problem, torch.as_tensor(np.concatenate([m.ravel() for m in matrices])))
 
@@ -138,6 +144,8 @@ class ResponseProblem:
         nx: order.
         largest_pole: limit for the radius of poles. Default: no limit.
         free_feedthrough: which entries of D may change, (ny, nu). Default: all.
+        together: whether the states under all inputs together are solved for, not those under each
+            alone: less work for inputs of few columns, other last digits.
     """
 
     def __init__(
@@ -147,8 +155,9 @@ class ResponseProblem:
         largest_pole: float = np.inf,
         *,
         free_feedthrough: NDArray[np.bool_] | None = None,
+        together: bool = False,
     ) -> None:
-        self.data, self.largest_pole = data, largest_pole
+        self.data, self.largest_pole, self._together = data, largest_pole, together
         nu, ny = data.U.shape[1], data.Y.shape[1]
         self.shapes = (nx, nx), (nx, nu), (ny, nx), (ny, nu)
         self._fixed: Tensor | None = None
@@ -169,8 +178,9 @@ class ResponseProblem:
         A, _, C, D = self.matrices(theta)
         if not np.abs(np.linalg.eigvals(A)).max() < self.largest_pole:
             return torch.full((2 * self.data.Y.size,), torch.inf, dtype=torch.float64)
-        X = self._states(theta)
-        return _real(self.data.weighted((C @ X + D) @ self.data.U - self.data.Y))
+        X, U = self._states(theta), self.data.U
+        response = C @ X + D @ U if self._together else (C @ X + D) @ U
+        return _real(self.data.weighted(response - self.data.Y))
 
     def cost(self, residual: Tensor) -> float:
         """|r|²."""
@@ -183,14 +193,17 @@ class ResponseProblem:
         self._reduced = reduction(cell, initial_states, before=self._reduced, fixed=self._fixed)
         A, _, C, _ = self.matrices(theta)
         X, L = self._states(theta), solve_resolvent(A.T, C.T, self.data.z).swapaxes(1, 2)
-        J = response_jacobian(X, L, self.data.U, self._reduced.kept.numpy())
+        jacobian = driven_jacobian if self._together else response_jacobian
+        J = jacobian(X, L, self.data.U, self._reduced.kept.numpy())
         return ResponseJacobian(self.data.weighted(J), self._reduced, self.residual(theta))
 
     def _states(self, theta: Tensor) -> Complex:
-        """(zI - A)⁻¹ B (F, nx, nu); the one of the latest θ is cached."""
+        """(zI - A)⁻¹ B (F, nx, nu), or that times U; the one of the latest θ is cached."""
         if self._latest is None or not torch.equal(self._latest[0], theta):
             A, B, _, _ = self.matrices(theta)
-            self._latest = theta.clone(), solve_resolvent(A, B, self.data.z)
+            z = self.data.z
+            X = solve_driven(A, B, z, self.data.U) if self._together else solve_resolvent(A, B, z)
+            self._latest = theta.clone(), X
         return self._latest[1]
 
 

@@ -257,6 +257,11 @@ def test_a_poor_validation_part_is_replaced_by_folds_over_all(why: str):
         assert found.scores[2] == pytest.approx(0.05, rel=0.1)
 
 
+def test_cross_validation_leaves_out_orders_that_fit_no_better():
+    models = [model_of(nx, rmse) for nx, rmse in enumerate((0.5, 0.2, 0.199, 0.21, 0.19), start=1)]
+    assert order_scan._worthwhile(models) == [1, 2, 5]
+
+
 def test_folds_score_each_sample_once_from_its_whole_record():
     record = driven(0, 500)
     train, validation, other = part(record, 300, 20), part(record, 500, 300), driven(1, 200)

@@ -9,7 +9,13 @@ from reference import System, random_system
 from torch import Tensor
 
 from lfrtorch._support.types import Complex
-from lfrtorch.linear.resolvent import frequency_response, response_jacobian, solve_resolvents
+from lfrtorch.linear.resolvent import (
+    driven_jacobian,
+    frequency_response,
+    response_jacobian,
+    solve_driven,
+    solve_resolvents,
+)
 
 pytestmark = pytest.mark.numeric
 
@@ -164,3 +170,14 @@ def test_slopes_at_a_defective_pole_are_central_differences():
         )  # fmt: skip
         # h² times a third derivative of up to 4⁴ gains of 10, and eps of those over h.
         np.testing.assert_allclose(J[..., i], (above - below) / (2 * h), rtol=0, atol=1e-7)
+
+
+@SIZES
+def test_states_under_all_inputs_together(nx: int, nu: int, ny: int):
+    A, B, C, _ = random_system(nx, nu, ny)
+    U = some_input(nu, 2)
+    X, L = solve_resolvents(A, B, C, Z)
+    S = solve_driven(A, B, Z, U)
+    np.testing.assert_allclose(S, X @ U, rtol=0, atol=1e-12 * np.abs(X @ U).max())
+    J = response_jacobian(X, L, U)
+    np.testing.assert_allclose(driven_jacobian(S, L, U), J, rtol=0, atol=1e-12 * np.abs(J).max())
