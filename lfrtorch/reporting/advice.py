@@ -147,7 +147,7 @@ def neither_usable(e: Evidence) -> Advice | None:
 
 def gain_is_lost(e: Evidence) -> Advice | None:
     """A gain over the linear model that the tests have not."""
-    if not e.lost_on_tests or e.parts_differ:
+    if not e.lost_on_tests or e.parts_differ or e.neither:
         return None
     which = e.judged[2]
     return Advice(

@@ -224,6 +224,9 @@ def test_no_system_is_called_linear_where_neither_model_is_usable():
     assert [text.partition(":")[0] for text in texts[1:]] == [
         "It is unknown whether the remaining error is noise"
     ]
+    lost = replace(useless, train=0.8, validation=0.8, tests=1.5)
+    assert lost.lost_on_tests
+    assert advice.gain_is_lost(lost) is None
     usable = replace(useless, started=1, searched=False)
     assert advise(usable) == advise(useless)
     assert len(advise(replace(usable, verdict=verdict(Kind.LINEAR)))) > 2
