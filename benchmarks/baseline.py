@@ -82,6 +82,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch, pinned(available_cores()[-1:]):
         folder = Path(scratch)
         problems.write_signals(folder)
+        problems.write_large(folder)
         sides = [Side(path, folder) for path in (checkout, HERE.parent)]
         sides[0].time("prepare")  # a later version reads what an earlier one saved
         timed = {case: compare(case, sides, options.pairs) for case in options.case}

@@ -24,7 +24,7 @@ import torch
 import lfrtorch
 from lfrtorch import LevenbergMarquardt, Model, Record
 
-NAMES = ("boucwen", "parallel_wh")
+NAMES = ("boucwen", "parallel_wh", "aircraft size", "mirror size")
 RIDGE = 1e-3
 """Ridge of conf/bench/boucwen.yaml."""
 CUTS = (0, 1024, 2048, 3072, 5120, 8192)
@@ -51,8 +51,16 @@ def prepare(folder: Path) -> Timed:
     for name in NAMES:
         with np.load(folder / f"{name}.npz") as file:
             nx, nz, nw, nn = (int(file[size]) for size in ("nx", "nz", "nw", "nn"))
+            system = [file[matrix] for matrix in "ABCD" if matrix in file]
+            fs = float(file["fs"])
         data = records(folder, name)
-        bla = lfrtorch.estimate_bla(data, nx, offset=False, max_iter=3)
+        if system:
+            A, B, C, D = system
+            inputs, outputs = data[0].inputs, data[0].outputs
+            operating_point = np.zeros(len(inputs)), np.zeros(len(outputs))
+            bla = lfrtorch.LinearModel(A, B, C, D, fs, *operating_point, inputs, outputs)
+        else:
+            bla = lfrtorch.estimate_bla(data, nx, offset=False, max_iter=3)
         lfrtorch.initialise(bla, data, nz=nz, nw=nw, nn=nn).save(folder / name)
     return time.process_time() - begin, 0.0
 
@@ -109,6 +117,8 @@ MEASURED: dict[str, Callable[[Path], Timed]] = {
     "Bouc-Wen, iteration": partial(iterations, name="boucwen", count=4),
     "Bouc-Wen in 5 records, iteration": partial(iterations, name="boucwen", count=3, cut=True),
     "Parallel WH, iteration": partial(iterations, name="parallel_wh", count=1),
+    "Aircraft size, iteration": partial(iterations, name="aircraft size", count=2),
+    "Mirror size, iteration": partial(iterations, name="mirror size", count=2),
     "Bouc-Wen, simulation": partial(simulations, name="boucwen", count=30),
     "Parallel WH, simulation": partial(simulations, name="parallel_wh", count=2),
     "Bouc-Wen, linear model": partial(linear, count=1),

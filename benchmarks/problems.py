@@ -1,20 +1,23 @@
 """The problems that are timed: records and a model to start from.
 
-Two of them are prepared once, in a folder that all processes read: the Bouc-Wen case, and five
-periods of a parallel Wiener-Hammerstein system of the benchmark's size.
+They are prepared once, in a folder that all processes read: the Bouc-Wen case, five periods of a
+parallel Wiener-Hammerstein system of the benchmark's size, and two simulated structures with
+lightly damped modes, of the sizes of an aircraft and of a fine steering mirror.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
 from scipy import signal
+from scipy.linalg import block_diag
 
 import lfrtorch
-from lfrtorch import LinearModel, Model, Record
+from lfrtorch import Channel, LinearModel, Model, Record
 from lfrtorch._support.types import Array
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
 
@@ -22,6 +25,11 @@ SIZES = {
     "boucwen": {"nx": 3, "nz": 2, "nw": 1, "nn": 15},
     "parallel_wh": {"nx": 12, "nz": 2, "nw": 2, "nn": 15},
 }
+LARGE = {
+    "aircraft size": {"records": 3, "nu": 1, "ny": 3, "nx": 20, "nz": 2, "nw": 2, "nn": 15},
+    "mirror size": {"records": 5, "nu": 3, "ny": 3, "nx": 28, "nz": 4, "nw": 4, "nn": 20},
+}
+"""Those of F16 and of the fine steering mirror: records of 8192 samples, one period each."""
 PEER_FILES = {"boucwen": "boucwen.npz", "parallel_wh": "pwh_synth.npz"}
 RATES = {"boucwen": 750.0, "parallel_wh": 78e3}
 PARALLEL_WH = {"records": 5, "samples": 16384, "lines": 4095}
@@ -39,6 +47,49 @@ def write_signals(folder: Path, peers: Path | None = None) -> None:
         u, y = _signals(name, peers)
         about: dict = {"fs": RATES[name], **sizes}
         np.savez(folder / f"{name}.npz", u=u, y=y, **about)
+
+
+def write_large(folder: Path) -> None:
+    """Write records and linear models of structures with nx / 2 lightly damped modes."""
+    for name, sizes in LARGE.items():
+        rng = np.random.default_rng(0)
+        nx, nu, ny, T = sizes["nx"], sizes["nu"], sizes["ny"], 8192
+        damping = 0.004 + 0.02 * rng.random(nx // 2)
+        poles = np.exp(np.linspace(0.05, 1.2, nx // 2) * (1j * np.sqrt(1.0 - damping**2) - damping))
+        blocks = [[[p.real, p.imag], [-p.imag, p.real]] for p in poles]
+        turn = np.linalg.qr(rng.standard_normal((nx, nx)))[0]
+        A = turn @ block_diag(*blocks) @ turn.T
+        B, C = turn @ rng.standard_normal((nx, nu)), rng.standard_normal((ny, nx)) @ turn.T / 10.0
+        D, lines = np.zeros((ny, nu)), np.arange(40, 2048)
+        spectra = np.zeros((sizes["records"], T // 2 + 1, nu), complex)
+        phases = rng.random((sizes["records"], len(lines), nu))
+        spectra[:, lines] = np.exp(2j * np.pi * phases)
+        u = np.fft.irfft(spectra, T, axis=1)
+        u /= u.std()
+        system = linear_model((A, B, C, D))
+        rest = [Record(each, np.zeros((T, ny)), start="periodic") for each in u]
+        whole = [replace(r, y=system.simulate(r)) for r in rest]
+        nz, nw, nn = (sizes[size] for size in ("nz", "nw", "nn"))
+        truth = lfrtorch.initialise(system, whole, nz=nz, nw=nw, nn=nn, seed=5)
+        with torch.no_grad():
+            generator = torch.Generator().manual_seed(1)
+            weights = truth.lfr.cell.get_parameter("static.Ww")
+            weights.uniform_(-0.1, 0.1, generator=generator)
+            truth.lfr.cell.Bw.mul_(0.1)
+        y = np.stack([truth.simulate(record) for record in rest])
+        y += 1e-3 * y.std() * rng.standard_normal(y.shape)
+        about: dict = {"fs": 1.0, "nx": nx, "nz": nz, "nw": nw, "nn": nn}
+        np.savez(folder / f"{name}.npz", u=u, y=y, A=A, B=B, C=C, D=D, **about)
+
+
+def linear_model(system: tuple[Array, Array, Array, Array]) -> LinearModel:
+    """The linear model of these matrices."""
+    D = system[3]
+    inputs, outputs = (
+        tuple(Channel(f"{letter}{i}") for i in range(count))
+        for letter, count in (("u", D.shape[1]), ("y", D.shape[0]))
+    )
+    return LinearModel(*system, 1.0, np.zeros(len(inputs)), np.zeros(len(outputs)), inputs, outputs)
 
 
 def prepare(folder: Path, peers: Path | None) -> dict[str, int]:
