@@ -73,6 +73,7 @@ TESTS: dict[str, str] = {
     "linear/response_fit": "linear/response_fit linear/bla",
     "linear/signal_fit": "linear/signal_fit linear/bla",
     "linear/bla": "linear/bla linear/order_scan",
+    "linear/minima": "linear/bla",
     "linear/spectral_data": "linear/response_fit linear/bla",
     "linear/spectra": "linear/spectra linear/frf",
     "linear/local_polynomial": "linear/local_polynomial linear/frf",

@@ -1,9 +1,8 @@
 """Parametric best linear approximation (BLA): a linear state-space model of an order.
 
-Subspace methods give several first estimates of A and C, and least squares the B and D of each.
-The estimates that fit best are refined a few steps by Levenberg-Marquardt, the best of these to the
-end, as a single search may end in a poor minimum. The result is put into balanced coordinates and
-physical units, with its covariance and notes on what is doubtful.
+Records or a response become a least-squares problem in normalised units, whose best minimum
+``minima`` finds. The result is put into balanced coordinates and physical units, with its
+covariance and notes on what is doubtful.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal, NamedTuple, Protocol, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -32,8 +31,9 @@ from lfrtorch.linear.integrators import (
     simulation_errors,
     whitening_pole,
 )
-from lfrtorch.linear.model import LinearFit, LinearModel, balancing
-from lfrtorch.linear.refinement import Matrices, Refined, Search
+from lfrtorch.linear.minima import LinearLeastSquares, best_minimum, candidates, transformation
+from lfrtorch.linear.model import LinearFit, LinearModel
+from lfrtorch.linear.refinement import Refined
 from lfrtorch.linear.requirements import (
     check_length,
     check_signals,
@@ -54,17 +54,6 @@ from lfrtorch.survey.integration import integrators as count_integrators
 
 Criterion = Literal["simulation", "prediction", "frequency"]
 
-FIRST_STEPS, FINALISTS = 8, 6
-"""Iterations after which the searches are compared, and how many of them go on."""
-
-SAME, AGREED = 1.0 + 2e-6, 3
-"""Ratio of two costs up to which two searches are in the same minimum; the comparison ends if this
-many in a row are in the best one."""
-
-ALIKE, HOPELESS = 1.001, 10.0
-"""Candidates whose costs differ by a factor below ALIKE count as one; a candidate whose cost is
-HOPELESS times the best is dropped."""
-
 EMPTY = 1e-10
 """Relative singular values below this are rounding errors: the data do not carry the order."""
 
@@ -82,38 +71,6 @@ COLOURED = 0.3
 
 BETTER = 0.25
 """The data come from an unstable system if its cost is below this part of a stable model's."""
-
-
-class LinearLeastSquares(Protocol):
-    """Least squares between data and a linear model, in normalised units."""
-
-    def most_candidates(self, nx: int) -> int:
-        """How many subspace estimates are refined: several if an iteration takes milliseconds."""
-        ...
-
-    def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
-        """Subspace estimates of A and C."""
-        ...
-
-    def with_input_matrices(self, A: Array, C: Array) -> tuple[float, Matrices]:
-        """Cost and system with the best B and D for A and C."""
-        ...
-
-    def state_deviation(self, matrices: Matrices) -> Array:
-        """Standard deviation (nx,) of the states."""
-        ...
-
-    def search(self, matrices: Matrices) -> Search:
-        """A search for the minimum near the given system."""
-        ...
-
-    def improbability(self, search: Search) -> float:
-        """The cost of a search, raised for initial states that the inputs hardly lead to."""
-        ...
-
-    def refined(self, search: Search) -> Refined:
-        """The present result of a search."""
-        ...
 
 
 @spread_by_hand()
@@ -274,7 +231,7 @@ def _stable(data: list[Record] | FRF, nx: int, settings: _Settings) -> LinearMod
         notes += excitation_notes(records, nx)
 
     balanced = coordinates == "balanced"
-    estimate, found = _best(problem, _candidates(problem, nx), max_iter, balanced=balanced)
+    estimate, found = best_minimum(problem, candidates(problem, nx), max_iter, balanced=balanced)
     notes += _notes(problem, estimate, found)
     if max_iter and found.iterations >= max_iter:
         notes.append(
@@ -370,77 +327,6 @@ def _of_records(
     return SignalFit(normalised, offset=offset, prediction=prediction, feedthrough=feedthrough)
 
 
-class _Candidate(NamedTuple):
-    """A subspace estimate with the best B and D, and its cost."""
-
-    cost: float
-    estimate: SubspaceEstimate
-    matrices: Matrices
-
-
-def _candidates(problem: LinearLeastSquares, nx: int) -> list[_Candidate]:
-    """The candidates of finite cost, the best one first."""
-    found = []
-    for estimate in problem.subspace_estimates(nx):
-        cost, matrices = problem.with_input_matrices(estimate.A, estimate.C)
-        if np.isfinite(cost):
-            found.append(_Candidate(cost, estimate, matrices))
-    if not found:
-        raise InputError(
-            f"no stable linear model of order {nx} could be started from these data; "
-            "try a lower nx or a longer record."
-        )
-    return sorted(found, key=lambda each: each.cost)
-
-
-def _best(
-    problem: LinearLeastSquares,
-    candidates: list[_Candidate],
-    max_iter: int,
-    *,
-    balanced: bool,
-) -> tuple[SubspaceEstimate, Refined]:
-    """The best of the minima that the candidates lead to: after a few steps the best few go on.
-
-    The candidate that fits best may lead to a poor minimum: at the highest level of the parallel
-    Wiener-Hammerstein system to one whose error on the data fitted is 4 % above the best one's.
-
-    If initial states are estimated, the most probable minimum is taken. The one of least cost may
-    spend a mode on drift: on seven eighths of the cascaded tanks' record a pole of 0.999996, which
-    the input hardly moves, from an initial state of 500 times its deviation.
-    """
-
-    field: list[_Candidate] = []
-    last = 0.0
-    for candidate in candidates[: problem.most_candidates(len(candidates[0].estimate.A))]:
-        hopeless = field and candidate.cost >= HOPELESS * candidates[0].cost
-        if candidate.cost > ALIKE * last and not hopeless:
-            field.append(candidate)
-            last = candidate.cost
-    searches: list[tuple[SubspaceEstimate, Search]] = []
-    for _, estimate, matrices in field if max_iter > FIRST_STEPS else field[:1]:
-        try:
-            search = problem.search(scaled(problem, matrices, balanced=balanced))
-        except ValueError:  # the data hardly move some states: their scaling is a rounding error
-            search = problem.search(matrices)
-        searches.append((estimate, search.advance(min(FIRST_STEPS, max_iter))))
-        costs = [search.state.cost for _, search in searches]
-        if len(costs) >= AGREED and max(costs[-AGREED:]) <= SAME * min(costs):
-            break  # the last ones are all in the best minimum: the others would be, too
-    searches.sort(key=lambda each: each[1].state.cost)
-    costs = [0.0, *(search.state.cost for _, search in searches)]
-    distinct = [
-        each
-        for each, last in zip(searches, costs, strict=False)
-        if each[1].state.cost > SAME * last
-    ]
-    finalists = (distinct or searches)[:FINALISTS]
-    for _, search in finalists:
-        search.advance(max_iter)
-    estimate, search = min(finalists, key=lambda each: problem.improbability(each[1]))
-    return estimate, problem.refined(search)
-
-
 def _notes(problem: LinearLeastSquares, estimate: SubspaceEstimate, found: Refined) -> list[str]:
     """What the subspace and the poles say of data and order."""
     nx, notes, s = len(found.A), [], estimate.singular_values
@@ -487,23 +373,3 @@ def physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearModel
         innovation_covariance=None if S is None else by_y * S * scaler.y_scale,
         covariance=None if found.covariance is None else size[:, None] * found.covariance * size,
     )
-
-
-def scaled(problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool) -> Matrices:
-    """The system with states of unit standard deviation, in balanced coordinates if wanted."""
-    A, B, C, D = matrices
-    T, inverse = transformation(problem, matrices, balanced=balanced)
-    return T @ A @ inverse, T @ B, C @ inverse, D
-
-
-def transformation(
-    problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool
-) -> tuple[Array, Array]:
-    """T and T⁻¹ (nx, nx) that give states of unit deviation, in balanced coordinates if wanted."""
-    A, B, C, D = matrices
-    T = inverse = np.eye(len(A))
-    if balanced:
-        T, inverse = balancing(A, B, C)
-    std = problem.state_deviation((T @ A @ inverse, T @ B, C @ inverse, D))
-    std = np.where(std > 0, std, 1.0)
-    return T / std[:, None], inverse * std

@@ -21,8 +21,9 @@ import numpy as np
 
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
-from lfrtorch.linear.bla import ALIKE, physical, scaled, transformation
+from lfrtorch.linear.bla import physical
 from lfrtorch.linear.frf import FRF, estimate_frf
+from lfrtorch.linear.minima import ALIKE, scaled, transformation
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Matrices, Refined, Search
 from lfrtorch.linear.requirements import check_spectral_data

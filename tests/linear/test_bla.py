@@ -13,7 +13,7 @@ import scipy.linalg
 from reference import System, random_system
 
 from lfrtorch._support.types import Array
-from lfrtorch.linear import bla
+from lfrtorch.linear import minima
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearModel
@@ -607,24 +607,24 @@ class Race:
 
 
 def test_candidates_that_are_alike_or_hopeless_are_not_searched(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(bla, "scaled", lambda problem, matrices, balanced: matrices)
+    monkeypatch.setattr(minima, "scaled", lambda problem, matrices, balanced: matrices)
     race, estimate = Race(), cast(Any, SimpleNamespace(A=[0]))
     candidates: Any = [
-        bla._Candidate(cost, estimate, cast(Any, cost))
+        minima.Candidate(cost, estimate, cast(Any, cost))
         for cost in (1.0, 1.0005, 2.0, 9.9, 10.1, 50.0)
     ]
-    _, refined = bla._best(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
+    _, refined = minima.best_minimum(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
     assert race.searched == [1.0, 2.0, 9.9]
     assert refined == 9.9  # the most probable one
-    bla._best(race, candidates, bla.FIRST_STEPS, balanced=True)  # pyright: ignore[reportArgumentType]
+    minima.best_minimum(race, candidates, minima.FIRST_STEPS, balanced=True)  # pyright: ignore[reportArgumentType]
     assert race.searched[3:] == [1.0]  # without steps to compare them the best one alone
 
 
 def test_candidates_that_went_to_one_minimum_end_the_race(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(bla, "scaled", lambda problem, matrices, balanced: matrices)
+    monkeypatch.setattr(minima, "scaled", lambda problem, matrices, balanced: matrices)
     race, estimate = Race(minimum=0.5), cast(Any, SimpleNamespace(A=[0]))
     candidates: Any = [
-        bla._Candidate(cost, estimate, cast(Any, cost)) for cost in (1.0, 2.0, 3.0, 4.0, 5.0)
+        minima.Candidate(cost, estimate, cast(Any, cost)) for cost in (1.0, 2.0, 3.0, 4.0, 5.0)
     ]
-    bla._best(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
+    minima.best_minimum(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
     assert race.searched == [1.0, 2.0, 3.0]

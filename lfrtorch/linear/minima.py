@@ -1,0 +1,151 @@
+"""The best of the minima of a linear model's error.
+
+Subspace methods give several first estimates of A and C, and least squares the B and D of each.
+The estimates that fit best are refined a few steps by Levenberg-Marquardt, the best of these to the
+end, as a single search may end in a poor minimum.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
+from lfrtorch.linear.model import balancing
+from lfrtorch.linear.refinement import Matrices, Refined, Search
+from lfrtorch.linear.subspace import SubspaceEstimate
+
+FIRST_STEPS, FINALISTS = 8, 6
+"""Iterations after which the searches are compared, and how many of them go on."""
+
+SAME, AGREED = 1.0 + 2e-6, 3
+"""Ratio of two costs up to which two searches are in the same minimum; the comparison ends if this
+many in a row are in the best one."""
+
+ALIKE, HOPELESS = 1.001, 10.0
+"""Candidates whose costs differ by a factor below ALIKE count as one; a candidate whose cost is
+HOPELESS times the best is dropped."""
+
+
+class LinearLeastSquares(Protocol):
+    """Least squares between data and a linear model, in normalised units."""
+
+    def most_candidates(self, nx: int) -> int:
+        """How many subspace estimates are refined: several if an iteration takes milliseconds."""
+        ...
+
+    def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
+        """Subspace estimates of A and C."""
+        ...
+
+    def with_input_matrices(self, A: Array, C: Array) -> tuple[float, Matrices]:
+        """Cost and system with the best B and D for A and C."""
+        ...
+
+    def state_deviation(self, matrices: Matrices) -> Array:
+        """Standard deviation (nx,) of the states."""
+        ...
+
+    def search(self, matrices: Matrices) -> Search:
+        """A search for the minimum near the given system."""
+        ...
+
+    def improbability(self, search: Search) -> float:
+        """The cost of a search, raised for initial states that the inputs hardly lead to."""
+        ...
+
+    def refined(self, search: Search) -> Refined:
+        """The present result of a search."""
+        ...
+
+
+class Candidate(NamedTuple):
+    """A subspace estimate with the best B and D, and its cost."""
+
+    cost: float
+    estimate: SubspaceEstimate
+    matrices: Matrices
+
+
+def candidates(problem: LinearLeastSquares, nx: int) -> list[Candidate]:
+    """The candidates of finite cost, the best one first."""
+    found = []
+    for estimate in problem.subspace_estimates(nx):
+        cost, matrices = problem.with_input_matrices(estimate.A, estimate.C)
+        if np.isfinite(cost):
+            found.append(Candidate(cost, estimate, matrices))
+    if not found:
+        raise InputError(
+            f"no stable linear model of order {nx} could be started from these data; "
+            "try a lower nx or a longer record."
+        )
+    return sorted(found, key=lambda each: each.cost)
+
+
+def best_minimum(
+    problem: LinearLeastSquares,
+    tried: list[Candidate],
+    max_iter: int,
+    *,
+    balanced: bool,
+) -> tuple[SubspaceEstimate, Refined]:
+    """The best of the minima that the candidates lead to: after a few steps the best few go on.
+
+    The candidate that fits best may lead to a poor minimum: at the highest level of the parallel
+    Wiener-Hammerstein system to one whose error on the data fitted is 4 % above the best one's.
+
+    If initial states are estimated, the most probable minimum is taken. The one of least cost may
+    spend a mode on drift: on seven eighths of the cascaded tanks' record a pole of 0.999996, which
+    the input hardly moves, from an initial state of 500 times its deviation.
+    """
+    field: list[Candidate] = []
+    last = 0.0
+    for candidate in tried[: problem.most_candidates(len(tried[0].estimate.A))]:
+        hopeless = field and candidate.cost >= HOPELESS * tried[0].cost
+        if candidate.cost > ALIKE * last and not hopeless:
+            field.append(candidate)
+            last = candidate.cost
+    searches: list[tuple[SubspaceEstimate, Search]] = []
+    for _, estimate, matrices in field if max_iter > FIRST_STEPS else field[:1]:
+        try:
+            search = problem.search(scaled(problem, matrices, balanced=balanced))
+        except ValueError:  # the data hardly move some states: their scaling is a rounding error
+            search = problem.search(matrices)
+        searches.append((estimate, search.advance(min(FIRST_STEPS, max_iter))))
+        costs = [search.state.cost for _, search in searches]
+        if len(costs) >= AGREED and max(costs[-AGREED:]) <= SAME * min(costs):
+            break  # the last ones are all in the best minimum: the others would be, too
+    searches.sort(key=lambda each: each[1].state.cost)
+    costs = [0.0, *(search.state.cost for _, search in searches)]
+    distinct = [
+        each
+        for each, last in zip(searches, costs, strict=False)
+        if each[1].state.cost > SAME * last
+    ]
+    finalists = (distinct or searches)[:FINALISTS]
+    for _, search in finalists:
+        search.advance(max_iter)
+    estimate, search = min(finalists, key=lambda each: problem.improbability(each[1]))
+    return estimate, problem.refined(search)
+
+
+def scaled(problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool) -> Matrices:
+    """The system with states of unit standard deviation, in balanced coordinates if wanted."""
+    A, B, C, D = matrices
+    T, inverse = transformation(problem, matrices, balanced=balanced)
+    return T @ A @ inverse, T @ B, C @ inverse, D
+
+
+def transformation(
+    problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool
+) -> tuple[Array, Array]:
+    """T and T⁻¹ (nx, nx) that give states of unit deviation, in balanced coordinates if wanted."""
+    A, B, C, D = matrices
+    T = inverse = np.eye(len(A))
+    if balanced:
+        T, inverse = balancing(A, B, C)
+    std = problem.state_deviation((T @ A @ inverse, T @ B, C @ inverse, D))
+    std = np.where(std > 0, std, 1.0)
+    return T / std[:, None], inverse * std
