@@ -286,7 +286,7 @@ def _errors(records: Sequence[Record], scale: Array, model: LinearModel) -> list
 def _doubt(model: LinearModel, train: list[Record], judges: list[Record]) -> str:
     """Why the validation records say little of an order; empty if they say enough."""
     scored = sum(record.samples - record.skip for record in judges)
-    memory = -1.0 / np.log(np.clip(np.abs(model.poles).max(), 1e-6, 1.0 - 1e-9))
+    memory = memory_of(model, max(record.samples for record in train))
     if scored < MEMORIES * memory:
         return (
             f"validation has {scored} scored samples, {number(scored / memory)} time constants "
@@ -297,6 +297,21 @@ def _doubt(model: LinearModel, train: list[Record], judges: list[Record]) -> str
     if not here / UNLIKE < there < here * UNLIKE:
         return f"the linear error on validation is {number(there / here)} times that on training"
     return ""
+
+
+def memory_of(model: LinearModel, samples: int) -> float:
+    """Time constant, in samples, of one pole whose impulse response is as long.
+
+    That of the slowest pole says too much: it may be next to nothing in the response.
+    """
+    x, responses = model.B, []
+    for _ in range(samples):
+        responses.append(model.C @ x)
+        x = model.A @ x
+    squares = np.square(responses).sum(axis=2)  # (samples, ny); every output counts alike
+    totals = squares.sum(axis=0)
+    mean = np.arange(samples) @ squares / np.where(totals > 0.0, totals, 1.0)
+    return max(1.0, 2.0 * float(mean.max()))  # a decay a^k has a mean of half its time constant
 
 
 class _Folds:

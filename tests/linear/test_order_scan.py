@@ -12,7 +12,7 @@ from lfrtorch.linear import order_scan
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel
-from lfrtorch.linear.order_scan import FOLDS, PATIENCE, OrderScan, scan_orders
+from lfrtorch.linear.order_scan import FOLDS, PATIENCE, OrderScan, memory_of, scan_orders
 from lfrtorch.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
@@ -277,3 +277,18 @@ def test_folds_score_each_sample_once_from_its_whole_record():
     errors = folds.errors(model)
     assert sum(map(len, errors)) == 480 + 180
     assert np.concatenate(errors).std() == pytest.approx(0.05, rel=0.1)
+
+
+def test_the_memory_is_that_of_the_response_and_not_of_its_slowest_pole():
+    channels = (Channel("s"),)
+
+    def model(poles: list[float], gains: list[float]) -> LinearModel:
+        n, zero = len(poles), np.zeros(1)
+        A, B, C = np.diag(poles), np.ones((n, 1)), np.array([gains])
+        return LinearModel(A, B, C, np.zeros((1, 1)), 1.0, zero, zero, channels, channels)
+
+    alone = memory_of(model([0.95], [1.0]), 2000)
+    assert alone == pytest.approx(-1.0 / np.log(0.95), rel=0.1)
+    assert memory_of(model([0.95, 0.9999], [1.0, 1e-4]), 2000) == pytest.approx(alone, rel=0.1)
+    assert memory_of(model([0.95, 0.9999], [1.0, 1.0]), 2000) > 20 * alone
+    assert memory_of(model([0.0], [1.0]), 2000) == 1.0
