@@ -62,7 +62,7 @@ def load_records(
     outputs: Columns | None = None,
     fs: float | None = None,
     time: str | int | None = None,
-    units: Mapping[str, str] | None = None,
+    units: Mapping[str | int, str] | None = None,
     validation: Use = 0.2,
     test: Use = 0.2,
     start: Start = "zero",
@@ -87,7 +87,7 @@ def load_records(
         fs: sampling frequency in Hz. Default: from ``time``.
         time: the column of time stamps, in seconds or as ISO date-times, evenly spaced. Default:
             one that is named as time is, or a lone number like ``Fs`` in a file of arrays.
-        units: of the channels by name. Default: those in the file's header.
+        units: of the channels by name or column number. Default: those in the file's header.
         validation: records that choose among iterates and are not fitted: a fraction below 1 of
             every record, the part after that for training; a number of records, the last ones;
             names of records of ``path``, which are those of the files without extension; or other

@@ -32,7 +32,7 @@ class Wanted:
     outputs: Columns | None
     fs: float | None = None
     time: str | int | None = None
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str | int, str] = field(default_factory=dict)
     gaps: Gaps = "error"
 
     def __post_init__(self) -> None:
@@ -93,7 +93,7 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
         fs, stamps = rate.fs, rate.stamps
         columns = (*columns, *stamps)
         notes.append(rate.note)
-    known = {name for i in (*u, *y) for name in (table.headers[i], table.columns[i].name)}
+    known = {name for i in (*u, *y) for name in (table.headers[i], table.columns[i].name, i)}
     strange = [name for name in wanted.units if name not in known]
     if strange:
         raise InputError(
@@ -130,14 +130,15 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
 
 
 def _channels(
-    table: Table, columns: Sequence[int], units: Mapping[str, str]
+    table: Table, columns: Sequence[int], units: Mapping[str | int, str]
 ) -> tuple[Channel, ...]:
-    """Channels with the units that are given by name or by header."""
-    listed = [(table.columns[i], table.headers[i]) for i in columns]
-    return tuple(
-        Channel(channel.name, units.get(channel.name, units.get(header, channel.unit)))
-        for channel, header in listed
-    )
+    """Channels with the units that are given by name, by header or by number."""
+    found = []
+    for i in columns:
+        channel = table.columns[i]
+        given = (units[key] for key in (channel.name, table.headers[i], i) if key in units)
+        found.append(Channel(channel.name, next(given, channel.unit)))
+    return tuple(found)
 
 
 def _stretches(missing: NDArray[np.bool_], gaps: Integers) -> list[tuple[int, int]]:

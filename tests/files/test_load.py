@@ -141,6 +141,8 @@ def test_units(tmp_path, signals):
     data = load_records(path, **USE, units={"u1": "kV", "y/mm": "m"})
     assert data.train[0].inputs[0] == Channel("u1", "kV")
     assert data.train[0].outputs == (Channel("y", "m"),)
+    data = load_records(path, **USE, units={0: "V", 2: "m"})
+    assert [c.unit for c in (*data.train[0].inputs, *data.train[0].outputs)][::2] == ["V", "m"]
     refused("units names 'v'.*none of the inputs and outputs: u1, u2, y", path, units={"v": ""})
 
 
