@@ -82,6 +82,7 @@ def test_second_derivatives_are_refused():
 def test_any_optimiser_trains_it_within_a_larger_model(start: Start):
     """A learned input filter before the model and a gain behind it."""
     lfr, u = LFR(random_cell(1, 1, 2, 1, 1, 3, radius=0.5)), normal(2, 60, 1)
+    torch.manual_seed(0)
     before, behind = torch.nn.Linear(1, 1).double(), torch.nn.Linear(1, 1).double()
     target = reference_output(u)
     parameters = [*before.parameters(), *lfr.parameters(), *behind.parameters()]
