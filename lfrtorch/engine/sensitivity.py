@@ -156,6 +156,7 @@ class Linearisation:
         R, nx = self.state.shape
         compiled = has_kernels(self.u)
         samples = BLOCK if compiled else PASS
+        Phi = self.state.new_empty(R, nx, nx * initial_state)
         # Blocks do not depend on the number of threads, and so neither do sums over them.
         together = 1 if compiled else R
         for records in _slices(R, max(together, samples // self.u.shape[1])):
@@ -172,6 +173,11 @@ class Linearisation:
                     rows = out[records, time]
                 write = self._rows_compiled if compiled else self._rows_generic
                 S = write(block, columns, S, rows)
+                if initial_state and time.stop == self.u.shape[1]:
+                    Phi[records] = S[:, :, len(kept) :]
+                    # If it has faded, fewer blocks are enough.
+                    if records.stop == R and Phi.abs().amax() >= FADED:
+                        self.__dict__.setdefault("_transition", (Phi, self._times))
                 yield Rows(records, time, rows, S)
 
     @torch.no_grad()
@@ -234,7 +240,10 @@ class Linearisation:
 
     @cached_property
     def _transition(self) -> tuple[Float[Tensor, "R nx nx"], list[slice]]:
-        """The product of all F(k), and the blocks that an initial state takes to fade."""
+        """The product of all F(k), and the blocks that an initial state takes to fade.
+
+        ``rows`` finds it on the way.
+        """
         R, nx = self.state.shape
         Phi, times = torch.eye(nx).to(self.state).expand(R, nx, nx), []
         for block in self._blocks():
@@ -256,10 +265,14 @@ class Linearisation:
     def _blocks(self, *, backwards: bool = False) -> Iterator[_Block]:
         """All records, block by block in time, or at once if they are few."""
         everything = slice(0, len(self.u))
-        T = self.u.shape[1]
-        times = list(_slices(T, T if self._whole else max(1, PASS // len(self.u))))
-        for time in reversed(times) if backwards else times:
+        for time in reversed(self._times) if backwards else self._times:
             yield self._whole or self._block(everything, time)
+
+    @property
+    def _times(self) -> list[slice]:
+        """Those blocks."""
+        T = self.u.shape[1]
+        return list(_slices(T, T if self._whole else max(1, PASS // len(self.u))))
 
     def _block(self, records: slice, time: slice) -> _Block:
         if self._whole is None:

@@ -12,8 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.sparse.linalg import ArpackError, eigsh
 from torch import Tensor
 
 from lfrtorch._support.threads import spread
@@ -25,6 +27,10 @@ MERGED = 16
 PIECES, TALL = 16, 8
 """Rows are cut into at most 16 pieces for the threads, each at least 8 times as tall as wide: the
 merge of their triangles then takes at most an eighth of the work."""
+
+
+KRYLOV = 400
+"""Parameters from which the largest eigenvalue is found without the others."""
 
 
 @runtime_checkable
@@ -85,7 +91,7 @@ class CholeskySystem:
         finite = bool(torch.isfinite(G).all())
         self._G, self.rank = G, rank
         self._latest: tuple[float, Tensor] | None = None  # damping and Cholesky factor
-        self.scale = float(torch.linalg.eigvalsh(G)[-1]) if finite else float("nan")
+        self.scale = _largest_eigenvalue(G) if finite else float("nan")
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient; NaN if rounding errors leave no positive definite matrix."""
@@ -95,6 +101,17 @@ class CholeskySystem:
             L, failed = torch.linalg.cholesky_ex(damped)
             self._latest = damping, torch.full_like(L, torch.nan) if failed else L
         return -torch.cholesky_solve(gradient.unsqueeze(-1), self._latest[1]).squeeze(-1)
+
+
+def _largest_eigenvalue(G: Float[Tensor, "P P"]) -> float:
+    """Of a symmetric matrix; of a large one by a Krylov subspace, some thirty products with it."""
+    if len(G) < KRYLOV or G.device.type != "cpu":
+        return float(torch.linalg.eigvalsh(G)[-1])
+    start = np.ones(len(G), G.numpy().dtype)  # ARPACK's own would be random
+    try:
+        return float(eigsh(G.numpy(), k=1, which="LA", v0=start, return_eigenvectors=False)[0])
+    except ArpackError:  # it did not converge, or G is zero
+        return float(torch.linalg.eigvalsh(G)[-1])
 
 
 class BroadcastSystem:

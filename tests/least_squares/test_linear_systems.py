@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.least_squares.linear_systems import (
+    KRYLOV,
     CholeskySystem,
     GramAccumulator,
     QRAccumulator,
@@ -106,3 +107,15 @@ def test_inverse_is_the_pseudo_inverse(rows: int):
     assert_close(inverse @ G @ inverse, inverse, rtol=1e-11, atol=1e-11)
     assert_close(inverse, torch.linalg.pinv(G, rtol=1e-12), rtol=1e-10, atol=1e-10)
     assert torch.equal(inverse[2], torch.zeros(6, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e-6])
+def test_the_largest_eigenvalue_of_many_parameters(spread: float):
+    # That of a matrix with one that stands out, and with neighbours of one size.
+    generator = torch.Generator().manual_seed(0)
+    J = torch.randn(KRYLOV + 50, KRYLOV + 20, generator=generator, dtype=torch.float64)
+    J[:, 0] *= 1.0 + 10.0 * spread
+    G = J.mT @ J
+    expected = float(torch.linalg.eigvalsh(G)[-1])
+    assert CholeskySystem(G, len(G)).scale == pytest.approx(expected, rel=1e-9)
+    assert CholeskySystem(torch.zeros_like(G), 0).scale == 0.0
