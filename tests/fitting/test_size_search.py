@@ -88,7 +88,8 @@ def test_planted_sizes_are_chosen(single: SizeSearch):
 
 
 def test_a_second_input_of_the_map_is_found():
-    found = search(plant(2, 1), nz=(1, 2), nw=(1, 2), nn=3)
+    trainer = LevenbergMarquardt(max_iter=30)
+    found = search(plant(2, 1, noise=0.005), nz=(1, 2), nw=(1, 2), nn=3, trainer=trainer)
     assert found.chosen.sizes == {"nz": 2, "nw": 1, "nn": 3}
     assert len(found.candidates) == 4
     assert found.notes == ("nz 2 is the largest tried; a larger one may do better.",)
@@ -102,7 +103,9 @@ def test_states_are_searched_with_the_other_sizes():
         sizes = dict(sizes)
         return initialise(models[sizes.pop("nx")], train, **sizes, seed=seed)
 
-    found = search(planted, start=start, nx=(1, 2, 3), nz=(1, 2), nw=1, nn=3)
+    options: dict[str, Any] = {"nx": (1, 2, 3), "nz": 2, "nw": 1, "nn": 3, "seeds": (0, 1, 2, 3)}
+    trainer = LevenbergMarquardt(max_iter=30)
+    found = search(planted, start=start, trainer=trainer, **options)
     assert found.chosen.sizes == {"nx": 2, "nz": 2, "nw": 1, "nn": 3}
     assert {c.sizes["nx"] for c in found.candidates} == {1, 2, 3}
 
