@@ -1,15 +1,14 @@
 """Recurrences of the linearised model, of which no F(k) is formed: F(k) = A + Bw J(k) Cz.
 
 J(k) has nw nz entries and F(k) has nx². A step of one column costs nx (nx + nz + nw) products, and
-the memory that it passes is that of J, the drive and the states. With 20 states the products of
-``linear_recurrence`` and the F that they need took four times as long.
+the memory that it passes is that of J, the drive and the states.
 
 Machine code serves the CPU; any other device forms F and goes through ``linear_recurrence``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from jaxtyping import Float
@@ -43,10 +42,7 @@ def forwards(
     if not has_kernels(J):
         F = linearise_at(weights, J).F
         return linear_recurrence(F, g.unsqueeze(-1), s0.unsqueeze(-1)).squeeze(-1)
-    s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
-    s[:, 0] = s0
-    spread(_forwards, len(g), *_matrices(weights), to_numpy(J), to_numpy(g), s.numpy())
-    return s
+    return _states(_forwards, weights, J, g, s0, 0)
 
 
 def backwards(
@@ -59,10 +55,7 @@ def backwards(
     if not has_kernels(J):
         F = linearise_at(weights, J).F
         return adjoint_recurrence(F, g.unsqueeze(-1), end.unsqueeze(-1)).squeeze(-1)
-    s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
-    s[:, -1] = end
-    spread(_backwards, len(g), *_matrices(weights), to_numpy(J), to_numpy(g), s.numpy())
-    return s
+    return _states(_backwards, weights, J, g, end, -1)
 
 
 def transition(
@@ -85,6 +78,21 @@ def monodromy(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx 
         J = linearise_static(cell.static, part, of_static(weights)).J
         Phi = transition(weights, J, Phi)
     return Phi
+
+
+def _states(
+    kernel: Callable[..., None],
+    weights: Weights,
+    J: Float[Tensor, "R T nw nz"],
+    g: Float[Tensor, "R T nx"],
+    known: Float[Tensor, "R nx"],
+    at: int,
+) -> Float[Tensor, "R T+1 nx"]:
+    """What a kernel finds from the states that are known at one time."""
+    s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
+    s[:, at] = known
+    spread(kernel, len(g), *_matrices(weights), to_numpy(J), to_numpy(g), s.numpy())
+    return s
 
 
 def _matrices(weights: Weights) -> list[NDArray]:

@@ -121,6 +121,7 @@ class Linearisation:
         self.layout = layout(cell, every=weights is not None)
         self.state = cell.A.new_zeros(len(u), cell.nx)
         self._ny = cell.ny
+        self._known_transition: tuple[Tensor, list[slice]] | None = None
 
     @property
     def parameters(self) -> int:
@@ -177,7 +178,7 @@ class Linearisation:
                     Phi[records] = S[:, :, len(kept) :]
                     # If it has faded, fewer blocks are enough.
                     if records.stop == R and Phi.abs().amax() >= FADED:
-                        self.__dict__.setdefault("_transition", (Phi, self._times))
+                        self._known_transition = Phi, self._times
                 yield Rows(records, time, rows, S)
 
     @torch.no_grad()
@@ -238,12 +239,14 @@ class Linearisation:
             end = self._costates(block, e, end)[:, 0]
         return fixed_point(Phi.mT, end.unsqueeze(-1)).squeeze(-1)
 
-    @cached_property
+    @property
     def _transition(self) -> tuple[Float[Tensor, "R nx nx"], list[slice]]:
         """The product of all F(k), and the blocks that an initial state takes to fade.
 
         ``rows`` finds it on the way.
         """
+        if self._known_transition is not None:
+            return self._known_transition
         R, nx = self.state.shape
         Phi, times = torch.eye(nx).to(self.state).expand(R, nx, nx), []
         for block in self._blocks():
@@ -251,6 +254,7 @@ class Linearisation:
             Phi = transition(self.weights, block.static.J, Phi)
             if Phi.abs().amax() < FADED:
                 break
+        self._known_transition = Phi, times
         return Phi, times
 
     def _costates(

@@ -367,7 +367,7 @@ def any_of(halt: Event, stop: Stop | None) -> Stop:
 
 
 class Together:
-    """The starts of one fit, and who watches them; ``halt`` is set if Ctrl-C ends one thread."""
+    """Fits side by side, and who watches them; ``halt`` is set if Ctrl-C ends one thread."""
 
     def __init__(
         self, fits: Sequence[Fit], monitors: Sequence[Sequence[Monitor]], halt: Event

@@ -2,8 +2,8 @@
 
 Fits of one size end in different minima, and only the good ones show what the size is worth. So
 many models of random sizes and starts begin, and the best of them go on, in three rounds
-(successive halving). On the drive with friction of the benchmarks (EMPS, 72 models) the error after
-6 iterations says little of that after 75 (rank correlation 0.1), after 25 more (0.6).
+(successive halving). The first round is long, as the error after a few iterations says little of
+that after many if there is friction, or an integrator.
 
 The fewest parameters that do as well as the best are chosen: ``lfrtorch.paired_blocks`` says what
 that is. The models that left the race count, too: if more parameters bring nothing, the smallest
@@ -38,7 +38,7 @@ from lfrtorch._support.types import Array, Integers
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting.live_line import StartsLine
 from lfrtorch.fitting.multistart import Together, any_of, iterations_of
-from lfrtorch.fitting.trainer import Fit, Monitor, StartDivergesError, Stop, StoppedError, Trainer
+from lfrtorch.fitting.trainer import Fit, Monitor, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
@@ -72,7 +72,8 @@ ITERATIONS = 75
 
 LEGEND = """\
 validation: rms error over that of the output. above best: in standard errors of the difference.
-chosen: the fewest net parameters with 1 at most, or an error up to 1 % above the best."""
+chosen: the fewest net parameters with 1 at most, or an error up to 1 % above the best; or fewer
+with a smaller error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Candidate:
     Args:
         sizes: nz, nw, and nn or degree; nx if it was searched, too.
         seed: of its start.
-        rounds, iterations: that it took part in; 0 if it diverges at the start.
+        rounds, iterations: that it took part in; no iteration if it diverges at the start.
         parameters, parameters_net: all, and without the gauge directions.
         seconds: they took.
         error, error_std: rms of the simulation error over the validation records, each output
@@ -322,19 +323,16 @@ def search_sizes(
     judge, clock = _Judge(as_records(validation), linear, ranks), time.perf_counter()
     drawn = _drawn(tried, seeds, ROUNDS[0][0] * finalists)
     planned = race(len(drawn), finalists, trainer.limit)
-    left: list[Candidate] = []
     halt = Event()
     options: dict[str, Any] = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
     options["stop"] = any_of(halt, stop) if ranks.world == 1 else stop
-    field: list[_Runner] = []
-    for sizes, seed in drawn:
-        model = start(sizes, seed)
-        try:
-            field.append(_Runner(sizes, seed, Fit(model, train, validation, **options)))
-        except StartDivergesError:
-            left.append(judge.diverging(sizes, seed, model))
+    field = [
+        _Runner(sizes, seed, Fit(start(sizes, seed), train, validation, **options))
+        for sizes, seed in drawn
+    ]
+    left: list[Candidate] = []
     with ExitStack() as ending:
-        if monitor is None and ranks.rank == 0 and field:
+        if monitor is None and ranks.rank == 0:
             unit, steps = field[0].fit.model.outputs[0].unit, iterations_of(planned)
             monitor = StartsLine(len(field), unit, iterations=steps, rounds=False)
             ending.callback(monitor.close)
@@ -344,8 +342,6 @@ def search_sizes(
             field = sorted(field, key=lambda runner: runner.fit.best)
             left = [judge.candidate(runner, number - 1) for runner in field[count:]] + left
             field = field[:count]
-            if not field:
-                break
             together.advance([runner.fit for runner in field], until)
             _check_whole([runner.fit for runner in field])
             best = judge.candidate(min(field, key=lambda runner: runner.fit.best), number)
@@ -431,13 +427,6 @@ class _Judge:
         return Candidate(
             runner.sizes, runner.seed, rounds, found.iterations, found.model.parameter_count,
             found.model.net_parameter_count, found.seconds, error, error_std, ratio, squares,
-        )  # fmt: skip
-
-    def diverging(self, sizes: Sizes, seed: int, model: Model) -> Candidate:
-        """A model that diverges on the training records at the start."""
-        return Candidate(
-            sizes, seed, 0, 0, model.parameter_count, model.net_parameter_count, 0.0,
-            inf, inf, inf, np.full(len(self.counts), inf),
         )  # fmt: skip
 
     def _error(self, squares: Array) -> tuple[float, float]:

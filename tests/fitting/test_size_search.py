@@ -14,7 +14,14 @@ from lfrtorch._support.tables import number
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Polynomial
-from lfrtorch.fitting.size_search import Candidate, SizeRound, SizeSearch, race, search_sizes
+from lfrtorch.fitting.size_search import (
+    LEGEND,
+    Candidate,
+    SizeRound,
+    SizeSearch,
+    race,
+    search_sizes,
+)
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import StoppedError
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -166,7 +173,7 @@ def test_table_marks_the_chosen_and_rises_in_parameters(
     found = single
     lines = found.table().splitlines()
     assert lines[0].split()[:6] == ["nz", "nw", "nn", "iterations", "parameters", "net"]
-    rows = [line.split() for line in lines[2:-2]]
+    rows = [line.split() for line in lines[2 : -len(LEGEND.splitlines())]]
     net = [int(row[5]) for row in rows]
     assert net == sorted(net)
     assert len(net) == 5  # those of the last round
