@@ -34,6 +34,7 @@ VARIANTS = {
     "inference": ["init=inference"],
     "zero_output, slow modes kept": ["init=zero_output", "init.minor=0"],
     "zero_output, no acceleration": ["init=zero_output", "trainer.acceleration=false"],
+    "zero_output, first damping 1e-2": ["init=zero_output", "trainer.least_damping=1e-2"],
     "zero_output, ridge 0": ["init=zero_output", "ridge=0"],
     "zero_output, ridge 1e-2": ["init=zero_output", "ridge=1e-2"],
 }

@@ -431,8 +431,12 @@ def _whitened(N: Array, xu: Array) -> Array:
 
 
 def _minimised(problem: InferenceError | StaticProblem, steps: int, **options: Any) -> Tensor:
-    """θ after some steps of Levenberg-Marquardt."""
-    search = LevenbergMarquardt(max_iter=steps, **options)
+    """θ after some steps of Levenberg-Marquardt.
+
+    The first one does not search its damping: of 32 starts on planted systems 31 were as good with
+    that, and one had 0.97 of the linear model's error instead of 0.19.
+    """
+    search = LevenbergMarquardt(max_iter=steps, least_damping=1.0, **options)
     state = search.init(problem, problem.theta)
     while not state.reason:
         state = search.step(problem, state)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -30,6 +30,13 @@ from lfrtorch.least_squares.linear_systems import SVDSystem, System
 
 FASTEST_DECREASE = 0.2
 """Smallest factor on λ after an accepted step; Nielsen has 1/3."""
+
+FIRST = 0.1
+"""Factor on λ from trial to trial of the first step, as long as the decrease grows by this part.
+
+The gain ratio stays near 1 down to some λ, and is far below 0 at the next two. What that saves is
+in benchmarks/starts.md.
+"""
 
 TAKEN_BACK = 10.0
 """Factor on λ after an undone step: reverts the largest decrease (1/0.2 = 5) and doubles."""
@@ -158,6 +165,16 @@ class LMState:
         }
 
 
+class _Trial(NamedTuple):
+    """A step and what it reached."""
+
+    theta: Tensor
+    residual: Tensor
+    cost: float
+    damping: float
+    gain_ratio: float
+
+
 @dataclass(frozen=True)
 class LevenbergMarquardt:
     """Options of the search; ``init`` and ``step`` run it.
@@ -174,6 +191,8 @@ class LevenbergMarquardt:
         finite_step: h of the directional second derivative (Transtrum et al. use 0.1).
         acceleration_limit: largest 2|a| / |δ| at which the acceleration is trusted.
         max_damping: λ relative to the largest squared singular value that ends the search.
+        least_damping: to which the first step may lower λ, in trials from the same Jacobian; with
+            ``damping`` or more it does not.
 
     Example:
         >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=10, acceleration=False)
@@ -192,10 +211,12 @@ class LevenbergMarquardt:
     finite_step: float = 0.1
     acceleration_limit: float = 0.75
     max_damping: float = 1e12
+    least_damping: float = 1e-8
 
     def __post_init__(self) -> None:
         for name in ("damping", "truncation", "finite_step", "acceleration_limit", "max_damping"):
             number(name, getattr(self, name), positive=True)
+        number("least_damping", self.least_damping, positive=True)
         for name in ("tolerance", "floor"):
             number(name, getattr(self, name))
         integer("max_iter", self.max_iter, 0)
@@ -221,7 +242,10 @@ class LevenbergMarquardt:
         return LMState(theta, residual, cost)
 
     def step(self, problem: LeastSquares, state: LMState) -> LMState:
-        """One iteration: linearise, then raise the damping until a step lowers the cost."""
+        """One iteration: linearise, then raise the damping until a step lowers the cost.
+
+        The first one also lowers it, as long as the next step is better.
+        """
         search = self._search(problem.cost, state)
         answer = None
         while True:
@@ -282,66 +306,88 @@ class LevenbergMarquardt:
     ) -> Generator[tuple[str, Tensor], Any, LMState]:
         """One iteration, which yields (what, θ) for each residual or Jacobian that it needs."""
         jacobian: Jacobian = yield JACOBIAN, state.theta
-        relative = self.damping if state.damping is None else state.damping / state.scale
+        damping, least = state.damping, math.inf
+        first = min(self.damping, self.least_damping)
+        relative = first if damping is None else damping / state.scale
         system, gradient = jacobian.system(relative, self.truncation)
         scale = system.scale
         if not scale > 0:
             return replace(state, reason=Reason.JACOBIAN_VANISHES)
-        damping = self.damping * scale if state.damping is None else state.damping
-        growth, cost = state.growth, state.cost
-
-        trials, gain_ratio = 0, float("nan")
+        if damping is None:  # to be lowered within this step
+            damping, least = self.damping * scale, self.least_damping * scale
+        growth, trials, gain_ratio = state.growth, 0, float("nan")
+        best: _Trial | None = None
         while damping <= self.max_damping * scale:
             trials += 1
-            delta = system.solve(gradient, damping)
-            # Decrease of |r + J δ|² by the δ with (JᵀJ + λI) δ = -gradient.
-            predicted = float(damping * delta.square().sum() - gradient @ delta)
-            theta = state.theta + delta
-            if self.acceleration:
-                h = self.finite_step
-                ahead = yield RESIDUAL, state.theta + h * delta
-                if math.isfinite(cost_of(ahead)):
-                    # r'' along δ, from r(θ + hδ) = r + h J δ + h² r'' / 2 + O(h³).
-                    second = 2.0 / h * ((ahead - state.residual) / h - jacobian.tangent(delta))
-                    theta = theta + self._acceleration(second, delta, jacobian, system, damping)
-            residual = yield RESIDUAL, theta
-            new_cost = cost_of(residual)
-            actual = cost - new_cost
-            gain_ratio = actual / predicted if predicted > 0 else float("nan")
-            if actual > 0:  # False for NaN: a diverging trial is a rejected step
-                damping *= max(FASTEST_DECREASE, 1.0 - (2.0 * gain_ratio - 1.0) ** 3)
-                quiet = state.quiet + 1 if actual <= self.tolerance * cost else 0
-                accepted = replace(
-                    state,
-                    theta=theta,
-                    residual=residual,
-                    cost=new_cost,
-                    damping=damping,
-                    scale=scale,
-                    growth=2.0,
-                    iteration=state.iteration + 1,
-                    gain_ratio=gain_ratio,
-                    trials=trials,
-                    rank=system.rank,
-                    quiet=quiet,
-                )
-                if accepted.cost <= self.floor**2 * cost_of(torch.ones_like(residual)):
-                    return replace(accepted, reason=Reason.RESIDUAL_VANISHES)
-                if quiet >= self.patience:
-                    return replace(accepted, reason=Reason.COST_SETTLED)
-                if accepted.iteration >= self.max_iter:
-                    return replace(accepted, reason=Reason.ALL_ITERATIONS)
-                return accepted
-            damping *= growth
-            growth *= 2.0
-        return replace(
+            trial = yield from self._trial(cost_of, state, jacobian, system, gradient, damping)
+            gain_ratio, decrease = trial.gain_ratio, state.cost - trial.cost
+            before = 0.0 if best is None else state.cost - best.cost
+            if decrease > before:  # False for NaN: a diverging trial is a rejected step
+                best = trial
+            elif best is None:
+                damping, growth, least = growth * damping, 2.0 * growth, math.inf
+                continue
+            damping *= FIRST
+            if damping < least or not decrease > (1.0 + FIRST) * before:
+                break
+        if best is None:
+            return replace(
+                state,
+                iteration=state.iteration + 1,
+                gain_ratio=gain_ratio,
+                trials=trials,
+                rank=system.rank,
+                reason=Reason.NO_STEP_LEFT,
+            )
+        actual = state.cost - best.cost
+        quiet = state.quiet + 1 if actual <= self.tolerance * state.cost else 0
+        accepted = replace(
             state,
+            theta=best.theta,
+            residual=best.residual,
+            cost=best.cost,
+            damping=best.damping * max(FASTEST_DECREASE, 1.0 - (2.0 * best.gain_ratio - 1.0) ** 3),
+            scale=scale,
+            growth=2.0,
             iteration=state.iteration + 1,
-            gain_ratio=gain_ratio,
+            gain_ratio=best.gain_ratio,
             trials=trials,
             rank=system.rank,
-            reason=Reason.NO_STEP_LEFT,
+            quiet=quiet,
         )
+        if accepted.cost <= self.floor**2 * cost_of(torch.ones_like(best.residual)):
+            return replace(accepted, reason=Reason.RESIDUAL_VANISHES)
+        if quiet >= self.patience:
+            return replace(accepted, reason=Reason.COST_SETTLED)
+        if accepted.iteration >= self.max_iter:
+            return replace(accepted, reason=Reason.ALL_ITERATIONS)
+        return accepted
+
+    def _trial(
+        self,
+        cost_of: Callable[[Tensor], float],
+        state: LMState,
+        jacobian: Jacobian,
+        system: System,
+        gradient: Float[Tensor, " P"],
+        damping: float,
+    ) -> Generator[tuple[str, Tensor], Any, _Trial]:
+        """The step at one damping."""
+        delta = system.solve(gradient, damping)
+        # Decrease of |r + J δ|² by the δ with (JᵀJ + λI) δ = -gradient.
+        predicted = float(damping * delta.square().sum() - gradient @ delta)
+        theta = state.theta + delta
+        if self.acceleration:
+            h = self.finite_step
+            ahead = yield RESIDUAL, state.theta + h * delta
+            if math.isfinite(cost_of(ahead)):
+                # r'' along δ, from r(θ + hδ) = r + h J δ + h² r'' / 2 + O(h³).
+                second = 2.0 / h * ((ahead - state.residual) / h - jacobian.tangent(delta))
+                theta = theta + self._acceleration(second, delta, jacobian, system, damping)
+        residual = yield RESIDUAL, theta
+        cost = cost_of(residual)
+        gain_ratio = (state.cost - cost) / predicted if predicted > 0 else float("nan")
+        return _Trial(theta, residual, cost, damping, gain_ratio)
 
     def _acceleration(
         self,

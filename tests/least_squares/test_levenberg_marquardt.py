@@ -154,11 +154,48 @@ def test_linear_problem_gains_what_is_predicted_at_any_damping():
 def test_damping_falls_to_a_fifth_where_the_model_is_exact():
     J, b = normal(30, 4), normal(30, seed=1)
     problem = Problem(lambda x: J @ x - b)
-    optimiser = LevenbergMarquardt(damping=1e-3)
+    optimiser = LevenbergMarquardt(damping=1e-3, least_damping=1e-3)
     first = optimiser.step(problem, optimiser.init(problem, torch.zeros(4, dtype=J.dtype)))
     start = 1e-3 * float(torch.linalg.svdvals(J)[0]) ** 2
     assert first.damping == pytest.approx(start / 5)
     assert optimiser.step(problem, first).damping == pytest.approx(start / 25)
+
+
+# --- the first damping ----------------------------------------------------------------------
+
+
+@BOTH
+def test_first_step_lowers_the_damping_as_long_as_that_pays(acceleration: bool):
+    # Singular values 1, 1e-2, 1e-3: a damping of 1e-2 leaves nearly all of the last two.
+    J = torch.diag(tensor(1, 1e-2, 1e-3))
+    problem = Problem(lambda x: J @ x - tensor(1, 1, 1))
+    optimiser = LevenbergMarquardt(acceleration=acceleration)
+    start = optimiser.init(problem, tensor(0, 0, 0))
+    first = optimiser.step(problem, start)
+    # Of each entry (λ / (λ + s²))² is left: the sums gained at 1e-5, 1e-6 and 1e-7 are 2.16, 2.74
+    # and 2.99, the last one less than a tenth more.
+    assert first.trials == 6
+    assert first.damping == pytest.approx(1e-7 / 5)
+    second = optimiser.step(problem, first)
+    assert (second.trials, second.damping) == (1, pytest.approx(1e-7 / 25))
+
+
+def test_best_trial_of_the_first_step_is_taken():
+    # r = -0.99 and J = 0.2: λ = 1000, 100, 10 and 1 of J² lead to 0.105, 0.149, 0.55 and 2.575.
+    problem = Problem(lambda x: x**2 - 1)
+    optimiser = LevenbergMarquardt(damping=1e3, acceleration=False)
+    first = optimiser.step(problem, optimiser.init(problem, tensor(0.1)))
+    assert first.trials == 4
+    assert float(first.theta) == pytest.approx(0.55)
+    assert first.cost == float(problem.f(first.theta).square())
+
+
+def test_first_step_that_was_refused_raises_the_damping_only():
+    problem = Problem(lambda x: torch.where(x < 2.1, x**3 - 8, torch.full_like(x, torch.nan)))
+    states = search(problem, tensor(0.5), LevenbergMarquardt(damping=1e-3, acceleration=False))
+    plain = replace(LevenbergMarquardt(damping=1e-3, acceleration=False), least_damping=1e-3)
+    assert states[1].trials > 1
+    assert torch.equal(states[1].theta, search(problem, tensor(0.5), plain)[1].theta)
 
 
 @BOTH
@@ -287,10 +324,11 @@ class Several(NamedTuple):
 
 
 @BOTH
-def test_searches_in_step_are_each_what_they_are_alone(acceleration: bool):
+@pytest.mark.parametrize("damping", [1e-9, 1.0])
+def test_searches_in_step_are_each_what_they_are_alone(damping: float, acceleration: bool):
     """They need different numbers of trials, and end one after another."""
     published = [PUBLISHED[0], PUBLISHED[5], PUBLISHED[4]]
-    optimiser = LevenbergMarquardt(max_iter=8, damping=1e-9, acceleration=acceleration)
+    optimiser = LevenbergMarquardt(max_iter=8, damping=damping, acceleration=acceleration)
     stack = Several([Problem(p.f) for p in published])
     states = [optimiser.init(Problem(p.f), p.start) for p in published]
     states[1] = replace(states[1], iteration=4)  # half of its iterations are gone
@@ -325,7 +363,7 @@ def test_patience_counts_steps_without_progress():
 
 def test_residual_below_the_floor_counts_as_zero():
     # λ is 1 and then 1/5 of |J|²: what is left is a half, and a sixth of that.
-    optimiser = LevenbergMarquardt(damping=1.0, floor=0.5)
+    optimiser = LevenbergMarquardt(damping=1.0, least_damping=1.0, floor=0.5)
     states = search(Problem(lambda x: x - 1), tensor(5, 7), optimiser)
     rms = [float(state.residual.square().mean().sqrt()) for state in states]
     assert rms == pytest.approx([26**0.5, 26**0.5 / 2, 26**0.5 / 12])
@@ -376,7 +414,15 @@ def build(**options: Any) -> LevenbergMarquardt:
 
 
 @pytest.mark.parametrize(
-    "option", ["damping", "truncation", "finite_step", "acceleration_limit", "max_damping"]
+    "option",
+    [
+        "damping",
+        "least_damping",
+        "truncation",
+        "finite_step",
+        "acceleration_limit",
+        "max_damping",
+    ],
 )
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
 def test_options_that_must_be_positive(option: str, value: float):
