@@ -43,6 +43,7 @@ from lfrtorch.linear.requirements import (
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.linear.spectral_data import (
+    SpectralData,
     Weight,
     spectral_data_of_records,
     spectral_data_of_response,
@@ -226,6 +227,7 @@ def _stable(data: list[Record] | FRF, nx: int, settings: _Settings) -> LinearMod
         )
     if isinstance(problem, ResponseFit):
         check_spectral_data(problem.data, nx)
+        notes += _band_notes(problem.data, about.fs)
     else:
         check_length(records, nx)
         notes += excitation_notes(records, nx)
@@ -325,6 +327,17 @@ def _of_records(
         if spectra is not None:
             return ResponseFit(spectra, known=False, feedthrough=feedthrough)
     return SignalFit(normalised, offset=offset, prediction=prediction, feedthrough=feedthrough)
+
+
+def _band_notes(data: SpectralData, fs: float) -> list[str]:
+    """What lines are fitted if not all at which the input has some power."""
+    if not data.left_out:
+        return []
+    f = np.abs(np.angle(data.z)) * fs / (2 * np.pi)
+    return [
+        f"the fit is to the {len(f)} lines that the input excites, {f.min():.4g} to {f.max():.4g} "
+        f"Hz; {data.left_out} lines with noise, hum or distortion at the input are left out."
+    ]
 
 
 def _notes(problem: LinearLeastSquares, estimate: SubspaceEstimate, found: Refined) -> list[str]:

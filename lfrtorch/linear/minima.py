@@ -24,6 +24,10 @@ SAME, AGREED = 1.0 + 2e-6, 3
 """Ratio of two costs up to which two searches are in the same minimum; the comparison ends if this
 many in a row are in the best one."""
 
+RACERS, APART, LEADERS, SETTLED = 4, 1.03, 3, 1e-3
+"""Of many unknowns: starts that are compared, the factor between their costs, how many go on, and
+the decrease in some iterations below which the best of these alone goes on."""
+
 ALIKE, HOPELESS = 1.001, 10.0
 """Candidates whose costs differ by a factor below ALIKE count as one; a candidate whose cost is
 HOPELESS times the best is dropped."""
@@ -34,6 +38,10 @@ class LinearLeastSquares(Protocol):
 
     def most_candidates(self, nx: int) -> int:
         """How many subspace estimates are refined: several if an iteration takes milliseconds."""
+        ...
+
+    def many(self, nx: int) -> bool:
+        """Whether a model of the order has so many unknowns that iterations count."""
         ...
 
     def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
@@ -101,14 +109,17 @@ def best_minimum(
     the input hardly moves, from an initial state of 500 times its deviation.
     """
     field: list[Candidate] = []
-    last = 0.0
-    for candidate in tried[: problem.most_candidates(len(tried[0].estimate.A))]:
+    last, nx = 0.0, len(tried[0].estimate.A)
+    many = problem.many(nx)
+    for candidate in tried[: problem.most_candidates(nx)]:
         hopeless = field and candidate.cost >= HOPELESS * tried[0].cost
-        if candidate.cost > ALIKE * last and not hopeless:
+        if candidate.cost > (APART if many else ALIKE) * last and not hopeless:
             field.append(candidate)
             last = candidate.cost
     searches: list[tuple[SubspaceEstimate, Search]] = []
-    for _, estimate, matrices in field if max_iter > FIRST_STEPS else field[:1]:
+    if max_iter <= FIRST_STEPS:
+        field = field[:1]
+    for _, estimate, matrices in field[:RACERS] if many else field:
         try:
             search = problem.search(scaled(problem, matrices, balanced=balanced))
         except ValueError:  # the data hardly move some states: their scaling is a rounding error
@@ -124,9 +135,12 @@ def best_minimum(
         for each, last in zip(searches, costs, strict=False)
         if each[1].state.cost > SAME * last
     ]
-    finalists = (distinct or searches)[:FINALISTS]
+    finalists = (distinct or searches)[: LEADERS if many else FINALISTS]
     for _, search in finalists:
-        search.advance(max_iter)
+        search.advance(max_iter, SETTLED if many else 0.0)
+    if many:
+        finalists = [min(finalists, key=lambda each: each[1].state.cost)]
+        finalists[0][1].advance(max_iter)
     estimate, search = min(finalists, key=lambda each: problem.improbability(each[1]))
     return estimate, problem.refined(search)
 

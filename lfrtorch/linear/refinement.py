@@ -18,6 +18,9 @@ Matrices = tuple[Array, Array, Array, Array]
 TOLERANCE = 1e-9
 """A relative decrease of the cost below this ends the search."""
 
+STRIDE = 4
+"""Iterations over which a search that need not end exactly is seen to have settled."""
+
 TRUNCATION = 1e-12
 """Relative singular value below which a direction of θ counts as gauge, which has no covariance."""
 
@@ -65,17 +68,27 @@ class Search:
     Args:
         problem: what is minimised.
         theta: initial parameters (P,).
+        tolerance: relative decrease of the cost that counts as none.
     """
 
-    def __init__(self, problem: Any, theta: Tensor) -> None:
+    def __init__(self, problem: Any, theta: Tensor, tolerance: float = TOLERANCE) -> None:
         self.problem = problem
-        self._optimiser = LevenbergMarquardt(max_iter=sys.maxsize, tolerance=TOLERANCE)
+        self._optimiser = LevenbergMarquardt(max_iter=sys.maxsize, tolerance=tolerance)
         self.state = self._optimiser.init(problem, theta)
 
-    def advance(self, max_iter: int) -> Self:
-        """Go on until the cost no longer falls, or to the iteration ``max_iter``."""
+    def advance(self, max_iter: int, settled: float = 0.0) -> Self:
+        """Go on until the cost no longer falls, or to the iteration ``max_iter``.
+
+        Args:
+            max_iter: last iteration.
+            settled: also end once STRIDE iterations lower the cost by less than this part.
+        """
+        costs = [self.state.cost]
         while not self.state.reason and self.state.iteration < max_iter:
             self.state = self._optimiser.step(self.problem, self.state)
+            costs.append(self.state.cost)
+            if settled and len(costs) > STRIDE and costs[-1] > (1.0 - settled) * costs[-1 - STRIDE]:
+                break
         return self
 
     @property

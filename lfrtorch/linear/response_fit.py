@@ -3,7 +3,8 @@
 The error at each DFT line is the measured Y minus G(z) U, where G(z) = C (zI - A)⁻¹ B + D is the
 response of the model. For given A and C it is linear in B and D, which one least-squares problem
 yields; that completes a subspace estimate to a model. Levenberg-Marquardt then refines all four
-matrices. A step that brings a pole out of the unit circle has an infinite cost, and is rejected.
+matrices. A step that brings a pole out of the unit circle has an infinite cost, and is rejected;
+poles that the lines do not tell are limited by ``pole_limits``.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from torch import Tensor
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.least_squares.gauge import Reduction, reduction
 from lfrtorch.least_squares.linear_systems import SVDSystem
+from lfrtorch.linear.modal_jacobian import ModalJacobian, Modes, stacked, with_best_inputs
 from lfrtorch.linear.model import linear_cell
-from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
+from lfrtorch.linear.pole_limits import PART, Excess, PoleLimits
+from lfrtorch.linear.refinement import TOLERANCE, TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.resolvent import (
     driven_jacobian,
     frequency_response,
@@ -35,6 +38,13 @@ from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_spectr
 
 MOST_CANDIDATES, LARGE = 12, 250_000
 """Subspace estimates that are refined; only one if errors times unknowns are LARGE or more."""
+
+
+MANY = 40
+"""Unknowns from which on the derivatives are computed by modes."""
+
+COARSE = 1e-7
+"""A relative decrease of the cost below this ends a search for many unknowns."""
 
 
 class ResponseFit:
@@ -57,6 +67,12 @@ class ResponseFit:
         nu, ny = self.data.U.shape[1], self.data.Y.shape[1]
         return MOST_CANDIDATES if self.data.Y.size * nx * (nu + ny) < LARGE else 1
 
+    def many(self, nx: int) -> bool:
+        """Whether a model of the order has so many unknowns that its modes save work."""
+        nu, free = self.data.U.shape[1], int(self._free_feedthrough.sum())
+        unknowns = nx * (nu + self.data.Y.shape[1]) + free
+        return unknowns >= MANY and self.data.weight is None and not self.starts
+
     def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
         """Subspace estimates of A and C."""
         return from_spectra(*self.equal_noise(self.data.Y), nx)
@@ -76,6 +92,12 @@ class ResponseFit:
     def with_input_matrices(self, A: Array, C: Array) -> tuple[float, Matrices]:
         """Cost and system with the best B and D for A and C: G is linear in them."""
         nx, nu, ny = len(A), self.data.U.shape[1], len(C)
+        if self.many(nx):
+            data = self.data
+            inputs = with_best_inputs(A, C, data.z, data.U, data.Y, self._free_feedthrough)
+            if inputs is not None:
+                matrices = A, inputs[0], C, inputs[1]
+                return float(np.sum(np.abs(self.errors(matrices)) ** 2)), matrices
         matrices = A, np.zeros((nx, nu)), C, np.zeros((ny, nu))
         X, L = solve_resolvents(*matrices[:3], self.data.z)
         of_B = nx * nx + np.arange(nx * nu)
@@ -106,8 +128,11 @@ class ResponseFit:
             LARGEST_POLE,
             free_feedthrough=self._free_feedthrough,
             together=self.starts > 0,
+            by_modes=self.many(len(matrices[0])),
+            limits=None if self.starts else PoleLimits(self.data.z),
         )
-        return Search(problem, torch.as_tensor(np.concatenate([m.ravel() for m in matrices])))
+        theta = torch.as_tensor(np.concatenate([m.ravel() for m in matrices]))
+        return Search(problem, theta, COARSE if self.many(len(matrices[0])) else TOLERANCE)
 
     @property
     def _free_feedthrough(self) -> NDArray[np.bool_]:
@@ -124,11 +149,10 @@ class ResponseFit:
     def refined(self, search: Search) -> Refined:
         """The present result of a search, with its covariance."""
         problem, state = search.problem, search.state
-        jacobian = problem.linearise(state.theta)
         return Refined(
             *problem.matrices(state.theta),
-            covariance=jacobian.covariance(known=self.known) if state.iteration else None,
-            rmse=math.sqrt(state.cost / self.data.Y.size),
+            covariance=problem.covariance(state.theta, self.known) if state.iteration else None,
+            rmse=float(np.linalg.norm(problem.errors(state.theta)) / math.sqrt(self.data.Y.size)),
             iterations=state.iteration,
             reason=search.reason,
         )
@@ -146,6 +170,8 @@ class ResponseProblem:
         free_feedthrough: which entries of D may change, (ny, nu). Default: all.
         together: whether the states under all inputs together are solved for, not those under each
             alone: less work for inputs of few columns, other last digits.
+        by_modes: whether derivatives are computed by modes: less work for many unknowns.
+        limits: of the poles.
     """
 
     def __init__(
@@ -156,6 +182,8 @@ class ResponseProblem:
         *,
         free_feedthrough: NDArray[np.bool_] | None = None,
         together: bool = False,
+        by_modes: bool = False,
+        limits: PoleLimits | None = None,
     ) -> None:
         self.data, self.largest_pole, self._together = data, largest_pole, together
         nu, ny = data.U.shape[1], data.Y.shape[1]
@@ -164,7 +192,12 @@ class ResponseProblem:
         if free_feedthrough is not None and not free_feedthrough.all():
             self._fixed = torch.zeros(nx * (nx + nu + ny) + ny * nu, dtype=torch.bool)
             self._fixed[nx * (nx + nu + ny) :] = torch.as_tensor(~free_feedthrough.ravel())
+        free = np.ones((ny, nu), dtype=bool) if free_feedthrough is None else free_feedthrough
+        self._free = free
+        self._by_modes = by_modes
+        self._limits = limits
         self._latest: tuple[Tensor, Complex] | None = None
+        self._latest_modes: tuple[Tensor, Modes | None] | None = None
         self._reduced: Reduction | None = None
 
     def matrices(self, theta: Tensor) -> list[Array]:
@@ -174,20 +207,48 @@ class ResponseProblem:
         return [p.reshape(s) for p, s in zip(np.split(parts, ends[:-1]), self.shapes, strict=True)]
 
     def residual(self, theta: Tensor) -> Tensor:
-        """Weighted G U - Y, real parts then imaginary parts, (2 F ny m,)."""
-        A, _, C, D = self.matrices(theta)
-        if not np.abs(np.linalg.eigvals(A)).max() < self.largest_pole:
-            return torch.full((2 * self.data.Y.size,), torch.inf, dtype=torch.float64)
-        X, U = self._states(theta), self.data.U
-        response = C @ X + D @ U if self._together else (C @ X + D) @ U
-        return _real(self.data.weighted(response - self.data.Y))
+        """Weighted G U - Y, real parts then imaginary parts, then ρ e, (2 F ny m + nx,)."""
+        poles = self._poles(theta)
+        if not np.abs(poles).max() < self.largest_pole:
+            size = 2 * self.data.Y.size + len(poles)
+            return torch.full((size,), torch.inf, dtype=torch.float64)
+        errors = self.errors(theta)
+        if self._limits is None:
+            return stacked(errors, np.zeros(len(poles)))
+        e, _ = self._limits.excess(poles)
+        return stacked(errors, math.sqrt(PART) * np.linalg.norm(errors) * e)
 
     def cost(self, residual: Tensor) -> float:
         """|r|²."""
         return float(residual.square().sum())
 
-    def linearise(self, theta: Tensor) -> ResponseJacobian:
+    def linearise(self, theta: Tensor) -> ResponseJacobian | ModalJacobian:
         """The Jacobian of the residual, without the columns of a change of state coordinates."""
+        modes, excess, data = self._modes(theta), self._excess(theta), self.data
+        if modes is not None:
+            errors = self.errors(theta)
+            return ModalJacobian(modes, data.z, data.U, errors, free=self._free, excess=excess)
+        return ResponseJacobian(*self._jacobian(theta), self.errors(theta), excess)
+
+    def covariance(self, theta: Tensor, known: bool) -> Array:
+        """Covariance (P, P) of θ at the minimum.
+
+        Args:
+            theta: the minimum.
+            known: whether the weights are the inverse variances of the errors. Otherwise the error
+                found at each line stands for its variance (White's estimate).
+        """
+        jacobian = self.linearise(theta)
+        if isinstance(jacobian, ModalJacobian):
+            found = jacobian.covariance(known=known)
+            if found is not None:
+                return found
+        errors, nx = self.errors(theta), self.shapes[0][0]
+        none = np.zeros(nx), np.zeros((nx, len(theta)))
+        return ResponseJacobian(*self._jacobian(theta), errors, none).covariance(known=known)
+
+    def _jacobian(self, theta: Tensor) -> tuple[Complex, Reduction]:
+        """Weighted derivative of G U in the columns that are kept, and how these give all."""
         cell = linear_cell(*self.matrices(theta))
         initial_states = torch.zeros(0, len(cell.A), dtype=torch.float64)
         self._reduced = reduction(cell, initial_states, before=self._reduced, fixed=self._fixed)
@@ -195,7 +256,43 @@ class ResponseProblem:
         X, L = self._states(theta), solve_resolvent(A.T, C.T, self.data.z).swapaxes(1, 2)
         jacobian = driven_jacobian if self._together else response_jacobian
         J = jacobian(X, L, self.data.U, self._reduced.kept.numpy())
-        return ResponseJacobian(self.data.weighted(J), self._reduced, self.residual(theta))
+        return self.data.weighted(J), self._reduced
+
+    def _excess(self, theta: Tensor) -> tuple[Array, Array]:
+        """Excess (nx,) of each pole over its limit, and its derivative (nx, P) with θ."""
+        poles = self._poles(theta)
+        e, slopes = np.zeros(len(poles)), np.zeros((len(poles), len(theta)))
+        if self._limits is not None:
+            e, _ = self._limits.excess(poles)
+            if e.any():
+                eigen = np.linalg.eig(self.matrices(theta)[0])
+                poles, V = (np.asarray(part, dtype=np.complex128) for part in eigen)
+                W = np.asarray(np.linalg.pinv(V), dtype=np.complex128)
+                slopes[:, : V.size] = self._limits.slopes(poles, V, W)
+        return e, slopes
+
+    def _poles(self, theta: Tensor) -> Complex:
+        modes = self._modes(theta)
+        poles = np.linalg.eigvals(self.matrices(theta)[0]) if modes is None else modes.poles
+        return np.asarray(poles, dtype=np.complex128)
+
+    def errors(self, theta: Tensor) -> Complex:
+        """Weighted G U - Y (F, ny, m)."""
+        modes, U = self._modes(theta), self.data.U
+        if modes is not None:
+            return modes.response(self.data.z) @ U - self.data.Y
+        _, _, C, D = self.matrices(theta)
+        X = self._states(theta)
+        response = C @ X + D @ U if self._together else (C @ X + D) @ U
+        return self.data.weighted(response - self.data.Y)
+
+    def _modes(self, theta: Tensor) -> Modes | None:
+        """The modes of θ, the latest of which are cached, if derivatives are computed by them."""
+        if not self._by_modes:
+            return None
+        if self._latest_modes is None or not torch.equal(self._latest_modes[0], theta):
+            self._latest_modes = theta.clone(), Modes.of(*self.matrices(theta))
+        return self._latest_modes[1]
 
     def _states(self, theta: Tensor) -> Complex:
         """(zI - A)⁻¹ B (F, nx, nu), or that times U; the one of the latest θ is cached."""
@@ -211,19 +308,27 @@ class ResponseJacobian:
     """Jacobian of the residual with θ.
 
     Args:
-        J: derivative in the columns that are kept.
+        J: derivative of the errors in the columns that are kept.
         reduced: how these give all columns.
-        residual: real parts, then imaginary parts.
+        errors: at θ.
+        excess: of each pole, and its derivative with θ.
     """
 
     def __init__(
         self,
         J: Complex128[Complex, "F ny m K"],
         reduced: Reduction,
-        residual: Float[Tensor, " M"],
+        errors: Complex128[Complex, "F ny m"],
+        excess: tuple[Float[Array, " nx"], Float[Array, "nx P"]],
     ) -> None:
-        self._J, self._reduced, self._residual = J, reduced, residual
+        self._J, self._reduced, self._errors = J, reduced, errors
         self._rows = _real(J)
+        r = _real(errors)
+        gradient = reduced.expand.mT @ (self._rows.mT @ r)
+        self._excess = Excess(*excess, float(torch.linalg.norm(r)), gradient.numpy())
+        rows = torch.as_tensor(self._excess.jacobian)[:, reduced.kept]
+        self._rows = torch.cat([self._rows, rows])
+        self._residual = torch.cat([r, torch.as_tensor(self._excess.residual)])
 
     def system(self, damping: float, truncation: float) -> tuple[SVDSystem, Tensor]:
         """The system and the gradient, see ``levenberg_marquardt.Jacobian``."""
@@ -250,9 +355,9 @@ class ResponseJacobian:
             return inverse / 2  # a complex error of variance 1 has real parts of variance 1/2
         # Sandwich (JᴴJ)⁻¹ (Σ s sᵀ) (JᴴJ)⁻¹ with the score s = Re(Jᴴ r) of each line.
         J = self._J.reshape(len(self._J), -1, self._J.shape[-1])
-        r = torch.complex(*self._residual.chunk(2)).numpy().reshape(J.shape[:2])
+        r = self._errors.reshape(J.shape[:2])
         scores = np.einsum("fek,fe->fk", J.conj(), r).real @ self._reduced.expand.numpy()
-        M, K = self._rows.shape
+        M, K = 2 * self._errors.size, self._rows.shape[1]
         return inverse @ (scores.T @ scores) @ inverse * (M / max(1, M - K))
 
 

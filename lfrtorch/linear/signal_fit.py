@@ -72,6 +72,10 @@ class SignalFit:
         """How many subspace estimates are refined: one of long records, as it is good."""
         return MOST_CANDIDATES if sum(map(len, self._us)) * nx**2 <= SHORT else 1
 
+    def many(self, nx: int) -> bool:
+        """No: all searches go to the end."""
+        return False
+
     def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
         """Subspace estimates of A and C."""
         return from_signals(self._us, self._ys, nx)

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Complex128, Float
+from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
@@ -33,6 +34,14 @@ SILENT = 1e-10
 """Relative amplitude of the input below which a line is not excited."""
 
 
+GAP = 1e-2
+"""A line with less than this part of the power of the next stronger one is not excited, nor are
+weaker ones ..."""
+
+FEW = 3
+"""... if they are this many. Of 3 weakest lines of a random input it is so once in 1e6."""
+
+
 @dataclass(frozen=True, eq=False)
 class SpectralData:
     """What is fitted: Y = G(z) U, and the weight of each error.
@@ -42,12 +51,14 @@ class SpectralData:
         U, Y: spectra of m experiments, scaled so that the sum of squared errors is their mean
             square.
         weight: of the errors Y - G U. Default: 1 for all.
+        left_out: lines at which the input has some power and yet is not meant to excite.
     """
 
     z: Complex128[Complex, " F"]
     U: Complex128[Complex, "F nu m"]
     Y: Complex128[Complex, "F ny m"]
     weight: Float[Array, "F ny m"] | None = None
+    left_out: int = 0
 
     def weighted(self, errors: Complex) -> Complex:
         """√weight times errors (F, ny, m), or times their Jacobian (F, ny, m, K)."""
@@ -108,9 +119,27 @@ def spectral_data_of_records(
         return np.concatenate(wide)
 
     z, U, Y = np.concatenate([z for z, _, _ in parts]), together(1), together(2)
-    size = np.abs(U).max(axis=(1, 2))
-    excited = size > SILENT * size.max(initial=0.0)
-    return SpectralData(z[excited], U[excited], Y[excited])
+    power = (np.abs(U) ** 2).sum(axis=(1, 2))
+    excited = carrying(power)
+    left_out = int((power[~excited] > SILENT**2 * power.max(initial=0.0)).sum())
+    return SpectralData(z[excited], U[excited], Y[excited], left_out=left_out)
+
+
+def carrying(power: Array) -> NDArray[np.bool_]:
+    """Which lines the input is meant to excite, of their power (F,).
+
+    Sorted by power, they end where the next one has less than the part GAP: a measured input has
+    noise, hum and distortion at the lines that its generator leaves out. A few lines of a random
+    input are as weak, and count.
+    """
+    order = np.argsort(-power, kind="stable")
+    ranked = power[order]
+    loud = int((ranked > SILENT**2 * power.max(initial=0.0)).sum())
+    gaps = 1 + np.flatnonzero(ranked[1:loud] < GAP * ranked[: max(0, loud - 1)])
+    ends = [int(end) for end in gaps if loud - end >= FEW]
+    excited = np.zeros(len(power), dtype=bool)
+    excited[order[: min([loud, *ends])]] = True
+    return excited
 
 
 def spectral_data_of_parts(

@@ -48,6 +48,10 @@ MOST_OPERATIONS = 1e10
 """Most multiplications of a decomposition; horizons that need more are skipped."""
 
 
+MOST_PRODUCTS = 2e9
+"""The same for spectra, which have three frequency axes."""
+
+
 class SubspaceEstimate(NamedTuple):
     """An estimate of A and C.
 
@@ -89,6 +93,9 @@ def from_spectra(
     most = _most_rows(U, Y)
     wanted = (fewest, *(multiple * (nx + 1) for multiple in SPECTRAL_HORIZONS))
     rows = [q for q in sorted({min(q, most) for q in wanted}) if q >= fewest]
+    ny, nu, m = Y.shape[1], *U.shape[1:]
+    cheap = [q for q in rows if (q * (nu + ny)) ** 2 * 2 * len(U) * m <= MOST_PRODUCTS]
+    rows = cheap or rows[:1]
     found = (subspace.estimate(nx) for q in rows for subspace in _subspaces(z, U, Y, q))
     return [estimate for estimate in found if estimate is not None]
 

@@ -586,17 +586,20 @@ def test_error_and_data_must_go_together():
 class Race:
     """A problem whose candidates are known by their costs; which of them are searched?"""
 
-    def __init__(self, minimum: float | None = None) -> None:
-        self.minimum, self.searched = minimum, list[float]()
+    def __init__(self, minimum: float | None = None, *, large: bool = False) -> None:
+        self.minimum, self.large, self.searched = minimum, large, list[float]()
 
     def most_candidates(self, nx: int) -> int:
         return 10
+
+    def many(self, nx: int) -> bool:
+        return self.large
 
     def search(self, matrices: float) -> SimpleNamespace:
         self.searched.append(matrices)
         cost = matrices if self.minimum is None else self.minimum
         search = SimpleNamespace(state=SimpleNamespace(cost=cost))
-        search.advance = lambda _: search
+        search.advance = lambda *_: search
         return search
 
     def improbability(self, search: SimpleNamespace) -> float:
@@ -628,3 +631,14 @@ def test_candidates_that_went_to_one_minimum_end_the_race(monkeypatch: pytest.Mo
     ]
     minima.best_minimum(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
     assert race.searched == [1.0, 2.0, 3.0]
+
+
+def test_of_many_unknowns_few_starts_that_differ_are_searched(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(minima, "scaled", lambda problem, matrices, balanced: matrices)
+    race, estimate = Race(large=True), cast(Any, SimpleNamespace(A=[0]))
+    candidates: Any = [
+        minima.Candidate(cost, estimate, cast(Any, cost))
+        for cost in (1.0, 1.02, 1.1, 1.3, 1.5, 1.7, 1.9)
+    ]
+    minima.best_minimum(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
+    assert race.searched == [1.0, 1.1, 1.3, 1.5]

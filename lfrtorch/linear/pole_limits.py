@@ -1,0 +1,86 @@
+"""Limits for the poles of a model that is fitted to spectral lines.
+
+A resonance that is narrower than the lines are apart fits one of them, and a resonance outside the
+excited band that is narrower than its distance from it fits the band's edge: the lines do not tell
+how narrow. With a pole e^(-h + jω), of half-power width 2h, the limit is
+
+    h >= m(ω) = max(half the distance of the lines, distance of ω from the nearest line).
+
+Residuals ρ e with e = max(0, 1 - h / m) and ρ² = PART |r|² raise the cost |r|² of poles beyond. So
+the fit keeps the limits unless the data clearly ask for more: a perfect model costs nothing anyway.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Complex128, Float
+
+from lfrtorch._support.types import Array, Complex
+
+PART = 0.1
+"""What a pole far beyond its limit adds to the squared error, relative to it."""
+
+
+class PoleLimits:
+    """The limits that some lines set.
+
+    Args:
+        z: the lines' points on the unit circle.
+    """
+
+    def __init__(self, z: Complex128[Complex, " F"]) -> None:
+        self._lines = np.unique(np.abs(np.angle(z)))
+        apart = np.diff(self._lines)
+        self._half = float(np.median(apart)) / 2 if len(apart) else 0.0
+
+    def excess(
+        self, poles: Complex128[Complex, " nx"]
+    ) -> tuple[Float[Array, " nx"], Complex128[Complex, " nx"]]:
+        """e, and its derivative e' with each pole: de = Re(e' dλ / λ)."""
+        h, angle = -np.log(np.maximum(np.abs(poles), 1e-300)), np.angle(poles)
+        omega = np.abs(angle)
+        right = np.searchsorted(self._lines, omega).clip(1, max(1, len(self._lines) - 1))
+        ends = self._lines[[right - 1, np.minimum(right, len(self._lines) - 1)]]
+        away = (omega - ends)[np.abs(omega - ends).argmin(axis=0), np.arange(len(poles))]
+        m = np.maximum(np.maximum(self._half, np.abs(away)), 1e-300)
+        e = np.maximum(0.0, 1.0 - h / m)
+        turned = np.where(np.abs(away) > self._half, np.sign(away) * np.sign(angle), 0.0)
+        # dh = -Re(dλ / λ), dω = Im(dλ / λ) = Re(-j dλ / λ)
+        return e, np.where(e > 0, 1.0 / m - 1j * turned * h / m**2, 0.0)
+
+    def slopes(
+        self,
+        poles: Complex128[Complex, " nx"],
+        V: Complex128[Complex, "nx nx"],
+        W: Complex128[Complex, "nx nx"],
+    ) -> Float[Array, "nx nx*nx"]:
+        """Derivative of each e with A, from its eigenvectors V and W = V⁻¹."""
+        e, slope = self.excess(poles)
+        by_pole = slope / np.where(e > 0, poles, 1.0)
+        slopes = by_pole[:, None, None] * W[:, :, None] * V.T[:, None, :]
+        return slopes.real.reshape(len(poles), -1)
+
+
+class Excess:
+    """The residuals ρ e at some θ, and their derivative.
+
+    Args:
+        e: excess of each pole.
+        slopes: its derivative with θ.
+        errors: |r|.
+        gradient: Jᵀ r.
+    """
+
+    def __init__(
+        self,
+        e: Float[Array, " nx"],
+        slopes: Float[Array, "nx P"],
+        errors: float,
+        gradient: Float[Array, " P"],
+    ) -> None:
+        root = math.sqrt(PART)
+        self.residual = root * errors * e
+        self.jacobian = root * (errors * slopes + np.outer(e, gradient / max(errors, 1e-300)))
+        self.active = bool(e.any())
