@@ -41,7 +41,7 @@ def jacobian_rows(
     network = nn > 0
     n_weights = nn * (nz + 1 + nw) + nw if network else by_weight.shape[2]
     x_own, z_own, y_own = (
-        _between(x_entries, c0, c1), _between(z_entries, c0, c1), _between(y_entries, c0, c1)
+        between(x_entries, c0, c1), between(z_entries, c0, c1), between(y_entries, c0, c1)
     )  # fmt: skip
     s0 = min(max(first, c0), c1)
     s1 = max(min(first + n_weights, c1), s0)
@@ -63,9 +63,9 @@ def jacobian_rows(
             for n in range(len(z_own)):
                 X[nx + q, z_own[n, 0]] = J[k, q, z_own[n, 1]] * v[k, z_own[n, 2]]
             if whole:
-                _by_weight(Ww, slope, h, z, k, q, X[nx + q], first - c0)
+                network_by_weight(Ww, slope, h, z, k, q, X[nx + q], first - c0)
             elif network:
-                _by_weight(Ww, slope, h, z, k, q, d_w[q], 0)
+                network_by_weight(Ww, slope, h, z, k, q, d_w[q], 0)
                 for c in range(s0, s1):
                     X[nx + q, c - c0] = d_w[q, c - first]
             else:
@@ -110,7 +110,7 @@ def copy_to(source, target, column):
 
 
 @njit(nogil=True, inline="always")
-def _by_weight(Ww, slope, h, z, k, q, d_w, first):
+def network_by_weight(Ww, slope, h, z, k, q, d_w, first):
     """Row q of what ``NetworkJacobian.by_weight`` computes, at sample k, from a column on."""
     nn, nz = h.shape[1], z.shape[1]
     bz = first + nn * nz
@@ -139,7 +139,7 @@ def add_slope(constant, M, J, k, Cz):
 
 
 @njit(nogil=True)
-def _between(entries, c0, c1):
+def between(entries, c0, c1):
     """The entries whose column lies between c0 and c1, counted from c0."""
     own, count = np.empty_like(entries), 0
     for n in range(len(entries)):

@@ -32,6 +32,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lfrtorch._support.threads import spread, workers
+from lfrtorch.engine.blocked_kernel import blocked_rows
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import backwards, forwards, transition
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
@@ -46,6 +47,9 @@ FADED = 1e-18
 
 BLOCK = 8192
 """Samples of all records together in a block of rows on the CPU."""
+
+MANY_STATES = 8
+"""States from which rows are products of larger matrices; both ways take as long there."""
 
 
 class Rows(NamedTuple):
@@ -337,7 +341,8 @@ class Linearisation:
             by_weight = (self._by_weight(block, columns), none, none, none[:1], none)
         tensors = (*W, static.J, block.v, *by_weight, *columns[:3])
         arguments = (*map(to_numpy, tensors), columns.first, chunks, S.numpy(), rows.numpy())
-        spread(jacobian_rows, R * chunks, *arguments)
+        kernel = blocked_rows if S.shape[1] >= MANY_STATES else jacobian_rows
+        spread(kernel, R * chunks, *arguments)
         return S
 
 

@@ -27,6 +27,10 @@ from lfrtorch.engine.nonlinearity import is_network
 DEPENDENT = 1e-3
 """A column is left out if its pivot is at least this fraction of the largest pivot."""
 
+DIRECT, RELUCTANT = ("Cy", "Dyu", "Dyw"), 0.1
+"""Columns of the output equation need no recurrence, so they are left out only if another pivot is
+ten times smaller."""
+
 
 class Reduction(NamedTuple):
     """The columns of a Jacobian that are computed, and how all columns follow from them."""
@@ -94,7 +98,9 @@ def reduction(
             return found
     # Only columns of the linear part are left out: those of the static map are computed together.
     lti = int((mask & linear).sum())
-    Q, R, pivots = scipy.linalg.qr(G[:lti].T, mode="economic", pivoting=True)
+    direct = np.repeat([n in DIRECT for n, _ in parameters] + [False], counts)[mask][:lti]
+    pick = np.where(direct, RELUCTANT, 1.0)[:, None] * G[:lti]
+    Q, R, pivots = scipy.linalg.qr(pick.T, mode="economic", pivoting=True)
     diagonal = np.abs(np.diag(R))
     least = max(DEPENDENT * diagonal.max(initial=0.0), ROUNDING * size)
     rank = int((diagonal > least).sum())

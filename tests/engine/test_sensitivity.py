@@ -1,5 +1,6 @@
 """The fast Jacobian against jacfwd through the plain loop, and its rank."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -21,6 +22,14 @@ pytestmark = pytest.mark.numeric
 
 # Sums of at most some hundred products along a contraction, in double precision: 1e-13 or so.
 TOLERANCE = 1e-9
+
+
+@pytest.fixture(scope="module", autouse=True, params=["small", "large"])
+def kernel(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Every model is a small or a large one: with the rows sample by sample, or block by block."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(sensitivity, "MANY_STATES", 99 if request.param == "small" else 1)
+        yield
 
 
 class Cubic(nn.Module):
@@ -65,7 +74,7 @@ def assert_all(linearisation: Linearisation, expected: Tensor):
     assert_jacobian(linearisation.adjoint(e).theta, adjoint)
 
 
-def check_zero_start(cell: LFRCell, R: int = 2, T: int = 6):
+def check_zero_start(cell: LFRCell, R: int = 2, T: int = 15):
     u, x0 = normal(R, T, cell.nu), normal(R, cell.nx, seed=1)
     assert_all(
         Linearisation(cell, u, simulate(cell, u, x0)), reference.output_jacobian(cell, u, x0)
@@ -82,7 +91,7 @@ def check_periodic(cell: LFRCell, R: int = 2, T: int = 5, periods: int = 12):
 # --- against the oracle ---------------------------------------------------------------------
 
 
-@given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 7))
+@given(sizes=SIZES, R=st.integers(1, 3), T=st.integers(1, 30))
 @settings(max_examples=20)
 def test_from_a_given_state(sizes: dict[str, Any], R: int, T: int):
     check_zero_start(random_cell(**sizes), R, T)
@@ -238,7 +247,11 @@ def test_faded_sensitivities_are_zero_and_never_denormal(way: str, monkeypatch):
     assert not by_Bu[:, -1].any()
 
 
-def test_single_precision():
+# Compiled for single precision, a kernel takes ten seconds.
+@pytest.mark.parametrize(
+    "kernel", ["small", pytest.param("large", marks=pytest.mark.slow)], indirect=True
+)
+def test_single_precision(kernel: None):
     double, single = random_cell(2, 1, 3), random_cell(2, 1, 3, dtype=torch.float32)
     u = normal(2, 50, 2)
     expected = output_jacobian(periodic(double, u))
