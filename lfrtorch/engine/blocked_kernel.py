@@ -143,7 +143,7 @@ def _responses(A, Bw, Cz, Cy, Dyw, J, M, room, P, QW):
                 P[i, b, t] = latest[i, t]
             for j in range(nx):
                 M[i, j] = A[j, i]
-        _add_feedback(Bw, J[b], Cz, M)
+        add_feedback(Bw, J[b], Cz, M)
         found = room[nx * len(P[0, 0]) :][: (nx + nw) * width].reshape(nx + nw, width)
         np.dot(M, latest, found)
         latest = room[: nx * (width + ny)].reshape(nx, width + ny)
@@ -152,7 +152,7 @@ def _responses(A, Bw, Cz, Cy, Dyw, J, M, room, P, QW):
                 latest[i, t] = found[i, t]
             for o in range(ny):
                 latest[i, width + o] = Cy[o, i]
-        _add_feedback(Dyw, J[b], Cz, latest[:, width:])
+        add_feedback(Dyw, J[b], Cz, latest[:, width:])
         for q in range(nw):
             response = QW[nx + q * steps + b]
             for t in range(width):
@@ -166,7 +166,7 @@ def _responses(A, Bw, Cz, Cy, Dyw, J, M, room, P, QW):
 
 
 @njit(nogil=True, fastmath={"contract"})
-def _add_feedback(drive, J, Cz, out):
+def add_feedback(drive, J, Cz, out):
     """out += (drive J Cz)ᵀ."""
     nw, nz = J.shape
     column = np.empty(len(drive), out.dtype)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from numba import njit
@@ -18,7 +19,8 @@ from torch import Tensor
 
 from lfrtorch._support.threads import spread
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.jacobian_kernel import add_slope, copy_to, state_rows, tiled
+from lfrtorch.engine.blocked_kernel import add_feedback
+from lfrtorch.engine.jacobian_kernel import copy_to
 from lfrtorch.engine.linear_recurrence import (
     adjoint_recurrence,
     flush,
@@ -153,19 +155,15 @@ def _backwards(r, A, Bw, Cz, J, g, s):
 def _transition(r, A, Bw, Cz, J, Phi):
     m = min(r, len(A) - 1)
     A, Bw, Cz, J, Phi = A[m], Bw[m], Cz[m], J[r], Phi[r]
-    nx, columns = Phi.shape
-    # M(k) = [F(k) Bw], and zeros in the place of the drive.
-    M, X, X_next = tiled(nx, Bw.shape[1], columns, Phi.dtype)
-    copy_to(Bw, M, nx)
-    copy_to(Phi, X, 0)
+    F, X = np.empty_like(A), Phi.T.copy()
+    X_next = np.empty_like(X)
     for k in range(len(J)):
-        add_slope(A, M, J, k, Cz)
-        state_rows(M, X, X_next)
+        copy_to(A.T, F, 0)
+        add_feedback(Bw, J[k], Cz, F)
+        np.dot(X, F, X_next)  # transposed, all of them
         X, X_next = X_next, X
         if k % 256 == 255:
-            flush(X[:nx])
-            if not X[:nx].any():
+            flush(X)
+            if not X.any():
                 break
-    for i in range(nx):
-        for c in range(columns):
-            Phi[i, c] = X[i, c]
+    copy_to(X.T, Phi, 0)
