@@ -156,14 +156,15 @@ class Memory:
 
 
 class _Cached(NamedTuple):
-    """Weighted rows of each record, whose J in the kept columns is ``(rows @ mix)[:, places]``.
+    """Weighted rows of each record, and where their first n columns stand among the kept ones.
 
-    Without ``mix`` C = n, and the rows are not mixed.
+    If the initial state of a record follows from the other parameters, its columns are the last
+    nx; otherwise C = n.
     """
 
     rows: Float[Tensor, "R m*ny C"]
     places: Int[Tensor, "R n"]
-    mix: Float[Tensor, "R C n"] | None
+    initial: Float[Tensor, "R nx n"] | None
 
 
 class Part:
@@ -229,17 +230,17 @@ class Part:
                 accumulators[0].fold(weighted.flatten(0, 2))
             end[records] = block.end
 
-        places, mix = self._columns(K, end)
+        places, initial = self._columns(K, end)
         # The residual is the last column before and after.
         last = places.new_full((len(places), 1), len(kept))
         for r, accumulator in enumerate(accumulators):
-            with_residual = None if mix is None else torch.block_diag(mix[r], end.new_ones(1, 1))
             place = torch.cat([places, last], dim=1)[r]
-            total.absorb(accumulator, place, len(kept) + 1, with_residual)
+            tie = None if initial is None else initial[r]
+            total.absorb(accumulator, place, len(kept) + 1, tie)
         if not cache:
             return 0
         assert self._buffer is not None
-        self._cached = _Cached(self._buffer[..., :-1].flatten(1, 2), places, mix)
+        self._cached = _Cached(self._buffer[..., :-1].flatten(1, 2), places, initial)
         return size
 
     def _blocks(self, own: Int[Tensor, " K"], shape: tuple[int, ...] | None) -> Iterable[Rows]:
@@ -259,18 +260,16 @@ class Part:
 
     def _columns(
         self, K: int, end: Float[Tensor, "R nx C"]
-    ) -> tuple[Int[Tensor, "R n"], Float[Tensor, "R C n"] | None]:
-        """Where the columns of each record stand among the kept ones, and what mixes them before.
+    ) -> tuple[Int[Tensor, "R n"], Float[Tensor, "R nx n"] | None]:
+        """Where the columns of each record stand among the kept ones, and dx0/dθ if it is tied.
 
         The first K are the same for all. An initial state that is a parameter has places of its
-        own. That of a periodic record depends on the other parameters, dx0/dθ = (I - Φ)⁻¹ end, and
-        its columns are added to theirs.
+        own. That of a periodic record depends on the other parameters, dx0/dθ = (I - Φ)⁻¹ end.
         """
         R = len(end)
         places = torch.arange(K, device=end.device).expand(R, K)
         if self.linearisation.periodic:
-            identity = torch.eye(K).to(end).expand(R, K, K)
-            return places, torch.cat([identity, fixed_point(end[:, :, K:], end[:, :, :K])], dim=1)
+            return places, fixed_point(end[:, :, K:], end[:, :, :K])
         if self.x0 is not None:
             own = self.x0.to(end.device) - self.linearisation.parameters + K
             places = torch.cat([places, own], dim=1)
@@ -281,10 +280,11 @@ class Part:
     ) -> Float[Tensor, "R m ny"]:
         """Weighted changes of the outputs: J dθ, given as well in the kept columns."""
         if self._cached is not None:
-            rows, places, mix = self._cached
+            rows, places, initial = self._cached
             by_column = reduced[places]
-            if mix is not None:
-                by_column = (mix @ by_column.unsqueeze(-1)).squeeze(-1)
+            if initial is not None:
+                d_x0 = (initial @ by_column.unsqueeze(-1)).squeeze(-1)
+                by_column = torch.cat([by_column, d_x0], dim=1)
             d_y = rows.new_empty(rows.shape[:2])
             spread(_product, len(rows), rows, by_column, d_y)
             return d_y.reshape(self.group.residual_shape)
@@ -301,11 +301,12 @@ class Part:
     ) -> None:
         """Add Jᵀ residual to the gradient, or to the one in the kept columns if there are rows."""
         if self._cached is not None:
-            rows, places, mix = self._cached
+            rows, places, initial = self._cached
             by_column = rows.new_empty(len(rows), rows.shape[2])
             spread(_product, len(rows), rows.mT, residual.reshape(len(rows), -1), by_column)
-            if mix is not None:
-                by_column = (mix.mT @ by_column.unsqueeze(-1)).squeeze(-1)
+            if initial is not None:
+                by_column, d_x0 = by_column.split([places.shape[1], initial.shape[1]], dim=1)
+                by_column = by_column + (initial.mT @ d_x0.unsqueeze(-1)).squeeze(-1)
             reduced.index_add_(0, places.flatten(), by_column.flatten())
             return
         adjoint = self.linearisation.adjoint(self.group.unweigh(residual))

@@ -148,10 +148,10 @@ class QRAccumulator:
         other: Any,
         place: Int[Tensor, " n"],
         width: int,
-        mix: Float[Tensor, "m n"] | None = None,
+        tie: Float[Tensor, "m n-1"] | None = None,
     ) -> None:
-        """Add the rows of another, after ``rows @ mix``, as the columns ``place`` of ``width``."""
-        R = other.R if mix is None else other.R @ mix
+        """Add the rows of another, ``tied`` if they shall be, as columns ``place`` of ``width``."""
+        R = other.R if tie is None else tied(other.R, tie)
         wide = R.new_zeros(len(R), width)
         wide[:, place] = R
         self.fold(wide)
@@ -183,12 +183,12 @@ class GramAccumulator:
         other: Any,
         place: Int[Tensor, " n"],
         width: int,
-        mix: Float[Tensor, "m n"] | None = None,
+        tie: Float[Tensor, "m n-1"] | None = None,
     ) -> None:
-        """Add the rows of another, after ``rows @ mix``, as the columns ``place`` of ``width``."""
+        """Add the rows of another, ``tied`` if they shall be, as columns ``place`` of ``width``."""
         if not self._parts:
             self._parts = [other.G.new_zeros(width, width)]
-        G = other.G if mix is None else mix.mT @ other.G @ mix
+        G = other.G if tie is None else tied(tied(other.G, tie).mT, tie)
         self._parts[0][place.unsqueeze(1), place] += G
 
     def combine(self, ranks: Ranks) -> None:
@@ -203,6 +203,19 @@ class GramAccumulator:
     def add(self, *parts: Float[Tensor, "n n"]) -> None:
         """Add AᵀA of more rows."""
         self._parts = [torch.stack([*self._parts, *parts]).sum(0)]
+
+
+def tied(
+    rows: Float[Tensor, "M columns"], tie: Float[Tensor, "m n"]
+) -> Float[Tensor, "M n+1"]:
+    """Rows of n + 1 columns from n + m + 1: m, all before the last, follow from the first n.
+
+    Args:
+        rows: what is multiplied by a change of n parameters, m that depend on them, and one more.
+        tie: the change of the m by that of the n.
+    """
+    m, n = tie.shape
+    return torch.cat([rows[:, :n] + rows[:, n : n + m] @ tie, rows[:, -1:]], dim=1)
 
 
 def _of_pieces(

@@ -42,15 +42,17 @@ def test_many_small_blocks_do_not_pile_up():
 
 
 @pytest.mark.parametrize("kind", [QRAccumulator, GramAccumulator])
-def test_absorbed_rows_have_their_columns_mixed_and_placed(kind):
-    rows, others, mix = normal(50, 4), normal(60, 6, seed=1), normal(6, 3, seed=2)
+def test_absorbed_rows_have_their_columns_tied_and_placed(kind):
+    """Of six columns three depend on the first two, and the last one stays."""
+    rows, others, tie = normal(50, 4), normal(60, 6, seed=1), normal(3, 2, seed=2)
     total, other = kind(), kind()
     total.fold(rows)
     other.fold(others)
     place = torch.tensor([2, 0, 3])
-    total.absorb(other, place, 4, mix)
+    total.absorb(other, place, 4, tie)
     wide = normal(60, 4) * 0
-    wide[:, place] = others @ mix
+    wide[:, [2, 0]] = others[:, :2] + others[:, 2:5] @ tie
+    wide[:, 3] = others[:, 5]
     whole = torch.cat([rows, wide])
     assert_close(squares(total), whole.mT @ whole, rtol=1e-11, atol=1e-10)
 
