@@ -63,7 +63,10 @@ def blocked_rows(
     # Columns that w drives: S, and below it d_w. Columns of x, and of the initial state: S.
     Sw = np.zeros((nx + nw * SAMPLES, n_z + n_static), rows.dtype)
     Sx = np.zeros((nx, n_x + n_initial), rows.dtype)
-    by_w, by_x = np.zeros((wide, Sw.shape[1]), rows.dtype), np.zeros((wide, Sx.shape[1]), rows.dtype)
+    by_w, by_x = (
+        np.zeros((wide, Sw.shape[1]), rows.dtype),
+        np.zeros((wide, Sx.shape[1]), rows.dtype),
+    )
     direct = np.zeros((n_x, SAMPLES), rows.dtype)
     of_direct = np.zeros((n_x, wide), rows.dtype)
     d_w = np.zeros((nw, n_weights), rows.dtype)

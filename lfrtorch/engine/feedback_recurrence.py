@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lfrtorch._support.threads import spread
-from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.blocked_kernel import add_feedback
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.jacobian_kernel import copy_to
 from lfrtorch.engine.linear_recurrence import (
     adjoint_recurrence,

@@ -132,6 +132,11 @@ class Linearisation:
         """P."""
         return self.layout.table.shape[1]
 
+    def signals(self, records: slice, time: slice) -> Float[Tensor, "R B v"]:
+        """v = [x; u; w]."""
+        t = self.trajectory
+        return torch.cat([s[records, time] for s in (t.x, self.u, t.w)], dim=-1)
+
     @cached_property
     def _whole(self) -> _Block | None:
         """All samples, kept from one pass to the next if they are few."""
@@ -289,10 +294,9 @@ class Linearisation:
         return _Block(time, v, static, self._of(records))
 
     def _at(self, records: slice, time: slice) -> _Block:
-        t = self.trajectory
-        z, w, x, u = (signal[records, time] for signal in (t.z, t.w, t.x, self.u))
-        static = linearise_static(self.static, z, of_static(self._of(records)))
-        return _Block(time, torch.cat([x, u, w], dim=-1), static, self._of(records))
+        weights = self._of(records)
+        static = linearise_static(self.static, self.trajectory.z[records, time], of_static(weights))
+        return _Block(time, self.signals(records, time), static, weights)
 
     def _of(self, records: slice) -> dict[str, Tensor]:
         """The weights of some of the records."""

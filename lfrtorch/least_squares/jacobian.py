@@ -32,6 +32,7 @@ from lfrtorch.least_squares.linear_systems import (
     QRAccumulator,
     SVDSystem,
     System,
+    tied,
 )
 from lfrtorch.least_squares.record_groups import RecordGroup
 
@@ -204,11 +205,18 @@ class Part:
         """
         group, linearisation = self.group, self.linearisation
         own = kept[kept < linearisation.parameters]
-        K, nx = len(own), linearisation.state.shape[1]
+        nx = linearisation.state.shape[1]
         errors = linearisation.trajectory.y - group.y
-        shape = (*errors.shape, K + nx * self.has_initial_state + 1)
+        shape = (*errors.shape, len(own) + nx * self.has_initial_state + 1)
         size = math.prod(shape) * errors.element_size()
         cache = size <= room and not group.spectral
+        among_kept = torch.arange(len(own), device=own.device)
+        direct = None
+        computed = size <= room or self.computed is not None
+        if isinstance(total, GramAccumulator) and group.plain and not computed:
+            direct = _OfOutputs(linearisation, own)
+            own, among_kept = direct.without(own), direct.without(among_kept)
+            shape = (*errors.shape, shape[-1] - len(direct.place))
         # A spectrum is taken of whole records, too.
         blocks = self._blocks(own, shape if size <= room or group.spectral else None)
 
@@ -228,15 +236,20 @@ class Part:
                     accumulator.fold(of_record.flatten(0, 1))
             else:
                 accumulators[0].fold(weighted.flatten(0, 2))
+            if direct is not None:
+                for r, of_record in zip(range(len(errors))[records], rows, strict=True):
+                    direct.fold(r if each else 0, r, block.time, of_record)
             end[records] = block.end
 
-        places, initial = self._columns(K, end)
+        places, initial = self._columns(kept, among_kept, end)
         # The residual is the last column before and after.
         last = places.new_full((len(places), 1), len(kept))
         for r, accumulator in enumerate(accumulators):
             place = torch.cat([places, last], dim=1)[r]
             tie = None if initial is None else initial[r]
             total.absorb(accumulator, place, len(kept) + 1, tie)
+            if direct is not None and isinstance(total, GramAccumulator):
+                total.add(direct.products(r, place, len(kept) + 1, tie))
         if not cache:
             return 0
         assert self._buffer is not None
@@ -259,19 +272,23 @@ class Part:
         )
 
     def _columns(
-        self, K: int, end: Float[Tensor, "R nx C"]
+        self,
+        kept: Int[Tensor, " all"],
+        among_kept: Int[Tensor, " K"],
+        end: Float[Tensor, "R nx C"],
     ) -> tuple[Int[Tensor, "R n"], Float[Tensor, "R nx n"] | None]:
         """Where the columns of each record stand among the kept ones, and dx0/dθ if it is tied.
 
         The first K are the same for all. An initial state that is a parameter has places of its
         own. That of a periodic record depends on the other parameters, dx0/dθ = (I - Φ)⁻¹ end.
         """
-        R = len(end)
-        places = torch.arange(K, device=end.device).expand(R, K)
+        K = len(among_kept)
+        places = among_kept.to(end.device).expand(len(end), K)
         if self.linearisation.periodic:
             return places, fixed_point(end[:, :, K:], end[:, :, :K])
         if self.x0 is not None:
-            own = self.x0.to(end.device) - self.linearisation.parameters + K
+            before = (kept < self.linearisation.parameters).sum()
+            own = self.x0.to(end.device) - self.linearisation.parameters + before
             places = torch.cat([places, own], dim=1)
         return places, None
 
@@ -323,6 +340,67 @@ class Part:
             for r, own_columns in enumerate(self.x0):
                 J[r][..., own_columns] = rows[r, ..., P:]
         return self.group.weigh(J)
+
+
+class _OfOutputs:
+    """The columns of Cy, Dyu and Dyw, and their products with the others.
+
+    The derivative of an output by a factor of a signal in v = [x; u; w] is that signal, and that of
+    the other outputs is zero. So the products of these columns are those of a few signals, and the
+    columns need not be made.
+
+    Args:
+        linearisation: the model along records whose samples count alike.
+        own: the parameters that have a column.
+    """
+
+    def __init__(self, linearisation: Linearisation, own: Int[Tensor, " K"]) -> None:
+        self._linearisation = linearisation
+        entries = linearisation.layout.columns(own).y.to(own.device)
+        self.place, self._output, self._signal = entries.T
+        self._with_rows: dict[int, Tensor] = {}
+        self._of_signals: dict[int, Tensor] = {}
+
+    def without(self, each: Int[Tensor, " K"]) -> Int[Tensor, " K_other"]:
+        """The entries of the other columns."""
+        other = torch.ones(len(each), dtype=torch.bool, device=each.device)
+        other[self.place] = False
+        return each[other]
+
+    def fold(self, to: int, r: int, time: slice, rows: Float[Tensor, "B ny C"]) -> None:
+        """Add the products of record r with the other columns, at some samples, to sum ``to``."""
+        v = self._linearisation.signals(slice(r, r + 1), time)[0]
+        with_rows, of_signals = rows.permute(1, 2, 0) @ v, v.mT @ v
+        if to in self._with_rows:
+            with_rows += self._with_rows[to]
+            of_signals += self._of_signals[to]
+        self._with_rows[to], self._of_signals[to] = with_rows, of_signals
+
+    def products(
+        self,
+        of: int,
+        place: Int[Tensor, " n"],
+        width: int,
+        tie: Float[Tensor, "m n-1"] | None,
+    ) -> Float[Tensor, "{width} {width}"]:
+        """JᵀJ, of ``width`` columns, without the products of the other columns.
+
+        Args:
+            of: the sum.
+            place: where the other columns stand.
+            width: how many columns there are.
+            tie: see ``linear_systems.tied``.
+        """
+        with_rows = self._with_rows[of][self._output, :, self._signal]
+        if tie is not None:
+            with_rows = tied(with_rows, tie)
+        own = self.place.unsqueeze(1)
+        G = with_rows.new_zeros(width, width)
+        G[own, place] = with_rows
+        G[place.unsqueeze(1), self.place] = with_rows.mT
+        same = self._output.unsqueeze(1) == self._output
+        G[own, self.place] = self._of_signals[of][self._signal.unsqueeze(1), self._signal] * same
+        return G
 
 
 def _product(

@@ -205,9 +205,7 @@ class GramAccumulator:
         self._parts = [torch.stack([*self._parts, *parts]).sum(0)]
 
 
-def tied(
-    rows: Float[Tensor, "M columns"], tie: Float[Tensor, "m n"]
-) -> Float[Tensor, "M n+1"]:
+def tied(rows: Float[Tensor, "M columns"], tie: Float[Tensor, "m n"]) -> Float[Tensor, "M n+1"]:
     """Rows of n + 1 columns from n + m + 1: m, all before the last, follow from the first n.
 
     Args:
