@@ -60,6 +60,7 @@ def blocks(monkeypatch: pytest.MonkeyPatch) -> int:
     """Bytes of blocks that are 8 times shorter than usual: a record is long that is short."""
     monkeypatch.setattr(linearised, "PASS", 2048)
     monkeypatch.setattr(sensitivity, "PASS", 2048)
+    monkeypatch.setattr(sensitivity, "KEPT", 8192)
     monkeypatch.setattr(sensitivity, "BLOCK", 1024)
     monkeypatch.setattr(jacobian, "CACHED_BYTES", 1 << 24)
     return 8 * 2048 * 20 * 30  # of neurons and derivatives, whatever the record's length

@@ -32,6 +32,7 @@ from lfrtorch.least_squares.linear_systems import (
     QRAccumulator,
     SVDSystem,
     System,
+    product,
     tied,
 )
 from lfrtorch.least_squares.record_groups import RecordGroup
@@ -370,7 +371,7 @@ class _OfOutputs:
     def fold(self, to: int, r: int, time: slice, rows: Float[Tensor, "B ny C"]) -> None:
         """Add the products of record r with the other columns, at some samples, to sum ``to``."""
         v = self._linearisation.signals(slice(r, r + 1), time)[0]
-        with_rows, of_signals = rows.permute(1, 2, 0) @ v, v.mT @ v
+        with_rows, of_signals = product(v.mT, rows.flatten(1)), product(v.mT, v)
         if to in self._with_rows:
             with_rows += self._with_rows[to]
             of_signals += self._of_signals[to]
@@ -391,7 +392,8 @@ class _OfOutputs:
             width: how many columns there are.
             tie: see ``linear_systems.tied``.
         """
-        with_rows = self._with_rows[of][self._output, :, self._signal]
+        outputs = self._linearisation.trajectory.y.shape[2]
+        with_rows = self._with_rows[of].unflatten(1, (outputs, -1))[self._signal, self._output]
         if tie is not None:
             with_rows = tied(with_rows, tie)
         own = self.place.unsqueeze(1)
