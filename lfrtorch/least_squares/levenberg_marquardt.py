@@ -378,12 +378,9 @@ class LevenbergMarquardt:
         predicted = float(damping * delta.square().sum() - gradient @ delta)
         theta = state.theta + delta
         if self.acceleration:
-            h = self.finite_step
-            ahead = yield RESIDUAL, state.theta + h * delta
-            if math.isfinite(cost_of(ahead)):
-                # r'' along δ, from r(θ + hδ) = r + h J δ + h² r'' / 2 + O(h³).
-                second = 2.0 / h * ((ahead - state.residual) / h - jacobian.tangent(delta))
-                theta = theta + self._acceleration(second, delta, jacobian, system, damping)
+            theta = theta + (
+                yield from self._acceleration(cost_of, state, jacobian, system, delta, damping)
+            )
         residual = yield RESIDUAL, theta
         cost = cost_of(residual)
         gain_ratio = (state.cost - cost) / predicted if predicted > 0 else float("nan")
@@ -391,13 +388,20 @@ class LevenbergMarquardt:
 
     def _acceleration(
         self,
-        second: Float[Tensor, " M"],
-        delta: Float[Tensor, " P"],
+        cost_of: Callable[[Tensor], float],
+        state: LMState,
         jacobian: Jacobian,
         system: System,
+        delta: Float[Tensor, " P"],
         damping: float,
-    ) -> Float[Tensor, " P"]:
+    ) -> Generator[tuple[str, Tensor], Any, Tensor]:
         """Second-order correction a = ½ argmin |J a + r''|² + λ|a|², or 0 if it is too long."""
+        h = self.finite_step
+        ahead = yield RESIDUAL, state.theta + h * delta
+        if not math.isfinite(cost_of(ahead)):
+            return torch.zeros_like(delta)
+        # r'' along δ, from r(θ + hδ) = r + h J δ + h² r'' / 2 + O(h³).
+        second = (ahead - state.residual).div_(h).sub_(jacobian.tangent(delta)).mul_(2.0 / h)
         a = 0.5 * system.solve(jacobian.adjoint(second), damping)
         trusted = 2.0 * a.norm() <= self.acceleration_limit * delta.norm()  # False for NaN
         return a if trusted else torch.zeros_like(delta)

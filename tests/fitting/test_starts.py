@@ -1,5 +1,6 @@
 """Both starts are exactly the linear model, with the weights drawn as documented."""
 
+import tracemalloc
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.signal import butter, lfilter
 from torch import Tensor, nn
 
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.fitting import nonlinear_end
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.starts import OUTPUT_RANGE, initialise
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -265,6 +267,20 @@ def test_start_where_the_nonlinearity_is(nz: int, nw: int):
         np.testing.assert_allclose(model.simulate(record), bla.simulate(record), rtol=0, atol=1e-10)
         usual = initialise(bla, record, nz=nz, nw=nw, nn=3, method="paper").signals(record).z[0]
         assert abs(np.corrcoef(usual[:, 0], source[:, 0])[0, 1]) < 1 - 1e-3
+
+
+@pytest.mark.parametrize("end", ["input", "output"])
+def test_long_record_is_searched_in_part(end: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(nonlinear_end, "SAMPLES", 400)  # a 25th, and both outputs of each sample
+    record = bent(end, samples=10_000)
+    bla = estimate_bla(record, 2, max_iter=1)
+    tracemalloc.start()
+    cell = initialise(bla, record, nz=2, nw=1, nn=3).lfr.cell
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert bool(cell.Bw.any()) == (end == "input")
+    assert bool(cell.Cz.any()) == (end == "output")
+    assert peak < 20 * record.y.nbytes  # the responses to 16 polynomials alone take 16
 
 
 @pytest.mark.parametrize(
