@@ -8,6 +8,8 @@ prints one line of JSON; ``engine.py`` calls it.
 from __future__ import annotations
 
 import argparse
+import ctypes
+import gc
 import itertools
 import json
 import sys
@@ -24,15 +26,19 @@ import torch
 import lfrtorch
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.least_squares.gauge import reduction
+from lfrtorch.least_squares.jacobian import CACHED_BYTES
 from lfrtorch.least_squares.levenberg_marquardt import LMState
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
 
 NEARBY = (1.0 + 1e-12 * i for i in itertools.count())
 """Factors of what is kept from one call to the next if it is the same."""
-ENDLESS = lfrtorch.LevenbergMarquardt(max_iter=10**9, tolerance=0.0)
+ENDLESS = lfrtorch.LevenbergMarquardt(max_iter=10**9, tolerance=0.0, least_damping=1.0)
+"""Its first iteration is like the others: it does not lower the damping in several trials."""
 REPETITIONS = 15
 RESTART = 4
 """Steps from the start that nearly always accept their first trial."""
+LONG_ENOUGH = 1.0
+"""Seconds to measure a point for."""
 
 
 def main() -> None:
@@ -64,9 +70,9 @@ def prepare(folder: Path, peers: str | None = None) -> dict:
     return {"parameters": problems.prepare(folder, None if peers is None else Path(peers))}
 
 
-def iteration(folder: Path, name: str, count: int) -> dict:
+def iteration(folder: Path, name: str, count: int, records: int | None = None) -> dict:
     """The first iterations of a fit: trial simulations, acceleration, Jacobian, factor."""
-    problem = problems.problem(folder, name)
+    problem = problems.problem(folder, name, count=records)
     _, steps = search(problem, count)
     seconds = [s for s, _ in steps]
     return {
@@ -143,23 +149,28 @@ def gradient(folder: Path) -> dict:
     }
 
 
-def scaling(folder: Path, axis: str, values: list[int]) -> dict:
+def scaling(folder: Path, axis: str, values: list[int], sizes: dict[str, int]) -> dict:
     """Seconds of an iteration with one accepted trial, from rest, against one size."""
     del folder
     points = []
     for value in values:
-        sizes = {"samples": 2048, "count": value} if axis == "count" else {axis: value}
-        model, problem = problems.synthetic(**sizes)
+        idle = start_of_peak()
+        model, problem = problems.synthetic(**{**sizes, axis: value})
+        start_of_peak()  # that of the iterations; the start and its data are made by other code
         theta = problem.theta
         search(problem, 1, theta)
         steps: list[tuple[float, int]] = []
         begin = clock()
-        while len(steps) < 2 * RESTART or (clock() - begin < 1.0 and len(steps) < 40):
+        while not one_trials(steps) or (clock() - begin < LONG_ENOUGH and len(steps) < 40):
             steps += search(problem, RESTART, theta)[1]
-        cell = model.lfr.cell
-        kept = reduction(cell, torch.zeros(0, cell.nx).to(cell.A)).kept
-        shape = {"samples": problem.size, **model.sizes, "P": model.parameter_count, "K": len(kept)}
-        points.append({**shape, "value": value, "s": one_trial(steps)})
+        cell, rows = model.lfr.cell, sum(group.y.numel() for group in problem.groups)
+        kept = len(reduction(cell, torch.zeros(0, cell.nx).to(cell.A)).kept)
+        shape = {"P": model.parameter_count, "K": kept, "cached": 8 * rows * kept <= CACHED_BYTES}
+        ports = {"samples": rows // cell.ny, "ports": cell.ny}
+        point = {**ports, **model.sizes, **shape, "value": value, "s": one_trial(steps)}
+        peak = status("VmHWM")
+        points.append({**point, "memory_mb": None if not peak or not idle else peak - idle})
+        del problem
     return {"points": points}
 
 
@@ -200,7 +211,12 @@ def search(
 
 def one_trial(steps: list[tuple[float, int]]) -> float:
     """Median seconds of the iterations that accept their first trial."""
-    return float(np.median([s for s, trials in steps if trials == 1]))
+    return float(np.median(one_trials(steps)))
+
+
+def one_trials(steps: list[tuple[float, int]]) -> list[float]:
+    """Seconds of each of these."""
+    return [s for s, trials in steps if trials == 1]
 
 
 def median(function: Callable[[], object], repetitions: int = REPETITIONS) -> float:
@@ -228,7 +244,10 @@ def waited(threads: str = "") -> float:
 
 
 def start_of_peak() -> float | None:
-    """Forget the peak memory so far; MB in use now."""
+    """Forget the peak memory so far; MB in use now, without what could be given back."""
+    gc.collect()
+    with suppress(OSError, AttributeError):  # of a C library that has it
+        ctypes.CDLL(None).malloc_trim(0)
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     return status("VmRSS")

@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 import peers
+import problems
 import scaling
 
 HERE = Path(__file__).resolve().parent
@@ -34,6 +35,7 @@ RUNS, SHARED = 4, 0.05
 
 Seconds on one core are those that the process had the core. What threads wait for each other cannot
 be taken off: a case is repeated until it hardly waited, and the one that waited least counts."""
+ONE_RECORD = f"{problems.MIRROR}, one record"
 PERIODS = 128
 """Periods of 8192 samples in the long record: 1,048,576 samples."""
 
@@ -150,12 +152,21 @@ def measure(scratch: Path, folder: Path | None, *, quick: bool) -> dict:
     if len(cores) > 1:
         found["parallel_wh, two cores"] = undisturbed("iteration", 2, name="parallel_wh", count=6)
     found["parallel_wh parts"] = undisturbed("parts", name="parallel_wh", repetitions=5)
+    for large in problems.LARGE:
+        found[large] = undisturbed("iteration", name=large, count=3)
+    if folder is not None:
+        found[ONE_RECORD] = undisturbed("iteration", name=problems.MIRROR, count=3, records=1)
+        peers.write_mirror(scratch)
+        print("  freq-statespace mirror size", file=sys.stderr, flush=True)
+        with pinned(cores[:1]):
+            recipe, found[f"freq-statespace {ONE_RECORD}"] = peers.mirror(folder, scratch)
+        found[f"freq-statespace {ONE_RECORD}, its recipe"] = recipe
     if not quick:
         for start in ("zero", "periodic"):
             found[f"long, {start}"] = undisturbed("long", start=start, periods=PERIODS)
         found["scaling"] = {
-            axis: case("scaling", axis=axis, values=values)["points"]
-            for axis, (_, values) in scaling.AXES.items()
+            name: case("scaling", axis=name, values=axis.values, sizes=axis.sizes)["points"]
+            for name, axis in scaling.AXES.items()
         }
     return found
 
@@ -210,6 +221,13 @@ def table(found: dict) -> list[Row]:
     if peer:
         whole = peer["whole_process_peak_mb"]
         rows.append(Row("- freq-statespace, whole process", whole, "MB"))
+    for large in problems.LARGE:
+        rows += [
+            Row(f"{large.capitalize()} iteration, one core", found[large]["s"], "s"),
+            Row("- with one accepted trial", found[large]["one_trial_s"], "s"),
+            Row("- peak memory over idle", found[large]["memory_mb"], "MB", 600.0),
+        ]
+    rows += of_mirror(found)
     for start in ("zero", "periodic"):
         case = found.get(f"long, {start}")
         if case:
@@ -218,6 +236,14 @@ def table(found: dict) -> list[Row]:
                 Row("- time a sample over that of 8192 samples", case["ratio"], "times", 1.3),
                 Row("- peak memory over idle", case["memory_mb"], "MB", 500.0),
             ]
+    if "scaling" in found:
+        few, many = found["scaling"]["samples"][-2:]
+        ratio = many["s"] / many["samples"] / (few["s"] / few["samples"])
+        rows += [
+            Row(f"{many['samples']:,} samples, 3 inputs, 3 outputs", many["s"], "s"),
+            Row(f"- time a sample over that of {few['samples']:,}", ratio, "times", 1.3),
+            Row("- peak memory over idle", many["memory_mb"], "MB", 600.0),
+        ]
     loop = gradient["python_loop_s"]
     rows += [
         Row("Gradient (one Adam step), periodic", ms(gradient["s"]), "ms", 30.0),
@@ -236,6 +262,27 @@ def table(found: dict) -> list[Row]:
             Row("- imports, in the first of these", case["imports_s"], "s"),
         ]
     return rows
+
+
+def of_mirror(found: dict) -> list[Row]:
+    """One record of the mirror's size beside freq-statespace."""
+    own, peer = found.get(ONE_RECORD), found.get(f"freq-statespace {ONE_RECORD}")
+    if own is None or peer is None:
+        return []
+    recipe = found[f"freq-statespace {ONE_RECORD}, its recipe"]
+    rows = [Row(f"{ONE_RECORD.capitalize()}, iteration", own["s"], "s")]
+    if "failed" in recipe:
+        print(f"\nThe recipe of freq-statespace for the mirror fails: {recipe['failed']}")
+    if "failed" in peer:
+        print(f"\nfreq-statespace is left out of {ONE_RECORD}: {peer['failed']}")
+        return rows
+    ratio, memory = peer["s"] / own["s"], peer["whole_process_peak_mb"]
+    return [
+        *rows,
+        Row("- freq-statespace, from its subspace model", peer["s"], "s"),
+        Row("- freq-statespace / lfrtorch", ratio, "times", 10.0, at_least=True),
+        Row("- freq-statespace, whole process", memory, "MB"),
+    ]
 
 
 def show(rows: list[Row]) -> None:

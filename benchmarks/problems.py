@@ -30,6 +30,9 @@ LARGE = {
     "mirror size": {"records": 5, "nu": 3, "ny": 3, "nx": 28, "nz": 4, "nw": 4, "nn": 20},
 }
 """Those of F16 and of the fine steering mirror: records of 8192 samples, one period each."""
+AIRCRAFT, MIRROR = LARGE
+LINES = np.arange(40, 2048)
+"""That their inputs excite."""
 PEER_FILES = {"boucwen": "boucwen.npz", "parallel_wh": "pwh_synth.npz"}
 RATES = {"boucwen": 750.0, "parallel_wh": 78e3}
 PARALLEL_WH = {"records": 5, "samples": 16384, "lines": 4095}
@@ -60,10 +63,10 @@ def write_large(folder: Path) -> None:
         turn = np.linalg.qr(rng.standard_normal((nx, nx)))[0]
         A = turn @ block_diag(*blocks) @ turn.T
         B, C = turn @ rng.standard_normal((nx, nu)), rng.standard_normal((ny, nx)) @ turn.T / 10.0
-        D, lines = np.zeros((ny, nu)), np.arange(40, 2048)
+        D = np.zeros((ny, nu))
         spectra = np.zeros((sizes["records"], T // 2 + 1, nu), complex)
-        phases = rng.random((sizes["records"], len(lines), nu))
-        spectra[:, lines] = np.exp(2j * np.pi * phases)
+        phases = rng.random((sizes["records"], len(LINES), nu))
+        spectra[:, LINES] = np.exp(2j * np.pi * phases)
         u = np.fft.irfft(spectra, T, axis=1)
         u /= u.std()
         system = linear_model((A, B, C, D))
@@ -95,26 +98,37 @@ def linear_model(system: tuple[Array, Array, Array, Array]) -> LinearModel:
 def prepare(folder: Path, peers: Path | None) -> dict[str, int]:
     """Write signals and models to the folder."""
     write_signals(folder, peers)
+    write_large(folder)
     parameters = {}
-    for name, sizes in SIZES.items():
-        bla = lfrtorch.estimate_bla(
-            records(folder, name), sizes["nx"], offset=False, max_iter=BLA_ITERATIONS
-        )
+    for name, sizes in (SIZES | LARGE).items():
+        data = records(folder, name)
+        if name in LARGE:
+            with np.load(folder / f"{name}.npz") as file:
+                A, B, C, D = (file[matrix] for matrix in "ABCD")
+            bla = linear_model((A, B, C, D))
+        else:
+            bla = lfrtorch.estimate_bla(data, sizes["nx"], offset=False, max_iter=BLA_ITERATIONS)
         nz, nw, nn = (sizes[size] for size in ("nz", "nw", "nn"))
-        model = lfrtorch.initialise(bla, records(folder, name), nz=nz, nw=nw, nn=nn)
+        model = lfrtorch.initialise(bla, data, nz=nz, nw=nw, nn=nn)
         model.save(folder / name)
         parameters[name] = model.parameter_count
     return parameters
 
 
 def records(
-    folder: Path, name: str, *, start: Literal["periodic", "zero"] = "periodic", periods: int = 1
+    folder: Path,
+    name: str,
+    *,
+    start: Literal["periodic", "zero"] = "periodic",
+    periods: int = 1,
+    count: int | None = None,
 ) -> list[Record]:
-    """The records of a problem, each repeated over some periods."""
+    """The first ones of a problem's records, each repeated over some periods."""
     with np.load(folder / f"{name}.npz") as file:
+        fs, pairs = float(file["fs"]), zip(file["u"][:count], file["y"][:count], strict=True)
         return [
-            Record(np.tile(u, periods), np.tile(y, periods), fs=RATES[name], start=start)
-            for u, y in zip(file["u"], file["y"], strict=True)
+            Record(*(np.concatenate([signal] * periods) for signal in pair), fs=fs, start=start)
+            for pair in pairs
         ]
 
 
@@ -125,30 +139,37 @@ def problem(
     *,
     start: Literal["periodic", "zero"] = "periodic",
     periods: int = 1,
+    count: int | None = None,
 ) -> SimulationProblem:
     """The residual that a fit of the problem minimises."""
     model = lfrtorch.load(folder / name)
-    data = records(folder, name, start=start, periods=periods)
+    data = records(folder, name, start=start, periods=periods, count=count)
     return SimulationProblem.of(model, data, ridge=ridge)
 
 
 def synthetic(
-    *, samples: int = 8192, count: int = 1, nx: int = 4, nz: int = 2, nw: int = 1, nn: int = 15
+    *,
+    samples: int = 8192,
+    count: int = 1,
+    ports: int = 1,
+    nx: int = 4,
+    nz: int = 2,
+    nw: int = 1,
+    nn: int = 15,
 ) -> tuple[Model, SimulationProblem]:
-    """A fit of any size: a random linear system with a quadratic output, records from rest."""
+    """A fit of any size: a random linear system with quadratic outputs, records from rest.
+
+    It has as many inputs as outputs.
+    """
     rng = np.random.default_rng(0)
-    rotation = np.linalg.qr(rng.standard_normal((nx, nx)))[0]
-    u = rng.standard_normal((count, samples))
-    system = (RADIUS * rotation, rng.standard_normal((nx, 1)), np.ones((1, nx)), np.zeros((1, 1)))
+    A = RADIUS * np.linalg.qr(rng.standard_normal((nx, nx)))[0]
+    B, C = rng.standard_normal((nx, ports)), rng.standard_normal((ports, nx)) / np.sqrt(nx)
+    system = linear_model((A, B, C, np.zeros((ports, ports))))
     data = []
-    for u_of_record in u:
-        linear = signal.dlsim((*system, 1.0), u_of_record)[1][:, 0] / np.sqrt(nx)
-        data.append(Record(u_of_record, linear + 0.1 * linear**2))
-    A, B, C, D = system
-    none = np.zeros(1)
-    channels = data[0].inputs, data[0].outputs
-    bla = LinearModel(A, B, C / np.sqrt(nx), D, 1.0, none, none, *channels)
-    model = lfrtorch.initialise(bla, data, nz=nz, nw=nw, nn=nn)
+    for u in rng.standard_normal((count, samples, ports)):
+        linear = system.simulate(u)
+        data.append(Record(u, linear + 0.1 * linear**2))
+    model = lfrtorch.initialise(system, data, nz=nz, nw=nw, nn=nn)
     return model, SimulationProblem.of(model, data)
 
 
