@@ -25,6 +25,7 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.threads import spread_by_hand
+from lfrtorch.engine.parameter_layout import layout
 from lfrtorch.least_squares.gauge import reduction
 from lfrtorch.least_squares.jacobian import CACHED_BYTES
 from lfrtorch.least_squares.levenberg_marquardt import LMState
@@ -164,8 +165,10 @@ def scaling(folder: Path, axis: str, values: list[int], sizes: dict[str, int]) -
         while not one_trials(steps) or (clock() - begin < LONG_ENOUGH and len(steps) < 40):
             steps += search(problem, RESTART, theta)[1]
         cell, rows = model.lfr.cell, sum(group.y.numel() for group in problem.groups)
-        kept = len(reduction(cell, torch.zeros(0, cell.nx).to(cell.A)).kept)
-        shape = {"P": model.parameter_count, "K": kept, "cached": 8 * rows * kept <= CACHED_BYTES}
+        kept = reduction(cell, torch.zeros(0, cell.nx).to(cell.A)).kept
+        by_x, _, by_y = layout(cell).columns(kept)[:3]
+        shape = {"P": model.parameter_count, "K": len(kept), "Kx": len(by_x)}
+        shape |= {"Ky": len(by_y), "cached": 8 * rows * (len(kept) + 1) <= CACHED_BYTES}
         ports = {"samples": rows // cell.ny, "ports": cell.ny}
         point = {**ports, **model.sizes, **shape, "value": value, "s": one_trial(steps)}
         peak = status("VmHWM")

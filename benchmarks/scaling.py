@@ -9,6 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 
+from lfrtorch.engine.blocked_kernel import SAMPLES
+from lfrtorch.engine.sensitivity import MANY_STATES
+
 
 class Axis(NamedTuple):
     """What changes along an axis, and the sizes that are others than usual there."""
@@ -36,7 +39,8 @@ TANH = 25
 def operations(point: dict) -> dict[str, float]:
     """Floating-point operations of an iteration with one accepted trial from rest, part by part.
 
-    K of the P columns of the Jacobian are computed, and the residual beside them.
+    K of the P columns of the Jacobian are computed, and the residual beside them; Kx and Ky of them
+    belong to the weights of the next state and of the output.
     """
     N, nx, nz, nw, nn, P, K = (point[key] for key in ("samples", "nx", "nz", "nw", "nn", "P", "K"))
     nu = ny = point["ports"]
@@ -47,19 +51,34 @@ def operations(point: dict) -> dict[str, float]:
     applied = 2 * (nx * nx + nx * (nz + nw) + nz * nw)
     formed = 2 * (nx + ny) * nz * (nw + nx)
     product = 4 * ny * K if point["cached"] else 2 * (linear + network + applied)
-    return {
+    # Columns of the output's weights are signals; they are not made if no rows are kept.
+    made = K if point["cached"] else K - point["Ky"]
+    of_signals = 2 * v * (ny * made + v) if made < K else 0
+    counts = {
         "two simulations": 2 * N * (network + linear),
         "slopes": N * (network + 2 * nn * nw * nz),
-        "rows": N * (formed + 2 * (nx + ny) * (nx + nw) * K),
-        "normal equations": 2 * N * ny * (K + 1) ** 2,
+        "normal equations": N * (ny * (made + 1) ** 2 + of_signals),  # one triangle
         "tangent and adjoint": N * product,
         "gauge": 2 / 3 * (P - K) ** 3 + 2 * (P - K) ** 2 * K,
         "expansion": 2 * P * K * (P - K),
         "two Cholesky solutions": 2 * P**3 / 3,
     }
+    if nx < MANY_STATES:
+        return counts | {"rows": N * (formed + 2 * (nx + ny) * (nx + nw) * made)}
+    # The responses of a block of samples, and what they make of its columns.
+    by_x, by_w, wide = point["Kx"], K - point["Kx"] - point["Ky"], nx + SAMPLES * ny
+    block = SAMPLES * (formed + 2 * (nx + nw) * nx * (nx + SAMPLES * ny / 2))
+    block += 2 * wide * ((nx + SAMPLES) * by_x + (nx + SAMPLES * nw) * by_w)
+    return counts | {"rows in blocks": N / SAMPLES * block}
 
 
-PRODUCTS = ("normal equations", "gauge", "expansion", "two Cholesky solutions")
+PRODUCTS = (
+    "rows in blocks",
+    "normal equations",
+    "gauge",
+    "expansion",
+    "two Cholesky solutions",
+)
 """Parts that are products of large matrices; the others go from sample to sample."""
 
 
@@ -73,7 +92,7 @@ class Speed(NamedTuple):
     def seconds(self, point: dict) -> float:
         """Those of an iteration, by its operation count."""
         counts = operations(point)
-        products = sum(counts[part] for part in PRODUCTS)
+        products = sum(counts.get(part, 0.0) for part in PRODUCTS)
         return (
             self.calls
             + (sum(counts.values()) - products) / self.recurrences
