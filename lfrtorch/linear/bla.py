@@ -39,6 +39,7 @@ from lfrtorch.linear.requirements import (
     check_signals,
     check_spectral_data,
     excitation_notes,
+    steady_state,
 )
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
@@ -94,13 +95,15 @@ def estimate_bla(
     reflected into the unit circle, and the refinement rejects every step to an unstable model.
 
     - ``"simulation"``, the default for records: simulated minus measured output. For periodic
-      records in steady state it is computed from their spectra, the same sum of squares at a
-      fraction of the work.
+      records in steady state, also if that begins after the skipped samples, it is computed from
+      their spectra at the excited lines, at a fraction of the work. A note names their band if a
+      measured input has power elsewhere. Poles are kept from being narrower than the lines are
+      apart, and than their distance from the band, unless the data clearly ask for that.
     - ``"prediction"``: output predicted one sample ahead by an innovation model, more precise if
       disturbances act on the states. The gain K is part of the model. For records in steady state
       an initial state is estimated, as their noise does not repeat.
     - ``"frequency"``, the default for a response and its only one: the nonparametric response,
-      weighted by its variance. ``estimate_frf`` turns records into a response.
+      weighted by its variance if wanted. ``estimate_frf`` turns records into a response.
 
     Args:
         data: records, or a nonparametric response. A given ``x0`` of a record is in the coordinates
@@ -108,8 +111,9 @@ def estimate_bla(
         nx: order.
         refine: the error. Default: see above.
         weight: of the errors of a response: one over its ``"total"`` or ``"noise"`` variance,
-            ``"none"``, or own weights. Default: the total variance if it is known, else that of the
-            noise if it is known, else none.
+            ``"none"``, or own weights. Default: none for periodic data, as that model simulates
+            best; the total variance for others, whose input has lines of little power; with
+            integrators the total or the noise variance if one is known.
         offset: whether constants are removed and stored as operating point.
         feedthrough: whether the input acts on the output at once; otherwise D is 0, as it must be
             for data under feedback, which a prediction fits without bias.
@@ -216,6 +220,8 @@ def _stable(data: list[Record] | FRF, nx: int, settings: _Settings) -> LinearMod
         problem = ResponseFit(spectra, known=known, feedthrough=feedthrough)
         notes += [*about.notes, *more]
     else:
+        if refine == "simulation":
+            records = steady_state(records) or records
         about = records[0]
         scaler = Scaler.of(records, offset=offset)
         problem = _of_records(
@@ -289,6 +295,9 @@ def _integrating(
         if isinstance(data, FRF):
             if isinstance(own.weight, np.ndarray):
                 own = own._replace(weight=differenced_weight(data, own.weight, integrators))
+            elif own.weight is None:  # differences raise the noise of the highest lines
+                known = [w for w in ("total", "noise") if getattr(data, f"var_{w}") is not None]
+                own = own._replace(weight=known[0] if known else None)
             response = differenced_response(data, integrators, feedthrough=feedthrough)
             return _stable(response, order, own)
         parts = [differenced(r, integrators, pole, feedthrough=feedthrough) for r in data]

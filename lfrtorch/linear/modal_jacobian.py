@@ -20,6 +20,7 @@ from torch import Tensor
 
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.pole_limits import Excess
+from lfrtorch.linear.spectral_data import SpectralData
 
 DEFECTIVE = 1e5
 """Modes are not used if the condition number of the eigenvectors is above this."""
@@ -65,12 +66,12 @@ class Modes(NamedTuple):
 
 
 class ModalJacobian:
-    """Jacobian of G U - Y with θ = (A, B, C, D).
+    """Jacobian of √weight (G U - Y) with θ = (A, B, C, D).
 
     Args:
         modes: of the model.
-        z, U: points and input spectra.
-        errors: G U - Y, (F, ny, m).
+        data: what is fitted.
+        errors: √weight (G U - Y).
         free: which entries of D are parameters.
         excess: of each pole, and its derivative with θ.
     """
@@ -78,15 +79,14 @@ class ModalJacobian:
     def __init__(
         self,
         modes: Modes,
-        z: Complex128[Complex, " F"],
-        U: Complex128[Complex, "F nu m"],
+        data: SpectralData,
         errors: Complex128[Complex, "F ny m"],
         *,
         free: NDArray[np.bool_],
         excess: tuple[Float[Array, " nx"], Float[Array, "nx P"]],
     ) -> None:
-        self._modes, self._U, self._errors = modes, U, errors
-        r = 1.0 / (z[:, None] - modes.poles)
+        self._modes, self._data, self._errors = modes, data, errors
+        r = 1.0 / (data.z[:, None] - modes.poles)
         self._functions = np.hstack([r * r, r])
         self._change = _change(modes, free)
         self._free = free
@@ -111,7 +111,7 @@ class ModalJacobian:
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J dθ."""
         d = d_theta.numpy()
-        response = self._tangent(self._change @ d) @ self._U
+        response = self._data.weighted(self._tangent(self._change @ d) @ self._data.U)
         return stacked(response, self._excess.jacobian @ d)
 
     def adjoint(self, residual: Tensor) -> Tensor:
@@ -138,16 +138,15 @@ class ModalJacobian:
 
     def _products(self) -> Complex:
         """JᴴJ with λ, b, c and the free entries of D, (Kc, Kc)."""
-        m, U = self._modes, self._U
         functions = _with_one(self._functions)
-        left, right = _constants(m, U.shape[1])
+        left, right = _constants(self._modes, self._data.U.shape[1])
         free = np.concatenate([np.ones(left.shape[1] - self._free.size, bool), self._free.ravel()])
-        return _products(functions, U, left[:, free], right[:, free])
+        return _products(functions, self._data, left[:, free], right[:, free])
 
     def _scores(self, r: Complex) -> Complex:
         """What each line adds to Jᴴ r with λ, b, c and D, conjugate: (F, Kc)."""
         m, (squares, singles) = self._modes, np.split(self._functions, 2, axis=1)
-        F, H = len(r), r.conj() @ self._U.swapaxes(1, 2)
+        F, H = len(r), self._data.weighted(r).conj() @ self._data.U.swapaxes(1, 2)
         with_b, with_c = H @ m.b.T, m.c.T @ H  # (F, ny, nx), (F, nx, nu)
         parts = [
             squares * np.einsum("foi,oi->fi", with_b, m.c),
@@ -168,7 +167,7 @@ class ModalJacobian:
     def _gradient(self, r: Complex) -> Array:
         """Jᵀ r (P,) of errors (F, ny, m)."""
         m, n = self._modes, len(self._modes.poles)
-        H = r @ self._U.conj().swapaxes(1, 2)
+        H = self._data.weighted(r) @ self._data.U.conj().swapaxes(1, 2)
         sums = self._functions.conj().T @ H.reshape(len(H), -1)
         squares, singles = sums.reshape(2, n, len(m.c), -1)
         c, b = m.c.T.conj(), m.b.conj()
@@ -183,7 +182,7 @@ class ModalJacobian:
         return (self._change.conj().T @ g).real
 
     def _parts(self, change: Complex) -> tuple[Complex, Complex, Complex, Complex]:
-        (ny, n), nu = self._modes.c.shape, self._U.shape[1]
+        (ny, n), nu = self._modes.c.shape, self._data.U.shape[1]
         poles, b, c, free = np.split(change, np.cumsum([n, n * nu, n * ny]))
         D = np.zeros((ny, nu), dtype=complex)
         D[self._free] = free
@@ -227,31 +226,40 @@ def _with_one(functions: Complex) -> Complex:
     return np.hstack([functions, np.ones((len(functions), 1), dtype=complex)])
 
 
-def _products(functions: Complex, U: Complex, left: Complex, right: Complex) -> Complex:
+def _products(functions: Complex, data: SpectralData, left: Complex, right: Complex) -> Complex:
     """Inner products (K, K) of columns that are a function (F, a) of z times constants of the
     outputs, ``left`` (ny, K), and of the inputs, ``right`` (a nu, K)."""
-    nu, a = U.shape[1], functions.shape[1]
-    power = U @ U.conj().swapaxes(1, 2)  # (F, nu, nu), of j and the conjugate of k
-    sums = np.empty((a, nu, a, nu), dtype=complex)
-    for j in range(nu):
-        for k in range(j + 1):
-            part = functions.conj().T @ (power[:, j, k, None] * functions)
-            sums[:, k, :, j] = part
-            sums[:, j, :, k] = part.conj().T
-    return (left.conj().T @ left) * (right.conj().T @ (sums.reshape(a * nu, -1) @ right))
+    U, a = data.U, functions.shape[1]
+    nu, every = U.shape[1], slice(None)
+    weights = [(every, 1.0)]
+    if data.weight is not None:
+        weights = [([o], data.weight[:, [o]]) for o in range(len(left))]
+    found = np.zeros((left.shape[1], left.shape[1]), dtype=complex)
+    for outputs, weight in weights:
+        power = (weight * U) @ U.conj().swapaxes(1, 2)  # (F, nu, nu), of j and the conjugate of k
+        sums = np.zeros((a, nu, a, nu), dtype=complex)
+        for j in range(nu):
+            for k in range(j + 1):
+                if power[:, j, k].any():
+                    part = functions.conj().T @ (power[:, j, k, None] * functions)
+                    sums[:, k, :, j] = part
+                    sums[:, j, :, k] = part.conj().T
+        own = left[outputs]
+        found += (own.conj().T @ own) * (right.conj().T @ (sums.reshape(a * nu, -1) @ right))
+    return found
 
 
 def with_best_inputs(
-    A: Array, C: Array, z: Complex, U: Complex, Y: Complex, free: NDArray[np.bool_]
+    A: Array, C: Array, data: SpectralData, free: NDArray[np.bool_]
 ) -> tuple[Array, Array] | None:
-    """B and D of least |G U - Y| for A and C; ``None`` if the modes cannot be told apart.
+    """B and D of least errors for A and C; ``None`` if the modes cannot be told apart.
 
     Args:
         A, C: state and output matrix.
-        z, U, Y: points, input and output spectra.
+        data: what is fitted.
         free: which entries of D are not 0.
     """
-    n, nu, ny = len(A), U.shape[1], len(C)
+    z, U, n, nu, ny = data.z, data.U, len(A), data.U.shape[1], len(C)
     B, D = np.zeros((n, nu)), np.zeros((ny, nu))
     m = Modes.of(A, B, C, D)
     if m is None:
@@ -261,14 +269,14 @@ def with_best_inputs(
     right = right.reshape(-1, nu, right.shape[1])[n:, :, columns].reshape(-1, len(columns))
     functions = _with_one(1.0 / (z[:, None] - m.poles))
     Z = scipy.linalg.block_diag(np.kron(m.W, np.eye(nu)), np.eye(int(free.sum())))
-    G = (Z.conj().T @ _products(functions, U, left[:, columns], right) @ Z).real
+    G = (Z.conj().T @ _products(functions, data, left[:, columns], right) @ Z).real
     size = np.sqrt(np.maximum(np.diagonal(G), 1e-300))
     system = GramSystem(G / np.outer(size, size), np.eye(len(G)))
     if not system.rank:
         return None
     for _ in range(TWICE):
-        errors = Y - Modes(*m[:3], m.W @ B, m.c, D).response(z) @ U
-        H = errors @ U.conj().swapaxes(1, 2)
+        errors = data.Y - Modes(*m[:3], m.W @ B, m.c, D).response(z) @ U
+        H = data.weighted(data.weighted(errors)) @ U.conj().swapaxes(1, 2)
         sums = (functions.conj().T @ H.reshape(len(H), -1)).reshape(-1, ny, nu)
         of_b = np.einsum("iok,oi->ik", sums[:n], m.c.conj())
         gradient = (Z.conj().T @ np.concatenate([of_b.ravel(), sums[n][free]])).real / size

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,10 +11,17 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import shortest, suffice
 from lfrtorch.metrics import rms
+from lfrtorch.periods import find_transient
 from lfrtorch.records import Record
 
 NARROW = 1e-10
 """Relative size of a direction that the input does not excite."""
+
+REPEATS = 0.1
+"""Largest deviation of periods of an input, and of the means of an output, over the signal's."""
+
+TRANSIENT = 1 / 3
+"""Largest part of the scored samples in which an output that is fitted in steady state settles."""
 
 
 def check_signals(records: list[Record]) -> None:
@@ -42,6 +50,30 @@ def check_length(records: list[Record], nx: int) -> None:
             f"with {nu} input(s) and {ny} output(s) needs one of {shortest(nx, nu, ny)}, or many "
             "shorter ones:\nrecord more, or lower nx."
         )
+
+
+def steady_state(records: Sequence[Record]) -> list[Record] | None:
+    """The whole periods in steady state of all records, if these are most of the scored samples."""
+    found = [_steady_part(record) for record in records]
+    return [record for record in found if record] if all(found) else None
+
+
+def _steady_part(record: Record) -> Record | None:
+    N, scored = record.period, record.samples - record.skip
+    if record.start == "periodic" and not record.skip:
+        return record
+    if N is None or record.start in ("periodic", "given"):
+        return None
+    settling = find_transient(record.y[record.skip :], N)
+    P = (scored - settling) // N
+    if (1 if record.skip >= N else 2) > P or settling > TRANSIENT * scored:
+        return None
+    u, y = (s[record.samples - P * N :] for s in (record.u, record.y))
+    changes = (u.reshape(P, N, -1) - u.reshape(P, N, -1).mean(axis=0)).std(axis=(0, 1))
+    drift = y.reshape(P, N, -1).mean(axis=1).std(axis=0)
+    if (changes > REPEATS * u.std(axis=0)).any() or (drift > REPEATS * y.std(axis=0)).any():
+        return None
+    return replace(record, u=u, y=y, start="periodic", skip=0, skip_more=False)
 
 
 def check_spectral_data(data: SpectralData, nx: int) -> None:

@@ -71,7 +71,7 @@ class ResponseFit:
         """Whether a model of the order has so many unknowns that its modes save work."""
         nu, free = self.data.U.shape[1], int(self._free_feedthrough.sum())
         unknowns = nx * (nu + self.data.Y.shape[1]) + free
-        return unknowns >= MANY and self.data.weight is None and not self.starts
+        return unknowns >= MANY and not self.starts
 
     def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
         """Subspace estimates of A and C."""
@@ -93,11 +93,11 @@ class ResponseFit:
         """Cost and system with the best B and D for A and C: G is linear in them."""
         nx, nu, ny = len(A), self.data.U.shape[1], len(C)
         if self.many(nx):
-            data = self.data
-            inputs = with_best_inputs(A, C, data.z, data.U, data.Y, self._free_feedthrough)
+            inputs = with_best_inputs(A, C, self.data, self._free_feedthrough)
             if inputs is not None:
                 matrices = A, inputs[0], C, inputs[1]
-                return float(np.sum(np.abs(self.errors(matrices)) ** 2)), matrices
+                errors = self.data.weighted(self.errors(matrices))
+                return float(np.sum(np.abs(errors) ** 2)), matrices
         matrices = A, np.zeros((nx, nu)), C, np.zeros((ny, nu))
         X, L = solve_resolvents(*matrices[:3], self.data.z)
         of_B = nx * nx + np.arange(nx * nu)
@@ -224,10 +224,10 @@ class ResponseProblem:
 
     def linearise(self, theta: Tensor) -> ResponseJacobian | ModalJacobian:
         """The Jacobian of the residual, without the columns of a change of state coordinates."""
-        modes, excess, data = self._modes(theta), self._excess(theta), self.data
+        modes, excess = self._modes(theta), self._excess(theta)
         if modes is not None:
             errors = self.errors(theta)
-            return ModalJacobian(modes, data.z, data.U, errors, free=self._free, excess=excess)
+            return ModalJacobian(modes, self.data, errors, free=self._free, excess=excess)
         return ResponseJacobian(*self._jacobian(theta), self.errors(theta), excess)
 
     def covariance(self, theta: Tensor, known: bool) -> Array:
@@ -280,7 +280,7 @@ class ResponseProblem:
         """Weighted G U - Y (F, ny, m)."""
         modes, U = self._modes(theta), self.data.U
         if modes is not None:
-            return modes.response(self.data.z) @ U - self.data.Y
+            return self.data.weighted(modes.response(self.data.z) @ U - self.data.Y)
         _, _, C, D = self.matrices(theta)
         X = self._states(theta)
         response = C @ X + D @ U if self._together else (C @ X + D) @ U

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex128, Float, Int64
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._support.checks import dft_lines
 from lfrtorch._support.errors import InputError
@@ -33,6 +33,17 @@ NOISE_LINES = 21
 
 NO_POWER = 1e-12
 """An input has no power at a line if it has less than this part of that of its best line."""
+
+SILENT = 1e-10
+"""Relative amplitude of the input below which a line is not excited."""
+
+
+GAP = 1e-2
+"""A line with less than this part of the power of the next stronger one is not excited, nor are
+weaker ones ..."""
+
+FEW = 3
+"""... if they are this many. Of 3 weakest lines of a random input it is so once in 1e6."""
 
 LARGEST_CHANGE = 0.1
 """Largest rms deviation of a period of an input from the mean period, relative to the input's rms
@@ -235,6 +246,8 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     noise = np.diagonal(spectra.C, axis1=1, axis2=2).real[1 : last + 1, -len(inputs) :]
     shown = _smooth(noise, NOISE_LINES) * np.mean(1 / spectra.P)
     excited = power > np.maximum(RELATIVE_POWER * power.max(axis=0), NOISE_RATIO * shown)
+    if not noise.any():  # one period does not tell noise from a weak line
+        excited &= np.stack([carrying(channel) for channel in power.T], axis=1)
     lines = 1 + np.flatnonzero(excited.all(axis=1))
     if not lines.size:
         counts = zip(inputs, excited.sum(axis=0), strict=True)
@@ -244,6 +257,23 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
             + "); give the lines, or excite all inputs at the same ones."
         )
     return lines
+
+
+def carrying(power: Array) -> NDArray[np.bool_]:
+    """Which lines the input is meant to excite, of their power (F,).
+
+    Sorted by power, they end where the next one has less than the part GAP: a measured input has
+    noise, hum and distortion at the lines that its generator leaves out. A few lines of a random
+    input are as weak, and count.
+    """
+    order = np.argsort(-power, kind="stable")
+    ranked = power[order]
+    loud = int((ranked > SILENT**2 * power.max(initial=0.0)).sum())
+    gaps = 1 + np.flatnonzero(ranked[1:loud] < GAP * ranked[: max(0, loud - 1)])
+    ends = [int(end) for end in gaps if loud - end >= FEW]
+    excited = np.zeros(len(power), dtype=bool)
+    excited[order[: min([loud, *ends])]] = True
+    return excited
 
 
 def powered_lines(spectra: Spectra, n: int) -> Integers:

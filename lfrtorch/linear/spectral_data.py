@@ -14,11 +14,11 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Complex128, Float
-from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.frf import FRF
+from lfrtorch.linear.spectra import SILENT, carrying
 from lfrtorch.records import NormalisedRecord, Scaler, rms_scale
 
 Weight = Literal["total", "noise", "none"]
@@ -29,17 +29,6 @@ averaged until it has them."""
 
 VANISHING = 1e-12
 """Smallest variance that enters a weight, relative to the largest."""
-
-SILENT = 1e-10
-"""Relative amplitude of the input below which a line is not excited."""
-
-
-GAP = 1e-2
-"""A line with less than this part of the power of the next stronger one is not excited, nor are
-weaker ones ..."""
-
-FEW = 3
-"""... if they are this many. Of 3 weakest lines of a random input it is so once in 1e6."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,23 +112,6 @@ def spectral_data_of_records(
     excited = carrying(power)
     left_out = int((power[~excited] > SILENT**2 * power.max(initial=0.0)).sum())
     return SpectralData(z[excited], U[excited], Y[excited], left_out=left_out)
-
-
-def carrying(power: Array) -> NDArray[np.bool_]:
-    """Which lines the input is meant to excite, of their power (F,).
-
-    Sorted by power, they end where the next one has less than the part GAP: a measured input has
-    noise, hum and distortion at the lines that its generator leaves out. A few lines of a random
-    input are as weak, and count.
-    """
-    order = np.argsort(-power, kind="stable")
-    ranked = power[order]
-    loud = int((ranked > SILENT**2 * power.max(initial=0.0)).sum())
-    gaps = 1 + np.flatnonzero(ranked[1:loud] < GAP * ranked[: max(0, loud - 1)])
-    ends = [int(end) for end in gaps if loud - end >= FEW]
-    excited = np.zeros(len(power), dtype=bool)
-    excited[order[: min([loud, *ends])]] = True
-    return excited
 
 
 def spectral_data_of_parts(
@@ -252,14 +224,8 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
         return weight.astype(np.float64), False, notes
     variances = {"total": frf.var_total, "noise": frf.var_noise}
     if weight is None:
-        if frf.var_total is not None:
-            weight = "total"
-        else:
-            weight = "none" if frf.var_noise is None else "noise"
-        if weight == "noise":
-            notes.append("the fit is weighted by the noise alone: the total variance is not known.")
-        elif weight == "none":
-            notes.append("all lines count alike in the fit: no variance is known.")
+        random = frf.method == "local_polynomial" and frf.var_total is not None
+        weight = "total" if random else "none"
     if weight == "none":
         return None, False, notes
     if not isinstance(weight, str) or weight not in variances:

@@ -18,18 +18,18 @@ pytestmark = pytest.mark.numeric
 NX, NU, NY = 5, 2, 3
 
 
-def some_data(columns: int = 2) -> SpectralData:
+def some_data(columns: int = 2, *, weighted: bool = False) -> SpectralData:
     rng = np.random.default_rng(2)
     z = np.exp(1j * np.linspace(1.0, 2.0, 40))
     U, Y = (
         rng.normal(size=(40, n, columns)) + 1j * rng.normal(size=(40, n, columns)) for n in (NU, NY)
     )
-    return SpectralData(z, U, Y)
+    return SpectralData(z, U, Y, rng.uniform(0.5, 2.0, size=Y.shape) if weighted else None)
 
 
-def problems() -> tuple[ResponseProblem, ResponseProblem, torch.Tensor]:
+def problems(*, weighted: bool) -> tuple[ResponseProblem, ResponseProblem, torch.Tensor]:
     """The same problem by modes and in general, and θ with poles far from all lines."""
-    data, free = some_data(), np.ones((NY, NU), dtype=bool)
+    data, free = some_data(weighted=weighted), np.ones((NY, NU), dtype=bool)
     free[1, 0] = False
     limits = PoleLimits(data.z)
     pair = [
@@ -42,8 +42,9 @@ def problems() -> tuple[ResponseProblem, ResponseProblem, torch.Tensor]:
     return pair[0], pair[1], theta
 
 
-def test_residual_slope_and_system_are_those_of_the_general_path():
-    modal, general, theta = problems()
+@pytest.mark.parametrize("weighted", [True, False])
+def test_residual_slope_and_system_are_those_of_the_general_path(weighted: bool):
+    modal, general, theta = problems(weighted=weighted)
     r = modal.residual(theta)
     assert r[-NX:].abs().max() > 0  # some poles are beyond their limits
     np.testing.assert_allclose(r, general.residual(theta), rtol=1e-9, atol=1e-9)
@@ -66,7 +67,7 @@ def test_residual_slope_and_system_are_those_of_the_general_path():
 
 
 def test_slope_with_poles_beyond_their_limits_is_a_central_difference():
-    problem, _, theta = problems()
+    problem, _, theta = problems(weighted=True)
     jacobian, h = problem.linearise(theta), 1e-6
     for seed in range(3):
         d = torch.as_tensor(np.random.default_rng(seed).normal(size=len(theta)))
@@ -78,14 +79,15 @@ def test_slope_with_poles_beyond_their_limits_is_a_central_difference():
 
 @pytest.mark.parametrize("known", [True, False])
 def test_covariance_is_that_of_the_general_path(known: bool):
-    modal, general, theta = problems()
+    modal, general, theta = problems(weighted=known)
     expected = general.covariance(theta, known)
     atol = 1e-6 * np.abs(expected).max()
     np.testing.assert_allclose(modal.covariance(theta, known), expected, rtol=0, atol=atol)
 
 
-def test_best_inputs_are_those_of_the_general_path(monkeypatch: pytest.MonkeyPatch):
-    fit = ResponseFit(some_data(), known=False)
+@pytest.mark.parametrize("weighted", [True, False])
+def test_best_inputs_are_those_of_the_general_path(weighted: bool, monkeypatch: pytest.MonkeyPatch):
+    fit = ResponseFit(some_data(weighted=weighted), known=False)
     A, _, C, _ = random_system(NX, NU, NY, seed=3)
     cost, (_, B, _, D) = fit.with_input_matrices(A, C)
     monkeypatch.setattr("lfrtorch.linear.response_fit.MANY", 1)
@@ -100,7 +102,7 @@ def test_defective_matrix_has_no_modes_and_is_fitted_all_the_same():
     B, C, D = np.ones((3, NU)), np.ones((NY, 3)), np.zeros((NY, NU))
     data = some_data()
     assert Modes.of(A, B, C, D) is None
-    assert with_best_inputs(A, C, data.z, data.U, data.Y, D == 0) is None
+    assert with_best_inputs(A, C, data, D == 0) is None
     G = frequency_response(A, B, C, D, data.z)
     problem = ResponseProblem(SpectralData(data.z, data.U, G @ data.U), 3, by_modes=True)
     theta = torch.as_tensor(np.concatenate([m.ravel() for m in (A, B, C, D)]))

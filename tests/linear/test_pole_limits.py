@@ -7,7 +7,7 @@ import pytest
 
 from lfrtorch import Record, estimate_bla
 from lfrtorch.linear.pole_limits import PoleLimits
-from lfrtorch.linear.spectral_data import carrying
+from lfrtorch.linear.spectra import carrying
 
 N, FS = 2048, 400.0
 LINES = np.arange(41, 308)

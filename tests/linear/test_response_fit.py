@@ -1,5 +1,7 @@
 """SpectralData: the same sum of squares as the simulation error, its slope, and its covariance."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import reference
@@ -185,12 +187,12 @@ def response_of(variance: np.ndarray, name: str, **settings) -> FRF:
     ],
 )
 def test_weights_are_inverse_variances_of_some_20_degrees_of_freedom(
-    F: int, name: str, settings: dict, width: int
+    F: int, name: Literal["total", "noise"], settings: dict, width: int
 ):
     """From means over so many lines about each one, at most over those there are."""
     variance = 1e-20 * np.random.default_rng(0).uniform(0.5, 2.0, size=F)
     frf = response_of(variance, name, **settings)
-    found, scaler, known, _ = spectral_data_of_response(frf, None, offset=True)
+    found, scaler, known, _ = spectral_data_of_response(frf, name, offset=True)
     assert known
     assert found.weight is not None
     np.testing.assert_allclose(found.Y, 1.0, rtol=1e-12)
@@ -198,6 +200,12 @@ def test_weights_are_inverse_variances_of_some_20_degrees_of_freedom(
     means = np.convolve(variance, np.full(width, 1 / width), "valid")
     inside = found.weight[width // 2 : F - width // 2, 0, 0]
     np.testing.assert_allclose(inside, 4.0**2 / means, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("method", "weighted"), [("robust", False), ("local_polynomial", True)])
+def test_lines_count_alike_unless_the_input_is_random(method: str, weighted: bool):
+    frf = response_of(np.linspace(0.5, 2.0, 60), "total", experiments=41, method=method)
+    assert (spectral_data_of_response(frf, None, offset=True)[0].weight is not None) == weighted
 
 
 def test_line_without_variance_has_a_large_and_finite_weight():
