@@ -204,9 +204,9 @@ class Linearisation:
     def tangent(
         self, d_theta: Float[Tensor, "*records P"], d_x0: Float[Tensor, "R nx"] | None = None
     ) -> Float[Tensor, "R T ny"]:
-        """dy of a change dθ and of the initial state."""
+        """dy of a change dθ and of the initial state, which follows if a record is periodic."""
         start = self.state if d_x0 is None else d_x0
-        if self.periodic:
+        if self.periodic and d_x0 is None:
             *_, (_, end) = self._changes(d_theta, start)
             Phi, _ = self._transition
             start = fixed_point(Phi, end.unsqueeze(-1)).squeeze(-1)

@@ -189,6 +189,8 @@ class Part:
         self.group, self.linearisation, self.x0, self._memory = group, linearisation, x0, memory
         self._buffer: Tensor | None = None
         self._cached: _Cached | None = None
+        self._tied: tuple[Tensor, Tensor, Tensor] | None = None
+        """Kept parameters, those of them that move the initial state, and how."""
         self.computed: Rows | None = None
         """All rows with one spare column, if someone has computed them already."""
 
@@ -243,6 +245,7 @@ class Part:
             end[records] = block.end
 
         places, initial = self._columns(kept, among_kept, end)
+        self._tied = None if initial is None else (kept, places, initial)
         # The residual is the last column before and after.
         last = places.new_full((len(places), 1), len(kept))
         for r, accumulator in enumerate(accumulators):
@@ -308,6 +311,11 @@ class Part:
             return d_y.reshape(self.group.residual_shape)
         linearisation = self.linearisation
         d_x0 = None if self.x0 is None else d_theta[self.x0]
+        if self._tied is not None:
+            # Another change with the same outputs: of the kept parameters alone.
+            kept, places, initial = self._tied
+            d_theta = torch.zeros_like(d_theta).index_put_((kept,), reduced)
+            d_x0 = (initial @ reduced[places].unsqueeze(-1)).squeeze(-1)
         d_y = linearisation.tangent(d_theta[: linearisation.parameters], d_x0)
         return self.group.weigh(d_y)
 
