@@ -28,7 +28,7 @@ out = {}
 for name, options in SOLVERS.items():
     for turn in ("first",) if once else ("first", "again"):  # the first one compiles
         begin = time.perf_counter()
-        data = fss.create_data_object(given["u"], given["y"], given["lines"], float(given["fs"]))
+        data = fss.create_data_object(given["u"], given["y"], float(given["fs"]), given["lines"])
         model = fss.lin.subspace_id(data, nx, logging_enabled=False)
         model, details = fss.lin.optimize(
             model, data, print_every=-1, return_solve_details=True, **options

@@ -44,7 +44,7 @@ def stage(name, work):
 
 limits = [int(limit) for limit in given["limits"]]
 told = {"print_every": -1, "return_solve_details": True}
-data = fss.create_data_object(given["u"], given["y"], given["lines"], float(given["fs"]))
+data = fss.create_data_object(given["u"], given["y"], float(given["fs"]), given["lines"])
 model = stage(
     "subspace", lambda: fss.lin.subspace_id(data, int(given["nx"]), logging_enabled=False)
 )

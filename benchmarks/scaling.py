@@ -121,7 +121,8 @@ def figure(panels: dict[str, list[dict]], file: Path) -> None:
         measured = [1e3 * point["s"] for point in points]
         ax.loglog(values, counted, color="0.45", lw=1.2, label="operation count")
         ax.loglog(values, measured, "o", ms=4.5, color="tab:blue", label="measured")
-        ax.set_xticks(values, [f"{v}" if v < 1e4 else f"{v // 1024}k" for v in values])
+        short = [f"{v}" if v % 1024 else f"{v // 1024}k" for v in values]
+        ax.set_xticks(values, [label.replace("1024k", "1M") for label in short])
         ax.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
         ax.set_xlabel(AXES[axis].label)
         ax.set_title(f"({letter})", loc="left", fontsize=10)
