@@ -11,6 +11,7 @@ SCRIPTS = [
     "cases",
     "engine",
     "first_try",
+    "large_linear",
     "linear",
     "nonlinear",
     "starts",
