@@ -54,9 +54,12 @@ class Modes(NamedTuple):
     def of(cls, A: Array, B: Array, C: Array, D: Array) -> Modes | None:
         """Those of a system, ``None`` if they cannot be told apart."""
         poles, V = (np.asarray(part, dtype=np.complex128) for part in np.linalg.eig(A))
-        if not np.linalg.cond(V) < DEFECTIVE:
+        try:
+            W = np.asarray(np.linalg.inv(V), dtype=np.complex128)
+        except np.linalg.LinAlgError:
             return None
-        W = np.asarray(np.linalg.inv(V), dtype=np.complex128)
+        if not np.linalg.norm(V) * np.linalg.norm(W) < DEFECTIVE:
+            return None
         return cls(poles, V, W, W @ B, C @ V, D)
 
     def response(self, z: Complex128[Complex, " F"]) -> Complex128[Complex, "F ny nu"]:

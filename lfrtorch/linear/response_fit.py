@@ -265,9 +265,13 @@ class ResponseProblem:
         if self._limits is not None:
             e, _ = self._limits.excess(poles)
             if e.any():
-                eigen = np.linalg.eig(self.matrices(theta)[0])
-                poles, V = (np.asarray(part, dtype=np.complex128) for part in eigen)
-                W = np.asarray(np.linalg.pinv(V), dtype=np.complex128)
+                modes = self._modes(theta)
+                if modes is not None:
+                    poles, V, W = modes[:3]
+                else:
+                    eigen = np.linalg.eig(self.matrices(theta)[0])
+                    poles, V = (np.asarray(part, dtype=np.complex128) for part in eigen)
+                    W = np.asarray(np.linalg.pinv(V), dtype=np.complex128)
                 slopes[:, : V.size] = self._limits.slopes(poles, V, W)
         return e, slopes
 
