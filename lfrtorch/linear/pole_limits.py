@@ -1,10 +1,10 @@
 """Limits for the poles of a model that is fitted to spectral lines.
 
 A resonance that is narrower than the lines are apart fits one of them, and a resonance outside the
-excited band that is narrower than its distance from it fits the band's edge: the lines do not tell
-how narrow. With a pole e^(-h + jω), of half-power width 2h, the limit is
+excited band that is much narrower than its distance from it fits the band's edge: the lines do not
+tell how narrow. With a pole e^(-h + jω), of half-power width 2h, the limit is
 
-    h >= m(ω) = max(half the distance of the lines, distance of ω from the nearest line).
+    h >= m(ω) = max(half the distance of the lines, REACH times that of ω from the nearest one).
 
 Residuals ρ e with e = max(0, 1 - h / m) and ρ² = PART |r|² raise the cost |r|² of poles beyond. So
 the fit keeps the limits unless the data clearly ask for more: a perfect model costs nothing anyway.
@@ -21,6 +21,10 @@ from lfrtorch._support.types import Array, Complex
 
 PART = 0.1
 """What a pole far beyond its limit adds to the squared error, relative to it."""
+
+REACH = 1 / 3
+"""Half width of a pole outside the band, relative to its distance from it. The real pole of
+Bouc-Wen's linear model has 2 / 3."""
 
 
 class PoleLimits:
@@ -44,9 +48,10 @@ class PoleLimits:
         right = np.searchsorted(self._lines, omega).clip(1, max(1, len(self._lines) - 1))
         ends = self._lines[[right - 1, np.minimum(right, len(self._lines) - 1)]]
         away = (omega - ends)[np.abs(omega - ends).argmin(axis=0), np.arange(len(poles))]
-        m = np.maximum(np.maximum(self._half, np.abs(away)), 1e-300)
+        m = np.maximum(np.maximum(self._half, REACH * np.abs(away)), 1e-300)
         e = np.maximum(0.0, 1.0 - h / m)
-        turned = np.where(np.abs(away) > self._half, np.sign(away) * np.sign(angle), 0.0)
+        out = REACH * np.abs(away) > self._half
+        turned = np.where(out, REACH * np.sign(away) * np.sign(angle), 0.0)
         # dh = -Re(dλ / λ), dω = Im(dλ / λ) = Re(-j dλ / λ)
         return e, np.where(e > 0, 1.0 / m - 1j * turned * h / m**2, 0.0)
 

@@ -326,25 +326,31 @@ class ResponseJacobian:
         excess: tuple[Float[Array, " nx"], Float[Array, "nx P"]],
     ) -> None:
         self._J, self._reduced, self._errors = J, reduced, errors
-        self._rows = _real(J)
-        r = _real(errors)
-        gradient = reduced.expand.mT @ (self._rows.mT @ r)
-        self._excess = Excess(*excess, float(torch.linalg.norm(r)), gradient.numpy())
-        rows = torch.as_tensor(self._excess.jacobian)[:, reduced.kept]
-        self._rows = torch.cat([self._rows, rows])
-        self._residual = torch.cat([r, torch.as_tensor(self._excess.residual)])
+        self._rows, r, e = _real(J), _real(errors), excess[0]
+        self._more: Excess | None = None
+        self._residual, self._poles = r, len(e)
+        if e.any():
+            gradient = reduced.expand.mT @ (self._rows.mT @ r)
+            self._more = Excess(*excess, float(torch.linalg.norm(r)), gradient.numpy())
+            rows = torch.as_tensor(self._more.jacobian)[:, reduced.kept]
+            self._rows = torch.cat([self._rows, rows])
+            self._residual = torch.cat([r, torch.as_tensor(self._more.residual)])
 
     def system(self, damping: float, truncation: float) -> tuple[SVDSystem, Tensor]:
         """The system and the gradient, see ``levenberg_marquardt.Jacobian``."""
         R = torch.linalg.qr(self._rows, mode="r").R
-        return SVDSystem(self._reduced.columns(R), truncation), self.adjoint(self._residual)
+        return SVDSystem(self._reduced.columns(R), truncation), self._adjoint(self._residual)
 
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J d_theta."""
-        return self._rows @ (self._reduced.expand @ d_theta)
+        found = self._rows @ (self._reduced.expand @ d_theta)
+        return found if self._more else torch.cat([found, found.new_zeros(self._poles)])
 
     def adjoint(self, residual: Tensor) -> Tensor:
         """Jᵀ residual (P,)."""
+        return self._adjoint(residual if self._more else residual[: len(residual) - self._poles])
+
+    def _adjoint(self, residual: Tensor) -> Tensor:
         return self._reduced.expand.mT @ (self._rows.mT @ residual)
 
     def covariance(self, *, known: bool) -> Array:
