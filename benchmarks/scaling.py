@@ -43,7 +43,7 @@ def operations(point: dict) -> dict[str, float]:
     belong to the weights of the next state and of the output.
     """
     N, nx, nz, nw, nn, P, K = (point[key] for key in ("samples", "nx", "nz", "nw", "nn", "P", "K"))
-    nu = ny = point["ports"]
+    nu, ny = point.get("inputs", point["ports"]), point["ports"]
     v = nx + nu + nw
     network = 2 * nn * (nz + nw) + TANH * nn
     linear = 2 * ((nx + ny) * v + nz * (nx + nu))
@@ -60,8 +60,8 @@ def operations(point: dict) -> dict[str, float]:
         "normal equations": N * (ny * (made + 1) ** 2 + of_signals),  # one triangle
         "tangent and adjoint": N * product,
         "gauge": 2 / 3 * (P - K) ** 3 + 2 * (P - K) ** 2 * K,
-        "expansion": 2 * P * K * (P - K),
-        "two Cholesky solutions": 2 * P**3 / 3,
+        "reduced coordinates": 2 * P * K**2 + 4 * K**3,
+        "two Cholesky solutions": 2 * K**3 / 3,
     }
     if nx < MANY_STATES:
         return counts | {"rows": N * (formed + 2 * (nx + ny) * (nx + nw) * made)}
@@ -76,7 +76,7 @@ PRODUCTS = (
     "rows in blocks",
     "normal equations",
     "gauge",
-    "expansion",
+    "reduced coordinates",
     "two Cholesky solutions",
 )
 """Parts that are products of large matrices; the others go from sample to sample."""

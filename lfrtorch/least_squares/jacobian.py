@@ -30,6 +30,7 @@ from lfrtorch.least_squares.linear_systems import (
     CholeskySystem,
     GramAccumulator,
     QRAccumulator,
+    ReducedSystem,
     SVDSystem,
     System,
     product,
@@ -94,11 +95,15 @@ class Jacobian:
             system = SVDSystem(torch.cat(rows), truncation)
         else:
             gradient = (expand.mT @ total.G[:-1, -1]).masked_fill(self._fixed, 0.0)
-            # JᵀJ = expandᵀ G expand: the columns first, then the rows of this symmetric matrix.
-            G = self._reduced.columns(self._reduced.columns(total.G[:-1, :-1]).mT)
-            G = G.masked_fill(self._fixed | self._fixed.unsqueeze(1), 0.0)
-            rank = int((~self._fixed[kept]).sum())
-            system = CholeskySystem(G + torch.diag(self._ridge.square()), rank)
+            G, ridge = total.G[:-1, :-1], self._ridge.square()
+            if bool((ridge == ridge[0]).all()) and not self._fixed.any():
+                system = ReducedSystem(G, expand, float(ridge[0]))
+            else:
+                # JᵀJ = expandᵀ G expand: the columns first, then the rows of a symmetric matrix.
+                G = self._reduced.columns(self._reduced.columns(G).mT)
+                G = G.masked_fill(self._fixed | self._fixed.unsqueeze(1), 0.0)
+                rank = int((~self._fixed[kept]).sum())
+                system = CholeskySystem(G + torch.diag(ridge), rank)
         gradient = gradient + self._ridge.square() * self._penalty
         if self._ranks.world == 1:
             return system, gradient

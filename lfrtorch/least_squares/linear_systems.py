@@ -4,7 +4,7 @@ J is long and narrow. An accumulator takes in its rows, block by block, and hold
 R with RᵀR = JᵀJ (``QRAccumulator``, all digits) or JᵀJ itself (``GramAccumulator``, three times
 faster, half the digits). Either is the same whatever the blocks and their order, which is how
 blocks of time, threads and processes share the work. A system then solves for the step δ at any
-damping λ: ``SVDSystem`` from R, ``CholeskySystem`` from JᵀJ.
+damping λ: ``SVDSystem`` from R, ``CholeskySystem`` and ``ReducedSystem`` from JᵀJ.
 """
 
 from __future__ import annotations
@@ -101,6 +101,42 @@ class CholeskySystem:
             L, failed = torch.linalg.cholesky_ex(damped)
             self._latest = damping, torch.full_like(L, torch.nan) if failed else L
         return -torch.cholesky_solve(gradient.unsqueeze(-1), self._latest[1]).squeeze(-1)
+
+
+class ReducedSystem:
+    """From G = JᵀJ in K columns of which all P are combinations, J = J[:, kept] E.
+
+    With E Eᵀ = L Lᵀ the rows of L⁻¹ E are orthonormal, and span all that J sees. In their
+    coordinates JᵀJ is Lᵀ G L, so nothing of size P × P is formed.
+
+    Args:
+        G: the matrix.
+        expand: E.
+        ridge: what is added to each eigenvalue of JᵀJ, those of other directions included.
+    """
+
+    def __init__(self, G: Float[Tensor, "K K"], expand: Float[Tensor, "K P"], ridge: float) -> None:
+        self._expand, self._ridge, self.rank = expand, ridge, len(G)
+        self._L = torch.linalg.cholesky(expand @ expand.mT)
+        own = self._L.mT @ G @ self._L
+        own.diagonal().add_(ridge)
+        self._own = CholeskySystem(own, self.rank)
+        self.scale = self._own.scale
+
+    def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
+        """-(JᵀJ + (ridge + λ) I)⁻¹ gradient."""
+        own = torch.linalg.solve_triangular(
+            self._L, (self._expand @ gradient).unsqueeze(-1), upper=False
+        )
+        step = self._back(self._own.solve(own.squeeze(-1), damping).unsqueeze(-1))
+        if self._ridge:
+            step -= (gradient - self._back(own)) / (self._ridge + damping)
+        return step
+
+    def _back(self, own: Float[Tensor, "K 1"]) -> Float[Tensor, " P"]:
+        """A vector in the coordinates of θ."""
+        kept = torch.linalg.solve_triangular(self._L.mT, own, upper=True)
+        return self._expand.mT @ kept.squeeze(-1)
 
 
 def _largest_eigenvalue(G: Float[Tensor, "P P"]) -> float:

@@ -13,6 +13,7 @@ from lfrtorch.least_squares.linear_systems import (
     CholeskySystem,
     GramAccumulator,
     QRAccumulator,
+    ReducedSystem,
     SVDSystem,
 )
 
@@ -65,6 +66,21 @@ def test_systems_are_the_normal_equations(damping: float):
     for system in (SVDSystem(J, 1e-12), CholeskySystem(G, 6)):
         assert system.rank == 6
         assert system.scale == pytest.approx(float(torch.linalg.eigvalsh(G)[-1]), rel=1e-12)
+        assert_close(system.solve(gradient, damping), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.3])
+def test_reduced_system_is_that_of_all_columns(ridge: float):
+    """Four columns of which seven are combinations; a gradient that J sees, or any with a ridge."""
+    own, expand = normal(20, 4), torch.cat([torch.eye(4).double(), normal(4, 3, seed=1)], dim=1)
+    J = own @ expand
+    G = J.mT @ J + ridge * torch.eye(7, dtype=J.dtype)
+    gradient = normal(7, seed=2) if ridge else J.mT @ normal(20, seed=2)
+    system = ReducedSystem(own.mT @ own, expand, ridge)
+    assert system.rank == 4
+    assert system.scale == pytest.approx(float(torch.linalg.eigvalsh(G)[-1]), rel=1e-12)
+    for damping in (1e-3, 1.0, 1e6):
+        expected = -torch.linalg.solve(G + damping * torch.eye(7), gradient)
         assert_close(system.solve(gradient, damping), expected, rtol=1e-9, atol=1e-12)
 
 
