@@ -93,7 +93,9 @@ def counts(problem: SimulationProblem) -> dict[str, float]:
     found = {
         "simulation of a trial": passes.call_count / 2 * each["two simulations"] / 2,
         "linearisation": each["slopes"] + each["gauge"],
-        "rows and normal equations": wider[rows_of] + wider["normal equations"] + each["expansion"],
+        "rows and normal equations": wider[rows_of]
+        + wider["normal equations"]
+        + each["reduced coordinates"],
         "Cholesky solution": each["two Cholesky solutions"] / 2,
         "tangent": each["tangent and adjoint"] / 2,
         "adjoint": each["tangent and adjoint"] / 2,

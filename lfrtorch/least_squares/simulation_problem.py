@@ -202,6 +202,7 @@ class SimulationProblem:
         """Trajectories of each group at θ; those of the latest θ are cached."""
         if self._latest is None or not torch.equal(self._latest[0], theta):
             self.write(theta)
+            self._latest = None  # free its memory first
             self._latest = theta.clone(), [self._trajectory(i) for i in range(len(self.groups))]
         return self._latest[1]
 
