@@ -7,6 +7,7 @@ prints the table of docs/guide/engine.md: one core, records in periodic steady s
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from pathlib import Path
 from unittest import mock
@@ -29,6 +30,7 @@ REPETITIONS = 5
 
 def main() -> None:
     """Measure and print."""
+    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
     torch.set_num_threads(1)
     columns, sizes = [], []
     with tempfile.TemporaryDirectory() as scratch, pinned(available_cores()[-1:]):

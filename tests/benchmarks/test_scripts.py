@@ -14,6 +14,7 @@ SCRIPTS = [
     "large_linear",
     "linear",
     "nonlinear",
+    "parts",
     "starts",
     "tanks",
 ]
