@@ -345,7 +345,7 @@ def _without_scaling(m: Modes, change: Complex) -> Float[Array, "K P"]:
     relative = c[at, largest] / m.c[largest, at][:, None]  # (n, P)
     b = b + m.b[:, :, None] * relative[:, None]
     c = c - m.c.T[:, :, None] * relative[:, None]
-    c = c[np.arange(ny) != largest[:, None]].reshape(n, ny - 1, -1)
+    c = c[np.arange(ny) != largest[:, None]].reshape(n, ny - 1, change.shape[1])
     whole = np.concatenate([poles[:, None], b, c], axis=1)
     upper, pair = whole[m.poles.imag >= 0], whole[m.poles.imag > 0]
     parts = [part.reshape(-1, change.shape[1]) for part in (upper.real, pair.imag)]

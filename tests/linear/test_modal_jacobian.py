@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import reference
 import torch
 from reference import random_system
 
+from lfrtorch import Record, estimate_bla
 from lfrtorch.linear.modal_jacobian import ModalJacobian, Modes, with_best_inputs
 from lfrtorch.linear.pole_limits import PoleLimits
 from lfrtorch.linear.resolvent import frequency_response
@@ -108,3 +110,17 @@ def test_defective_matrix_has_no_modes_and_is_fitted_all_the_same():
     theta = torch.as_tensor(np.concatenate([m.ravel() for m in (A, B, C, D)]))
     assert float(problem.residual(theta).abs().max()) < 1e-9
     assert isinstance(problem.linearise(theta), ResponseJacobian)
+
+
+def test_one_input_and_output_are_fitted_by_modes_as_well(monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(5)
+    system = random_system(4, 1, 1, seed=6)
+    u = rng.normal(size=(300, 1))
+    y = reference.dlsim(system, np.tile(u, (4, 1)))[-300:]
+    record = Record(u, y + 0.01 * y.std() * rng.normal(size=y.shape), start="periodic")
+    expected = estimate_bla(record, 4)
+    monkeypatch.setattr("lfrtorch.linear.response_fit.MANY", 1)
+    found = estimate_bla(record, 4)
+    assert found.fit is not None
+    assert expected.fit is not None
+    assert found.fit.rmse == pytest.approx(expected.fit.rmse, rel=1e-4)
