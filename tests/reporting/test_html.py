@@ -216,8 +216,12 @@ def test_several_outputs_have_scores_of_their_own():
     for i, name in ((0, "a"), (1, "b")):
         error = np.sqrt(np.mean(test.error[:, i] ** 2))
         linear = np.sqrt(np.mean(test.linear_error[:, i] ** 2))
-        assert f"{name} V {number(linear)} {number(error)}" in page.text
-    assert "test all V" in page.text
+        scores = {
+            unit: f"{name} {unit} {number(factor * linear)} {number(factor * error)}"
+            for unit, factor in (("V", 1.0), ("mV", 1e3))
+        }
+        assert any(line in page.text for line in scores.values())
+    assert "test all V" in page.text or "test all mV" in page.text
     assert page.text.count("maximum number of iterations") == 2
     assert "The best of 2 starts" in page.text
     lines = html_report.comparisons(same.responses)
