@@ -117,7 +117,9 @@ class ReducedSystem:
 
     def __init__(self, G: Float[Tensor, "K K"], expand: Float[Tensor, "K P"], ridge: float) -> None:
         self._expand, self._ridge, self.rank = expand, ridge, len(G)
-        self._L = torch.linalg.cholesky(expand @ expand.mT)
+        # E Eᵀ is as badly conditioned as E squared: too much for single precision.
+        wide = expand.double()
+        self._L = torch.linalg.cholesky(wide @ wide.mT).to(expand)
         own = self._L.mT @ G @ self._L
         own.diagonal().add_(ridge)
         self._own = CholeskySystem(own, self.rank)

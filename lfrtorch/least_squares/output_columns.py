@@ -1,0 +1,72 @@
+"""Columns of the Jacobian that need no recurrence: those of the output's own weights."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lfrtorch.engine.sensitivity import Linearisation
+from lfrtorch.least_squares.linear_systems import product, tied
+
+
+class OutputColumns:
+    """The columns of Cy, Dyu and Dyw, and their products with the others.
+
+    The derivative of an output by a factor of a signal in v = [x; u; w] is that signal, and that of
+    the other outputs is zero. So the products of these columns are those of a few signals, and the
+    columns need not be made.
+
+    Args:
+        linearisation: the model along records whose samples count alike.
+        own: the parameters that have a column.
+    """
+
+    def __init__(self, linearisation: Linearisation, own: Int[Tensor, " K"]) -> None:
+        self._linearisation = linearisation
+        entries = linearisation.layout.columns(own).y.to(own.device)
+        self.place, self._output, self._signal = entries.T
+        self._with_rows: dict[int, Tensor] = {}
+        self._of_signals: dict[int, Tensor] = {}
+
+    def without(self, each: Int[Tensor, " K"]) -> Int[Tensor, " K_other"]:
+        """The entries of the other columns."""
+        other = torch.ones(len(each), dtype=torch.bool, device=each.device)
+        other[self.place] = False
+        return each[other]
+
+    def fold(self, to: int, r: int, time: slice, rows: Float[Tensor, "B ny C"]) -> None:
+        """Add the products of record r with the other columns, at some samples, to sum ``to``."""
+        v = self._linearisation.signals(slice(r, r + 1), time)[0]
+        with_rows, of_signals = product(v.mT, rows.flatten(1)), product(v.mT, v)
+        if to in self._with_rows:
+            with_rows += self._with_rows[to]
+            of_signals += self._of_signals[to]
+        self._with_rows[to], self._of_signals[to] = with_rows, of_signals
+
+    def products(
+        self,
+        of: int,
+        place: Int[Tensor, " n"],
+        width: int,
+        tie: Float[Tensor, "m n-1"] | None,
+    ) -> Float[Tensor, "{width} {width}"]:
+        """JᵀJ, of ``width`` columns, without the products of the other columns.
+
+        Args:
+            of: the sum.
+            place: where the other columns stand.
+            width: how many columns there are.
+            tie: see ``linear_systems.tied``.
+        """
+        outputs = self._linearisation.trajectory.y.shape[2]
+        with_rows = self._with_rows[of].unflatten(1, (outputs, -1))[self._signal, self._output]
+        if tie is not None:
+            with_rows = tied(with_rows, tie)
+        own = self.place.unsqueeze(1)
+        G = with_rows.new_zeros(width, width)
+        G[own, place] = with_rows
+        G[place.unsqueeze(1), self.place] = with_rows.mT
+        same = self._output.unsqueeze(1) == self._output
+        G[own, self.place] = self._of_signals[of][self._signal.unsqueeze(1), self._signal] * same
+        return G
