@@ -24,6 +24,7 @@ from lfrtorch.model import Model, load, simulate_blocks
 from lfrtorch.fitting.inference import infer
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
@@ -84,6 +85,7 @@ __all__ = [
     "mean_model",
     "multisine",
     "nrmse",
+    "refit",
     "reporting",
     "rmse",
     "scan_orders",

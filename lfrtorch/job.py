@@ -13,8 +13,10 @@ from typing import Any, cast
 import torch
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.reasons import CUT_SHORT, Reason
 from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import each_alone
+from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
@@ -22,11 +24,12 @@ from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.inference import infer
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.observer import LineObserver, Observer
+from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
-from lfrtorch.fitting.trainer import FitResult, Stop
+from lfrtorch.fitting.trainer import FitResult, Stop, StoppedError
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
@@ -34,7 +37,7 @@ from lfrtorch.linear.order_scan import OrderScan, scan_orders
 from lfrtorch.linear.requirements import check_excitation
 from lfrtorch.linear.score_window import with_score_windows
 from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.records import Record, common_unit
 from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import evidence
 from lfrtorch.reporting.run import Run
@@ -163,7 +166,64 @@ def _identified(
         stop=stop,
     )
     observer.end(result)
-    return scored_run(dataset, settings, linear, result, order_scan=order_scan, size_search=sizes)
+    again = None
+    if settings.refit:
+        result, again = refitted(whole, settings, result, observer, ranks=ranks, stop=stop)
+    return scored_run(
+        dataset, settings, linear, result, order_scan=order_scan, size_search=sizes, again=again
+    )
+
+
+def refitted(
+    dataset: Dataset,
+    settings: Settings,
+    result: FitResult,
+    observer: Observer,
+    *,
+    ranks: Ranks,
+    stop: Stop | None,
+) -> tuple[FitResult, FitResult | None]:
+    """The fit and that to all estimation records; None if the model that was chosen stays.
+
+    A fit that was interrupted here has that for its reason.
+
+    Args:
+        dataset: the records without windows for scores: what need not be skipped is fitted.
+        settings, result, ranks, stop: of the fit.
+        observer: who is told.
+    """
+    held_out = [*dataset.validation, *dataset.selection]
+    if result.reason in CUT_SHORT:
+        return result, None
+    if not held_out:
+        observer.say("note: refit: there are no validation records, so all were fitted before")
+        return result, None
+    options: Any = {"trainer": settings.trainer, "ridge": settings.ridge, "ranks": ranks}
+    try:
+        again = refit(
+            result, dataset.train, held_out, **options, monitor=observer.searching(), stop=stop
+        )
+    except (KeyboardInterrupt, StoppedError):
+        return replace(result, reason=Reason.INTERRUPTED), None
+    if again.reason in CUT_SHORT:
+        return replace(result, reason=again.reason, detail=again.detail), None
+    records = [*dataset.train, *held_out]
+    margins = torch.tensor(
+        [largest_stable_amplitude(m, records) for m in (again.model, result.model)]
+    )
+    if bool(torch.lt(*ranks.first(margins))):
+        observer.say(
+            "note: refit: the model would become unstable on louder inputs; that before it stays"
+        )
+        return result, None
+    before, after = (again.history[i].train for i in (0, again.chosen_iteration))
+    unit = common_unit(again.model.outputs)
+    observer.say(
+        f"refit to all estimation records: {again.iterations} iterations, "
+        f"{quantity(again.seconds, 's')}, their error {quantity(before, unit)} -> "
+        f"{quantity(after, unit)}; validation errors are those before it"
+    )
+    return result, again
 
 
 def windowed(
@@ -199,10 +259,17 @@ def scored_run(
     *,
     order_scan: OrderScan | None,
     size_search: SizeSearch | None,
+    again: FitResult | None = None,
 ) -> Run:
-    """All records simulated and scored, with verdict and advice."""
+    """All records simulated and scored, with verdict and advice; the tests by a model fitted again.
+
+    Args:
+        dataset, settings, linear, result, order_scan, size_search: what was found.
+        again: the fit to all estimation records.
+    """
     test_linear = linear_models_of_tests(dataset, settings)
-    simulations = respond(result.model, linear, dataset, test_linear)
+    last = None if again is None else again.model
+    simulations = respond(result.model, linear, dataset, test_linear, refitted=last)
     verdict = judge(result, simulations)
     found = evidence(
         result,
@@ -223,6 +290,7 @@ def scored_run(
         seeds=settings.seeds,
         search=size_search,
         verdict=verdict,
+        refit=again,
     )
     return Run(
         dataset=dataset,
@@ -232,6 +300,7 @@ def scored_run(
         order_scan=order_scan,
         size_search=size_search,
         fit=result,
+        refit=again,
         simulations=simulations,
         metrics=numbers,
         verdict=verdict,

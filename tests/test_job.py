@@ -170,7 +170,9 @@ def test_the_command_line_calls_the_same_function(tmp_path: Path):
     y = np.convolve(np.tanh(u), [0.0, 0.6, 0.3])[: len(u)]
     np.savez(tmp_path / "x.npz", u=u, y=y)
     words = ["data=file", f"data.path={tmp_path / 'x.npz'}", "data.inputs=[u]", "data.outputs=[y]"]
-    cfg = configuration(*words, "data.fs=10", "nx=1", "starts=2", "trainer.max_iter=3")
+    cfg = configuration(
+        *words, "data.fs=10", "nx=1", "starts=2", "trainer.max_iter=3", "refit=true"
+    )
     fit.run(cfg, tmp_path)
     run = identify(config.loaded(cfg), config.configured(cfg))
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -223,6 +225,55 @@ def test_starts_that_are_kept_go_on(dataset: Dataset, tmp_path: Path):
     assert on.metrics["scores"] == whole.metrics["scores"]
 
 
+@pytest.mark.numeric
+def test_a_refit_is_scored_on_tests_and_validation_is_that_before(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(plots, "DPI", 40)
+    run = identify(dataset, settings(refit=True))
+    assert run.refit is not None
+    assert run.model is run.refit.model
+    (validation,), (test,) = dataset.validation, dataset.tests
+    for record, model, score in (
+        (validation, run.fit.model, run.metrics["validation"]["records"]["validation"]),
+        (test, run.model, run.metrics["scores"]["test"]),
+    ):
+        assert score["rmse"] == lfrtorch.rmse(record, model.simulate(record))
+    assert run.metrics["scores"] != identify(dataset, settings()).metrics["scores"]
+    write(run, tmp_path)
+    assert np.array_equal(lfrtorch.load(tmp_path).simulate(test), run.model.simulate(test))
+    for text in (str(run), (tmp_path / "report.html").read_text()):
+        assert "validation errors are those before it" in text
+
+
+@pytest.mark.numeric
+def test_a_refit_that_is_interrupted_is_done_again(dataset: Dataset, tmp_path: Path):
+    asked = iter([False] * (SHORT.limit + 2))
+    cut = identify(
+        dataset,
+        settings(refit=True),
+        snapshots=Snapshots(tmp_path),
+        stop=lambda: next(asked, True),
+    )
+    assert (cut.fit.reason, cut.fit.iterations, cut.refit) == ("interrupted", SHORT.limit, None)
+    on = identify(dataset, settings(refit=True), snapshots=Snapshots(tmp_path))
+    assert on.metrics["scores"] == identify(dataset, settings(refit=True)).metrics["scores"]
+
+
+def test_a_refit_that_cannot_help_leaves_the_model(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    alone = Dataset("alone", dataset.train, [], dataset.tests)
+    run = identify(alone, settings(refit=True), observer=Console())
+    assert run.refit is None
+    assert "note: refit: there are no validation records" in capsys.readouterr().out
+    margins = iter([1.0, 2.0])
+    monkeypatch.setattr("lfrtorch.job.largest_stable_amplitude", lambda *_: next(margins))
+    run = identify(dataset, settings(refit=True), observer=Console())
+    assert run.model is run.fit.model
+    assert "unstable on louder inputs" in capsys.readouterr().out
+
+
 def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     identify(dataset, settings(nn="auto", sizes_search=SizesSearch(nn=(1, 3))), observer=Console())
     printed = capsys.readouterr().out
@@ -249,6 +300,7 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
         ({"trainer": "adam"}, "trainer is 'adam'; give lfrtorch.LevenbergMarquardt() or"),
         ({"trainer": Adam}, "give lfrtorch.LevenbergMarquardt() or lfrtorch.Adam()"),
         ({"average": 0}, "average is 0"),
+        ({"refit": "yes"}, "refit is 'yes'"),
         ({"seed": -1}, "seed is -1"),
         ({"dtype": torch.float16}, "dtype is torch.float16"),
         ({"device": "abacus"}, "device is abacus, which torch cannot use here"),

@@ -53,8 +53,8 @@ def configured(cfg: DictConfig) -> Settings:
 
 
 AS_THEY_ARE = (
-    "nx", "nx_max", "nz", "nw", "nn", "activation", "degree", "ridge", "average", "starts",
-    "seed", "device",
+    "nx", "nx_max", "nz", "nw", "nn", "activation", "degree", "ridge", "average", "refit",
+    "starts", "seed", "device",
 )  # fmt: skip
 """Settings that are the words of the configuration."""
 

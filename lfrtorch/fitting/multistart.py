@@ -220,9 +220,10 @@ def fit(
     if not alone:
         result = replace(result, starts=judge.summaries(ranked))
     if average > 1:
-        mean, count = judge.mean(judge.stable(field, as_records(train))[:average])
+        best = judge.stable(field, as_records(train))[:average]
+        mean, count = judge.mean(best)
         if mean is not None:
-            result = replace(result, model=mean, averaged=count)
+            result = replace(result, model=mean, averaged=count, members=tuple(best[:count]))
     return replace(result, seconds=time.perf_counter() - clock)
 
 

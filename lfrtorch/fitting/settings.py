@@ -82,6 +82,8 @@ class Settings:
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
+        refit: whether the model that validation chose is fitted to all estimation records at last,
+            see :func:`lfrtorch.refit`.
         starts: random starts, of which the best is kept; at least 2 if sizes are searched.
         seed: of the first start; the others have seed + 1000, seed + 2000, ... If sizes are
             searched, the first start of the fit is the one that brought the sizes chosen.
@@ -112,6 +114,7 @@ class Settings:
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
     ridge: Ridge = 0.0
     average: int = 1
+    refit: bool = False
     starts: int = 1
     seed: int = 0
     init_from: Model | None = None
@@ -136,6 +139,8 @@ class Settings:
         for name in ("nx_max", "starts", "average"):
             integer(name, getattr(self, name), 1)
         integer("seed", self.seed, 0)
+        if not isinstance(self.refit, bool):
+            raise InputError(f"refit is {self.refit!r}; give True or False.")
         known = [*signature(estimate_bla).parameters][2:]
         for name in self.linear:
             if name not in known:

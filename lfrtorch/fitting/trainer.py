@@ -181,6 +181,7 @@ class FitResult:
         starts: all starts if there were several, the best first.
         averaged: number of starts that the model is the mean of; history and iterate are those
             of the best one.
+        members: the models of these starts; none if it is no mean.
 
     Example:
         >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=3))
@@ -199,6 +200,7 @@ class FitResult:
     starts: tuple[RestartSummary, ...] = ()
     averaged: int = 1
     detail: str = ""
+    members: tuple[Model, ...] = field(default=(), repr=False)
 
     @property
     def iterations(self) -> int:

@@ -36,7 +36,7 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rms
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.scores import NOT_SCORED, finalists, neurons, of_samples
+from lfrtorch.reporting.scores import NOT_SCORED, REFITTED, finalists, neurons, of_samples
 from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import LINEAR_MODEL, Verdict, of_linear
 
@@ -329,6 +329,8 @@ def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict
         summary += f" The best of {len(ranking)} starts."
     if metrics["averaged"] > 1:
         summary += f" The model is the mean of the best {metrics['averaged']}, side by side."
+    if metrics["refit"] is not None:
+        summary += f" {REFITTED}"
     return {"summary": summary, "head": head, "starts": starts, "others": others}
 
 

@@ -32,6 +32,8 @@ class Run:
         test_linear: linear models of single tests, by name, see ``Dataset.linear``.
         order_scan, size_search: how nx and the other sizes were chosen; None if they were given.
         fit: the nonlinear fit, of the best start or of the mean of several.
+        refit: the fit to all estimation records, if one was asked for. Its model is the run's, and
+            is scored on the tests; training and validation errors are those of ``fit.model``.
         simulations: every record with both simulations.
         metrics: what ``metrics.json`` holds: scores by record, sizes, the fit in numbers.
         verdict: whether the NL-LFR is worth more than the linear model.
@@ -54,6 +56,7 @@ class Run:
     order_scan: OrderScan | None
     size_search: SizeSearch | None
     fit: FitResult
+    refit: FitResult | None = None
     simulations: list[Response]
     metrics: Mapping[str, Any]
     verdict: Verdict
@@ -62,7 +65,7 @@ class Run:
     @property
     def model(self) -> Model:
         """The nonlinear model."""
-        return self.fit.model
+        return (self.refit or self.fit).model
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.model.sizes.items())
@@ -79,6 +82,8 @@ class Run:
             parts.append(scores.starts_table(self.metrics) + "\n")
         if fit.averaged > 1:
             parts.append(f"The model is the mean of the best {fit.averaged} starts.\n")
+        if self.refit is not None:
+            parts.append(f"{scores.REFITTED}\n")
         parts.append(scores.table(self.metrics, self.dataset.published))
         if self.metrics["stable_to"] < max(LOUDER):
             parts.append(

@@ -24,6 +24,9 @@ from lfrtorch.reporting.verdict import Verdict
 NOT_SCORED = "not scored"
 """What tables say of a record that has too few samples."""
 
+REFITTED = "Refitted to all estimation records: validation errors are those before it."
+"""What is said of a model that was."""
+
 
 @dataclass(frozen=True)
 class Score:
@@ -93,6 +96,7 @@ def metrics(
     command: str = "",
     search: SizeSearch | None = None,
     verdict: Verdict | None = None,
+    refit: FitResult | None = None,
 ) -> dict:
     """What ``metrics.json`` holds, scores by test record; None if a number is not finite.
 
@@ -105,9 +109,11 @@ def metrics(
         command: that made it.
         search: for the sizes, if they were not given.
         verdict: on the fit.
+        refit: the fit to all estimation records, if there was one. Its model is scored on the
+            tests; validation errors are those before it.
     """
-    model = result.model
-    entries = evaluation(model, bla, dataset, own=own, command=command)
+    model = result.model if refit is None else refit.model
+    entries = evaluation(model, bla, dataset, own=own, command=command, chosen=result.model)
     entries["data"] |= {
         "samples": sum(record.samples for record in dataset.train),
         "seed": dataset.seed,
@@ -122,6 +128,15 @@ def metrics(
             "reason": result.outcome,
         },
         "chosen_iteration": result.chosen_iteration,
+        "refit": None
+        if refit is None
+        else {
+            "iterations": refit.iterations,
+            "seconds": refit.seconds,
+            "reason": refit.outcome,
+            "train_before": refit.history[0].train,
+            "train": refit.history[refit.chosen_iteration].train,
+        },
         "stable_to": largest_stable_amplitude(model, dataset.train),
         "starts": max(1, len(result.starts)),
         "averaged": result.averaged,
@@ -137,16 +152,18 @@ def evaluation(
     *,
     own: Mapping[str, LinearModel] | None = None,
     command: str,
+    chosen: Model | None = None,
 ) -> dict:
     """What ``metrics`` has without a fit: scores of a model, and of a linear one if given, on data.
 
     Args:
         model, bla: what is scored.
         dataset, own, command: see :func:`metrics`.
+        chosen: what is scored on validation and selection, if the model was fitted to them.
     """
-    own = own or {}
-    validation = [score(model, bla, record, "validation") for record in dataset.validation]
-    selection = [score(model, bla, record, "selection") for record in dataset.selection]
+    own, chosen = own or {}, chosen or model
+    validation = [score(chosen, bla, record, "validation") for record in dataset.validation]
+    selection = [score(chosen, bla, record, "selection") for record in dataset.selection]
     lost: dict[bool, dict[str, Any]] = {True: {}, False: {}}
     for use, record in dataset.unscored:
         lost[use == "test"][record.name] = asdict(_unscored(record, use))

@@ -59,10 +59,13 @@ def respond(
     bla: LinearModel,
     dataset: Dataset,
     own: Mapping[str, LinearModel],
+    *,
+    refitted: Model | None = None,
 ) -> list[Response]:
     """All records beside their simulations; tests with linear models of their own have those.
 
-    Estimated starts of training records are fitted to all samples, as in the fit.
+    Estimated starts of training records are fitted to all samples, as in the fit. If the model was
+    fitted again to all of them, the tests are simulated by what came of it.
     """
     used = {
         "train": dataset.train,
@@ -73,7 +76,9 @@ def respond(
     found = []
     for use, records in used.items():
         for record in records:
-            linear = own.get(record.name, bla) if use == "test" else bla
+            linear, chosen = bla, model
+            if use == "test":
+                linear, chosen = own.get(record.name, bla), refitted or model
             driven = fitted(record) if use == "train" else record
-            found.append(Response(record, use, linear.simulate(driven), model.simulate(driven)))
+            found.append(Response(record, use, linear.simulate(driven), chosen.simulate(driven)))
     return found

@@ -1,0 +1,117 @@
+"""A last fit to all records, once those that were held out have chosen the model.
+
+The fit goes on from the model that was chosen, for as many iterations as the new samples are worth:
+if K iterations over n samples were best on validation, m samples more get K m / n, and no more than
+the fit was allowed. Many more would spoil short records, as K itself stops the fit before it learns
+their noise. A fit from the first start, for K iterations, may end in another minimum, and nothing
+is left to tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
+from math import ceil
+from typing import Any
+
+import numpy as np
+
+from lfrtorch.distributed import Ranks
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.trainer import FitResult, Monitor, Stop, Trainer
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.simulation_problem import Ridge
+from lfrtorch.records import Record, as_records
+
+
+def refit(
+    result: FitResult,
+    train: Record | Sequence[Record],
+    held_out: Record | Sequence[Record],
+    *,
+    trainer: Trainer | None = None,
+    ridge: Ridge = 0.0,
+    monitor: Monitor | None = None,
+    ranks: Ranks | None = None,
+    stop: Stop | None = None,
+) -> FitResult:
+    """Go on with a fit on its training records and those that were held out to choose.
+
+    Of a mean of several models each is fitted, and the mean taken again. The errors on the records
+    that were held out are no validation any more: quote those of ``result``.
+
+    Args:
+        result: of :func:`lfrtorch.fit`; its model is copied.
+        train: records that it was fitted to.
+        held_out: records that chose its iterate. One that begins in a training record, as the
+            parts of a measurement do, continues that record.
+        trainer, ridge: of the fit; ridge pulls towards the model that was chosen.
+        monitor: called after every iteration. Default: a line on a terminal or in a notebook.
+        ranks, stop: see :func:`lfrtorch.fit`.
+
+    Returns:
+        The fit to all records; that of the models as they are if no iteration was chosen.
+
+    Raises:
+        ValueError: records of other channels than the model's.
+        ProcessLostError, StoppedError: before there was an iterate to keep.
+
+    Example:
+        >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=8)
+        >>> train, validation = record[:300], record[300:]
+        >>> result = lfrtorch.fit(model, train, validation, trainer=trainer)
+        >>> again = lfrtorch.refit(result, train, validation, trainer=trainer)
+        >>> again.history[-1].train <= again.history[0].train
+        True
+    """
+    train, held_out = as_records(train), as_records(held_out)
+    seen, new = (sum(r.samples - r.skip for r in records) for records in (train, held_out))
+    base: Any = LevenbergMarquardt() if trainer is None else trainer
+    limit = min(ceil(result.chosen_iteration * new / seen), base.limit)
+    models = [deepcopy(model) for model in result.members or (result.model,)]
+    return fit(
+        models,
+        all_records(train, held_out),
+        trainer=replace(base, max_iter=limit),
+        ridge=ridge,
+        average=len(models),
+        monitors=None if monitor is None else [[monitor]] * len(models),
+        ranks=ranks,
+        stop=stop,
+    )
+
+
+def all_records(train: Sequence[Record], held_out: Sequence[Record]) -> list[Record]:
+    """Training records and others; one that begins in a training record continues that one.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from lfrtorch.fitting.refit import all_records
+        >>> train, validation = record[:300], replace(record[200:], skip=100)
+        >>> [each.samples for each in all_records([train], [validation])]
+        [400]
+    """
+    found = list(train)
+    for record in held_out:
+        at = next((i for i, other in enumerate(found) if _continues(record, other)), None)
+        if at is None:
+            found.append(record)
+            continue
+        u, y = (
+            np.concatenate([before, after[record.skip :]])
+            for before, after in ((found[at].u, record.u), (found[at].y, record.y))
+        )
+        found[at] = replace(found[at], u=u, y=y)
+    return found
+
+
+def _continues(record: Record, other: Record) -> bool:
+    """Whether the samples that a record skips are the last ones of another."""
+    count = min(record.skip, other.samples)
+    if not count or "periodic" in (record.start, other.start):
+        return False
+    window = slice(record.skip - count, record.skip)
+    pairs = (record.u[window], other.u[-count:]), (record.y[window], other.y[-count:])
+    # Records at rest may be equal by chance.
+    return all(np.array_equal(*pair) for pair in pairs) and bool(np.ptp(record.y[window]))
