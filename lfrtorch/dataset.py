@@ -21,6 +21,8 @@ class Published:
         scores: RMSE in the output's unit, by the name of the test record.
         reference: where it was published.
         sizes: (nz, nw) if the number belongs to one model size only.
+        unit: the output's with the prefix that tables shall have, ``"µm"`` for example. Default:
+            tables choose one.
 
     Example:
         >>> paper = lfrtorch.Published("NL-LFR (paper)", {"multisine": 1.9e-5}, "a paper")
@@ -32,6 +34,7 @@ class Published:
     scores: dict[str, float]
     reference: str
     sizes: tuple[int, int] | None = None
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -49,11 +52,13 @@ class Dataset:
             ``None`` for measured data.
         published: results of others on the same tests.
         linear: training records that a test's own linear model is estimated from, by the names of
-            test and records; tests without an entry have the linear model of all records.
+            test or group and of records; others have the linear model of all records.
         notes: what a reader of the scores should know of the data, a sentence each.
         seed: that simulated data were drawn with.
         unscored: records that cannot be scored, each after its use (``"test"``, ...): too few
             samples to determine the start state and score the rest.
+        groups: test or validation records that make one score together, by its name and theirs: the
+            mean of the RMSE of each output of each record.
         leaderboard: test records as nonlinearbenchmark.org has them scored: cut by the package
             nonlinear_benchmarks, the start state fitted to the samples that it leaves unscored.
 
@@ -82,6 +87,7 @@ class Dataset:
     leaderboard: list[Record] = field(default_factory=list)
     seed: int | None = None
     unscored: Sequence[tuple[str, Record]] = ()
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for use in ("train", "validation", "tests", "selection", "leaderboard"):
@@ -94,6 +100,13 @@ class Dataset:
                     f"{use} has something else than records; give a list of them, or [] for none."
                 )
             object.__setattr__(self, use, records)
+
+    def score_of(self, record: Record) -> str:
+        """The name of the score that a record counts for: its group's, or its own."""
+        for name, records in self.groups.items():
+            if record.name in records:
+                return name
+        return record.name
 
     def __repr__(self) -> str:
         uses = ("train", "validation", "selection", "tests", "leaderboard")

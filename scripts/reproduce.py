@@ -56,6 +56,7 @@ CASES = {
     "ced": ["+bench=ced"],
     "emps": ["+bench=emps"],
     "f16": ["+bench=f16"],
+    "fine_steering_mirror": ["+bench=fine_steering_mirror"],
     "wh_process_noise": ["+bench=wh_process_noise"],
 }
 """Settings of train.py by name."""
@@ -139,6 +140,8 @@ def case(name: str, words: list[str], out: Path, seeds: int, *, start: bool) -> 
             raise
         print(f"{name}: no data. {cause}", flush=True)
         return Case(name, None, missing="no data at hand")
+    if not dataset.tests:
+        return Case(name, None, missing="no test records at hand")
     stand_in = any(record.source == STAND_IN for record in dataset.tests)
     if stand_in and f"data.source={STAND_IN}" not in words:
         return Case(name, None, missing="no data at hand")

@@ -69,7 +69,7 @@ def number(value: float | None, digits: int = DIGITS) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
-def engineering(values: Iterable[float | None], unit: str) -> tuple[float, str]:
+def engineering(values: Iterable[float | None], unit: str, shown: str = "") -> tuple[float, str]:
     """What numbers of a unit are multiplied by to be read well, and the unit with its SI prefix.
 
     One for all, so that they compare: their median is between 0.1 and 1000 there.
@@ -77,7 +77,16 @@ def engineering(values: Iterable[float | None], unit: str) -> tuple[float, str]:
     Args:
         values: numbers of a column, or the largest one of an axis; unknown ones do not count.
         unit: theirs; one that takes no prefix is returned as it is.
+        shown: the unit with the prefix that it shall have, whatever the numbers.
+
+    Example:
+        >>> from lfrtorch._support.tables import engineering
+        >>> engineering([2e-7], "m")[1], engineering([2e-7], "m", "µm")[1]
+        ('nm', 'µm')
     """
+    for power, prefix in PREFIXES.items():
+        if shown and shown == prefix + unit:
+            return 10.0**-power, shown
     known = [abs(v) for v in values if v and math.isfinite(v)]
     if not known or unit not in PREFIXED:
         return 1.0, unit

@@ -87,6 +87,35 @@ def find(
     return path
 
 
+def find_tests(
+    root: str | Path | None,
+    files: Mapping[str, str],
+    loader: str,
+    *,
+    others: Sequence[str] = (),
+    download: bool = False,
+) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """The paths of the test files that are there, and a note on those that are not.
+
+    Args:
+        root, loader, others, download: see :func:`find`.
+        files: below ``root``, by the name of the test.
+
+    Raises:
+        ValueError: ``download`` is neither true nor false.
+        FileNotFoundError, OSError: with ``download``, if a missing file cannot be had.
+    """
+    below, found = folder(root), {}
+    for test, file in files.items():
+        if download or _present(below, (file, *others)):
+            found[test] = find(root, file, loader, others=others, download=download)
+    missing = [test for test in files if test not in found]
+    lost = [Path(files[test]).name for test in missing]
+    more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
+    why = f"{lost[0]}{more} not found; data.download=true fetches them" if lost else ""
+    return found, without_tests(missing, why, partly=bool(found))
+
+
 def archive_note(archive: Path, md5: str, file: str) -> str:
     """Whether a benchmark's archive is the one that is known, by its checksum.
 
@@ -173,6 +202,45 @@ def read_struct(path: Path, name: str, fields: Sequence[str], advice: str = _AGA
         _numbers(path, f"{name}.{field}", matrix, (shape,), advice)
         for field, matrix in zip(fields, matrices, strict=True)
     ]
+
+
+def read_npz(path: Path, advice: str = _AGAIN) -> dict[str, Array]:
+    """All arrays of a .npz file by name.
+
+    Args:
+        path: the file.
+        advice: what to do about a file that cannot be used.
+
+    Raises:
+        ValueError: a file that cannot be read, another type, or NaN.
+    """
+    try:
+        with path.open("rb") as content, np.load(content) as file:
+            found = {name: file[name] for name in file.files}
+    except Exception as error:  # a damaged archive makes for several kinds
+        raise InputError(f"'{path}' is no readable .npz file ({error!r}); {advice}") from error
+    return {
+        name: _numbers(path, name, array, (array.shape,), advice) for name, array in found.items()
+    }
+
+
+def without_tests(missing: Sequence[str], why: str, *, partly: bool = False) -> tuple[str, ...]:
+    """The note on test records that are not at hand; none if none are missing.
+
+    Args:
+        missing: their names.
+        why: the reason.
+        partly: whether other test records are there.
+
+    Example:
+        >>> from lfrtorch.datasets import official
+        >>> official.without_tests(["test"], "no file")
+        ('no test records: no file',)
+        >>> official.without_tests(["a", "b"], "no files", partly=True)
+        ('no test records a, b: no files',)
+    """
+    names = f" {', '.join(missing)}" if partly else ""
+    return (f"no test records{names}: {why}",) if missing else ()
 
 
 def held_out(samples: int, validation: float, least: int = 1) -> int:

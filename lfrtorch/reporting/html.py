@@ -36,7 +36,15 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rms
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.scores import NOT_SCORED, REFITTED, finalists, neurons, of_samples
+from lfrtorch.reporting.scores import (
+    NOT_SCORED,
+    REFITTED,
+    finalists,
+    neurons,
+    of_samples,
+    own_linear,
+    published_unit,
+)
 from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import LINEAR_MODEL, Verdict, of_linear
 
@@ -170,20 +178,23 @@ def _scores(
     metrics: Mapping[str, Any], dataset: Dataset, responses: Sequence[Response]
 ) -> dict[str, Any]:
     sizes = metrics["sizes"]["nz"], metrics["sizes"]["nw"]
-    in_unit = _units(responses)
     published = [p for p in dataset.published if p.sizes in (None, sizes)]
+    in_unit = _units(responses, published_unit(published))
     outputs = responses[0].record.outputs
     several, units = len(outputs) > 1, any(channel.unit for channel in outputs)
     what = [*["output"] * several, *["unit"] * (several and units)]
     errors = ["linear", "NL-LFR", "ratio", "linear NRMSE", "NRMSE"]
     tests, others = [], []
-    for response in responses:
-        name, use = response.record.name, response.use
-        for row, (channel, unit, of) in enumerate(_channels(response)):
+    for (use, name), scored in _scored(dataset, responses).items():
+        for row, (channel, unit, of) in enumerate(_channels(scored[0])):
             factor, shown = in_unit[unit]
-            cells = [*[channel, shown][: len(what)], *_cells(_errors(response, of), factor)]
+            grouped = name in dataset.groups
+            found = _mean_errors(scored, of) if grouped else _errors(scored[0], of)
+            cells = [*[channel, shown][: len(what)], *_cells(found, factor)]
             if use == "test":
-                known = [times(factor, p.scores.get(name)) if row == 0 else "" for p in published]
+                key = name if row == 0 else f"{name} {channel}"
+                values = [times(factor, p.scores.get(key)) for p in published]
+                known = values if row == 0 else ["" if v is None else v for v in values]
                 tests.append([name if row == 0 else "", *cells, *known])
             else:
                 others.append([*([name, USES[use]] if row == 0 else ["", ""]), *cells])
@@ -196,8 +207,7 @@ def _scores(
             others.append([record.name, USES[use], *nothing])
     references = [f"{p.label}: {p.reference}" for p in published if tests]
     if metrics["linear"]:
-        own = ", ".join(f"{test} of {'+'.join(used)}" for test, used in metrics["linear"].items())
-        references.insert(0, f"linear: a model for each of these: {own}")
+        references.insert(0, own_linear(metrics))
     return {
         "unit": "" if several else in_unit[outputs[0].unit][1],
         "words": 1 + len(what),
@@ -207,6 +217,16 @@ def _scores(
         "others_head": ["record", "use", *what, *errors],
         "others": others,
     }
+
+
+def _scored(
+    dataset: Dataset, responses: Sequence[Response]
+) -> dict[tuple[str, str], list[Response]]:
+    """The responses of each score, by its use and name."""
+    found: dict[tuple[str, str], list[Response]] = {}
+    for response in responses:
+        found.setdefault((response.use, dataset.score_of(response.record)), []).append(response)
+    return found
 
 
 def _channels(response: Response) -> list[tuple[str, str, slice]]:
@@ -219,14 +239,14 @@ def _channels(response: Response) -> list[tuple[str, str, slice]]:
     return [(ALL, units.pop(), slice(None)), *single]
 
 
-def _units(responses: Sequence[Response]) -> dict[str, tuple[float, str]]:
+def _units(responses: Sequence[Response], shown: str = "") -> dict[str, tuple[float, str]]:
     """Of each unit of the outputs a factor and the unit with a prefix, for all of their errors."""
     errors: dict[str, list[float]] = {}
     for response in responses:
         for _, unit, of in _channels(response):
             found = _errors(response, of)
             errors.setdefault(unit, []).extend([found.linear, found.error])
-    return {unit: engineering(values, unit) for unit, values in errors.items()}
+    return {unit: engineering(values, unit, shown) for unit, values in errors.items()}
 
 
 def _errors(response: Response, of: slice) -> Errors:
@@ -234,7 +254,25 @@ def _errors(response: Response, of: slice) -> Errors:
     linear, error = (
         float(rms(signal[:, of])) for signal in (response.linear_error, response.error)
     )
-    deviation = float(np.sqrt(np.mean(np.var(response.scored[:, of], axis=0)))) or math.nan
+    deviation = float(np.sqrt(np.mean(np.var(response.scored[:, of], axis=0))))
+    return _compared(linear, error, deviation)
+
+
+def _mean_errors(responses: Sequence[Response], of: slice) -> Errors:
+    """Their means over some outputs, one by one, of several records."""
+
+    def mean(signals: Sequence[Array]) -> float:
+        return float(np.mean([rms(signal[:, of], axis=0) for signal in signals]))
+
+    return _compared(
+        mean([response.linear_error for response in responses]),
+        mean([response.error for response in responses]),
+        mean([response.scored - response.scored.mean(axis=0) for response in responses]),
+    )
+
+
+def _compared(linear: float, error: float, deviation: float) -> Errors:
+    deviation = deviation or math.nan
     ratio = linear / error if error > 0 else math.nan
     return Errors(linear, error, ratio, linear / deviation, error / deviation)
 

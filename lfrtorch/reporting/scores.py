@@ -1,25 +1,31 @@
-"""Scores of a run: one entry a test record, as a table for people and as JSON for programs."""
+"""Scores of a run: an entry for each test record or group, as a table and as JSON."""
 
 from __future__ import annotations
 
 import math
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
 from lfrtorch._support import tables
 from lfrtorch._support.reasons import Reason
+from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.dataset import LISTED, Dataset, Published
 from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.metrics import nrmse, rmse
+from lfrtorch.metrics import nrmse, rms, rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 from lfrtorch.reporting.verdict import Verdict
+
+ERRORS = "rmse", "lti_rmse"
+"""Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
 
 NOT_SCORED = "not scored"
 """What tables say of a record that has too few samples."""
@@ -41,6 +47,9 @@ class Score:
         samples, skip: length of the record, and how many at its beginning do not count.
         use: ``"test"``, ``"validation"`` or ``"selection"``.
         scored: how many samples count, 0 of a record that cannot be scored.
+        outputs: their names.
+        rmse_by_output, lti_rmse_by_output: errors of each output.
+        records: how many the score is of.
     """
 
     rmse: float | None
@@ -52,6 +61,20 @@ class Score:
     skip: int
     use: str
     scored: int
+    outputs: tuple[str, ...] = ()
+    rmse_by_output: tuple[float, ...] = ()
+    lti_rmse_by_output: tuple[float, ...] = ()
+    records: int = 1
+
+    def entry(self) -> dict[str, Any]:
+        """For ``metrics.json``: errors of each output and the number of records if several."""
+        found = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
+        if len(self.outputs) < 2:
+            for name in ("outputs", "rmse_by_output", "lti_rmse_by_output"):
+                del found[name]
+        if self.records == 1:
+            del found["records"]
+        return found
 
 
 def score(model: Model, bla: LinearModel | None, record: Record, use: str = "test") -> Score:
@@ -67,9 +90,10 @@ def score(model: Model, bla: LinearModel | None, record: Record, use: str = "tes
         (400, True)
     """
     y_hat = model.simulate(record)
+    y_linear = None if bla is None else bla.simulate(record)
     return Score(
         rmse=rmse(record, y_hat),
-        lti_rmse=None if bla is None else rmse(record, bla.simulate(record)),
+        lti_rmse=None if y_linear is None else rmse(record, y_linear),
         nrmse=nrmse(record, y_hat),
         unit=", ".join(dict.fromkeys(c.unit for c in record.outputs)),
         source=record.source,
@@ -77,6 +101,32 @@ def score(model: Model, bla: LinearModel | None, record: Record, use: str = "tes
         skip=record.skip,
         use=use,
         scored=record.samples - record.skip,
+        outputs=tuple(channel.name for channel in record.outputs),
+        rmse_by_output=_by_output(record, y_hat),
+        lti_rmse_by_output=() if y_linear is None else _by_output(record, y_linear),
+    )
+
+
+def _by_output(record: Record, y_hat: Array) -> tuple[float, ...]:
+    """RMSE of each output over the scored samples."""
+    return tuple(rms((record.y - y_hat)[record.skip :], axis=0).tolist())
+
+
+def together(scores: Sequence[Score]) -> Score:
+    """The score of a group of records: means of the RMSE of each output of each record."""
+    first = scores[0]
+    errors, linear = (
+        np.mean([getattr(s, f"{of}_by_output") for s in scores], axis=0) for of in ERRORS
+    )
+    return replace(
+        first,
+        rmse=float(np.mean(errors)),
+        lti_rmse=float(np.mean(linear)) if linear.size else None,
+        nrmse=float(np.mean([math.nan if s.nrmse is None else s.nrmse for s in scores])),
+        rmse_by_output=tuple(errors.tolist()),
+        lti_rmse_by_output=tuple(linear.tolist()),
+        records=len(scores),
+        **{name: sum(getattr(s, name) for s in scores) for name in ("samples", "skip", "scored")},
     )
 
 
@@ -166,7 +216,7 @@ def evaluation(
     selection = [score(chosen, bla, record, "selection") for record in dataset.selection]
     lost: dict[bool, dict[str, Any]] = {True: {}, False: {}}
     for use, record in dataset.unscored:
-        lost[use == "test"][record.name] = asdict(_unscored(record, use))
+        lost[use == "test"][record.name] = _unscored(record, use).entry()
     entries = {
         "bench": dataset.name,
         "sizes": model.sizes,
@@ -176,20 +226,19 @@ def evaluation(
         "validation": {
             "rmse": _pooled([s.rmse for s in validation], validation),
             "lti_rmse": _pooled([s.lti_rmse for s in validation], validation),
-            "records": {
-                record.name: asdict(s)
-                for record, s in zip(
-                    (*dataset.validation, *dataset.selection),
-                    (*validation, *selection),
-                    strict=True,
-                )
-            }
+            "records": _entries(
+                dataset, (*dataset.validation, *dataset.selection), (*validation, *selection)
+            )
             | lost[False],
         },
-        "scores": {
-            record.name: asdict(score(model, own.get(record.name, bla), record))
-            for record in dataset.tests
-        }
+        "scores": _entries(
+            dataset,
+            dataset.tests,
+            [
+                score(model, own.get(dataset.score_of(record), bla), record)
+                for record in dataset.tests
+            ],
+        )
         | lost[True],
         "linear": {name: list(dataset.linear[name]) for name in own},
         "command": command,
@@ -199,6 +248,19 @@ def evaluation(
         },
     }
     return _finite(entries)
+
+
+def _entries(
+    dataset: Dataset, records: Sequence[Record], scores: Sequence[Score]
+) -> dict[str, dict[str, Any]]:
+    """Entries by name: one a record, or one a group of them."""
+    found: dict[str, list[Score]] = {}
+    for record, of in zip(records, scores, strict=True):
+        found.setdefault(dataset.score_of(record), []).append(of)
+    return {
+        name: (together(of) if name in dataset.groups else of[0]).entry()
+        for name, of in found.items()
+    }
 
 
 def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
@@ -212,18 +274,20 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     head = ["record", "use", *["source"] * sources, "scored", *["linear", "NL-LFR"][: len(models)]]
     head += [p.label for p in others]
     errors = [s[model] for _, s in listed for model in models]
-    factor, unit = tables.engineering(errors, _unit(result))
-    rows = [
-        [
-            *(name, s["use"], *[s["source"]] * sources, of_samples(s["scored"], s["samples"])),
-            *(tables.times(factor, s[model]) for model in models),
-            *(
-                tables.times(factor, p.scores.get(name)) if s["use"] == "test" else None
-                for p in others
-            ),
-        ]
-        for name, s in listed
-    ]
+    factor, unit = tables.engineering(errors, _unit(result), published_unit(others))
+    rows = []
+    for name, s in listed:
+        known = others if s["use"] == "test" else []
+        about = [s["use"], *[s["source"]] * sources, of_samples(s["scored"], s["samples"])]
+        lines = [(name, [s[model] for model in models])]
+        for i, output in enumerate(s.get("outputs", [])):
+            if any(f"{name} {output}" in p.scores for p in known):
+                own = [s[f"{model}_by_output"] for model in models]
+                lines.append((f"{name} {output}", [of[i] if of else None for of in own]))
+        for line, values in lines:
+            mine = [tables.times(factor, value) for value in values]
+            beside = [tables.times(factor, p.scores.get(line)) for p in known]
+            rows.append([line, *about, *mine, *(beside or [None] * len(others))])
     title = f"Simulation RMSE{f' ({unit})' if unit else ''}"
     static = f"degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])
     title += f", nx {sizes['nx']}, "
@@ -232,9 +296,22 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
         return f"{title}: nothing is scored, as there is no test and no validation record"
     references = [f"{p.label}: {p.reference}" for p in others]
     if result["linear"]:
-        models = ", ".join(f"{n} of {'+'.join(r)}" for n, r in result["linear"].items())
-        references.insert(0, f"linear: a model for each of these: {models}")
+        references.insert(0, own_linear(result))
     return "\n".join([title, "", tables.table(head, rows), *[""] * bool(references), *references])
+
+
+def own_linear(result: Mapping[str, Any]) -> str:
+    """Which tests have a linear model of their own, and of which records."""
+    models = [
+        f"{name} of {'+'.join(of) if len(of) <= LISTED else f'{len(of)} training records'}"
+        for name, of in result["linear"].items()
+    ]
+    return f"linear: a model for each of these: {', '.join(models)}"
+
+
+def published_unit(published: Sequence[Published]) -> str:
+    """The unit of tables, with a prefix, that publications give; none if they leave it open."""
+    return next((p.unit for p in published if p.unit), "")
 
 
 def _unit(result: Mapping[str, Any]) -> str:

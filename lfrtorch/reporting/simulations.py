@@ -78,7 +78,7 @@ def respond(
         for record in records:
             linear, chosen = bla, model
             if use == "test":
-                linear, chosen = own.get(record.name, bla), refitted or model
+                linear, chosen = own.get(dataset.score_of(record), bla), refitted or model
             driven = fitted(record) if use == "train" else record
             found.append(Response(record, use, linear.simulate(driven), chosen.simulate(driven)))
     return found

@@ -232,6 +232,31 @@ def test_several_outputs_have_scores_of_their_own():
     assert [line.split(":")[0] for line in lines] == ["test, a", "test, b"]
 
 
+def test_records_of_a_group_have_one_score():
+    same = run((Channel("a", "V"), Channel("b", "V")))
+    (test,) = same.dataset.tests
+    tests = [test, replace(test, y=2 * test.y, name="again")]
+    other = Published("other", {"board": 0.25, "board b": 0.125}, "B", unit="mV")
+    groups = {"board": ("test", "again")}
+    data = replace(same.dataset, tests=tests, groups=groups, published=(other,))
+    grouped = Run(same.result, same.bla, data)
+    metrics = report.evaluation(same.result.model, same.bla, data, command="")
+    errors = [report.score(same.result.model, same.bla, record) for record in tests]
+    (score,) = metrics["scores"].values()
+    expected = np.mean([each.rmse_by_output for each in errors], axis=0)
+    assert score["rmse_by_output"] == pytest.approx(expected)
+    assert score["rmse"] == pytest.approx(expected.mean())
+    assert score["records"] == 2
+    linear, error = (number(1e3 * score[name]) for name in ("lti_rmse", "rmse"))
+    page = grouped.page().text
+    assert f"board all mV {linear} {error}" in page
+    a, b = (number(1e3 * score["rmse_by_output"][i]) for i in range(2))
+    assert re.search(rf"a mV \S+ {a} .* b mV \S+ {b} ", page)
+    table = report.table(metrics, data.published).splitlines()
+    rows = {line.split("  ")[0]: line.split()[-1] for line in table if line.startswith("board")}
+    assert rows == {"board": "250", "board b": "125"}
+
+
 def test_many_tests_have_one_verdict(single: Run):
     test = single.responses[-1]
     error = test.record.y - test.y_linear

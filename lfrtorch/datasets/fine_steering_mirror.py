@@ -1,0 +1,195 @@
+"""Fine steering mirror: measurements of a mirror on three piezo actuators.
+
+Inputs u1, u2, u3 (V), outputs y1, y2, y3 (m), in steady state, at 6400 Hz. At each of three levels,
+100, 200 and 300 mV rms, there are realisations of random-phase multisines up to 3000 Hz, orthogonal
+in groups of three, with two periods of 8192 samples each: six realisations for estimation and three
+for the test. The hysteresis of the actuators is the nonlinearity, and the structure resonates.
+
+The score of a level is the mean over outputs, realisations and periods of the RMSE, without the
+first 100 samples of each period. A published model simulates each period as a record of its own,
+and its start is behind it by sample 100. Here a test is simulated in its own periodic steady state,
+from the inputs alone, which is what was measured; the same samples are scored.
+
+All data are in one file, in arrays (samples, channels, realisations, periods) for each level and
+use, ``u_100mV_train`` to ``y_300mV_test``. They are by M. Floren, CC BY 4.0.
+
+References:
+    https://www.nonlinearbenchmark.org, "Fine steering mirror".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
+from lfrtorch.dataset import Dataset, Published
+from lfrtorch.datasets import official
+from lfrtorch.records import Channel, Record
+
+__all__ = ["LEVELS", "load"]
+
+LEVELS = (100, 200, 300)
+"""Amplitudes of the inputs, mV rms."""
+
+_FILE = "FineSteeringMirror/combined_data.npz"
+_FS = 6400.0  # Hz
+_CHANNELS = 3  # inputs, and outputs
+_WINDOW = 100  # samples, unscored, of each period
+
+
+def _published(label: str, micrometres: Sequence[float], reference: str) -> Published:
+    scores = {f"level_{a}": 1e-6 * e for a, e in zip(LEVELS, micrometres, strict=True)}
+    return Published(label, scores, reference, unit="µm")
+
+
+_PUBLISHED = (
+    _published("LTI", (0.114, 0.216, 0.228), "leaderboard; nx 28, a model for each level"),
+    _published(
+        "freq-statespace",
+        (0.0866, 0.131, 0.169),
+        "leaderboard; NL-LFR with nx 28, nz 16, nw 8, 128 neurons, a model for all levels",
+    ),
+)
+
+
+def load(
+    *,
+    levels: Sequence[int] = LEVELS,
+    validation: int = 1,
+    download: bool = False,
+    root: str | Path | None = None,
+) -> Dataset:
+    """Realisations of several levels to fit, others to choose by, and the tests.
+
+    A training record is the mean of the two periods of a realisation. Each period of a validation
+    or test realisation is a record. Those of a level make one score, ``"level_100"``,
+    ``"level_200"`` and ``"level_300"``, and ``"validation_100"`` and so on: the mean over outputs
+    and records of the RMSE. A level's linear model is that of its training records.
+
+    Without test arrays in the file there are no tests, and a note says so.
+
+    Args:
+        levels: that train and validate, mV rms.
+        validation: how many realisations of each level, the last of them, validate; 0 for none.
+        download: whether a missing file is downloaded, by a package nonlinear_benchmarks that has
+            this benchmark (version 1.0.1 has not).
+        root: folder that holds ``FineSteeringMirror/combined_data.npz``; by default the cache
+            folder of the package nonlinear_benchmarks.
+
+    Shape:
+        u (V), y (m): (8192, 3), of which 8092 are scored.
+
+    Raises:
+        ValueError: an argument out of range, or a file that cannot be used.
+        FileNotFoundError: no such file below ``root``, or nothing to download it with.
+        OSError: the download fails.
+
+    Example:
+        >>> data = lfrtorch.datasets.fine_steering_mirror.load(download=True)  # doctest: +SKIP
+        >>> lfrtorch.datasets.fine_steering_mirror.load(root="elsewhere")
+        Traceback (most recent call last):
+        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
+    """
+    chosen = _checked(levels)
+    integer("validation", validation, 0)
+    path = official.find(root, _FILE, "FineSteeringMirror", download=download)
+    arrays = official.read_npz(path)
+
+    def pair(level: int, use: str) -> tuple[Array, Array]:
+        """u and y (samples, channels, realisations, periods)."""
+        u, y = (arrays.get(f"{name}_{level}mV_{use}", np.zeros(0)) for name in "uy")
+        if u.ndim != 4 or u.shape != y.shape or u.shape[1] != _CHANNELS or len(u) <= _WINDOW:
+            raise InputError(
+                f"'{path}': u_{level}mV_{use} has shape {u.shape} and y_{level}mV_{use} {y.shape}; "
+                f"expected (samples, {_CHANNELS}, realisations, periods); download the file again."
+            )
+        return u, y
+
+    train: list[Record] = []
+    chosen_by: list[Record] = []
+    tests: list[Record] = []
+    for level in chosen:
+        u, y = pair(level, "train")
+        trained = u.shape[2] - validation
+        if trained < 1:
+            raise InputError(
+                f"validation is {validation}, and there are {u.shape[2]} realisations of "
+                f"{level} mV, of which one at least must train; give 0 to {u.shape[2] - 1}."
+            )
+        train += [
+            _record(f"train_{level}_{r + 1}", u[:, :, r].mean(-1), y[:, :, r].mean(-1))
+            for r in range(trained)
+        ]
+        chosen_by += _each(f"validation_{level}", u, y, range(trained, u.shape[2]))
+    for level in LEVELS:
+        if any(f"{name}_{level}mV_test" in arrays for name in "uy"):
+            u, y = pair(level, "test")
+            tests += _each(f"level_{level}", u, y, range(u.shape[2]))
+
+    def names(records: Sequence[Record], level: str) -> tuple[str, ...]:
+        return tuple(record.name for record in records if record.name.startswith(f"{level}_"))
+
+    of = [f"{use}_{level}" for use in ("level", "validation") for level in LEVELS]
+    found = {score: names((*chosen_by, *tests), score) for score in of}
+    groups = {score: records for score, records in found.items() if records}
+    missing = [f"level_{level}" for level in LEVELS if f"level_{level}" not in groups]
+    why = f"{path.name} has estimation data alone"
+    return Dataset(
+        name="fine_steering_mirror",
+        train=train,
+        validation=chosen_by,
+        tests=tests,
+        published=_PUBLISHED,
+        notes=official.without_tests(missing, why, partly=bool(tests)),
+        groups=groups,
+        linear={
+            f"level_{level}": names(train, f"train_{level}")
+            for level in chosen
+            if f"level_{level}" in groups
+        },
+        leaderboard=tests,
+    )
+
+
+def _record(name: str, u: Array, y: Array, skip: int = 0) -> Record:
+    """One period in steady state."""
+    return Record(
+        u,
+        y,
+        fs=_FS,
+        start="periodic",
+        skip=skip,
+        name=name,
+        source="official",
+        inputs=tuple(Channel(f"u{i + 1}", "V") for i in range(_CHANNELS)),
+        outputs=tuple(Channel(f"y{i + 1}", "m") for i in range(_CHANNELS)),
+        period=len(u),
+    )
+
+
+def _each(name: str, u: Array, y: Array, realisations: Iterable[int]) -> list[Record]:
+    """Each period of some realisations."""
+    return [
+        _record(f"{name}_{r + 1}_{p + 1}", *(s[:, :, r, p].copy() for s in (u, y)), skip=_WINDOW)
+        for r in realisations
+        for p in range(u.shape[3])
+    ]
+
+
+def _checked(levels: Sequence[int]) -> list[int]:
+    """The levels as plain integers, in the order given."""
+    try:
+        chosen = [LEVELS[LEVELS.index(level)] for level in levels]
+    except (TypeError, ValueError):
+        chosen = []
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise InputError(
+            f"levels is {levels}; give one or more of {', '.join(map(str, LEVELS))} (mV rms), "
+            "each once, for example [100, 300]."
+        )
+    return chosen
