@@ -431,7 +431,9 @@ def starting_model(
     """The model that one start begins with."""
     begin = infer
     if settings.init != "inference":
-        begin = partial(initialise, method=settings.init, minor=settings.minor)
+        begin = partial(
+            initialise, method=settings.init, minor=settings.minor, modes=settings.modes
+        )
     nz, nw = cast(int, settings.nz), cast(int, settings.nw)
     model = begin(linear, train, nz=nz, nw=nw, seed=seed, **settings.static_map())
     model.lfr.to(device=settings.device, dtype=settings.dtype)

@@ -79,6 +79,8 @@ class Settings:
         init: where the fit starts, see :func:`lfrtorch.initialise`; ``"inference"``, for periodic
             records, is :func:`lfrtorch.infer`.
         minor: see :func:`lfrtorch.initialise`. Default: its own.
+        modes: modes that w alone drives, two states each beside the ``nx`` of the linear model, see
+            :func:`lfrtorch.initialise`.
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
@@ -110,6 +112,7 @@ class Settings:
     static: Literal["network", "polynomial"] | Callable[..., Module] = "network"
     init: Literal["zero_output", "paper", "inference"] = "zero_output"
     minor: float | None = None
+    modes: int = 0
     linear: Mapping[str, Any] = field(default_factory=dict)
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
     ridge: Ridge = 0.0
@@ -151,6 +154,12 @@ class Settings:
             )
         if self.minor is not None:
             number("minor", self.minor)
+        integer("modes", self.modes, 0)
+        if self.modes and self.init == "inference":
+            raise InputError(
+                f"modes is {self.modes}, which init='inference' has no use for; give modes=0, or "
+                "init='zero_output'."
+            )
         if self.dtype not in (torch.float32, torch.float64):
             raise InputError(f"dtype is {self.dtype}; give torch.float64 or torch.float32.")
         try:

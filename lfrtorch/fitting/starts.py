@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -15,6 +16,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.fitting.distortion_modes import distortion_frequencies, with_modes
 from lfrtorch.fitting.nonlinear_end import nonlinear_end
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.modes import MINOR, without_slow_minor_modes
@@ -40,6 +42,7 @@ def initialise(
     method: Literal["zero_output", "paper"] = "zero_output",
     seed: int = 0,
     minor: float | None = None,
+    modes: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> Model:
     """NL-LFR model whose output is that of the linear model.
@@ -61,6 +64,10 @@ def initialise(
     ``"zero_output"`` begins there: the first z are the linear model's outputs, and Bw = 0. If one
     of its input does, as in a Hammerstein system, the first z are the inputs.
 
+    ``modes`` adds lightly damped modes that w alone drives, two states each. They are above the
+    band of the inputs, where the linear model has none, at frequencies that split the power of its
+    errors into equal parts: friction, clearance and impacts excite modes of a structure there.
+
     Args:
         bla: stable linear model, best in balanced coordinates.
         records: the data that are to be fitted.
@@ -72,10 +79,12 @@ def initialise(
         seed: of the random weights.
         minor: what counts as next to nothing: the part of a mode in the output over the model's
             error; 0 leaves the linear model as it is. Default: 0 for ``"paper"``, else 1/3.
+        modes: how many modes are added to those of the linear model.
         dtype: of the weights.
 
     Raises:
-        ValueError: sizes below 1, an unknown method or a static map of other sizes.
+        ValueError: sizes below 1, an unknown method, a static map of other sizes, or modes and no
+            errors above the band of the inputs.
 
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
@@ -92,6 +101,7 @@ def initialise(
     for name, size in (("nz", nz), ("nw", nw)):
         integer(name, size, 1)
     integer("seed", seed, 0)
+    integer("modes", modes, 0)
     if method not in ("zero_output", "paper"):
         raise InputError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
     if minor is None:
@@ -149,6 +159,11 @@ def initialise(
         if method == "zero_output" and not static((z / spread.mT).unsqueeze(0)).any():
             uniform(cell.Bw, 0.0 if end == "output" else OUTPUT_RANGE)
             uniform(cell.Dyw, OUTPUT_RANGE)
+    if modes:
+        pairs = zip(data, found, strict=True)
+        errors = [(scaler.normalise_y(r.y) - t.y[0].double().numpy())[r.skip :] for r, t in pairs]
+        angles = distortion_frequencies([r.u for r in data], errors, modes)
+        model = replace(model, lfr=LFR(with_modes(cell, angles, generator)))
     return model
 
 
