@@ -38,6 +38,7 @@ from lfrtorch._support.tables import number
 from lfrtorch.cli import CONF
 from lfrtorch.dataset import Dataset
 from lfrtorch.reporting import leaderboard
+from lfrtorch.reporting import scores as report
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -51,6 +52,7 @@ CASES = {
     "parwh": ["+bench=parwh"],
     "parwh_stand_in": ["+bench=parwh", f"data.source={STAND_IN}"],
     "wiener_hammerstein": ["+bench=wiener_hammerstein"],
+    "wiener_hammerstein_site": ["+bench=wiener_hammerstein", "data.split=site"],
     "silverbox": ["+bench=silverbox"],
     "cascaded_tanks": ["+bench=cascaded_tanks"],
     "ced": ["+bench=ced"],
@@ -235,26 +237,36 @@ def rows(each: Case) -> list[str]:
     """Rows of the table of errors, one a test record."""
     if not each.runs or each.dataset is None:
         return [f"| {each.name} | {each.missing} |" + " |" * 9]
-    scores = each.runs[each.chosen]["scores"]
-    errors = {name: [r["scores"][name]["rmse"] for r in each.runs] for name in scores}
-    errors = {name: [np.inf if e is None else e for e in of] for name, of in errors.items()}
-    (plain,) = {score["unit"] for score in scores.values()}
-    linear = [score["lti_rmse"] for score in scores.values()]
+    of_runs = [errors_of(run, each.dataset) for run in each.runs]
+    shown = of_runs[each.chosen]
+    errors = {line: [run[line][1]["rmse"] for run in of_runs] for line in shown}
+    errors = {line: [np.inf if e is None else e for e in of] for line, of in errors.items()}
+    (plain,) = {score["unit"] for score, _ in shown.values()}
+    linear = [of["lti_rmse"] or 0.0 for _, of in shown.values()]
     unit, scale = prefixed(plain, min(map(min, errors.values())), max(linear))
     found = []
-    for name, score in scores.items():
-        values = errors[name]
-        best = published(each.dataset, name)
-        cells = [score["lti_rmse"], values[each.chosen], np.median(values)]
+    for line, (score, of) in shown.items():
+        values = errors[line]
+        best = published(each.dataset, line)
+        cells = [of["lti_rmse"], values[each.chosen], np.median(values)]
         cells = [three_digits(value, scale) for value in cells]
         cells[1] = f"**{cells[1]}**"
         spread = f"{three_digits(min(values), scale)} .. {three_digits(max(values), scale)}"
         other = "-" if best is None else f"{three_digits(best[1], scale)} ({best[0]})"
         window = f"{score['samples']} - {score['skip']}"
-        head = [each.name, name, score["source"], unit]
+        head = [each.name, line, score["source"], unit]
         row = [*head, *cells, spread, str(len(values)), other, window]
         found.append(f"| {' | '.join(row)} |")
     return found
+
+
+def errors_of(run: dict[str, Any], dataset: Dataset) -> dict[str, tuple[dict[str, Any], Any]]:
+    """The entry and the errors of each line of a run: a score, or one output of it."""
+    return {
+        line: (score, errors)
+        for name, score in run["scores"].items()
+        for line, errors in report.lines(name, score, dataset.published)
+    }
 
 
 def costs(each: Case) -> str:
@@ -300,7 +312,7 @@ def references(cases: Sequence[Case]) -> list[str]:
     for each in cases:
         if each.dataset is None or not each.runs:
             continue
-        for test in each.runs[0]["scores"]:
+        for test in errors_of(each.runs[0], each.dataset):
             best = published(each.dataset, test)
             if best is not None:
                 source = next(p.reference for p in each.dataset.published if p.label == best[0])
@@ -316,6 +328,7 @@ def entries(cases: Sequence[Case]) -> list[leaderboard.Entry]:
             each.name,
             lfrtorch.load(each.folders[each.chosen]),
             each.dataset.leaderboard,
+            groups=each.dataset.groups,
             seconds=each.runs[each.chosen]["seconds"],
             command=anywhere(each.runs[each.chosen]["command"]),
         )
@@ -336,7 +349,9 @@ def gallery(cases: Sequence[Case], folder: Path, start: Path) -> dict[str, list[
         if not each.runs:
             continue
         drawn = each.folders[each.chosen] / "figures"
-        for test, score in each.runs[each.chosen]["scores"].items():
+        groups = {} if each.dataset is None else each.dataset.groups
+        for name, score in each.runs[each.chosen]["scores"].items():
+            test = groups.get(name, [name])[0]
             density = drawn / f"{test}_density.png"
             dense = density.is_file() and score["samples"] > LONG
             figures = [density if dense else drawn / f"{test}.png"]

@@ -81,7 +81,7 @@ def load(
 
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file below ``root``, or nothing to download it with.
+        FileNotFoundError: no estimation file below ``root``, or nothing to download it with.
         OSError: the download fails.
 
     Example:
@@ -98,27 +98,34 @@ def load(
             "to score; give fewer, or a larger validation."
         )
     trained = _SAMPLES - held_out
-    estimation, test = (_measured(file, root, download) for file in (_ESTIMATION, _TEST))
+    path = official.find(root, _ESTIMATION, "EMPS", others=[_ARCHIVE], download=download)
+    estimation = _measured(path, _ESTIMATION)
+    found, notes = official.find_tests(
+        root, {"test": _TEST}, "EMPS", others=[_ARCHIVE], download=download
+    )
 
     def part(whole: Record, first: int, last: int, *, unscored: int, name: str) -> Record:
         return official.part(
             whole, first + unscored, last, warm_up=unscored, name=name, start="estimated"
         )
 
-    tests = [part(test, 0, _SAMPLES, unscored=_WINDOW, name="test")]
+    tests = [
+        part(_measured(path, _TEST), 0, _SAMPLES, unscored=_WINDOW, name=name)
+        for name, path in found.items()
+    ]
     return Dataset(
         name="emps",
         train=[part(estimation, 0, trained, unscored=0, name="train")],
         validation=[part(estimation, trained, _SAMPLES, unscored=warm_up, name="validation")],
         tests=tests,
         published=_PUBLISHED,
+        notes=notes,
         leaderboard=tests,
     )
 
 
-def _measured(file: str, root: str | Path | None, download: bool) -> Record:
-    """One file as a record."""
-    path = official.find(root, file, "EMPS", others=[_ARCHIVE], download=download)
+def _measured(path: Path, file: str) -> Record:
+    """One file, or the archive with it, as a record."""
     advice = f"remove '{file}' and '{_ARCHIVE}', and download them again."
     shapes = {signal: (_SAMPLES, 1) for signal in ("vir", "qm")}
     arrays = official.read_arrays(path, shapes, Path(file).name, advice)

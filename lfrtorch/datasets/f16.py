@@ -3,25 +3,25 @@
 Input: the measured force of the shaker below the right wing (N). Outputs: three accelerations
 (m/s²), where the shaker acts (acc1), and on the wing's (acc2) and the payload's (acc3) side of the
 mounting of a dummy payload at the wing tip, whose clearance and friction are the nonlinearity. The
-modes are lightly damped. Sampled at 400 Hz; at each of seven levels (12.4, 24.6, 36.8, 61.4, 73.6,
-85.7 and 97.8 N rms) one realisation of a random-phase multisine of 2 to 15 Hz, 9 periods of 8192
-samples in a file of its own, the first of them a transient. Levels 1, 3, 5 and 7 are for
-estimation; 2, 4 and 6, whose files end in ``_Validation``, are the tests.
+modes are lightly damped. Sampled at 400 Hz, at seven levels (of the multisines 12.4, 24.6, 36.8,
+61.4, 73.6, 85.7 and 97.8 N rms). At each level there is a random-phase multisine of 2 to 15 Hz, 9
+periods of 8192 samples, the first of them a transient, and a swept sine from rest. Levels 1, 3, 5
+and 7 are for estimation; 2, 4 and 6, whose files end in ``_Validation``, are the tests.
 
-What to know of the files and of the package nonlinear_benchmarks, which downloads them (all of it
-from the package and from public code that reads the files, none of it checked on them):
+What to know of the files and of the package nonlinear_benchmarks, which downloads them:
 
 - The force carries measurement noise, and the structure acts back on the shaker and so on the
   force: it is not the generator's signal (``Voltage``, not used here). Noise at the input biases a
   least squares fit; the mean over periods lessens it.
-- The package returns the first acceleration alone unless it is told ``output_index``, and swept
-  sines and multisines in one list.
+- The published scores are of the first acceleration alone, which the package returns unless it is
+  told ``output_index``. A score here pools the three outputs; ``rmse_by_output`` has each.
 - The package's window of 50 samples, 0.125 s, is no warm-up for modes that ring for seconds. The
   tests are therefore simulated from rest at their first sample, where the input begins, and the
-  transient of their first period is scored.
-- The swept sines (``SineSw``) are not used, nor the special odd multisines (``SpecialOddMSine``),
-  whose arrays have three axes and which the package leaves out.
-- A score here pools the three outputs; publications give one for each.
+  transient of a multisine's first period is scored.
+- The swept sines (``SineSw``) of levels 1, 3 and 5 end in zeros, up to 1500 of all channels: they
+  fill the file and are no measurement. Training and validation leave them out; the tests are scored
+  as they are.
+- The special odd multisines (``SpecialOddMSine``), whose arrays have three axes, are not used.
 
 References:
     J.P. Noël, M. Schoukens (2017), "F-16 aircraft benchmark based on ground vibration test data",
@@ -34,6 +34,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset, Published
@@ -43,53 +45,73 @@ from lfrtorch.records import Channel, Record
 
 __all__ = ["load"]
 
-_FILE = "F16/F16GVT_Files/BenchmarkData/F16Data_FullMSine_Level{}.mat"
+_FILE = "F16/F16GVT_Files/BenchmarkData/F16Data_{}_Level{}.mat"
+_KINDS = {"multisine": "FullMSine", "sweep": "SineSw"}
 _FS = 400.0  # Hz
-_PERIOD, _PERIODS = 8192, 9  # samples, and how many; the first is a transient
-_SHAPES = {"Force": (1, _PERIODS * _PERIOD), "Acceleration": (3, _PERIODS * _PERIOD)}
+_PERIOD, _PERIODS = 8192, 9  # samples of a multisine, and how many; the first is a transient
 _ESTIMATION, _TESTS = (1, 3, 5, 7), (2, 4, 6)  # levels
-_SKIP = 50  # samples, unscored, of the tests
+_SKIP = 50  # samples, unscored, of records from rest
+
+
+def _published(label: str, errors: Sequence[float], reference: str) -> Published:
+    names = [f"{kind}_{level} acc1" for kind in _KINDS for level in _TESTS]
+    return Published(label, dict(zip(names, errors, strict=True)), reference)
+
 
 _PUBLISHED = (
+    _published("ARX", (0.291, 0.502, 0.653, 0.178, 0.306, 0.422), "leaderboard"),
+    _published("LSTM", (0.122, 0.268, 0.379, 0.0874, 0.187, 0.300), "leaderboard"),
+    _published("GRU", (0.111, 0.264, 0.383, 0.0876, 0.191, 0.315), "leaderboard"),
+    _published(
+        "modal TCN",
+        (0.0999, 0.1766, 0.2710, 0.0503, 0.1111, 0.1670),
+        "modal FFT backbone with a temporal convolutional network, mean of 8 folds, not submitted",
+    ),
     Published(
         "deep LRU",
-        {"level_6": float(rms([0.180, 0.167, 0.368]))},
-        "Forgione et al. (2024), fitted to multisines and swept sines; of its 0.180, 0.167 and "
-        "0.368 m/s² for the three outputs",
+        {"multisine_6": float(rms([0.180, 0.167, 0.368]))},
+        "Forgione et al. (2024); of its 0.180, 0.167 and 0.368 m/s² for the three outputs",
     ),
 )
 
-_NOTE = "RMSE is that of the three accelerations together"
+_NOTE = "RMSE is that of the three accelerations together; published figures are of acc1 alone"
 
 
 def load(
     *,
-    levels: Sequence[int] = (1, 3, 7),
-    validation_level: int = 5,
+    train: Sequence[str] = ("multisine_1", "multisine_3", "multisine_7"),
+    validation: Sequence[str] = ("multisine_5", "sweep_5"),
+    levels: Sequence[int] | None = None,
+    validation_level: int | None = None,
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """Steady-state periods to fit, and whole records of other levels to choose by and to score.
+    """Measurements to fit, whole records of others to choose by, and the six tests.
 
-    A training record is the mean of the last 8 of the 9 periods of a level: noise, that of the
-    force included, is lower by √8. Validation is done as the tests are, ``"level_2"``,
-    ``"level_4"`` and ``"level_6"``: on the whole record of a level that is not fitted, from rest,
-    its first 50 samples unscored.
+    A multisine that trains is the mean of the last 8 of its 9 periods, in steady state: noise, that
+    of the force included, is lower by √8. Swept sines, validation and the tests are whole records
+    from rest, their first 50 samples unscored.
+
+    The tests are ``"multisine_2"``, ``"multisine_4"``, ``"multisine_6"``, ``"sweep_2"``,
+    ``"sweep_4"`` and ``"sweep_6"``. If a test's file is missing, a note says so.
 
     Args:
-        levels: that train, of 1, 3, 5 and 7.
-        validation_level: another one of these.
+        train: what is fitted, ``"multisine_1"`` or ``"sweep_1"``, of the levels 1, 3, 5 and 7.
+        validation: what is chosen by, of the same; it may be empty.
+        levels: those whose multisines train, in the place of ``train``.
+        validation_level: that whose multisine validates, in the place of ``validation``.
         download: whether files that are missing are downloaded (148 MB) by nonlinear_benchmarks.
         root: folder that holds ``F16/F16GVT_Files/BenchmarkData/F16Data_FullMSine_Level1.mat`` and
             so on; by default the cache folder of the package nonlinear_benchmarks.
 
     Shape:
-        u (N), y (m/s²) of training: (8192, 1), (8192, 3); of validation and of the tests:
-        (73728, 1), (73728, 3), of which 73678 are scored.
+        u (N), y (m/s²) of a multisine that trains: (8192, 1), (8192, 3); of others: (73728, 1),
+        (73728, 3); of swept sines: (T, 1), (T, 3), T about 108000.
 
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file below ``root``, or nothing to download it with.
+        FileNotFoundError: no such file of the estimation data below ``root``, or nothing to
+            download it with.
         OSError: the download fails.
 
     Example:
@@ -98,38 +120,81 @@ def load(
         Traceback (most recent call last):
         FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
-    trained = _checked(levels, validation_level)
+    if levels is not None:
+        train = _multisines("levels", levels)
+    if validation_level is not None:
+        validation = _multisines("validation_level", [validation_level])
+    _check(train, validation)
 
-    def whole(level: int, name: str) -> Record:
-        """A file, from rest."""
-        file = _FILE.format(f"{level}_Validation" if level in _TESTS else level)
-        path = official.find(root, file, "F16", download=download)
-        signals = official.read_arrays(path, _SHAPES, path.name)
-        return Record(
-            signals["Force"].T,
-            signals["Acceleration"].T,
-            fs=_FS,
-            skip=_SKIP,
-            name=name,
-            source="official",
-            inputs=(Channel("force", "N"),),
-            outputs=tuple(Channel(f"acc{i}", "m/s²") for i in (1, 2, 3)),
-            period=_PERIOD,
-        )
+    def measured(use: str, name: str) -> Record:
+        path = official.find(root, _file(name), "F16", download=download)
+        return _measured(path, name, f"{use}_{name}")
 
-    def steady(level: int) -> Record:
-        """One period, the mean of those without transient."""
-        record = whole(level, f"train_{level}")
-        return replace(record, u=_mean(record.u), y=_mean(record.y), start="periodic", skip=0)
-
+    fitted = [_fitted(measured("train", name)) for name in train]
+    chosen_by = [measured("validation", name) for name in validation]
+    names = [f"{kind}_{level}" for kind in _KINDS for level in _TESTS]
+    files = {name: _file(name, "_Validation") for name in names}
+    found, notes = official.find_tests(root, files, "F16", download=download)
+    tests = [_whole(path, name, name) for name, path in found.items()]
+    first = np.array([1.0, 0.0, 0.0])  # of the outputs
     return Dataset(
         name="f16",
-        train=[steady(level) for level in trained],
-        validation=[whole(validation_level, f"validation_{validation_level}")],
-        tests=[whole(level, f"level_{level}") for level in _TESTS],
+        train=fitted,
+        validation=chosen_by,
+        tests=tests,
         published=_PUBLISHED,
-        notes=(_NOTE,),
+        notes=(*notes, _NOTE),
+        leaderboard=[replace(test, weight=first) for test in tests],
     )
+
+
+def _file(name: str, end: str = "") -> str:
+    kind, _, level = name.partition("_")
+    return _FILE.format(_KINDS[kind], level + end)
+
+
+def _whole(path: Path, name: str, called: str) -> Record:
+    """A file, from rest."""
+    period = _PERIOD if name.startswith("multisine") else None
+    samples = None if period is None else _PERIODS * _PERIOD
+    force = official.read_arrays(path, {"Force": (1, samples)}, path.name)["Force"]
+    shape = 3, force.shape[1]
+    acceleration = official.read_arrays(path, {"Acceleration": shape}, path.name)["Acceleration"]
+    if force.shape[1] <= _SKIP:
+        raise InputError(
+            f"'{path}': 'Force' has {force.shape[1]} samples; expected more than {_SKIP}; download "
+            "the file again."
+        )
+    return Record(
+        force.T,
+        acceleration.T,
+        fs=_FS,
+        skip=_SKIP,
+        name=called,
+        source="official",
+        inputs=(Channel("force", "N"),),
+        outputs=tuple(Channel(f"acc{i}", "m/s²") for i in (1, 2, 3)),
+        period=period,
+    )
+
+
+def _measured(path: Path, name: str, called: str) -> Record:
+    """A file; a sweep up to where the first of its channels is filled up with zeros."""
+    record = _whole(path, name, called)
+    if record.period is not None:
+        return record
+    signals = np.column_stack([record.u, record.y])
+    end = min(int(np.max(np.nonzero(signal)[0], initial=-1)) + 1 for signal in signals.T)
+    if not _SKIP < end < record.samples:
+        return record
+    return replace(record, u=record.u[:end], y=record.y[:end])
+
+
+def _fitted(record: Record) -> Record:
+    """For training: of a multisine one period, the mean of those without transient."""
+    if record.period is None:
+        return record
+    return replace(record, u=_mean(record.u), y=_mean(record.y), start="periodic", skip=0)
 
 
 def _mean(signal: Array) -> Array:
@@ -137,16 +202,30 @@ def _mean(signal: Array) -> Array:
     return signal.reshape(_PERIODS, _PERIOD, -1)[1:].mean(axis=0)
 
 
-def _checked(levels: Sequence[int], validation_level: int) -> list[int]:
-    """The levels that train as plain integers, in the order given."""
+def _multisines(option: str, levels: Sequence[int]) -> list[str]:
+    """The names of the multisines of some levels."""
     try:
-        chosen = [_ESTIMATION[_ESTIMATION.index(level)] for level in (*levels, validation_level)]
+        return [f"multisine_{_ESTIMATION[_ESTIMATION.index(level)]}" for level in levels]
     except (TypeError, ValueError):
-        chosen = []
-    if len(chosen) < 2 or len(set(chosen)) < len(chosen):
         raise InputError(
-            f"levels is {levels} and validation_level is {validation_level}; give one or "
-            f"more of {', '.join(map(str, _ESTIMATION))} to train, as [1, 3, 7], and "
-            "another one of them to validate on, each once."
+            f"{option} is {levels}; give of {', '.join(map(str, _ESTIMATION))}, for example "
+            "levels=[1, 3, 7] and validation_level=5."
+        ) from None
+
+
+def _check(train: Sequence[str], validation: Sequence[str]) -> None:
+    """Refuse other names than those of estimation measurements, and any that stands twice."""
+    known = [f"{kind}_{level}" for kind in _KINDS for level in _ESTIMATION]
+    for option, given in (("train", train), ("validation", validation)):
+        listed = isinstance(given, Sequence) and not isinstance(given, str)
+        if not listed or any(name not in known for name in given):
+            raise InputError(
+                f"{option} is {given}; give a list of {', '.join(known)}, for example "
+                "[multisine_1, sweep_1]."
+            )
+    names = [*train, *validation]
+    if not train or len(set(names)) < len(names):
+        raise InputError(
+            f"train is {list(train)} and validation is {list(validation)}; give one or more to "
+            "train, and each once in all."
         )
-    return chosen[:-1]

@@ -22,6 +22,9 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.records import Record, Start
 
+Shape = tuple[int | None, ...]
+"""Of an array in a file; None for an axis of any length."""
+
 _AGAIN = "download the file again."
 
 
@@ -112,7 +115,7 @@ def find_tests(
     missing = [test for test in files if test not in found]
     lost = [Path(files[test]).name for test in missing]
     more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
-    why = f"{lost[0]}{more} not found; data.download=true fetches them" if lost else ""
+    why = f"{lost[0]}{more} not found (download=True fetches them)" if lost else ""
     return found, without_tests(missing, why, partly=bool(found))
 
 
@@ -152,13 +155,13 @@ def read_mat(path: Path, names: Sequence[str], samples: int, advice: str = _AGAI
 
 
 def read_arrays(
-    path: Path, shapes: Mapping[str, tuple[int, ...]], member: str, advice: str = _AGAIN
+    path: Path, shapes: Mapping[str, Shape], member: str, advice: str = _AGAIN
 ) -> dict[str, Array]:
     """Arrays of a .mat file by name.
 
     Args:
         path: the file, or a zip archive that holds it.
-        shapes: of the arrays, by name.
+        shapes: of the arrays, by name; None for an axis of any length.
         member: name of the file in the archive, in whatever folder.
         advice: what to do about a file that cannot be used.
 
@@ -321,7 +324,7 @@ def _variable(
     path: Path,
     content: Path | BytesIO,
     name: str,
-    shapes: Sequence[tuple[int, ...]],
+    shapes: Sequence[Shape],
     advice: str,
 ) -> Array:
     """A variable of a .mat file with one of the shapes."""
@@ -336,13 +339,22 @@ def _numbers(
     path: Path,
     name: str,
     found: NDArray[Any],
-    shapes: Sequence[tuple[int, ...]],
+    shapes: Sequence[Shape],
     advice: str,
 ) -> Array:
     """What was found of a name, if it has one of the shapes and is real and finite."""
-    if found.dtype.kind not in "iuf" or found.shape not in shapes or not np.isfinite(found).all():
+    fits = any(
+        len(shape) == found.ndim
+        and all(n in (None, own) for n, own in zip(shape, found.shape, strict=True))
+        for shape in shapes
+    )
+    if found.dtype.kind not in "iuf" or not fits or not np.isfinite(found).all():
         raise InputError(
             f"'{path}': '{name}' has shape {found.shape} and type {found.dtype}; expected "
-            f"{' or '.join(map(str, shapes))} and real numbers without NaN; {advice}"
+            f"{' or '.join(map(_shape, shapes))} and real numbers without NaN; {advice}"
         )
     return found.astype(np.float64)
+
+
+def _shape(shape: Shape) -> str:
+    return str(shape).replace("None", "any")

@@ -64,6 +64,8 @@ _NOTE = (
 def load(*, validation: int = 2, download: bool = False, root: str | Path | None = None) -> Dataset:
     """The realisations of the estimation file, and the two tests.
 
+    Without the test file there are no tests, and a note says so.
+
     Args:
         validation: how many realisations, the last of them, validate.
         download: whether files that are missing are downloaded (423 MB) by nonlinear_benchmarks.
@@ -77,7 +79,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
 
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file below ``root``, or nothing to download it with.
+        FileNotFoundError: no estimation file below ``root``, or nothing to download it with.
         OSError: the download fails.
 
     Example:
@@ -88,16 +90,15 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
     """
     integer("validation", validation, 1)
 
-    def columns(file: str) -> tuple[Path, Array, Array]:
-        """Path, u and y (samples, records)."""
-        path = official.find(root, f"{_FILES}/{file}", _LOADER, download=download)
+    def columns(path: Path) -> tuple[Array, Array]:
+        """u and y (samples, records)."""
         u, y = official.read_struct(path, "dataMeas", ("u", "y"))
         if len(u) <= _SKIP:
             raise InputError(
                 f"'{path}': 'dataMeas.u' has shape {u.shape}; expected (samples, records) and more "
                 f"than {_SKIP} samples; download the file again."
             )
-        return path, u, y
+        return u, y
 
     def record(name: str, u: Array, y: Array) -> Record:
         return Record(
@@ -111,7 +112,8 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
             outputs=(Channel("y", "V"),),
         )
 
-    path, u, y = columns(_ESTIMATION)
+    path = official.find(root, f"{_FILES}/{_ESTIMATION}", _LOADER, download=download)
+    u, y = columns(path)
     trained = u.shape[1] - validation
     if trained < 1:
         raise InputError(
@@ -122,16 +124,21 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
         record(f"train_{i + 1}" if i < trained else f"validation_{i - trained + 1}", *signals)
         for i, signals in enumerate(zip(u.T, y.T, strict=True))
     ]
-    path, u, y = columns(_TEST)
-    if u.shape[1] != len(_TESTS):
-        raise InputError(
-            f"'{path}': 'dataMeas.u' has shape {u.shape}; expected (samples, {len(_TESTS)}), "
-            f"{' and '.join(_TESTS)}; download the file again."
-        )
+    files = {" and ".join(_TESTS): f"{_FILES}/{_TEST}"}
+    found, notes = official.find_tests(root, files, _LOADER, download=download)
+    tests: list[Record] = []
+    for path in found.values():
+        u, y = columns(path)
+        if u.shape[1] != len(_TESTS):
+            raise InputError(
+                f"'{path}': 'dataMeas.u' has shape {u.shape}; expected (samples, {len(_TESTS)}), "
+                f"{' and '.join(_TESTS)}; download the file again."
+            )
+        tests = [record(*test) for test in zip(_TESTS, u.T, y.T, strict=True)]
     return Dataset(
         name="wh_process_noise",
         train=estimation[:trained],
         validation=estimation[trained:],
-        tests=[record(*test) for test in zip(_TESTS, u.T, y.T, strict=True)],
-        notes=(_NOTE,),
+        tests=tests,
+        notes=(*notes, _NOTE),
     )

@@ -1,9 +1,9 @@
-"""Wiener-Hammerstein benchmark of 2009: measurements of an electronic circuit, official split.
+"""Wiener-Hammerstein benchmark of 2009: measurements of an electronic circuit.
 
 Input u (V), output y (V), 188000 samples at 51.2 kHz in one file. Officially samples 1 to 100000
 are for estimation and 100001 to 188000 for the test, whose first 1000 the usual score leaves out.
-(The package nonlinear_benchmarks tests on samples 105201 to 184000 alone, 78800 of 88000, and
-estimates on 5201 to 105200, which reach into the official test.)
+The site nonlinearbenchmark.org and its package test on samples 105201 to 184000, of which 50 are
+not scored, and estimate on 5201 to 105200, which reach into the official test.
 
 References:
     J. Schoukens, J. Suykens, L. Ljung (2009), "Wiener-Hammerstein benchmark", 15th IFAC Symposium
@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.records import Channel, Record
@@ -28,42 +29,62 @@ _SAMPLES, _ESTIMATION = 188_000, 100_000
 _AT_REST = 5000  # samples at the beginning of the file; the input starts at 4999
 _WARM_UP = 1000  # samples, unscored, of the official test: a BLA's transient is 1e-12 V after 300
 
-_PACKAGE = (105_200, 184_000)  # its test, the first 50 samples unscored
+_SITE = (5200, 105_200), (105_200, 184_000)
+"""Estimation and test of nonlinearbenchmark.org."""
 
+_SITE_WINDOW = 50  # samples, unscored, of its test
+
+
+def _published(
+    label: str, millivolts: float, reference: str, tests: tuple[str, ...] = ("site",)
+) -> Published:
+    scores = dict.fromkeys(tests, 1e-3 * millivolts)
+    return Published(label, scores, reference, unit="mV")
+
+
+_BOTH = ("test", "site")
 _COMPARED = "as compared in Beintema, Schoukens and Tóth (2023)"
 _PUBLISHED = (
-    Published("BLA", {"test": 44e-3}, "the best of several, which reach up to 56 mV"),
-    Published("PNLSS", {"test": 0.4e-3}, _COMPARED),
-    Published("NL-LFR (2020)", {"test": 0.294e-3}, _COMPARED),
-    Published("QBLA", {"test": 0.28e-3}, _COMPARED),
-    Published("SUBNET", {"test": 0.241e-3}, "Beintema, Schoukens and Tóth (2023)"),
+    _published("BLA", 44, "the best of several, which reach up to 56 mV", ("test",)),
+    _published("LSTM", 1.54, "leaderboard"),
+    _published("PNLSS", 0.42, "leaderboard, published before the site fixed its split", _BOTH),
+    _published("NL-LFR", 0.30, "Schoukens and Tóth (2020), and leaderboard", _BOTH),
+    _published("QBLA", 0.279, f"{_COMPARED}, and leaderboard", _BOTH),
+    _published("SUBNET", 0.241, "Beintema, Schoukens and Tóth (2023), and leaderboard", _BOTH),
 )
 
 
 def load(
     *,
+    split: str = "official",
     validation: float = 0.2,
-    skip: int = _AT_REST,
+    skip: int | None = None,
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
-    """The measurement, cut in time into a training, a validation and the official test record.
+    """The measurement, cut in time into a training, a validation and the test records.
 
-    Validation and test begin amid the measurement. They are simulated from zero state, 1000 samples
-    ahead of what they score: validation begins that much earlier, in the training part, and the
-    official test score leaves its first 1000 samples out.
+    The tests are ``"test"``, the official one, and ``"site"``. With ``split="site"``, which trains
+    on the site's estimation part, the latter is the only one, as the former overlaps the training.
+
+    Validation and ``"test"`` begin amid the measurement. They are simulated from zero state, 1000
+    samples ahead of what they score: validation begins that much earlier, in the training part, and
+    the official test score leaves its first 1000 samples out. The start state of ``"site"`` is
+    fitted to the 50 samples that are not scored.
 
     Args:
+        split: ``"official"`` or ``"site"``.
         validation: fraction of the estimation samples, the last of them, that validate.
-        skip: samples at the beginning of the training record that are not fitted: the end of an
-            earlier response (55 samples), then rest. The input starts at sample 4999.
+        skip: samples at the beginning of the training record that are not fitted. Default: 5000 of
+            the official split, the end of an earlier response (55 samples), then rest, as the input
+            starts at sample 4999; 1000 of the site's, which begins amid the measurement.
         download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
         root: folder that holds ``WienerHammerBenchMark/WienerHammerBenchMark.mat``; by default the
             cache folder of the package nonlinear_benchmarks.
 
     Shape:
         u, y (V) of training: (80000, 1); of validation: (21000, 1), 20000 of them scored; of the
-        test: (88000, 1), 87000 scored.
+        tests: (88000, 1), 87000 scored, and (78800, 1), 78750 scored.
 
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.
@@ -76,8 +97,14 @@ def load(
         Traceback (most recent call last):
         FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
+    if split not in ("official", "site"):
+        raise InputError(f"split is {split!r}; give 'official' or 'site'.")
+    site = split == "site"
+    if skip is None:
+        skip = _WARM_UP if site else _AT_REST
     integer("skip", skip, 0)
-    held_out = official.held_out(_ESTIMATION, validation, least=_WARM_UP + skip + 1)
+    first, last = _SITE[0] if site else (0, _ESTIMATION)
+    held_out = official.held_out(last - first, validation, least=_WARM_UP + skip + 1)
     path = official.find(root, _FILE, "WienerHammerBenchMark", download=download)
     u, y = official.read_mat(path, ["uBenchMark", "yBenchMark"], _SAMPLES)
     whole = Record(
@@ -88,16 +115,14 @@ def load(
         inputs=(Channel("u", "V"),),
         outputs=(Channel("y", "V"),),
     )
-    trained = _ESTIMATION - held_out
+    trained = last - held_out
+    of_site = replace(whole[slice(*_SITE[1])], start="estimated", skip=_SITE_WINDOW, name="site")
+    of_paper = official.part(whole, _ESTIMATION + _WARM_UP, _SAMPLES, warm_up=_WARM_UP, name="test")
     return Dataset(
         name="wiener_hammerstein",
-        train=[official.part(whole, skip, trained, warm_up=skip, name="train")],
-        validation=[
-            official.part(whole, trained, _ESTIMATION, warm_up=_WARM_UP, name="validation")
-        ],
-        tests=[
-            official.part(whole, _ESTIMATION + _WARM_UP, _SAMPLES, warm_up=_WARM_UP, name="test")
-        ],
+        train=[official.part(whole, first + skip, trained, warm_up=skip, name="train")],
+        validation=[official.part(whole, trained, last, warm_up=_WARM_UP, name="validation")],
+        tests=[of_site] if site else [of_paper, of_site],
         published=_PUBLISHED,
-        leaderboard=[replace(whole[slice(*_PACKAGE)], start="estimated", skip=50, name="test")],
+        leaderboard=[of_site],
     )

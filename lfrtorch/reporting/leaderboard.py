@@ -3,22 +3,28 @@
 The site's templates score ``y[n:]`` of test records cut by the package nonlinear_benchmarks, with a
 model that sees the inputs and ``y[:n]`` of those records alone. So the records of
 ``Dataset.leaderboard`` have an estimated start and ``skip`` n, and nothing before them is used.
-Cut and window may differ from those of the usual tables (see the datasets).
+Starts at rest and periodic ones, of records that begin so, use no output at all. Cut and window may
+differ from those of the usual tables (see the datasets).
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
+
+import numpy as np
 
 from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
 UNITS = {"V": ("mV", 1e3), "m": ("mm", 1e3)}
-"""Units of the site by those of the records, if they differ; volts of the tanks stay volts."""
+"""Units of the site by those of the records, if they differ."""
+
+OWN_UNITS = {"cascaded_tanks": ("V", 1.0), "fine_steering_mirror": ("µm", 1e6)}
+"""Units of the site of single benchmarks."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,13 @@ class Entry:
 
 
 def entry(
-    benchmark: str, model: Model, records: Sequence[Record], *, seconds: float, command: str
+    benchmark: str,
+    model: Model,
+    records: Sequence[Record],
+    *,
+    groups: Mapping[str, Sequence[str]] | None = None,
+    seconds: float,
+    command: str,
 ) -> Entry:
     """The line of a model.
 
@@ -45,20 +57,25 @@ def entry(
         benchmark: its name.
         model: what is submitted.
         records: as the package cuts them, ``skip`` the samples that the start may be fitted to.
+        groups: names of the records that make one number together, the mean of their errors.
         seconds: of all the training.
         command: that made the model.
     """
     unit = records[0].outputs[0].unit
-    shown, scale = (unit, 1.0) if benchmark == "cascaded_tanks" else UNITS.get(unit, (unit, 1.0))
-    errors = [error for record in records for error in errors_of(model, record)]
+    shown, scale = OWN_UNITS.get(benchmark, UNITS.get(unit, (unit, 1.0)))
+    of = {name: [r for r in records if r.name in names] for name, names in (groups or {}).items()}
+    grouped = {name: found for name, found in of.items() if found}
+    scored = grouped or {record.name: [record] for record in records}
+    found = {name: [errors_of(model, r) for r in group] for name, group in scored.items()}
+    errors = [e for each in found.values() for e in ([np.mean(each)] if grouped else each[0])]
     listed = "; ".join(f"{scale * error:.3g}" for error in errors)
     sizes = ", ".join(f"{name} {size}" for name, size in model.sizes.items() if size)
     return Entry(
         benchmark,
         f"[{listed}]" if len(errors) > 1 else listed,
         shown,
-        "; ".join(record.name for record in records),
-        "; ".join(str(record.skip) for record in records),
+        "; ".join(scored),
+        "; ".join(str(group[0].skip) for group in scored.values()),
         f"NL-LFR state space ({sizes}), from the best linear approximation",
         model.parameter_count,
         f"{seconds:.0f}",
@@ -67,9 +84,10 @@ def entry(
 
 
 def errors_of(model: Model, record: Record) -> list[float]:
-    """RMSE of each output after the samples that are skipped."""
+    """RMSE of each output after the samples that are skipped; those of weight 0 are left out."""
     error = (record.y - model.simulate(record))[record.skip :]
-    return rms(error, axis=0).tolist()
+    counts = np.broadcast_to(np.asarray(record.weight) > 0, len(record.outputs))
+    return rms(error, axis=0)[counts].tolist()
 
 
 def table(entries: Sequence[Entry]) -> str:

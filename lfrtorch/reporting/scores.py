@@ -279,13 +279,8 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     for name, s in listed:
         known = others if s["use"] == "test" else []
         about = [s["use"], *[s["source"]] * sources, of_samples(s["scored"], s["samples"])]
-        lines = [(name, [s[model] for model in models])]
-        for i, output in enumerate(s.get("outputs", [])):
-            if any(f"{name} {output}" in p.scores for p in known):
-                own = [s[f"{model}_by_output"] for model in models]
-                lines.append((f"{name} {output}", [of[i] if of else None for of in own]))
-        for line, values in lines:
-            mine = [tables.times(factor, value) for value in values]
+        for line, of in lines(name, s, known):
+            mine = [tables.times(factor, of[model]) for model in models]
             beside = [tables.times(factor, p.scores.get(line)) for p in known]
             rows.append([line, *about, *mine, *(beside or [None] * len(others))])
     title = f"Simulation RMSE{f' ({unit})' if unit else ''}"
@@ -298,6 +293,25 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     if result["linear"]:
         references.insert(0, own_linear(result))
     return "\n".join([title, "", tables.table(head, rows), *[""] * bool(references), *references])
+
+
+def lines(
+    name: str, entry: Mapping[str, Any], published: Sequence[Published]
+) -> list[tuple[str, Mapping[str, float | None]]]:
+    """The errors of a score by name: all outputs together, and single ones with published figures.
+
+    Args:
+        name: of the score.
+        entry: of ``metrics.json``.
+        published: what stands beside it.
+    """
+    found: list[tuple[str, Mapping[str, float | None]]] = [(name, {of: entry[of] for of in ERRORS})]
+    for i, output in enumerate(entry.get("outputs", [])):
+        line = f"{name} {output}"
+        if any(line in p.scores for p in published):
+            each = {of: entry[f"{of}_by_output"] for of in ERRORS}
+            found.append((line, {of: values[i] if values else None for of, values in each.items()}))
+    return found
 
 
 def own_linear(result: Mapping[str, Any]) -> str:

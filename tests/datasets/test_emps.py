@@ -99,11 +99,21 @@ def test_refused_arguments(arguments, match):
         emps.load(**arguments)
 
 
-def test_a_missing_file_is_one_message(numbered):
-    for file in reversed(FILES):
-        (numbered / file).unlink()
-        with pytest.raises(FileNotFoundError, match=rf"(?s)no '{file}'.*root=DIR"):
-            emps.load(root=numbered)
+def test_a_missing_estimation_file_is_one_message(numbered):
+    (numbered / ESTIMATION).unlink()
+    with pytest.raises(FileNotFoundError, match=rf"(?s)no '{ESTIMATION}'.*root=DIR"):
+        emps.load(root=numbered)
+
+
+def test_a_missing_test_file_is_a_note(numbered):
+    (numbered / TEST).unlink()
+    data = emps.load(root=numbered)
+    assert (data.tests, data.leaderboard, data.train[0].samples) == ([], [], 19_873)
+    (note,) = data.notes
+    assert note.startswith("no test records: DATA_EMPS_PULSES.mat")
+    (numbered / TEST).write_bytes(b"text " * 99)
+    with pytest.raises(ValueError, match=r"remove .* and download them again"):
+        emps.load(root=numbered)
 
 
 def test_missing_files_are_downloaded(tmp_path, monkeypatch):

@@ -72,15 +72,22 @@ def test_one_record_trains_at_least(numbered, validation):
     assert f"validation is {validation}" in str(told.value)
 
 
-@pytest.mark.parametrize("file", [ESTIMATION, TEST])
-def test_a_missing_file_is_one_message(numbered, file):
-    (numbered / FOLDER / file).unlink()
+def test_a_missing_estimation_file_is_one_message(numbered):
+    (numbered / FOLDER / ESTIMATION).unlink()
     with pytest.raises(FileNotFoundError, match=r"holds 'WienHammer' with root=DIR") as told:
         wh_process_noise.load(root=numbered)
-    assert f"no '{FOLDER}/{file}'" in str(told.value)
+    assert f"no '{FOLDER}/{ESTIMATION}'" in str(told.value)
     assert "nonlinear_benchmarks.not_splitted_benchmarks.WienerHammerstein_Process_Noise()" in str(
         told.value
     )
+
+
+def test_a_missing_test_file_is_a_note(numbered):
+    (numbered / FOLDER / "WH_TestDataset.mat").unlink()
+    data = wh_process_noise.load(root=numbered)
+    assert data.tests == []
+    assert data.train
+    assert data.notes[0].startswith("no test records: WH_TestDataset.mat")
 
 
 def test_missing_files_are_downloaded(numbered, tmp_path, monkeypatch):

@@ -27,7 +27,7 @@ def scored(record):
 
 def test_official_split(numbered):
     data = wiener_hammerstein.load(root=numbered)
-    (train,), (validation,), (test,) = data.train, data.validation, data.tests
+    (train,), (validation,), (test, site) = data.train, data.validation, data.tests
     assert [r.name for r in (train, validation, test)] == ["train", "validation", "test"]
     assert scored(train) == (5001, 80_000)
     assert scored(validation) == (80_001, 100_000)
@@ -38,10 +38,22 @@ def test_official_split(numbered):
         assert (record.fs, record.start, record.source) == (51200.0, "zero", "official")
         assert [str(c) for c in (*record.inputs, *record.outputs)] == ["u (V)", "y (V)"]
     assert (data.name, data.noise_rms) == ("wiener_hammerstein", None)
-    assert {p.label: p.scores["test"] for p in data.published}["SUBNET"] == 0.241e-3
-    (submitted,) = data.leaderboard  # the package's [5200:184000][100000:], 78800 samples
-    assert (scored(submitted), submitted.samples) == ((105_251, 184_000), 78_800)
-    assert (submitted.start, submitted.skip) == ("estimated", 50)
+    (subnet,) = (p for p in data.published if p.label == "SUBNET")
+    assert subnet.scores == pytest.approx({"test": 0.241e-3, "site": 0.241e-3})
+    # The package's [5200:184000][100000:], 78800 samples.
+    assert (scored(site), site.samples) == ((105_251, 184_000), 78_800)
+    assert (site.name, site.start, site.skip) == ("site", "estimated", 50)
+    assert data.leaderboard == [site]
+
+
+def test_split_of_the_site(numbered):
+    data = wiener_hammerstein.load(root=numbered, split="site")
+    (train,), (validation,), (site,) = data.train, data.validation, data.tests
+    assert (int(train.u[0, 0]), scored(train)) == (5201, (6201, 85_200))
+    assert scored(validation) == (85_201, 105_200)
+    assert (site.name, scored(site)) == ("site", (105_251, 184_000))
+    data = wiener_hammerstein.load(root=numbered, split="site", skip=0)
+    assert scored(data.train[0]) == (5201, 85_200)
 
 
 def test_the_rule_of_the_validation_part(numbered):
@@ -57,6 +69,7 @@ def test_the_rule_of_the_validation_part(numbered):
         ({"validation": 0}, "validation is 0"),
         ({"validation": 1.0}, "leaves 0 of the 100000"),
         ({"validation": 0.95}, "leaves 5000 of the 100000 .* needs 6001"),
+        ({"split": "package"}, "split is 'package'; give 'official' or 'site'"),
         ({"skip": -1}, "skip is -1"),
         ({"skip": 80_000}, "validation is 0.2, which leaves 80000"),
     ],
@@ -92,7 +105,7 @@ def test_a_file_of_another_length_is_refused(numbered):
 @pytest.mark.data
 def test_official_file(official):
     data = official(wiener_hammerstein.load)
-    (train,), (test,) = data.train, data.tests
+    (train,), (test, _) = data.train, data.tests
     assert 1e3 * np.std(test.y) == pytest.approx(239.1, abs=0.1)
     # What is skipped of the training part is rest but for an old response, and the input follows.
     assert np.std(train.u[100:4990]) < 5e-4

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,6 +54,28 @@ def test_several_records_are_one_list_in_the_unit_of_the_site():
     assert line.samples_for_the_start == "50; 50"
     assert line.parameters == MODEL.parameter_count
     assert "nx 3, nz 2, nw 1, nn 4" in line.model_class
+
+
+def test_a_group_is_one_number_and_outputs_of_weight_0_are_none():
+    model = random_model(random_cell(2, 2, 3, 2, 1, 4), fs=50.0)
+    u = RNG.standard_normal((2, 60, 2))
+    y = [model.simulate(each) + RNG.uniform(1, 2, 2) for each in u]
+    first, second = (Record(u[i], y[i], fs=50.0, name=f"level_{i}") for i in range(2))
+    errors = [leaderboard.errors_of(model, r) for r in (first, second)]
+    options = {"seconds": 1.0, "command": "python train.py x"}
+    groups = {"level": ("level_0", "level_1"), "other": ("none",)}
+    line = leaderboard.entry(
+        "fine_steering_mirror",
+        model,
+        [replace(r, outputs=(Channel("a", "m"), Channel("b", "m"))) for r in (first, second)],
+        groups=groups,
+        **options,
+    )
+    assert line.rmse_to_submit == f"{1e6 * np.mean(errors):.3g}"
+    assert (line.unit, line.records) == ("µm", "level")
+    single = [replace(r, weight=np.array([0.0, 1.0])) for r in (first, second)]
+    line = leaderboard.entry("f16", model, single, **options)
+    assert line.rmse_to_submit == f"[{errors[0][1]:.3g}; {errors[1][1]:.3g}]"
 
 
 def test_units_stay_where_the_site_has_them():
