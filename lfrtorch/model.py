@@ -135,7 +135,9 @@ class Model:
             >>> model.simulate(np.zeros(50)).shape  # any input, from rest
             (50, 1)
         """
-        return self.scaler.restore_y(self.signals(data, start=start, x0=x0).y[0].double().numpy())
+        y = self.signals(data, start=start, x0=x0).y[0].double().numpy()
+        y = self.scaler.restore_y(y)
+        return data.shown(y) if isinstance(data, Record) else y
 
     def signals(
         self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None

@@ -90,6 +90,10 @@ class Record:
         line_weight: of the squared errors in a fit by spectral line, for whole periods without
             ``skip``: line f is that of ``numpy.fft.rfft``. 1 for all lines is plain least squares;
             1 / noise variance is maximum likelihood (Pintelon and Schoukens, 2012, chapter 9).
+        limits: least and greatest output that the sensors show, each the same for all outputs or a
+            number for each of them, or ``None`` if there is none. A sample at a limit says that the
+            output is there or beyond: a fit counts its error on the inner side alone, an estimated
+            start state of a given model leaves it out, and a simulation of the record ends there.
         name: what tables and messages call it.
         source: where it comes from: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
         inputs, outputs: channel names and units, one a column of ``u`` and ``y``.
@@ -98,7 +102,7 @@ class Record:
 
     Shape:
         u: (T, nu), y: (T, ny), x0: (nx,), weight: () or (ny,),
-        line_weight: (T // 2 + 1,) or (T // 2 + 1, ny).
+        line_weight: (T // 2 + 1,) or (T // 2 + 1, ny), limits: (2, ny).
 
     Raises:
         ValueError: NaN or infinite samples, different lengths, wrong shapes, negative weights, a
@@ -126,6 +130,7 @@ class Record:
     weight: float | Array = 1.0
     line_weight: Array | None = None
     skip_more: bool = False
+    limits: Sequence[ArrayLike | None] | Array | None = None
 
     def __post_init__(self) -> None:
         inputs = _channels(self.inputs, self.u, "u")
@@ -161,6 +166,7 @@ class Record:
                 raise InputError(f"record '{self.name}': x0 is {x0}; give finite numbers.")
             object.__setattr__(self, "x0", x0)
         self._check_weights(len(u), y.shape[1])
+        self._check_limits(y.shape[1])
         for field, value in (("u", u), ("y", y), ("inputs", inputs), ("outputs", outputs)):
             object.__setattr__(self, field, value)
 
@@ -210,6 +216,27 @@ class Record:
                 )
             object.__setattr__(self, name, values)
 
+    def _check_limits(self, ny: int) -> None:
+        if self.limits is None:
+            return
+        if self.line_weight is not None:
+            raise InputError(
+                f"record '{self.name}' has limits and line_weight; a sample at a limit has no "
+                "spectrum: give one of the two."
+            )
+        try:
+            low, high = self.limits
+            low, high = -np.inf if low is None else low, np.inf if high is None else high
+            limits = np.stack(np.broadcast_arrays(low, high, np.zeros(ny))[:2]).astype(np.float64)
+        except (TypeError, ValueError):
+            limits = np.zeros((2, ny))
+        if limits.shape != (2, ny) or not (limits[0] < limits[1]).all():
+            raise InputError(
+                f"record '{self.name}': limits is {self.limits!r}; give the least and the greatest "
+                "output that the sensors show, as (None, 10), or a number for each output."
+            )
+        object.__setattr__(self, "limits", limits)
+
     def __repr__(self) -> str:
         parts = [f"{self.samples} samples at {self.fs:g} Hz", f"start {self.start}"]
         parts += [f"skip {self.skip}"] if self.skip else []
@@ -225,10 +252,23 @@ class Record:
     @property
     def start_factors(self) -> Array:
         """The same for an estimated start of a given model: √weight, 0 in the scored samples."""
+        inside = self.beyond == 0
         if not self.skip:
-            return self.factors
+            return self.factors * inside
         counts = np.arange(len(self.y))[:, None] < self.skip
-        return np.broadcast_to(np.sqrt(self.weight) * counts, self.y.shape)
+        return np.sqrt(self.weight) * (counts & inside)
+
+    @property
+    def beyond(self) -> Array:
+        """Which way the output (T, ny) may be beyond a limit: 1 up, -1 down, 0 if it is inside."""
+        if self.limits is None:
+            return np.zeros(self.y.shape)
+        low, high = np.asarray(self.limits)
+        return (self.y >= high) * 1.0 - (self.y <= low)
+
+    def shown(self, y: Array) -> Array:
+        """An output (T, ny) as the sensors show it: no further than the limits."""
+        return y if self.limits is None else np.clip(y, *np.asarray(self.limits))
 
     @property
     def samples(self) -> int:

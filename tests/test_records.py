@@ -69,6 +69,26 @@ def test_any_real_type_becomes_float64(dtype):
     assert np.array_equal(record.u, np.ones((4, 1)))
 
 
+def test_output_is_shown_up_to_the_limits_of_the_sensor():
+    record = lab(limits=(3.2, 3.9))
+    assert record.beyond[:, 0].tolist() == [-1, -1, 0, 0, 0, 0, 0, 0, 0, 1]
+    assert record.shown(np.array([[3.0], [3.5], [9.0]]))[:, 0].tolist() == [3.2, 3.5, 3.9]
+    assert record.start_factors[:, 0].tolist() == [0, 0, *[1] * 7, 0]
+    assert lab(limits=(None, 3.9), skip=2).start_factors[:, 0].tolist() == [1, 1, *[0] * 8]
+    two = lab(y=np.c_[Y, Y], limits=(None, [3.9, np.inf]))
+    assert two.beyond.sum(axis=0).tolist() == [1, 0]
+    assert np.array_equal(two.shown(two.y + 9.0)[:, 1], Y + 9.0)
+    assert two[:9].beyond.sum() == 0
+    assert not lab().beyond.any()
+
+
+def test_limits_that_cannot_be_say_so():
+    for given in ((4.0, 3.0), (None,), 3.0, (None, [1.0, 2.0]), ("low", "high")):
+        refused("give the least and the greatest output", limits=given)
+    lines = {"start": "periodic", "line_weight": np.ones(6), "limits": (None, 3.9)}
+    refused("has limits and line_weight", **lines)
+
+
 def test_slice_is_a_record_from_zero_with_nothing_skipped():
     inputs = (Channel("a", "V"), Channel("b", "V"))
     record = Record(U, Y, 50.0, "periodic", 3, "lab", "official", inputs)

@@ -3,7 +3,8 @@
 Input u (V), of the pump that fills the upper tank; output y (V), the level of the lower one, which
 the upper one drains into. An estimation and a test record of 1024 samples each, 4 s apart. The
 outflow goes as the root of the level. At large inputs the upper tank overflows, partly into the
-lower one, and the sensor of the lower one ends at 10 V, which is in the records as measured.
+lower one, and the sensor of the lower one ends at 10 V (48 estimation samples): a limit of the
+records.
 
 The records do not begin at rest, and their start states are unknown; the benchmark says that they
 are the same. Older versions of the package nonlinear_benchmarks left 5 samples of the test
@@ -30,6 +31,7 @@ __all__ = ["load"]
 _FILE = "Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat"
 _FS = 0.25  # Hz
 _SAMPLES = 1024  # of each record
+_MOST = 10.0  # V, of the sensor
 _WINDOW = 50  # samples that the package leaves unscored
 
 _CT_SUBNET = "Beintema, Schoukens and Tóth (2023), continuous-time SUBNET"
@@ -97,8 +99,9 @@ def load(
         u, y = signals[2 * which : 2 * which + 2]
         channels: dict[str, Any] = {"inputs": (Channel("u", "V"),), "outputs": (Channel("y", "V"),)}
         return Record(
-            u, y, fs=_FS, start="estimated", name=name, source="official", **channels, **settings
-        )
+            u, y, fs=_FS, start="estimated", name=name, source="official", limits=(None, _MOST),
+            **channels, **settings,
+        )  # fmt: skip
 
     whole, end = record("train", 0), first + held_out
 

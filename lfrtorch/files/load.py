@@ -10,6 +10,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Literal, cast, get_args
 
+from numpy.typing import ArrayLike
+
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch.dataset import Dataset
@@ -69,6 +71,7 @@ def load_records(
     period: Period = "auto",
     skip: int | Literal["auto"] | None = None,
     gaps: Gaps = "error",
+    limits: Sequence[ArrayLike | None] | None = None,
 ) -> Dataset:
     """Measurements from files, each a record, by use: training, validation and test.
 
@@ -102,6 +105,8 @@ def load_records(
             does not repeat, and for the score of an estimated start as many more as determine it.
         gaps: ``"error"`` refuses missing values and missing time stamps, ``"split"`` makes a record
             of every stretch between them.
+        limits: least and greatest output that the sensors show, see :class:`lfrtorch.Record`; for
+            example ``(None, 10)``.
 
     Shape:
         u, y of a record: (its samples, inputs), (its samples, outputs), in the file's units.
@@ -128,6 +133,7 @@ def load_records(
         start,
         period,
         None if skip == "auto" else skip,
+        limits,
     )
     paths = listed_files(path, "path")
     left = reader.read(paths)
@@ -176,7 +182,14 @@ def load_records(
 class _Reader:
     """Reads files into whole records, all of one kind, and keeps what was found."""
 
-    def __init__(self, wanted: Wanted, start: Start, period: Period, skip: int | None) -> None:
+    def __init__(
+        self,
+        wanted: Wanted,
+        start: Start,
+        period: Period,
+        skip: int | None,
+        limits: Sequence[ArrayLike | None] | None,
+    ) -> None:
         if start not in get_args(Start):
             raise InputError(f"start is {start!r}; use 'zero', 'estimated' or 'periodic'.")
         if period not in (None, "auto"):
@@ -184,6 +197,7 @@ class _Reader:
         if skip is not None:
             integer("skip", skip, 0)
         self.wanted, self.period, self.skip = wanted, period, skip
+        self.limits = limits
         self.start: Start = start
         self.all: list[_Whole] = []
         self._first: Measurement | None = None
@@ -319,6 +333,7 @@ class _Reader:
             outputs=measured.outputs,
             period=N,
             skip_more=self.skip is None and start == "estimated",
+            limits=self.limits,
         )
         return record, notes
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -35,6 +35,8 @@ class RecordGroup:
         start_weight: the factors with which the initial state of a given model is estimated.
         spectral: whether the weight is by spectral line.
         start: how the records begin.
+        beyond: which way an output may be beyond a limit of its sensor, 1, -1 or 0; None if there
+            are no limits.
     """
 
     u: Float[Tensor, "R T nu"]
@@ -46,6 +48,16 @@ class RecordGroup:
     start_weight: Float[Tensor, "R T ny"] | None
     spectral: bool
     start: Start
+    beyond: Float[Tensor, "R T ny"] | None = None
+
+    def counted(self, y_hat: Float[Tensor, "R T ny"]) -> RecordGroup:
+        """The group with the weights of the samples that count at an output.
+
+        Where the measurement is at a limit and the model beyond it, there is no error.
+        """
+        if self.beyond is None:
+            return self
+        return replace(self, weight=self.weight * (self.beyond * (y_hat - self.y) <= 0))
 
     def weigh(
         self,
@@ -122,6 +134,9 @@ def group_records(
                 else None,
                 spectral=spectral,
                 start=start,
+                beyond=stacked([r.beyond for r in physical])
+                if any(r.limits is not None for r in physical)
+                else None,
             )
         )
     return groups

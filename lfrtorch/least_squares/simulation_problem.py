@@ -121,6 +121,8 @@ class SimulationProblem:
         scale = torch.as_tensor(self._y_scale).to(self._theta_0)
         for group, trajectory in zip(self.groups, self.trajectories(theta), strict=True):
             errors = (trajectory.y - group.y) * scale * group.scored.unsqueeze(-1)
+            if group.beyond is not None:
+                errors = errors * (group.beyond * errors <= 0)
             total = total + errors.double().square().sum()
         return math.sqrt(self.ranks.sum(total) / self.size)
 
@@ -142,7 +144,7 @@ class SimulationProblem:
     def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """r at θ; infinite or NaN if the model diverges."""
         pairs = zip(self.groups, self.trajectories(theta), strict=True)
-        errors = [group.weigh(t.y - group.y).flatten() for group, t in pairs]
+        errors = [group.counted(t.y).weigh(t.y - group.y).flatten() for group, t in pairs]
         if self._ridge.any() and self.ranks.rank == 0:
             errors.append(self._ridge.sqrt() * (theta - self._theta_0))
         return torch.cat(errors)
@@ -165,7 +167,7 @@ class SimulationProblem:
                 x0 = P + cell.nx * x0.unsqueeze(1) + torch.arange(cell.nx)
             periodic = group.start == "periodic"
             linearisation = Linearisation(cell, group.u, trajectory, periodic=periodic)
-            parts.append(Part(group, linearisation, x0, self._memory))
+            parts.append(Part(group.counted(trajectory.y), linearisation, x0, self._memory))
         fixed = None
         if self.fixed is not None:
             fixed = torch.zeros_like(theta, dtype=torch.bool)
@@ -268,7 +270,10 @@ class SimulationProblem:
         states = cell.A.new_zeros(0 if self._solved else count, cell.nx)
         for group in self.groups if len(states) else ():
             if group.estimated is not None:
-                found = simulate_estimated(cell, group.u, group.y, group.weight)
+                weight = group.weight
+                if group.beyond is not None:
+                    weight = weight * (group.beyond == 0)
+                found = simulate_estimated(cell, group.u, group.y, weight)
                 states[group.estimated] = found.x[:, 0]
         return self.ranks.sum(states)
 

@@ -56,7 +56,7 @@ def differenced(
     if record.start == "periodic":
         for _ in range(n):
             v = v - np.roll(v, 1, axis=0) if feedthrough else np.roll(v, -1, axis=0) - v
-        return replace(record, y=v)
+        return replace(record, y=v, limits=None)
     v, u = np.diff(v, n, axis=0), u[n:] if feedthrough else u[: len(u) - n]
     skip = record.skip
     if pole:
@@ -65,7 +65,9 @@ def differenced(
         skip = max(skip, round(n * FORGOTTEN / (1.0 - pole)))
     outputs = tuple(Channel(f"{c.name} differenced", c.unit) for c in record.outputs)
     skip = min(skip, len(u) - 1)
-    return replace(record, u=u, y=v, skip=skip, start="estimated", outputs=outputs, period=None)
+    return replace(
+        record, u=u, y=v, skip=skip, start="estimated", outputs=outputs, period=None, limits=None
+    )
 
 
 def whitening_pole(errors: Sequence[Array], integrators: int) -> float:

@@ -186,7 +186,7 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
                 f"clipped {name} {what}",
                 f"{kind}'{name}' has its {what} value {end.value:.6g} in {end.samples} samples "
                 f"({100 * end.samples / T:.2g} %), {end.run} in a row: it is clipped; if by the "
-                "sensor, use more range.",
+                "sensor, use more range, or give its limits.",
             )
         first, length = longest_run(np.diff(signal) == 0)
         length += 1

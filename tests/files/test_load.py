@@ -82,6 +82,13 @@ def test_five_percent_warm_up_unless_told(tmp_path, signals):
         assert [(r.skip, r.samples) for r in records] == [(10, 120), (120, 160), (160, 200)]
 
 
+def test_limits_of_the_sensors_are_those_of_all_records(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals)
+    data = load_records(path, **USE, limits=(None, 1.0))
+    for record in (*data.train, *data.validation, *data.tests):
+        assert np.array_equal(record.shown(record.y), np.minimum(record.y, 1.0))
+
+
 @pytest.mark.parametrize("samples", [51, 53, 97])
 @pytest.mark.parametrize("skip", [0, 3])
 def test_every_sample_after_the_first_warm_up_is_scored_once(tmp_path, signals, samples, skip):

@@ -143,6 +143,30 @@ def test_weights_multiply_the_squared_errors(model: Model):
     assert weighted.rmse(theta) == pytest.approx(plain.rmse(theta), rel=1e-12)
 
 
+def test_beyond_a_limit_there_is_no_error(model: Model):
+    """Samples at the limit of a sensor count on its inner side alone."""
+    exact = measure(model, 60)
+    high = float(np.quantile(exact.y, 0.7))
+    record = replace(exact, y=np.minimum(exact.y, high), limits=(None, high))
+    problem = SimulationProblem.of(model, record)
+    theta = problem.theta
+    assert problem.cost(problem.residual(theta)) < 1e-20
+    assert problem.rmse(theta) < 1e-9
+    assert np.allclose(model.simulate(record), record.y)
+    other = theta + 0.05
+    errors = problem.residual(other).reshape(60, 2)
+    problem.write(other)
+    y_hat = model.simulate(record.u)
+    beyond = (record.y >= high) & (y_hat > high)
+    assert beyond.any()
+    assert ((record.y >= high) & ~beyond).any()
+    expected = np.where(beyond, 0.0, y_hat - record.y) / model.scaler.y_scale
+    assert_close(errors, torch.as_tensor(expected))
+    step = 1e-6 * torch.linspace(-1.0, 1.0, len(theta)).to(theta)
+    slope = problem.residual(other + step) - problem.residual(other - step)
+    assert_close(2.0 * problem.jacobian(other) @ step, slope, atol=1e-10, rtol=1e-4)
+
+
 @pytest.mark.parametrize("T", [30, 31])
 def test_unit_line_weights_are_plain_least_squares(model: Model, T: int):
     noise = np.random.default_rng(1).normal(size=(T, 2))
