@@ -48,11 +48,11 @@ def _published(label: str, micrometres: Sequence[float], reference: str) -> Publ
 
 
 _PUBLISHED = (
-    _published("LTI", (0.114, 0.216, 0.228), "leaderboard; nx 28, a model for each level"),
+    _published("LTI", (0.114, 0.216, 0.228), f"{official.BOARD}; nx 28, a model for each level"),
     _published(
         "freq-statespace",
         (0.0866, 0.131, 0.169),
-        "leaderboard; NL-LFR with nx 28, nz 16, nw 8, 128 neurons, a model for all levels",
+        f"{official.BOARD}; NL-LFR with nx 28, nz 16, nw 8, 128 neurons, a model for all levels",
     ),
 )
 

@@ -25,6 +25,9 @@ from lfrtorch.records import Record, Start
 Shape = tuple[int | None, ...]
 """Of an array in a file; None for an axis of any length."""
 
+BOARD = "leaderboard of nonlinearbenchmark.org"
+"""What a published score is cited by that stands there."""
+
 _AGAIN = "download the file again."
 
 
