@@ -138,6 +138,10 @@ def _identified(
     models = starting_models(dataset.train, settings, linear)
     if settings.init_from is not None and settings.starts > 1:
         observer.say("note: starts is 1: the fit starts from the model of init_from alone")
+    if settings.first_part < 1.0:
+        settings, models = begun_on_part(
+            dataset, settings, models, observer, ranks=ranks, stop=stop
+        )
     average = _most_averaged(models, settings.average, observer)
     samples = sum(record.samples for record in dataset.train)
     if samples >= SLOW_SAMPLES and not is_compiled(cell := models[0].lfr.cell, cell.A.cpu()):
@@ -172,6 +176,62 @@ def _identified(
     return scored_run(
         dataset, settings, linear, result, order_scan=order_scan, size_search=sizes, again=again
     )
+
+
+def begun_on_part(
+    dataset: Dataset,
+    settings: Settings,
+    models: list[Model],
+    observer: Observer,
+    *,
+    ranks: Ranks,
+    stop: Stop | None,
+) -> tuple[Settings, list[Model]]:
+    """The best start after the first iterations, on a part of the training records.
+
+    Args:
+        dataset, ranks, stop: see :func:`identify`.
+        settings: name the part.
+        models: of all starts.
+        observer: who is told.
+
+    Returns:
+        The settings, with the seed of the start that is kept, and its model.
+    """
+    train = dataset.train
+    count = max(1, ranks.world, round(settings.first_part * len(train)))
+    if count >= len(train):
+        observer.say(
+            f"note: first_part is {settings.first_part}, and there are {len(train)} training "
+            "records: all are fitted from the first iteration"
+        )
+        return settings, models
+    part = [train[i * len(train) // count] for i in range(count)]
+    trainer: Any = settings.trainer
+    monitor = observer.searching()
+    result = fit(
+        models,
+        part,
+        dataset.validation,
+        dataset.selection,
+        trainer=replace(trainer, max_iter=settings.first_iterations),
+        ridge=settings.ridge,
+        monitors=None if monitor is None else [[monitor]] * len(models),
+        ranks=ranks,
+        stop=stop,
+    )
+    if result.reason in CUT_SHORT:
+        raise StoppedError("stopped during the first iterations, on a part of the records")
+    best = result.starts[0].number if result.starts else 0
+    seed = settings.seeds[best]
+    chosen = result.history[result.chosen_iteration]
+    unit = common_unit(result.model.outputs)
+    observer.say(
+        f"first {result.iterations} iterations on {count} of {len(train)} training records: "
+        f"{quantity(result.seconds, 's')}, error {quantity(chosen.train, unit)}, "
+        f"seed {seed}"
+    )
+    return replace(settings, seed=seed, starts=1), [result.model]
 
 
 def refitted(

@@ -44,6 +44,16 @@ def saturation(name: str, seed: int, samples: int = 300) -> Record:
     return Record(u, y, name=name, skip=20)
 
 
+class Said(Observer):
+    """Keeps what is said."""
+
+    def __init__(self):
+        self.texts: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.texts.append(text)
+
+
 @pytest.fixture
 def dataset() -> Dataset:
     train, validation, test = map(saturation, ("train", "validation", "test"), range(3))
@@ -226,6 +236,24 @@ def test_starts_that_are_kept_go_on(dataset: Dataset, tmp_path: Path):
 
 
 @pytest.mark.numeric
+def test_a_part_of_the_records_begins_the_fit_and_chooses_a_start(dataset: Dataset):
+    more = [saturation(f"train_{i}", 10 + i) for i in range(4)]
+    data = Dataset("saturation", more, dataset.validation, dataset.tests)
+    given = {"starts": 3, "first_part": 0.5, "first_iterations": 6}
+    said = Said()
+    run = identify(data, settings(**given), observer=said)
+    assert len(run.fit.starts) == run.settings.starts == 1
+    assert run.settings.seed in settings(**given).seeds
+    assert any("on 2 of 4 training records" in text for text in said.texts)
+    direct = identify(data, settings(starts=3))
+    assert run.fit.history[0].train < direct.fit.history[0].train
+    with pytest.raises(StoppedError, match="on a part of the records"):
+        identify(data, settings(**given), stop=lambda: said.texts.append("") or len(said.texts) > 9)
+    said = Said()
+    identify(dataset, settings(first_part=0.5), observer=said)
+    assert any("note: first_part is 0.5, and there are 1 training" in t for t in said.texts)
+
+
 def test_a_refit_is_scored_on_tests_and_validation_is_that_before(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -294,6 +322,12 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
         ({"static": torch.nn.Linear, "nz": "auto"}, "is not searched; give numbers"),
         ({"init": "magic"}, "init is 'magic'"),
         ({"minor": -1.0}, "minor is -1"),
+        ({"modes": -1}, "modes is -1"),
+        ({"modes": 2, "init": "inference"}, "init='inference' has no use for"),
+        ({"first_part": 0}, "first_part is 0"),
+        ({"first_part": 1.5}, "first_part is 1.5"),
+        ({"first_part": 0.5, "average": 2}, "keeps one start"),
+        ({"first_iterations": 0}, "first_iterations is 0"),
         ({"linear": {"speed": 3}}, "linear has no option 'speed'"),
         ({"starts": 0}, "starts is 0"),
         ({"init_from": "runs/x"}, "give a model: lfrtorch.load('runs/x')"),

@@ -54,7 +54,7 @@ def configured(cfg: DictConfig) -> Settings:
 
 AS_THEY_ARE = (
     "nx", "nx_max", "modes", "nz", "nw", "nn", "activation", "degree", "ridge", "average", "refit",
-    "starts", "seed", "device",
+    "first_part", "first_iterations", "starts", "seed", "device",
 )  # fmt: skip
 """Settings that are the words of the configuration."""
 

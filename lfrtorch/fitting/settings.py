@@ -86,6 +86,9 @@ class Settings:
         ridge, average: see :func:`lfrtorch.fit`.
         refit: whether the model that validation chose is fitted to all estimation records at last,
             see :func:`lfrtorch.refit`.
+        first_part: part of the training records that the first iterations fit, spread over all; of
+            several starts they choose one. An iteration costs as much less; 1 is for all records.
+        first_iterations: how many.
         starts: random starts, of which the best is kept; at least 2 if sizes are searched.
         seed: of the first start; the others have seed + 1000, seed + 2000, ... If sizes are
             searched, the first start of the fit is the one that brought the sizes chosen.
@@ -118,6 +121,8 @@ class Settings:
     ridge: Ridge = 0.0
     average: int = 1
     refit: bool = False
+    first_part: float = 1.0
+    first_iterations: int = 40
     starts: int = 1
     seed: int = 0
     init_from: Model | None = None
@@ -154,6 +159,15 @@ class Settings:
             )
         if self.minor is not None:
             number("minor", self.minor)
+        number("first_part", self.first_part, positive=True)
+        if self.first_part > 1:
+            raise InputError(f"first_part is {self.first_part}; give a part: above 0, 1 at most.")
+        if self.first_part < 1 and self.average > 1:
+            raise InputError(
+                f"first_part is {self.first_part}, which keeps one start, and average is "
+                f"{self.average}; give first_part=1 or average=1."
+            )
+        integer("first_iterations", self.first_iterations, 1)
         integer("modes", self.modes, 0)
         if self.modes and self.init == "inference":
             raise InputError(
