@@ -199,14 +199,13 @@ def begun_on_part(
         The settings, with the seed of the start that is kept, and its model.
     """
     train = dataset.train
-    count = max(1, ranks.world, round(settings.first_part * len(train)))
-    if count >= len(train):
+    part = part_of(train, settings.first_part)
+    if len(part) < ranks.world or len(part) == len(train):
         observer.say(
             f"note: first_part is {settings.first_part}, and there are {len(train)} training "
-            "records: all are fitted from the first iteration"
+            "record(s): all are fitted from the first iteration"
         )
         return settings, models
-    part = [train[i * len(train) // count] for i in range(count)]
     trainer: Any = settings.trainer
     monitor = observer.searching()
     result = fit(
@@ -227,11 +226,29 @@ def begun_on_part(
     chosen = result.history[result.chosen_iteration]
     unit = common_unit(result.model.outputs)
     observer.say(
-        f"first {result.iterations} iterations on {count} of {len(train)} training records: "
+        f"first {result.iterations} iterations on {len(part)} of {len(train)} training records: "
         f"{quantity(result.seconds, 's')}, error {quantity(chosen.train, unit)}, "
         f"seed {seed}"
     )
     return replace(settings, seed=seed, starts=1), [result.model]
+
+
+def part_of(records: Sequence[Record], part: float) -> list[Record]:
+    """The shortest records, which have this part of all samples; those of a length spread evenly.
+
+    Args:
+        records: of any lengths.
+        part: of their samples, more than 0; one record at least is found.
+    """
+    room, found = part * sum(record.samples for record in records), []
+    for samples in sorted({record.samples for record in records}):
+        alike = [record for record in records if record.samples == samples]
+        count = min(len(alike), max(int(not found), round(room / samples)))
+        found += [alike[i * len(alike) // count] for i in range(count)]
+        room -= count * samples
+        if count < len(alike):
+            break
+    return found
 
 
 def refitted(

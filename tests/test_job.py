@@ -29,7 +29,7 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.job import choose_sizes
+from lfrtorch.job import choose_sizes, part_of
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.reporting import Console, plots, write
 
@@ -252,6 +252,18 @@ def test_a_part_of_the_records_begins_the_fit_and_chooses_a_start(dataset: Datas
     said = Said()
     identify(dataset, settings(first_part=0.5), observer=said)
     assert any("note: first_part is 0.5, and there are 1 training" in t for t in said.texts)
+
+
+def test_a_part_has_the_shortest_records():
+    lengths = [400, 100, 400, 100, 100, 400]
+    records = [saturation(str(i), i, samples) for i, samples in enumerate(lengths)]
+    chosen = {
+        part: [r.name for r in part_of(records, part)] for part in (0.01, 0.14, 0.2, 0.5, 0.8)
+    }
+    assert chosen == {
+        0.01: ["1"], 0.14: ["1", "3"], 0.2: ["1", "3", "4"], 0.5: ["1", "3", "4", "0"],
+        0.8: ["1", "3", "4", "0", "2"],
+    }  # fmt: skip
 
 
 def test_a_refit_is_scored_on_tests_and_validation_is_that_before(

@@ -89,8 +89,8 @@ def load(
     """Measurements to fit, whole records of others to choose by, and the six tests.
 
     A multisine that trains is the mean of the last 8 of its 9 periods, in steady state: noise, that
-    of the force included, is lower by √8. Swept sines, validation and the tests are whole records
-    from rest, their first 50 samples unscored.
+    of the force included, is lower by √8, and its squared errors have the weight 8. Swept sines,
+    validation and the tests are whole records from rest, their first 50 samples unscored.
 
     The tests are ``"multisine_2"``, ``"multisine_4"``, ``"multisine_6"``, ``"sweep_2"``,
     ``"sweep_4"`` and ``"sweep_6"``. If a test's file is missing, a note says so.
@@ -194,7 +194,8 @@ def _fitted(record: Record) -> Record:
     """For training: of a multisine one period, the mean of those without transient."""
     if record.period is None:
         return record
-    return replace(record, u=_mean(record.u), y=_mean(record.y), start="periodic", skip=0)
+    u, y = _mean(record.u), _mean(record.y)
+    return replace(record, u=u, y=y, start="periodic", skip=0, weight=float(_PERIODS - 1))
 
 
 def _mean(signal: Array) -> Array:

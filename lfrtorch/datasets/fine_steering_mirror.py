@@ -20,6 +20,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,10 +67,11 @@ def load(
 ) -> Dataset:
     """Realisations of several levels to fit, others to choose by, and the tests.
 
-    A training record is the mean of the two periods of a realisation. Each period of a validation
-    or test realisation is a record. Those of a level make one score, ``"level_100"``,
-    ``"level_200"`` and ``"level_300"``, and ``"validation_100"`` and so on: the mean over outputs
-    and records of the RMSE. A level's linear model is that of its training records.
+    A training record is the mean of the two periods of a realisation, with the weight 2. Each
+    period of a validation or test realisation is a record. Those of a level make one score,
+    ``"level_100"``, ``"level_200"`` and ``"level_300"``, and ``"validation_100"`` and so on: the
+    mean over outputs and records of the RMSE. A level's linear model is that of its training
+    records.
 
     Without test arrays in the file there are no tests, and a note says so.
 
@@ -122,7 +124,10 @@ def load(
                 f"{level} mV, of which one at least must train; give 0 to {u.shape[2] - 1}."
             )
         train += [
-            _record(f"train_{level}_{r + 1}", u[:, :, r].mean(-1), y[:, :, r].mean(-1))
+            replace(
+                _record(f"train_{level}_{r + 1}", u[:, :, r].mean(-1), y[:, :, r].mean(-1)),
+                weight=float(u.shape[3]),
+            )
             for r in range(trained)
         ]
         chosen_by += _each(f"validation_{level}", u, y, range(trained, u.shape[2]))
