@@ -18,6 +18,7 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting.distortion_modes import distortion_frequencies, with_modes
 from lfrtorch.fitting.nonlinear_end import nonlinear_end
+from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.modes import MINOR, without_slow_minor_modes
 from lfrtorch.model import Model
@@ -67,6 +68,9 @@ def initialise(
     ``modes`` adds lightly damped modes that w alone drives, two states each. They are above the
     band of the inputs, where the linear model has none, at frequencies that split the power of its
     errors into equal parts: friction, clearance and impacts excite modes of a structure there.
+
+    Exact integrators of the linear model (``estimate_bla(..., integrators=1)``) stay so: no z sees
+    their states, and a fit leaves those columns of A and Cz as they are.
 
     Args:
         bla: stable linear model, best in balanced coordinates.
@@ -143,6 +147,7 @@ def initialise(
         cell.A.copy_(cell.A * std / std[:, None])
         cell.Bu.div_(std[:, None])
         cell.Cy.mul_(std)
+        integrating = integrating_states(cell)
         uniform(cell.Cz)
         uniform(cell.Dzu)
         end = nonlinear_end(response, data, found) if method == "zero_output" else None
@@ -150,6 +155,7 @@ def initialise(
             cell.Cz[: cell.ny], cell.Dzu[: cell.ny] = cell.Cy[:nz], cell.Dyu[:nz]
         elif end == "input":
             cell.Cz[: cell.nu], cell.Dzu[: cell.nu] = 0.0, torch.eye(cell.nu).to(u)[:nz]
+        cell.Cz[:, integrating] = 0.0
         z = (x / std) @ cell.Cz.mT + u @ cell.Dzu.mT
         spread = _deviation(z)[:, None]
         cell.Cz.div_(spread)

@@ -18,6 +18,7 @@ from lfrtorch.engine.initial_state import simulate_estimated
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, is_compiled
+from lfrtorch.least_squares.exact_integrators import fixed_parameters
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.jacobian import Jacobian, Memory, Part
 from lfrtorch.least_squares.record_groups import group_records
@@ -82,7 +83,7 @@ class SimulationProblem:
         )
         self._theta_0 = self.theta
         self._ridge = self._ridge_of(ridge)
-        self.fixed: Bool[Tensor, " free"] | None = None
+        self.fixed: Bool[Tensor, " free"] | None = fixed_parameters(lfr.cell)
         """Which entries of the module's free parameters are constants: columns of zeros in J."""
         self._reduced: Reduction | None = None
         self._memory = Memory()

@@ -1,0 +1,47 @@
+"""Exact integrators of a model: which of its parameters a fit must leave alone.
+
+A state i integrates if column i of A is 0 but for a 1 on the diagonal and entries in rows of other
+integrators, and column i of Cz is 0: nothing but integrators and the output sees it. Then z = 1 is
+a pole of the model, whatever its other parameters are, and a shift of that state shifts the output
+for good. Two in a row are a double pole. Such columns of A and Cz are constants of a fit.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from lfrtorch.engine.cell import LFRCell
+
+
+def integrating_states(cell: LFRCell) -> Bool[Tensor, " nx"]:
+    """Which states are exact integrators.
+
+    Example:
+        >>> from lfrtorch.least_squares.exact_integrators import integrating_states
+        >>> cell = lfrtorch.LFRCell(nu=1, ny=1, nx=2)
+        >>> _ = cell.A.data.copy_(torch.tensor([[0.5, 0.0], [2.0, 1.0]]))
+        >>> integrating_states(cell)
+        tensor([False,  True])
+    """
+    A = cell.A.detach()
+    acts = A - torch.diag(A.diagonal()) != 0
+    candidates = (A.diagonal() == 1) & ~cell.Cz.detach().any(dim=0)
+    found = torch.zeros_like(candidates)
+    for _ in range(cell.nx):  # the last of a chain comes first
+        found = candidates & ~acts[~found].any(dim=0)
+    return found
+
+
+def fixed_parameters(cell: LFRCell) -> Bool[Tensor, " free"] | None:
+    """Which entries of the free parameters a fit must not change; None if there are none."""
+    states = integrating_states(cell)
+    if not states.any():
+        return None
+    masks = [
+        (states if name in ("A", "Cz") else torch.zeros_like(p, dtype=torch.bool)).expand(p.shape)
+        for name, p in cell.named_parameters()
+        if p.requires_grad
+    ]
+    return torch.cat([mask.flatten() for mask in masks])

@@ -1,0 +1,107 @@
+"""Integrators of the linear model stay exact in a fit: no other state and no z sees their state."""
+
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import torch
+
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.fitting.means import mean_model
+from lfrtorch.fitting.multistart import advance_in_step, fit
+from lfrtorch.fitting.starts import initialise
+from lfrtorch.fitting.trainer import Fit
+from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.exact_integrators import fixed_parameters, integrating_states
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.metrics import rmse
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+pytestmark = pytest.mark.numeric
+
+
+def axis(integrators: int) -> Record:
+    """A mass with friction, or a motor whose speed integrates twice, from rest."""
+    u = np.random.default_rng(0).standard_normal(800)
+    y = np.zeros((len(u), 1))
+    v = s = p = 0.0
+    for k, force in enumerate(u):
+        y[k] = s if integrators == 1 else p
+        v, s, p = 0.8 * v + force - 0.5 * np.tanh(2 * v), s + v, p + s
+    return Record(u, y[:, 0], start="estimated")
+
+
+def started(integrators: Literal[1, 2], **options: Any) -> Model:
+    record = axis(integrators)
+    bla = estimate_bla(record, integrators + 1, integrators=integrators)
+    sizes = {"nz": 1, "nw": 1} | ({} if "static" in options else {"nn": 4})
+    return initialise(bla, record, **sizes, **options)
+
+
+def bits(model: Model, count: int) -> list[bytes]:
+    cell = model.lfr.cell
+    return [m[:, -count:].detach().contiguous().numpy().tobytes() for m in (cell.A, cell.Cz)]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize(
+    ("options", "trainer"),
+    [
+        ({}, LevenbergMarquardt(max_iter=15)),
+        ({}, LevenbergMarquardt(max_iter=5, least_damping=1e-14, damping=1e-14)),  # by QR
+        ({"static": Polynomial(1, 1, 3)}, LevenbergMarquardt(max_iter=5)),
+        ({}, Adam(max_iter=20)),
+    ],
+    ids=["cholesky", "svd", "polynomial", "adam"],
+)
+def test_a_fit_keeps_them(count, options, trainer):
+    record, model = axis(count), started(count, **options)
+    before, error = bits(model, count), rmse(record, model.simulate(record))
+    fit(model, record, trainer=trainer)
+    assert bits(model, count) == before
+    assert integrating_states(model.lfr.cell).sum() == count
+    assert rmse(record, model.simulate(record)) < error
+    assert np.sum(np.abs(np.linalg.eigvals(model.lfr.cell.A.detach()) - 1) < 1e-6) == count
+
+
+def test_a_shift_stays_for_good():
+    record, model = axis(1), started(1)
+    fit(model, record, trainer=LevenbergMarquardt(max_iter=10))
+    u = np.random.default_rng(1).standard_normal(2000)
+    at, ahead = (model.simulate(u, start="given", x0=[0.0, shift]) for shift in (0.0, 1.0))
+    assert np.allclose(ahead - at, (ahead - at)[0], rtol=1e-6)
+
+
+def test_starts_that_go_in_step_keep_them():
+    record, models = axis(1), [started(1, seed=seed) for seed in range(2)]
+    before = [bits(model, 1) for model in models]
+    trainer = LevenbergMarquardt(max_iter=5)
+    advance_in_step([Fit(model, record, trainer=trainer) for model in models], 5)
+    assert [bits(model, 1) for model in models] == before
+
+
+def test_a_mean_has_those_of_all():
+    mean = mean_model([started(1, seed=seed) for seed in range(3)])
+    assert integrating_states(mean.lfr.cell).tolist() == 3 * [False, True]
+
+
+def test_what_is_seen_is_free():
+    cell = LFRCell(1, 1, 3, 1, 1, Network(1, 1, 2), dtype=torch.float64)
+    assert fixed_parameters(cell) is None
+    with torch.no_grad():
+        cell.A.copy_(torch.tensor([[0.9, 0, 0], [1, 1, 0], [2, 3, 1]]))
+    assert integrating_states(cell).tolist() == [False, True, True]
+    with torch.no_grad():
+        cell.Cz[0, 1] = 1e-9
+    assert integrating_states(cell).tolist() == [False, False, True]
+    cell.A.requires_grad_(False)
+    mask = fixed_parameters(cell)
+    assert mask is not None
+    assert len(mask) == sum(p.numel() for p in cell.parameters() if p.requires_grad)
+    assert mask.sum() == 1  # of Cz
+    with torch.no_grad():
+        cell.A[0, 2] = 1e-9
+    assert fixed_parameters(cell) is None
