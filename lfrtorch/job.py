@@ -464,6 +464,7 @@ def choose_sizes(
         linear=linear,
         seeds=settings.first_seeds(grid.starts),
         finalists=grid.finalists,
+        folds=grid.folds,
         trainer=replace(trainer, max_iter=math.ceil(grid.iterations * trainer.limit)),
         ridge=settings.ridge,
         monitor=observer.searching(),

@@ -40,6 +40,8 @@ class SizesSearch:
         starts: random starts of each size, at most.
         finalists: models that get all iterations of the search; 8 times as many begin it.
         iterations: part of the iterations of the fit that they get.
+        folds: if not 0, the finalists are compared by cross-validation over so many stretches of
+            the training and validation records: for short records.
 
     Example:
         >>> lfrtorch.SizesSearch(nn=(5, 10), starts=2).nn
@@ -54,10 +56,12 @@ class SizesSearch:
     starts: int = 4
     finalists: int = 6
     iterations: float = 0.375
+    folds: int = 0
 
     def __post_init__(self) -> None:
         integer("sizes_search.starts", self.starts, 1)
         integer("sizes_search.finalists", self.finalists, 1)
+        integer("sizes_search.folds", self.folds, 0)
         number("sizes_search.iterations", self.iterations, positive=True)
 
 

@@ -9,6 +9,9 @@ The fewest parameters that do as well as the best are chosen: ``lfrtorch.paired_
 that is. The models that left the race count, too: if more parameters bring nothing, the smallest
 does as well after its first iterations.
 
+A few hundred samples of validation do not tell sizes apart. There the models of the last round are
+fitted again by cross-validation, each stretch of all records left out in turn.
+
 References:
     Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter
     optimization", AISTATS 2016.
@@ -19,7 +22,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from math import ceil, inf, isfinite, nan, sqrt
 from threading import Event
@@ -36,8 +39,11 @@ from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.distributed import ProcessLostError, Ranks
+from lfrtorch.fitting.folds import Fold
+from lfrtorch.fitting.folds import folds as folds_of
 from lfrtorch.fitting.live_line import StartsLine
 from lfrtorch.fitting.multistart import Together, any_of, iterations_of
+from lfrtorch.fitting.refit import all_records
 from lfrtorch.fitting.trainer import Fit, Monitor, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
@@ -257,6 +263,7 @@ def search_sizes(
     linear: LinearModel | None = None,
     seeds: Sequence[int] = SEEDS,
     finalists: int = FINALISTS,
+    folds: int = 0,
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
     monitor: Monitor | None = None,
@@ -281,6 +288,9 @@ def search_sizes(
         linear: the model that errors are compared with.
         seeds: of the starts of each size.
         finalists: models that get all iterations.
+        folds: if not 0, the finalists are fitted again, to all but one of so many stretches of the
+            training and validation records in turn (:func:`lfrtorch.fitting.folds.folds`), and the
+            errors in the stretches that were left out choose, those of finalists alone.
         trainer: the search. Default: Levenberg-Marquardt with 75 iterations.
         ridge, ranks, stop: see :func:`lfrtorch.fit`.
         monitor: called after every iteration of any model. Default: a line on a terminal or in a
@@ -307,6 +317,7 @@ def search_sizes(
     given |= {"nz": nz, "nw": nw} | ({"nn": nn} if degree is None else {"degree": degree})
     tried = {name: _sizes(name, values) for name, values in given.items()}
     integer("finalists", finalists, 1)
+    integer("folds", folds, 0)
     if not seeds:
         raise InputError("seeds is empty; give one for each start, for example (0, 1000).")
     if not validation:
@@ -314,13 +325,15 @@ def search_sizes(
             "there are no validation records, on which sizes are chosen; give some, or set "
             f"{', '.join(tried)} to numbers."
         )
+    given_records = all_records(as_records(train), as_records(validation)) if folds else []
     ranks = Ranks() if ranks is None else ranks
     trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer
     if any(map(is_open, as_records(validation))):  # the same samples for all sizes
         first = {name: values[0] for name, values in tried.items()}
         model = start(first, seeds[0]) if linear is None else linear.to_model()
         validation, _ = settled(model, as_records(validation), as_records(train))
-    judge, clock = _Judge(as_records(validation), linear, ranks), time.perf_counter()
+    scale = Scaler.of(as_records(validation)).y_scale
+    judge, clock = _Judge(as_records(validation), linear, ranks, scale), time.perf_counter()
     drawn = _drawn(tried, seeds, ROUNDS[0][0] * finalists)
     planned = race(len(drawn), finalists, trainer.limit)
     halt = Event()
@@ -347,14 +360,55 @@ def search_sizes(
             best = judge.candidate(min(field, key=lambda runner: runner.fit.best), number)
             seconds = time.perf_counter() - clock
             watch(SizeRound(number, len(planned), len(field), until, best, seconds))
-    last = sorted((judge.candidate(each, len(planned)) for each in field), key=lambda c: c.error)
-    search = SizeSearch((*last, *left), judge.counts)
+        counts = judge.counts
+        last = [judge.candidate(each, len(planned)) for each in field]
+        if folds:
+            parts = _left_out(given_records, folds, linear or field[0].fit.model)
+            judges = [_Judge(part.left_out, linear, ranks, scale) for part in parts]
+            fits = [
+                [
+                    Fit(start(r.sizes, r.seed), part.train, part.left_out, **options)
+                    for part in parts
+                ]
+                for r in field
+            ]
+            each = [fit for own in fits for fit in own]
+            Together(each, [watching] * len(each), halt).advance(each, trainer.limit)
+            _check_whole(each)
+            counts = np.concatenate([judge.counts for judge in judges])
+            left = []
+            last = [_crossed(c, own, judges) for c, own in zip(last, fits, strict=True)]
+    search = SizeSearch((*sorted(last, key=lambda c: c.error), *left), counts)
     if not isfinite(search.chosen.error):
         raise InputError(
             "all models that were tried diverge on the validation records; give training data at "
             "amplitudes like theirs, or set the sizes."
         )
     return search
+
+
+def _left_out(records: list[Record], count: int, model: Model | LinearModel) -> list[Fold]:
+    """The folds, their scores from where the start states are determined."""
+    model = model if isinstance(model, Model) else model.to_model()
+    parts = folds_of(records, count)
+    return [part._replace(left_out=settled(model, part.left_out, part.train)[0]) for part in parts]
+
+
+def _crossed(candidate: Candidate, fits: Sequence[Fit], judges: Sequence[_Judge]) -> Candidate:
+    """A model of the last round with the errors of its fits in what was left out of each."""
+    results = [fit.result() for fit in fits]
+    pairs = zip(judges, results, strict=True)
+    squares = np.concatenate([judge.squares(result.model) for judge, result in pairs])
+    linear = np.concatenate([judge.linear for judge in judges])
+    counts = np.concatenate([judge.counts for judge in judges])
+    error, error_std = _relative(squares, counts)
+    return replace(
+        candidate,
+        iterations=candidate.iterations + sum(result.iterations for result in results),
+        seconds=candidate.seconds + sum(result.seconds for result in results),
+        error=error, error_std=error_std, ratio=_ratio(error, linear, counts),
+        squares=squares,
+    )  # fmt: skip
 
 
 def race(models: int, finalists: int, limit: int) -> list[tuple[int, int]]:
@@ -403,14 +457,15 @@ class _Runner(NamedTuple):
 
 
 class _Judge:
-    """Scores models on the validation records; those of the first process count."""
+    """Scores models on records that are not fitted; those of the first process count."""
 
-    def __init__(self, records: list[Record], linear: LinearModel | None, ranks: Ranks) -> None:
-        self._records, self._ranks = records, ranks
-        self._scale = Scaler.of(records).y_scale
+    def __init__(
+        self, records: list[Record], linear: LinearModel | None, ranks: Ranks, scale: Array
+    ) -> None:
+        self._records, self._ranks, self._scale = records, ranks, scale
         blocks = in_blocks([record.y[record.skip :, 0] for record in records])
         self.counts = np.array([len(block) for block in blocks])
-        self._linear = nan if linear is None else self._error(self.squares(linear))[0]
+        self.linear = np.full(len(blocks), nan) if linear is None else self.squares(linear)
 
     def squares(self, model: Model | LinearModel) -> Array:
         """Sums of the squared relative errors over each block, (B,), the mean of the outputs."""
@@ -422,20 +477,29 @@ class _Judge:
         """What is known of a model that took part in some rounds."""
         found = runner.fit.result()
         squares = self.squares(found.model)
-        error, error_std = self._error(squares)
-        ratio = error / self._linear if self._linear else nan
+        error, error_std = _relative(squares, self.counts)
+        ratio = _ratio(error, self.linear, self.counts)
         return Candidate(
             runner.sizes, runner.seed, rounds, found.iterations, found.model.parameter_count,
             found.model.net_parameter_count, found.seconds, error, error_std, ratio, squares,
         )  # fmt: skip
 
-    def _error(self, squares: Array) -> tuple[float, float]:
-        """Root of the mean square and its standard error."""
-        if not np.isfinite(squares).all():
-            return inf, inf
-        mean, error = blocked_mean(squares, self.counts)
-        rms = sqrt(mean)
-        return rms, float(error) / (2.0 * rms) if rms else 0.0
+
+def _relative(squares: Array, counts: Integers) -> tuple[float, float]:
+    """Root of the mean square and its standard error."""
+    if not np.isfinite(squares).all():
+        return inf, inf
+    mean, error = blocked_mean(squares, counts)
+    rms = sqrt(mean)
+    return rms, float(error) / (2.0 * rms) if rms else 0.0
+
+
+def _ratio(error: float, linear: Array, counts: Integers) -> float:
+    """An error over the linear model's; NaN if there is none, or if it is 0."""
+    if np.isnan(linear).any():
+        return nan
+    least = _relative(linear, counts)[0]
+    return error / least if least else nan
 
 
 def _sizes(name: str, given: int | Sequence[int]) -> list[int]:

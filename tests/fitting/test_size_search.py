@@ -221,6 +221,20 @@ def test_the_fewest_parameters_that_do_as_well_are_chosen(mean: float, error: fl
     assert SizeSearch(models, np.ones(BLOCKS, int)).chosen.sizes == {"nn": chosen}
 
 
+def test_finalists_are_compared_where_they_were_not_fitted():
+    planted = plant(1, 1, T=150)
+    found = search(planted, nz=1, nw=1, finalists=2, folds=3)
+    assert len(found.candidates) == 2  # of the last round alone
+    assert len(found.counts) == len(found.chosen.squares) == 3 * BLOCKS
+    assert found.counts.sum() == 2 * 130
+    assert found.chosen.sizes["nn"] > 1  # one neuron does not do
+    for candidate in found.candidates:
+        assert candidate.iterations > OPTIMISER.limit
+        assert 0.0 < candidate.ratio < 1.0
+    with pytest.raises(ValueError, match="folds is 1"):
+        search(planted, nz=1, nw=1, folds=1)
+
+
 def test_a_smaller_model_with_a_smaller_error_is_chosen():
     # 20 is within one standard error of the best; 10 is not, and is better than 20.
     models = tried(30, 1.0, 0.0), tried(20, 1.3, 0.4), tried(10, 1.2, 0.1)
