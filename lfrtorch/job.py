@@ -510,7 +510,11 @@ def starting_model(
     begin = infer
     if settings.init != "inference":
         begin = partial(
-            initialise, method=settings.init, minor=settings.minor, modes=settings.modes
+            initialise,
+            method=settings.init,
+            minor=settings.minor,
+            relaxations=settings.relaxations,
+            modes=settings.modes,
         )
     nz, nw = cast(int, settings.nz), cast(int, settings.nw)
     model = begin(linear, train, nz=nz, nw=nw, seed=seed, **settings.static_map())

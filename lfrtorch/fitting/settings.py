@@ -83,8 +83,8 @@ class Settings:
         init: where the fit starts, see :func:`lfrtorch.initialise`; ``"inference"``, for periodic
             records, is :func:`lfrtorch.infer`.
         minor: see :func:`lfrtorch.initialise`. Default: its own.
-        modes: modes that w alone drives, two states each beside the ``nx`` of the linear model, see
-            :func:`lfrtorch.initialise`.
+        relaxations, modes: that w alone drives, one and two states each beside the ``nx`` of the
+            linear model, see :func:`lfrtorch.initialise`.
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
@@ -120,6 +120,7 @@ class Settings:
     static: Literal["network", "polynomial"] | Callable[..., Module] = "network"
     init: Literal["zero_output", "paper", "inference"] = "zero_output"
     minor: float | None = None
+    relaxations: int = 0
     modes: int = 0
     linear: Mapping[str, Any] = field(default_factory=dict)
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
@@ -173,12 +174,13 @@ class Settings:
                 f"{self.average}; give first_part=1 or average=1."
             )
         integer("first_iterations", self.first_iterations, 1)
-        integer("modes", self.modes, 0)
-        if self.modes and self.init == "inference":
-            raise InputError(
-                f"modes is {self.modes}, which init='inference' has no use for; give modes=0, or "
-                "init='zero_output'."
-            )
+        for name in ("relaxations", "modes"):
+            integer(name, count := getattr(self, name), 0)
+            if count and self.init == "inference":
+                raise InputError(
+                    f"{name} is {count}, which init='inference' has no use for; give {name}=0, or "
+                    "init='zero_output'."
+                )
         if self.dtype not in (torch.float32, torch.float64):
             raise InputError(f"dtype is {self.dtype}; give torch.float64 or torch.float32.")
         try:

@@ -16,7 +16,11 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.fitting.distortion_modes import distortion_frequencies, with_modes
+from lfrtorch.fitting.driven_states import (
+    distortion_frequencies,
+    relaxation_frequencies,
+    with_driven_states,
+)
 from lfrtorch.fitting.nonlinear_end import nonlinear_end
 from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.linear.model import LinearModel
@@ -43,6 +47,7 @@ def initialise(
     method: Literal["zero_output", "paper"] = "zero_output",
     seed: int = 0,
     minor: float | None = None,
+    relaxations: int = 0,
     modes: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> Model:
@@ -65,9 +70,11 @@ def initialise(
     ``"zero_output"`` begins there: the first z are the linear model's outputs, and Bw = 0. If one
     of its input does, as in a Hammerstein system, the first z are the inputs.
 
-    ``modes`` adds lightly damped modes that w alone drives, two states each. They are above the
-    band of the inputs, where the linear model has none, at frequencies that split the power of its
-    errors into equal parts: friction, clearance and impacts excite modes of a structure there.
+    ``relaxations`` and ``modes`` add states that w alone drives. A relaxation is a real pole, which
+    z sees, too: hysteresis is made of them. Their corner frequencies are spread over two decades up
+    to half the band of the inputs. Modes are lightly damped, above the band of the inputs, where
+    the linear model has none; their frequencies split the power of its errors there into equal
+    parts. Friction, clearance and impacts excite such modes of a structure.
 
     Exact integrators of the linear model (``estimate_bla(..., integrators=1)``) stay so: no z sees
     their states, and a fit leaves those columns of A and Cz as they are.
@@ -83,7 +90,8 @@ def initialise(
         seed: of the random weights.
         minor: what counts as next to nothing: the part of a mode in the output over the model's
             error; 0 leaves the linear model as it is. Default: 0 for ``"paper"``, else 1/3.
-        modes: how many modes are added to those of the linear model.
+        relaxations, modes: how many are added to those of the linear model, one and two states
+            each.
         dtype: of the weights.
 
     Raises:
@@ -105,6 +113,7 @@ def initialise(
     for name, size in (("nz", nz), ("nw", nw)):
         integer(name, size, 1)
     integer("seed", seed, 0)
+    integer("relaxations", relaxations, 0)
     integer("modes", modes, 0)
     if method not in ("zero_output", "paper"):
         raise InputError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
@@ -165,11 +174,17 @@ def initialise(
         if method == "zero_output" and not static((z / spread.mT).unsqueeze(0)).any():
             uniform(cell.Bw, 0.0 if end == "output" else OUTPUT_RANGE)
             uniform(cell.Dyw, OUTPUT_RANGE)
-    if modes:
-        pairs = zip(data, found, strict=True)
-        errors = [(scaler.normalise_y(r.y) - t.y[0].double().numpy())[r.skip :] for r, t in pairs]
-        angles = distortion_frequencies([r.u for r in data], errors, modes)
-        model = replace(model, lfr=LFR(with_modes(cell, angles, generator)))
+    if relaxations or modes:
+        inputs = [record.u for record in data]
+        corners = relaxation_frequencies(inputs, relaxations)
+        natural = corners[:0]
+        if modes:
+            pairs = zip(data, found, strict=True)
+            errors = [scaler.normalise_y(r.y) - t.y[0].double().numpy() for r, t in pairs]
+            errors = [error[r.skip :] for r, error in zip(data, errors, strict=True)]
+            natural = distortion_frequencies(inputs, errors, modes)
+        cell = with_driven_states(cell, corners, natural, generator)
+        model = replace(model, lfr=LFR(cell))
     return model
 
 

@@ -1,4 +1,9 @@
-"""Modes above the band of the inputs: no linear model has them, the nonlinearity excites them."""
+"""States that w alone drives, beside those of the linear model.
+
+A linear model has the states that the input reaches. What a nonlinearity adds begins at rest here:
+modes above the band of the inputs, which friction and impacts excite, and relaxations, from which
+hysteresis is made.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +29,10 @@ DAMPING = 0.03
 """Damping ratio of the modes."""
 
 RANGE = 0.3
-"""Entries of Bw and Cy are in -RANGE .. RANGE."""
+"""Entries of Bw, Cy and Cz are in -RANGE .. RANGE."""
+
+DECADES = 100.0
+"""Range of the corner frequencies of relaxations, the highest over the lowest."""
 
 
 def distortion_frequencies(
@@ -45,8 +53,7 @@ def distortion_frequencies(
     Raises:
         ValueError: the inputs reach up to half the sampling rate, or there are no errors above.
     """
-    bands = [band(channel) for u in inputs for channel in u.T]
-    edge = 2.0 * np.pi * max((high for found in bands if found for high in found), default=0.0)
+    edge = _edge(inputs)
     grid = np.linspace(edge, np.pi, GRID)
     power = np.zeros(GRID)  # of all frequencies from the edge up to each
     for error in errors:
@@ -62,38 +69,63 @@ def distortion_frequencies(
     return np.interp((np.arange(count) + 0.5) / count, power / power[-1], grid)
 
 
-@torch.no_grad()
-def with_modes(
-    cell: LFRCell, angles: Float[Array, " modes"], generator: torch.Generator
-) -> LFRCell:
-    """A cell with the same output, and modes that w alone drives beside its states.
+def relaxation_frequencies(
+    inputs: Sequence[Float[Array, "T nu"]], count: int
+) -> Float[Array, " count"]:
+    """Corner frequencies that divide two decades below half the inputs' band into equal ratios.
 
-    Their entries of Bw and Cy are random; those of Bu and Cz are 0, so that the modes are at rest
-    as long as w is 0, and z is what it was.
+    Args:
+        inputs: of every record.
+        count: how many frequencies.
+
+    Returns:
+        Angles per sample, falling.
+    """
+    return 0.5 * _edge(inputs) * DECADES ** -((np.arange(count) + 0.5) / count)
+
+
+@torch.no_grad()
+def with_driven_states(
+    cell: LFRCell,
+    relaxations: Float[Array, " r"],
+    modes: Float[Array, " m"],
+    generator: torch.Generator,
+) -> LFRCell:
+    """A cell with the same output, and states beside its own that w alone drives.
+
+    Their entries of Bw and Cy are random; those of Bu are 0, so that they are at rest as long as w
+    is 0. z sees the relaxations, and not the modes.
 
     Args:
         cell: is copied.
-        angles: natural frequency of each mode, rad per sample.
+        relaxations: corner frequency of each, rad per sample: a state.
+        modes: natural frequency of each, rad per sample: two states.
         generator: of the random entries.
     """
-    nx, states = cell.nx, 2 * len(angles)
     like = {"dtype": cell.A.dtype, "device": cell.A.device}
+    decay = np.exp(-np.concatenate([relaxations, np.repeat(DAMPING * modes, 2)]))
+    nx, states = cell.nx, len(decay)
     larger = LFRCell(cell.nu, cell.ny, nx + states, cell.nz, cell.nw, deepcopy(cell.static), **like)
     for name in ("A", "Bu", "Bw", "Cy", "Cz"):
         entries, own = larger.get_parameter(name).zero_(), cell.get_parameter(name)
         entries[: len(own), : own.shape[1]] = own
     for name in ("Dyu", "Dyw", "Dzu"):
         larger.get_parameter(name).copy_(cell.get_parameter(name))
-    decay = torch.exp(-DAMPING * torch.as_tensor(angles))
-    turn = np.sqrt(1.0 - DAMPING**2) * torch.as_tensor(angles)
-    for i, (radius, angle) in enumerate(zip(decay.tolist(), turn.tolist(), strict=True)):
-        at = slice(nx + 2 * i, nx + 2 * i + 2)
-        cosine, sine = radius * np.cos(angle), radius * np.sin(angle)
-        larger.A[at, at] = torch.tensor([[cosine, sine], [-sine, cosine]], **like)
+    A = np.diag(decay)
+    for i, angle in enumerate(np.sqrt(1.0 - DAMPING**2) * modes):
+        at = slice(len(relaxations) + 2 * i, len(relaxations) + 2 * i + 2)
+        A[at, at] @= [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    larger.A[nx:, nx:] = torch.as_tensor(A)
     # White w of unit variance makes for states of about that.
-    gain = (1.0 - decay**2).sqrt().repeat_interleave(2).to(**like)
-    Bw, Cy = torch.empty(states, cell.nw, **like), torch.empty(cell.ny, states, **like)
-    for entries in (Bw, Cy):
+    gain = torch.as_tensor(np.sqrt(1.0 - decay**2)).to(**like)
+    seen = slice(nx, nx + len(relaxations))
+    for entries in (larger.Bw[nx:], larger.Cy[:, nx:], larger.Cz[:, seen]):
         entries.uniform_(-RANGE, RANGE, generator=generator)
-    larger.Bw[nx:], larger.Cy[:, nx:] = gain[:, None] * Bw, Cy
+    larger.Bw[nx:] *= gain[:, None]
     return larger
+
+
+def _edge(inputs: Sequence[Float[Array, "T nu"]]) -> float:
+    """The upper end of the inputs' band, rad per sample."""
+    bands = [band(channel) for u in inputs for channel in u.T]
+    return 2.0 * np.pi * max((high for found in bands if found for high in found), default=0.5)

@@ -1,11 +1,11 @@
-"""Modes above the band of the inputs: placed where errors are, silent until the fit uses them."""
+"""States that w alone drives: placed by the data, silent until the fit uses them."""
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from lfrtorch.excitation import multisine
-from lfrtorch.fitting.distortion_modes import distortion_frequencies
+from lfrtorch.fitting.driven_states import distortion_frequencies, relaxation_frequencies
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -43,11 +43,19 @@ def test_frequencies_split_the_errors_above_the_band():
         distortion_frequencies([low], [0 * errors], 1)
 
 
-def test_a_start_with_modes_is_the_linear_model():
+def test_relaxations_cover_two_decades_below_half_the_band():
+    low = multisine(4000, band=(0.001, 0.1)).u[0]
+    found = relaxation_frequencies([low], 5) / (2 * np.pi)
+    assert np.all((found > 0.05 / 100) & (found < 0.05))
+    assert found[:-1] / found[1:] == pytest.approx([100**0.2] * 4)
+    assert not len(relaxation_frequencies([low], 0))
+
+
+def test_a_start_with_driven_states_is_the_linear_model():
     record = rattling()
     bla = estimate_bla(record, 2)
-    model = initialise(bla, record, nz=1, nw=1, nn=4, modes=2)
-    assert model.sizes["nx"] == 2 + 4
+    model = initialise(bla, record, nz=1, nw=1, nn=4, relaxations=3, modes=2)
+    assert model.sizes["nx"] == 2 + 3 + 4
     assert np.allclose(model.simulate(record), bla.simulate(record), rtol=0, atol=1e-9)
     frequencies = np.abs(np.angle(np.linalg.eigvals(model.lfr.cell.A.detach().numpy())))
     assert np.sum(np.abs(frequencies / (2 * np.pi) - RATTLE) < 0.05) >= 2
