@@ -2,17 +2,17 @@
 
     OMP_NUM_THREADS=1 python benchmarks/large_linear.py DIR [--realisations 5] [--f16 10 14 20]
 
-DIR holds the files of nonlinear_benchmarks. Only names of the public interface stand here, so that
-older checkouts run as well, with PYTHONPATH=CHECKOUT. Prints a table in Markdown; seconds are those
-of the processor, after a small fit that compiles. Errors are those of simulations in steady state:
-the mean over the records that are fitted, and over others (the mirror's sixth realisation, the
-F-16's level 5).
+DIR holds the files of nonlinear_benchmarks. Other checkouts run with PYTHONPATH=CHECKOUT. Prints a
+table in Markdown; seconds are those of the processor, after a small fit that compiles. Errors are
+those of simulations in steady state: the mean over the records that are fitted, and over others
+(the mirror's sixth realisation, the F-16's level 5).
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,8 @@ import scipy.io
 import torch
 
 import lfrtorch
-from lfrtorch import Record
+from lfrtorch import Channel, Record
+from lfrtorch.datasets import fine_steering_mirror
 
 MIRROR_ORDER = 28
 
@@ -74,14 +75,9 @@ def row(name: str, nx: int, fitted: list[Record], others: list[Record], **option
 
 def mirror(root: Path, level: int = 300, periods: int = 1) -> list[Record]:
     """Six realisations, V to µm, in steady state: the mean of two periods, or both."""
-    with np.load(root / "FineSteeringMirror" / "combined_data.npz") as file:
-        u, y = (file[f"{name}_{level}mV_train"] for name in "uy")  # (N, channels, realisations, P)
-    found = []
-    for r in range(u.shape[2]):
-        signals = [s[:, :, r].transpose(2, 0, 1) for s in (u, 1e6 * y)]
-        whole = [s.mean(axis=0) if periods == 1 else s.reshape(-1, s.shape[2]) for s in signals]
-        found.append(Record(*whole, fs=6400.0, start="periodic", period=len(u)))
-    return found
+    data = fine_steering_mirror.load(levels=[level], validation=0, mean=periods == 1, root=root)
+    unit = tuple(Channel(channel.name, "µm") for channel in data.train[0].outputs)
+    return [replace(r, y=1e6 * r.y, outputs=unit, weight=1.0) for r in data.train]
 
 
 def level(root: Path, number: int, *, mean: bool = True) -> Record:

@@ -351,7 +351,7 @@ def gallery(cases: Sequence[Case], folder: Path, start: Path) -> dict[str, list[
         drawn = each.folders[each.chosen] / "figures"
         groups = {} if each.dataset is None else each.dataset.groups
         for name, score in each.runs[each.chosen]["scores"].items():
-            test = groups.get(name, [name])[0]
+            test = next(r for r in groups.get(name, [name]) if (drawn / f"{r}.png").is_file())
             density = drawn / f"{test}_density.png"
             dense = density.is_file() and score["samples"] > LONG
             figures = [density if dense else drawn / f"{test}.png"]

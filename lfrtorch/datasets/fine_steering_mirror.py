@@ -62,6 +62,7 @@ def load(
     *,
     levels: Sequence[int] = LEVELS,
     validation: int = 1,
+    mean: bool = True,
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
@@ -78,13 +79,15 @@ def load(
     Args:
         levels: that train and validate, mV rms.
         validation: how many realisations of each level, the last of them, validate; 0 for none.
+        mean: whether a training record is the mean of the periods; if not, it has them one after
+            the other, and their difference shows the noise.
         download: whether a missing file is downloaded, by a package nonlinear_benchmarks that has
             this benchmark (version 1.0.1 has not).
         root: folder that holds ``FineSteeringMirror/combined_data.npz``; by default the cache
             folder of the package nonlinear_benchmarks.
 
     Shape:
-        u (V), y (m): (8192, 3), of which 8092 are scored.
+        u (V), y (m): (8192, 3), of which 8092 are scored; of training without ``mean`` (16384, 3).
 
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.
@@ -99,6 +102,8 @@ def load(
     """
     chosen = _checked(levels)
     integer("validation", validation, 0)
+    if not isinstance(mean, bool):
+        raise InputError(f"mean is {mean!r}; give True or False.")
     path = official.find(root, _FILE, "FineSteeringMirror", download=download)
     arrays = official.read_npz(path)
 
@@ -123,13 +128,11 @@ def load(
                 f"validation is {validation}, and there are {u.shape[2]} realisations of "
                 f"{level} mV, of which one at least must train; give 0 to {u.shape[2] - 1}."
             )
-        train += [
-            replace(
-                _record(f"train_{level}_{r + 1}", u[:, :, r].mean(-1), y[:, :, r].mean(-1)),
-                weight=float(u.shape[3]),
-            )
-            for r in range(trained)
-        ]
+        for r in range(trained):
+            periods = [signal[:, :, r].transpose(2, 0, 1) for signal in (u, y)]  # first of all axes
+            signals = [p.mean(axis=0) if mean else p.reshape(-1, _CHANNELS) for p in periods]
+            whole = _record(f"train_{level}_{r + 1}", *signals, period=len(u))
+            train.append(replace(whole, weight=float(u.shape[3])) if mean else whole)
         chosen_by += _each(f"validation_{level}", u, y, range(trained, u.shape[2]))
     for level in LEVELS:
         if any(f"{name}_{level}mV_test" in arrays for name in "uy"):
@@ -161,8 +164,8 @@ def load(
     )
 
 
-def _record(name: str, u: Array, y: Array, skip: int = 0) -> Record:
-    """One period in steady state."""
+def _record(name: str, u: Array, y: Array, *, period: int, skip: int = 0) -> Record:
+    """Whole periods in steady state."""
     return Record(
         u,
         y,
@@ -173,14 +176,19 @@ def _record(name: str, u: Array, y: Array, skip: int = 0) -> Record:
         source="official",
         inputs=tuple(Channel(f"u{i + 1}", "V") for i in range(_CHANNELS)),
         outputs=tuple(Channel(f"y{i + 1}", "m") for i in range(_CHANNELS)),
-        period=len(u),
+        period=period,
     )
 
 
 def _each(name: str, u: Array, y: Array, realisations: Iterable[int]) -> list[Record]:
     """Each period of some realisations."""
     return [
-        _record(f"{name}_{r + 1}_{p + 1}", *(s[:, :, r, p].copy() for s in (u, y)), skip=_WINDOW)
+        _record(
+            f"{name}_{r + 1}_{p + 1}",
+            *(signal[:, :, r, p].copy() for signal in (u, y)),
+            period=len(u),
+            skip=_WINDOW,
+        )
         for r in realisations
         for p in range(u.shape[3])
     ]

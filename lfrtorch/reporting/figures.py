@@ -37,10 +37,10 @@ def of_run(
     """All figures of a run's folder by file name, and those of the records that the report shows.
 
     The records are the tests; without tests those of validation, and else those of training. The
-    first is that with the largest error.
+    first is that with the largest error; of a group that make one score it is the only one.
     """
     model = result.model
-    drawn, views = of_records(simulated)
+    drawn, views = of_records(simulated, dataset)
     signals = model.signals(dataset.train[0])
     of_best = [s[0, :, : s.shape[2] // result.averaged].numpy() for s in (signals.z, signals.w)]
     drawn["static_map"] = plots.static_map(*of_best)
@@ -52,11 +52,15 @@ def of_run(
     return drawn, views
 
 
-def of_records(simulated: Sequence[Response]) -> tuple[dict[str, Figure], Views]:
+def of_records(simulated: Sequence[Response], dataset: Dataset) -> tuple[dict[str, Figure], Views]:
     """Errors of all tests, and all views of the records with the largest errors."""
     uses = [use for use in ("test", "validation", "train") if any(r.use == use for r in simulated)]
-    shown = [response for response in simulated if response.use == uses[0]]
-    shown.sort(key=_relative, reverse=True)
+    ranked = [response for response in simulated if response.use == uses[0]]
+    ranked.sort(key=_relative, reverse=True)
+    largest: dict[str, Response] = {}
+    for response in ranked:
+        largest.setdefault(dataset.score_of(response.record), response)
+    shown = list(largest.values())
     drawn: dict[str, Figure] = {}
     views: Views = {}
     for response in shown[:MOST_RECORDS]:

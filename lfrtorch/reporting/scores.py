@@ -258,7 +258,7 @@ def _entries(
     for record, of in zip(records, scores, strict=True):
         found.setdefault(dataset.score_of(record), []).append(of)
     return {
-        name: (together(of) if name in dataset.groups else of[0]).entry()
+        name: (together(of) if name in dataset.groups else of[-1]).entry()
         for name, of in found.items()
     }
 

@@ -70,6 +70,10 @@ def test_what_trains(tmp_path):
     assert len(data.tests) == 18  # of all levels
     assert list(data.linear) == ["level_300", "level_100"]
     assert fine_steering_mirror.load(root=root, validation=0).validation == []
+    both = fine_steering_mirror.load(root=root, mean=False).train[3]
+    assert np.array_equal(both.u[:N], numbered(100, "train")[:, :, 3, 0])
+    assert np.array_equal(both.y[N:], -numbered(100, "train")[:, :, 3, 1])
+    assert (both.samples, both.period, both.start) == (2 * N, N, "periodic")
 
 
 def test_without_test_arrays(tmp_path):
@@ -90,6 +94,7 @@ def test_without_test_arrays(tmp_path):
         ({"levels": None}, "levels is None"),
         ({"validation": 6}, "give 0 to 5"),
         ({"validation": -1}, "validation"),
+        ({"mean": 1}, "mean is 1; give True or False"),
     ],
 )
 def test_refused_arguments(tmp_path, arguments, match):

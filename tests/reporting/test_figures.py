@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from lfrtorch.dataset import Dataset
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import figures, plots
 from lfrtorch.reporting.simulations import Response
 
+DATA = Dataset("lab", [], [], [])
 Y = np.random.default_rng(0).standard_normal((200, 1))
 
 
@@ -26,7 +28,7 @@ def responses(use: str, errors: dict[str, float]) -> list[Response]:
 
 def test_the_report_begins_with_the_worst_test():
     tests = responses("test", {"a": 0.1, "b": np.inf, "c": 0.3})
-    drawn, views = figures.of_records([*responses("validation", {"v": 9.0}), *tests])
+    drawn, views = figures.of_records([*responses("validation", {"v": 9.0}), *tests], DATA)
     assert list(views) == ["b", "c", "a"]
     assert list(views["b"]) == ["b", "b_near", "b_density", "b_distribution"]
     assert set(drawn) == {name for own in views.values() for name in own}
@@ -35,17 +37,25 @@ def test_the_report_begins_with_the_worst_test():
 
 def test_of_many_tests_the_worst_have_all_views_and_each_its_errors():
     tests = responses("test", {f"t{k}": 1.0 / (1 + k) for k in range(6)})
-    drawn, views = figures.of_records(tests)
+    drawn, views = figures.of_records(tests, DATA)
     assert list(views) == ["t0", "t1", "t2", "t3"]
     assert {name for name in drawn if name.startswith(("t4", "t5"))} == {
         "t4", "t4_density", "t5", "t5_density"
     }  # fmt: skip
 
 
+def test_of_a_group_the_worst_record_is_shown():
+    tests = responses("test", {"a": 0.1, "b": 0.3, "c": 0.2})
+    data = Dataset("lab", [], [], [], groups={"board": ("a", "b")})
+    drawn, views = figures.of_records(tests, data)
+    assert list(views) == ["b", "c"]
+    assert not any(name.startswith("a") for name in drawn)
+
+
 def test_without_tests_what_there_is_is_shown():
     validation, train = responses("validation", {"v": 0.1}), responses("train", {"a": 9.0})
-    assert list(figures.of_records([*train, *validation])[1]) == ["v"]
-    assert list(figures.of_records(train)[1]) == ["a"]
+    assert list(figures.of_records([*train, *validation], DATA)[1]) == ["v"]
+    assert list(figures.of_records(train, DATA)[1]) == ["a"]
 
 
 def test_many_outputs_have_several_files_and_the_first_is_in_the_report():
