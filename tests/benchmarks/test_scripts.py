@@ -15,6 +15,7 @@ SCRIPTS = [
     "linear",
     "nonlinear",
     "parts",
+    "refit",
     "starts",
     "tanks",
 ]

@@ -178,7 +178,7 @@ def test_the_words_of_a_run_are_read_by_their_new_names(tmp_path: Path):
 def test_the_paper_cases_are_one_override():
     for nz, nw in ((1, 1), (2, 1), (2, 2)):
         cfg = configuration("+bench=boucwen", f"nz={nz}", f"nw={nw}")
-        assert config.configured(cfg).sizes == {"nx": 3, "nz": nz, "nw": nw, "nn": 15}
+        assert config.configured(cfg).sizes == {"nx": 3, "nz": nz, "nw": nw, "nn": 25}
 
 
 @pytest.mark.numeric
