@@ -34,7 +34,7 @@ from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
-from lfrtorch.linear.requirements import check_excitation
+from lfrtorch.linear.requirements import check_excitation, excited_directions
 from lfrtorch.linear.score_window import with_score_windows
 from lfrtorch.model import Model
 from lfrtorch.records import Record, common_unit
@@ -120,8 +120,9 @@ def _identified(
     """``identify`` with somebody who looks on."""
     if settings.init_from is not None:
         check_channels(settings.init_from, dataset.train[0])
+    approximated = linear_records(dataset.train, settings, observer)
     linear, order_scan = linear_model(
-        dataset.train, settings, dataset.validation, observer=observer, ranks=ranks
+        approximated, settings, dataset.validation, observer=observer, ranks=ranks
     )
     settings, asked = replace(settings, nx=linear.nx), settings
     whole, dataset = dataset, windowed(dataset, linear.to_model(), observer)
@@ -133,7 +134,7 @@ def _identified(
             observer.say(
                 f"nx: {settings.nx}, as the NL-LFR makes use of more states than the linear model"
             )
-            linear = estimate_bla(dataset.train, cast(int, settings.nx), **settings.linear)
+            linear = estimate_bla(approximated, cast(int, settings.nx), **settings.linear)
             dataset = windowed(whole, linear.to_model(), observer, dataset.notes)
     models = starting_models(dataset.train, settings, linear)
     if settings.init_from is not None and settings.starts > 1:
@@ -423,6 +424,25 @@ def linear_model(
     return linear, scan
 
 
+def linear_records(
+    train: Sequence[Record], settings: Settings, observer: Observer
+) -> Sequence[Record]:
+    """The records that the linear model is estimated from: those in steady state, or all.
+
+    A best linear approximation is that of one kind of signal, and takes a fraction of the work in
+    steady state. If those records excite too little for the order, all are taken.
+    """
+    steady = [record for record in train if record.start == "periodic"]
+    if len(steady) in (0, len(train)):
+        return train
+    order = settings.nx_max if settings.nx == "auto" else cast(int, settings.nx)
+    excited, wanted = excited_directions(steady, order)
+    if excited < wanted:
+        return train
+    observer.say(f"linear model: from the {len(steady)} training record(s) in steady state alone")
+    return steady
+
+
 def choose_sizes(
     dataset: Dataset,
     settings: Settings,
@@ -444,7 +464,7 @@ def choose_sizes(
     linears = {linear.nx: linear}
     if settings.nx == "auto":
         above = [nx for nx in grid.nx if linear.nx < nx <= settings.nx_max]
-        linears |= _larger(dataset.train, above, settings)
+        linears |= _larger(linear_records(dataset.train, settings, Observer()), above, settings)
 
     def start(tried: dict[str, Any], seed: int) -> Model:
         begin = linears[tried.get("nx", linear.nx)]

@@ -29,7 +29,7 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.job import choose_sizes, part_of
+from lfrtorch.job import choose_sizes, linear_records, part_of
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.reporting import Console, plots, write
 
@@ -252,6 +252,26 @@ def test_a_part_of_the_records_begins_the_fit_and_chooses_a_start(dataset: Datas
     said = Said()
     identify(dataset, settings(first_part=0.5), observer=said)
     assert any("note: first_part is 0.5, and there are 1 training" in t for t in said.texts)
+
+
+def test_records_in_steady_state_make_the_linear_model():
+    u, y = _periodic(3)
+    steady = Record(u[-100:], y[-100:], start="periodic", name="steady")
+    other = saturation("other", 5)
+    said = Said()
+    assert linear_records([steady, other], settings(), said) == [steady]
+    assert "from the 1 training record(s) in steady state" in said.texts[0]
+    assert linear_records([other], settings(), said) == [other]
+    flat = Record(np.ones(100), np.ones(100), start="periodic")
+    assert linear_records([flat, other], settings(), said) == [flat, other]  # excites nothing
+
+
+def _periodic(periods: int) -> tuple[np.ndarray, np.ndarray]:
+    """A saturation driven by the same noise again and again."""
+    u, y = np.tile(np.random.default_rng(0).standard_normal(100), periods), np.zeros(100 * periods)
+    for k in range(len(u) - 1):
+        y[k + 1] = 0.7 * y[k] + np.tanh(u[k])
+    return u, y
 
 
 def test_a_part_has_the_shortest_records():

@@ -35,7 +35,7 @@ from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, pr
 from lfrtorch.cli.words import Terminal
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
-from lfrtorch.job import linear_model, windowed
+from lfrtorch.job import linear_model, linear_records, windowed
 from lfrtorch.linear.score_window import fitted
 from lfrtorch.metrics import rms
 from lfrtorch.reporting import figures as run_figures
@@ -53,8 +53,9 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     print(f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples")
     frf, notes = response(cfg, dataset.train)
     # A fit to the response takes the one that the figures show.
-    data = frf if frf and cfg.bla.refine == "frequency" else dataset.train
     terminal = Terminal(cfg)
+    data = frf if frf and cfg.bla.refine == "frequency" else None
+    data = data or linear_records(dataset.train, settings, terminal)
     model, scan = linear_model(data, settings, dataset.validation, observer=terminal, ranks=Ranks())
     dataset = windowed(dataset, model.to_model(), terminal)
     cfg.nx = model.nx
