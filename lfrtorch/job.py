@@ -535,6 +535,7 @@ def starting_model(
             minor=settings.minor,
             relaxations=settings.relaxations,
             modes=settings.modes,
+            z_feedthrough=settings.z_feedthrough,
         )
     nz, nw = cast(int, settings.nz), cast(int, settings.nw)
     model = begin(linear, train, nz=nz, nw=nw, seed=seed, **settings.static_map())

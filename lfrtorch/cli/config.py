@@ -53,8 +53,9 @@ def configured(cfg: DictConfig) -> Settings:
 
 
 AS_THEY_ARE = (
-    "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "activation", "degree", "ridge",
-    "average", "refit", "first_part", "first_iterations", "starts", "seed", "device",
+    "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "z_feedthrough", "activation",
+    "degree", "ridge", "average", "refit", "first_part", "first_iterations", "starts",
+    "seed", "device",
 )  # fmt: skip
 """Settings that are the words of the configuration."""
 

@@ -26,6 +26,7 @@ References:
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from lfrtorch._support.checks import integer
@@ -70,18 +71,18 @@ def load(
     All start states are estimated. An integrator never forgets where it started: the error that a
     zero state makes in the position stays for good, and no warm-up from zero state would end it.
     Training fits the start with the parameters; in validation and test it is fitted to the first
-    samples, which are not scored.
+    samples, which are not scored. Those of the validation record are the last ones of training.
 
     Args:
         validation: fraction of the estimation samples, the last of them, that validate.
         warm_up: first samples of the validation record, which its start state is fitted to and
-            which are not scored; by default as many as the test has.
+            which train, too; by default as many as the test has.
         download: whether missing files are downloaded, by the package nonlinear_benchmarks.
         root: folder that holds ``EMPS/DATA_EMPS.mat`` and ``EMPS/DATA_EMPS_PULSES.mat``, or
             ``EMPS/EMPS.zip`` with both in it; by default the cache folder of nonlinear_benchmarks.
 
     Shape:
-        u (V), y (m) of training: (19873, 1); of validation: (4968, 1), 4948 of them scored; of the
+        u (V), y (m) of training: (19873, 1); of validation: (4988, 1), 4968 of them scored; of the
         test: (24841, 1), 24821 scored.
 
     Raises:
@@ -97,31 +98,27 @@ def load(
     """
     integer("warm_up", warm_up, 1)
     held_out = official.held_out(_SAMPLES, validation)
-    if warm_up >= held_out:
-        raise InputError(
-            f"warm_up is {warm_up}, which leaves none of the {held_out} validation samples "
-            "to score; give fewer, or a larger validation."
-        )
     trained = _SAMPLES - held_out
+    if warm_up > trained:
+        raise InputError(
+            f"warm_up is {warm_up}, and there are {trained} samples before the validation record; "
+            "give fewer, or a smaller validation."
+        )
     path = official.find(root, _ESTIMATION, "EMPS", others=[_ARCHIVE], download=download)
     estimation = _measured(path, _ESTIMATION)
     found, notes = official.find_tests(
         root, {"test": _TEST}, "EMPS", others=[_ARCHIVE], download=download
     )
 
-    def part(whole: Record, first: int, last: int, *, unscored: int, name: str) -> Record:
-        return official.part(
-            whole, first + unscored, last, warm_up=unscored, name=name, start="estimated"
-        )
-
+    part = partial(official.part, start="estimated")
     tests = [
-        part(_measured(path, _TEST), 0, _SAMPLES, unscored=_WINDOW, name=name)
+        part(_measured(path, _TEST), _WINDOW, _SAMPLES, warm_up=_WINDOW, name=name)
         for name, path in found.items()
     ]
     return Dataset(
         name="emps",
-        train=[part(estimation, 0, trained, unscored=0, name="train")],
-        validation=[part(estimation, trained, _SAMPLES, unscored=warm_up, name="validation")],
+        train=[part(estimation, 0, trained, warm_up=0, name="train")],
+        validation=[part(estimation, trained, _SAMPLES, warm_up=warm_up, name="validation")],
         tests=tests,
         published=_PUBLISHED,
         notes=notes,

@@ -83,6 +83,7 @@ def mean_model(models: Sequence[Model]) -> Model:
         network.Ww.copy_(torch.block_diag(*(n.Ww for n in networks)))
         network.bz.copy_(torch.cat([n.bz for n in networks]))
         network.bw.copy_(torch.cat([n.bw for n in networks]))
+    cell.Dzu.requires_grad_(any(c.Dzu.requires_grad for c in cells))
     return replace(first, lfr=LFR(cell))
 
 

@@ -85,6 +85,8 @@ class Settings:
         minor: see :func:`lfrtorch.initialise`. Default: its own.
         relaxations, modes: that w alone drives, one and two states each beside the ``nx`` of the
             linear model, see :func:`lfrtorch.initialise`.
+        z_feedthrough: whether the input acts on z at once; False for a nonlinearity of the states
+            alone, see :func:`lfrtorch.initialise`.
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
@@ -122,6 +124,7 @@ class Settings:
     minor: float | None = None
     relaxations: int = 0
     modes: int = 0
+    z_feedthrough: bool = True
     linear: Mapping[str, Any] = field(default_factory=dict)
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
     ridge: Ridge = 0.0
@@ -153,8 +156,9 @@ class Settings:
         for name in ("nx_max", "starts", "average"):
             integer(name, getattr(self, name), 1)
         integer("seed", self.seed, 0)
-        if not isinstance(self.refit, bool):
-            raise InputError(f"refit is {self.refit!r}; give True or False.")
+        for name in ("refit", "z_feedthrough"):
+            if not isinstance(given := getattr(self, name), bool):
+                raise InputError(f"{name} is {given!r}; give True or False.")
         known = [*signature(estimate_bla).parameters][2:]
         for name in self.linear:
             if name not in known:
@@ -175,11 +179,12 @@ class Settings:
             )
         integer("first_iterations", self.first_iterations, 1)
         for name in ("relaxations", "modes"):
-            integer(name, count := getattr(self, name), 0)
-            if count and self.init == "inference":
+            integer(name, getattr(self, name), 0)
+        for name, unused in (("relaxations", 0), ("modes", 0), ("z_feedthrough", True)):
+            if self.init == "inference" and getattr(self, name) != unused:
                 raise InputError(
-                    f"{name} is {count}, which init='inference' has no use for; give {name}=0, or "
-                    "init='zero_output'."
+                    f"{name} is {getattr(self, name)}, which init='inference' has no use for; give "
+                    f"{name}={unused}, or init='zero_output'."
                 )
         if self.dtype not in (torch.float32, torch.float64):
             raise InputError(f"dtype is {self.dtype}; give torch.float64 or torch.float32.")

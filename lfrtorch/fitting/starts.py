@@ -49,6 +49,7 @@ def initialise(
     minor: float | None = None,
     relaxations: int = 0,
     modes: int = 0,
+    z_feedthrough: bool = True,
     dtype: torch.dtype = torch.float64,
 ) -> Model:
     """NL-LFR model whose output is that of the linear model.
@@ -77,7 +78,8 @@ def initialise(
     parts. Friction, clearance and impacts excite such modes of a structure.
 
     Exact integrators of the linear model (``estimate_bla(..., integrators=1)``) stay so: no z sees
-    their states, and a fit leaves those columns of A and Cz as they are.
+    their states, and a fit leaves those columns of A and Cz as they are. Without ``z_feedthrough``
+    Dzu is 0, and a fit of this model leaves it so: the nonlinearity sees the states alone.
 
     Args:
         bla: stable linear model, best in balanced coordinates.
@@ -92,11 +94,12 @@ def initialise(
             error; 0 leaves the linear model as it is. Default: 0 for ``"paper"``, else 1/3.
         relaxations, modes: how many are added to those of the linear model, one and two states
             each.
+        z_feedthrough: whether the input acts on z at once.
         dtype: of the weights.
 
     Raises:
-        ValueError: sizes below 1, an unknown method, a static map of other sizes, or modes and no
-            errors above the band of the inputs.
+        ValueError: sizes below 1, an unknown method, a static map of other sizes, modes and no
+            errors above the band of the inputs, or nothing that z may see.
 
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
@@ -159,12 +162,18 @@ def initialise(
         integrating = integrating_states(cell)
         uniform(cell.Cz)
         uniform(cell.Dzu)
-        end = nonlinear_end(response, data, found) if method == "zero_output" else None
-        if end == "output":
+        known = method == "zero_output" and z_feedthrough
+        end = nonlinear_end(response, data, found) if known else None
+        if end == "output" and not integrating.any():
             cell.Cz[: cell.ny], cell.Dzu[: cell.ny] = cell.Cy[:nz], cell.Dyu[:nz]
         elif end == "input":
             cell.Cz[: cell.nu], cell.Dzu[: cell.nu] = 0.0, torch.eye(cell.nu).to(u)[:nz]
+        if integrating.all() and not z_feedthrough:
+            raise InputError(
+                "z_feedthrough is False, and all states integrate, which z must not see; raise nx."
+            )
         cell.Cz[:, integrating] = 0.0
+        cell.Dzu.mul_(z_feedthrough)
         z = (x / std) @ cell.Cz.mT + u @ cell.Dzu.mT
         spread = _deviation(z)[:, None]
         cell.Cz.div_(spread)
@@ -185,6 +194,7 @@ def initialise(
             natural = distortion_frequencies(inputs, errors, modes)
         cell = with_driven_states(cell, corners, natural, generator)
         model = replace(model, lfr=LFR(cell))
+    model.lfr.cell.Dzu.requires_grad_(z_feedthrough)
     return model
 
 

@@ -51,9 +51,9 @@ def test_split(numbered):
     (training,), (validation,), (test,) = data.train, data.validation, data.tests
     assert [r.name for r in (training, validation, test)] == ["train", "validation", "test"]
     assert scored(training) == (1, 19_873)
-    assert scored(validation) == (19_873 + 21, SAMPLES)
+    assert scored(validation) == (19_873 + 1, SAMPLES)
     assert scored(test) == (-21, -SAMPLES)  # of the other file
-    assert [r.samples for r in (training, validation, test)] == [19_873, 4968, SAMPLES]
+    assert [r.samples for r in (training, validation, test)] == [19_873, 4988, SAMPLES]
     for record in (training, validation, test):
         assert np.array_equal(record.y, -record.u)
         assert (record.fs, record.start, record.source) == (1000.0, "estimated", "official")
@@ -68,8 +68,8 @@ def test_split(numbered):
 def test_the_rules_of_the_cuts(numbered):
     data = emps.load(root=str(numbered), validation=0.5, warm_up=1000)
     assert scored(data.train[0]) == (1, 12_421)
-    assert scored(data.validation[0]) == (13_422, SAMPLES)
-    assert data.validation[0].u[0, 0] == 12_422
+    assert scored(data.validation[0]) == (12_422, SAMPLES)
+    assert data.validation[0].u[0, 0] == 11_422
     assert data.validation[0].skip == 1000
     assert scored(data.tests[0]) == (-21, -SAMPLES)
 
@@ -91,7 +91,7 @@ def test_the_archive_does_as_well(tmp_path):
         ({"validation": 0}, "validation is 0"),
         ({"validation": 1.0}, "leaves 0 of the 24841"),
         ({"warm_up": 0}, "warm_up is 0"),
-        ({"warm_up": 4968}, "warm_up is 4968, which leaves none of the 4968"),
+        ({"warm_up": 19_874}, "warm_up is 19874, and there are 19873 samples before"),
         ({"download": "no"}, "download is 'no'; give True or False"),
     ],
 )

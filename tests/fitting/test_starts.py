@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting import nonlinear_end
+from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.starts import OUTPUT_RANGE, initialise
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -312,3 +313,31 @@ def test_every_start_finds_a_nonlinearity_at_one_end(end: str):
         model = initialise(bla, record, nz=1, nw=1, nn=4, seed=seed)
         found = fit(model, record, trainer=LevenbergMarquardt(max_iter=15))
         assert found.history[-1].train < 0.1 * rmse(record, bla.simulate(record))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_nonlinearity_of_the_states_alone(method):
+    """Dzu is 0 before and after a fit; else the start is that of any model."""
+    bla = estimate_bla(RECORDS, 3)
+    models = [
+        initialise(bla, RECORDS, **SIZES, method=method, seed=seed, z_feedthrough=False)
+        for seed in range(2)
+    ]
+    mean = mean_model(models)
+    assert np.allclose(models[0].simulate(RECORDS[1]), bla.simulate(RECORDS[1]))
+    z = torch.cat([models[0].signals(record).z[0] for record in RECORDS])
+    assert torch.allclose(z.std(dim=0, correction=0), torch.ones(2, dtype=z.dtype))
+    for model in (models[0], mean):
+        before = model.lfr.cell.Cz.detach().clone()
+        fit(model, RECORDS, trainer=LevenbergMarquardt(max_iter=2), monitors=[])
+        assert not model.lfr.cell.Dzu.any()
+        assert not torch.equal(model.lfr.cell.Cz, before)
+
+
+def test_integrators_leave_z_something_to_see():
+    u = np.random.default_rng(0).normal(size=300)
+    record = Record(u, np.cumsum(u) - u, start="estimated")
+    bla = estimate_bla(record, 1, integrators=1)
+    assert initialise(bla, record, nz=1, nw=1, nn=2).lfr.cell.Dzu.all()
+    with pytest.raises(ValueError, match="all states integrate, which z must not see; raise nx"):
+        initialise(bla, record, nz=1, nw=1, nn=2, z_feedthrough=False)
