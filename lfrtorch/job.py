@@ -455,7 +455,8 @@ def choose_sizes(
     """The search for the sizes that are ``"auto"``; None if none but nx is.
 
     If nx is one of them, the order of the linear model is the least: an NL-LFR may make use of
-    states that a linear model does not.
+    states that a linear model does not. Models are fitted to the part of the training records that
+    the first iterations have.
     """
     if not settings.searched:
         return None
@@ -478,7 +479,7 @@ def choose_sizes(
         tried["nx"] = list(linears)
     search = search_sizes(
         start,
-        dataset.train,
+        part_of(dataset.train, settings.first_part),
         dataset.validation,
         **tried,
         linear=linear,
