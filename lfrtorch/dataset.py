@@ -18,7 +18,8 @@ class Published:
 
     Args:
         label: column head, for example ``"NL-LFR (paper)"``.
-        scores: RMSE in the output's unit, by the name of the test record.
+        scores: RMSE in the output's unit, by the name of the test record; of one of several outputs
+            by the names of both, as ``"multisine acc1"``.
         reference: where it was published.
         sizes: (nz, nw) if the number belongs to one model size only.
         unit: the output's with the prefix that tables shall have, ``"µm"`` for example. Default:

@@ -271,18 +271,22 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     listed = [*result["scores"].items(), *result["validation"]["records"].items()]
     sources = any(s["source"] != "file" for _, s in listed)
     models = ["lti_rmse", "rmse"] if sizes["nz"] else ["rmse"]
+    shown = [(line, s, of) for name, s in listed for line, of in lines(name, s, others)]
+    tested = {line for line, s, _ in shown if s["use"] == "test"}
+    factor, unit = tables.engineering(
+        [s[model] for _, s in listed for model in models], _unit(result), published_unit(others)
+    )
+    others = [p for p in others if tested & p.scores.keys()]
     head = ["record", "use", *["source"] * sources, "scored", *["linear", "NL-LFR"][: len(models)]]
     head += [p.label for p in others]
-    errors = [s[model] for _, s in listed for model in models]
-    factor, unit = tables.engineering(errors, _unit(result), published_unit(others))
-    rows = []
-    for name, s in listed:
-        known = others if s["use"] == "test" else []
-        about = [s["use"], *[s["source"]] * sources, of_samples(s["scored"], s["samples"])]
-        for line, of in lines(name, s, known):
-            mine = [tables.times(factor, of[model]) for model in models]
-            beside = [tables.times(factor, p.scores.get(line)) for p in known]
-            rows.append([line, *about, *mine, *(beside or [None] * len(others))])
+    rows = [
+        [
+            *(line, s["use"], *[s["source"]] * sources, of_samples(s["scored"], s["samples"])),
+            *(tables.times(factor, of[model]) for model in models),
+            *(tables.times(factor, p.scores.get(line) if line in tested else None) for p in others),
+        ]
+        for line, s, of in shown
+    ]
     title = f"Simulation RMSE{f' ({unit})' if unit else ''}"
     static = f"degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])
     title += f", nx {sizes['nx']}, "
@@ -298,7 +302,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
 def lines(
     name: str, entry: Mapping[str, Any], published: Sequence[Published]
 ) -> list[tuple[str, Mapping[str, float | None]]]:
-    """The errors of a score by name: all outputs together, and single ones with published figures.
+    """The errors of a score by name: all outputs together, and those that published figures name.
 
     Args:
         name: of the score.
@@ -306,11 +310,12 @@ def lines(
         published: what stands beside it.
     """
     found: list[tuple[str, Mapping[str, float | None]]] = [(name, {of: entry[of] for of in ERRORS})]
+    named = {key.rpartition(" ")[2] for p in published for key in p.scores if " " in key}
     for i, output in enumerate(entry.get("outputs", [])):
-        line = f"{name} {output}"
-        if any(line in p.scores for p in published):
+        if output in named:
             each = {of: entry[f"{of}_by_output"] for of in ERRORS}
-            found.append((line, {of: values[i] if values else None for of, values in each.items()}))
+            errors = {of: values[i] if values else None for of, values in each.items()}
+            found.append((f"{name} {output}", errors))
     return found
 
 

@@ -253,8 +253,11 @@ def test_records_of_a_group_have_one_score():
     a, b = (number(1e3 * score["rmse_by_output"][i]) for i in range(2))
     assert re.search(rf"a mV \S+ {a} .* b mV \S+ {b} ", page)
     table = report.table(metrics, data.published).splitlines()
-    rows = {line.split("  ")[0]: line.split()[-1] for line in table if line.startswith("board")}
-    assert rows == {"board": "250", "board b": "125"}
+    rows = {line.split("  ")[0]: line.split()[-1] for line in table if "  " in line}
+    assert (rows["board"], rows["board b"], rows["validation b"]) == ("250", "125", "–")
+    untested = report.table(metrics | {"scores": {}}, data.published)
+    assert "validation b" in untested
+    assert "other" not in untested  # nothing to compare with
 
 
 def test_many_tests_have_one_verdict(single: Run):
