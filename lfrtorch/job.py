@@ -277,6 +277,9 @@ def refitted(
         observer.say("note: refit: there are no validation records, so all were fitted before")
         return result, None
     options: Any = {"trainer": settings.trainer, "ridge": settings.ridge, "ranks": ranks}
+    if settings.first_part < 1.0:  # as many as cost the same with all records
+        before = round(settings.first_part * settings.first_iterations)
+        options["iterations"] = before + result.chosen_iteration
     try:
         again = refit(
             result, dataset.train, held_out, **options, monitor=observer.searching(), stop=stop

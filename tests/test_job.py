@@ -247,6 +247,9 @@ def test_a_part_of_the_records_begins_the_fit_and_chooses_a_start(dataset: Datas
     assert any("on 2 of 4 training records" in text for text in said.texts)
     direct = identify(data, settings(starts=3))
     assert run.fit.history[0].train < direct.fit.history[0].train
+    again = identify(data, settings(**given, refit=True, trainer=LevenbergMarquardt(max_iter=1)))
+    assert again.refit is not None
+    assert again.refit.iterations == 1  # of (0.5 * 6 + 1) * 280 / 1120
     with pytest.raises(StoppedError, match="on a part of the records"):
         identify(data, settings(**given), stop=lambda: said.texts.append("") or len(said.texts) > 9)
     said = Said()

@@ -32,6 +32,7 @@ def refit(
     *,
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
+    iterations: int | None = None,
     monitor: Monitor | None = None,
     ranks: Ranks | None = None,
     stop: Stop | None = None,
@@ -47,6 +48,7 @@ def refit(
         held_out: records that chose its iterate. One that begins in a training record, as the
             parts of a measurement do, continues that record.
         trainer, ridge: of the fit; ridge pulls towards the model that was chosen.
+        iterations: that were chosen. Default: those of the fit, without what came before it.
         monitor: called after every iteration. Default: a line on a terminal or in a notebook.
         ranks, stop: see :func:`lfrtorch.fit`.
 
@@ -68,7 +70,8 @@ def refit(
     train, held_out = as_records(train), as_records(held_out)
     seen, new = (sum(r.samples - r.skip for r in records) for records in (train, held_out))
     base: Any = LevenbergMarquardt() if trainer is None else trainer
-    limit = min(ceil(result.chosen_iteration * new / seen), base.limit)
+    chosen = result.chosen_iteration if iterations is None else iterations
+    limit = min(ceil(chosen * new / seen), base.limit)
     models = [deepcopy(model) for model in result.members or (result.model,)]
     return fit(
         models,
