@@ -201,7 +201,8 @@ def begun_on_part(
     """
     train = dataset.train
     part = part_of(train, settings.first_part)
-    if len(part) < ranks.world or len(part) == len(train):
+    samples, all_samples = (sum(r.samples for r in records) for records in (part, train))
+    if len(part) < ranks.world or samples == all_samples:
         observer.say(
             f"note: first_part is {settings.first_part}, and there are {len(train)} training "
             "record(s): all are fitted from the first iteration"
@@ -227,7 +228,7 @@ def begun_on_part(
     chosen = result.history[result.chosen_iteration]
     unit = common_unit(result.model.outputs)
     observer.say(
-        f"first {result.iterations} iterations on {len(part)} of {len(train)} training records: "
+        f"first {result.iterations} iterations on {samples} of {all_samples} training samples: "
         f"{quantity(result.seconds, 's')}, error {quantity(chosen.train, unit)}, "
         f"seed {seed}"
     )
@@ -235,13 +236,18 @@ def begun_on_part(
 
 
 def part_of(records: Sequence[Record], part: float) -> list[Record]:
-    """The shortest records, which have this part of all samples; those of a length spread evenly.
+    """Records with a part of all samples: the shortest, or the beginning of each.
+
+    Of records of one length some are taken, spread evenly. If even the shortest record has more
+    samples than the part, that is the beginning of each record, unless it is in steady state.
 
     Args:
         records: of any lengths.
-        part: of their samples, more than 0; one record at least is found.
+        part: of their samples, more than 0, 1 at most.
     """
     room, found = part * sum(record.samples for record in records), []
+    if room < min(r.samples for r in records) and all(r.start != "periodic" for r in records):
+        return [_beginning(record, part) for record in records]
     for samples in sorted({record.samples for record in records}):
         alike = [record for record in records if record.samples == samples]
         count = min(len(alike), max(int(not found), round(room / samples)))
@@ -250,6 +256,12 @@ def part_of(records: Sequence[Record], part: float) -> list[Record]:
         if count < len(alike):
             break
     return found
+
+
+def _beginning(record: Record, part: float) -> Record:
+    """What is skipped, and a part of the other samples."""
+    end = record.skip + math.ceil(part * (record.samples - record.skip))
+    return replace(record, u=record.u[:end], y=record.y[:end], period=None)
 
 
 def refitted(

@@ -244,7 +244,7 @@ def test_a_part_of_the_records_begins_the_fit_and_chooses_a_start(dataset: Datas
     run = identify(data, settings(**given), observer=said)
     assert len(run.fit.starts) == run.settings.starts == 1
     assert run.settings.seed in settings(**given).seeds
-    assert any("on 2 of 4 training records" in text for text in said.texts)
+    assert any("on 600 of 1200 training samples" in text for text in said.texts)
     direct = identify(data, settings(starts=3))
     assert run.fit.history[0].train < direct.fit.history[0].train
     again = identify(data, settings(**given, refit=True, trainer=LevenbergMarquardt(max_iter=1)))
@@ -253,7 +253,8 @@ def test_a_part_of_the_records_begins_the_fit_and_chooses_a_start(dataset: Datas
     with pytest.raises(StoppedError, match="on a part of the records"):
         identify(data, settings(**given), stop=lambda: said.texts.append("") or len(said.texts) > 9)
     said = Said()
-    identify(dataset, settings(first_part=0.5), observer=said)
+    steady = [Record(r.u, r.y, start="periodic") for r in more[:1]]
+    identify(Dataset("one", steady, [], []), settings(first_part=0.5), observer=said)
     assert any("note: first_part is 0.5, and there are 1 training" in t for t in said.texts)
 
 
@@ -281,12 +282,15 @@ def test_a_part_has_the_shortest_records():
     lengths = [400, 100, 400, 100, 100, 400]
     records = [saturation(str(i), i, samples) for i, samples in enumerate(lengths)]
     chosen = {
-        part: [r.name for r in part_of(records, part)] for part in (0.01, 0.14, 0.2, 0.5, 0.8)
+        part: [r.name for r in part_of(records, part)] for part in (0.07, 0.14, 0.2, 0.5, 0.8)
     }
     assert chosen == {
-        0.01: ["1"], 0.14: ["1", "3"], 0.2: ["1", "3", "4"], 0.5: ["1", "3", "4", "0"],
+        0.07: ["1"], 0.14: ["1", "3"], 0.2: ["1", "3", "4"], 0.5: ["1", "3", "4", "0"],
         0.8: ["1", "3", "4", "0", "2"],
     }  # fmt: skip
+    short = part_of(records, 0.05)  # less than one record: of each that much beyond what it skips
+    assert [r.samples for r in short] == [39, 24, 39, 24, 24, 39]
+    assert all(np.array_equal(a.y, b.y[: a.samples]) for a, b in zip(short, records, strict=True))
 
 
 def test_a_refit_is_scored_on_tests_and_validation_is_that_before(

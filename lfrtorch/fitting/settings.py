@@ -94,7 +94,8 @@ class Settings:
             see :func:`lfrtorch.refit`.
         first_part: part of the training samples that the first iterations fit, which cost as much
             less and choose one of the starts: the shortest records, those of a length spread
-            evenly. The search for sizes fits them, too. 1 is for all.
+            evenly; the beginning of each if the part is less than a record. The search for sizes
+            fits them, too. 1 is for all.
         first_iterations: how many.
         starts: random starts, of which the best is kept; at least 2 if sizes are searched.
         seed: of the first start; the others have seed + 1000, seed + 2000, ... If sizes are
