@@ -23,11 +23,14 @@ SHORTER = {  # fewer samples and iterations, so that two iterations take a secon
     "boucwen_record": f"data.samples={PERIOD} data.rms=[50,25] bla.max_iter=1 starts=1",
     "cascaded_tanks": "bla.max_iter=1 starts=1",
     "ced": "bla.max_iter=1 starts=1",
-    "emps": "data.validation=0.8 bla.max_iter=1",
-    "f16": "data.levels=[3] nx=6 bla.max_iter=1 starts=1",
+    "emps": "data.validation=0.8 bla.max_iter=1 starts=1 refit=false",
+    "f16": "data.levels=[3] data.validation_level=5 nx=6 modes=1 bla.max_iter=1 starts=1"
+    " first_part=1 refit=false",
+    "fine_steering_mirror": "data.levels=[100] data.validation=5 nx=4 nz=1 nw=1 nn=4 relaxations=1"
+    " bla.max_iter=1 first_part=1 refit=false",
     "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1 starts=1",
     "silverbox": "data.validation=0.8 bla.max_iter=1 starts=1",
-    "wh_process_noise": "bla.max_iter=1 starts=1",
+    "wh_process_noise": "data.validation=9 bla.max_iter=1 starts=1",
     "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1 starts=1",
 }
 SIMULATED = ("boucwen", "boucwen_record", "parwh")

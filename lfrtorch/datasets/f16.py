@@ -79,8 +79,8 @@ _NOTE = "RMSE is that of the three accelerations together; published figures are
 
 def load(
     *,
-    train: Sequence[str] = ("multisine_1", "multisine_3", "multisine_7"),
-    validation: Sequence[str] = ("multisine_5", "sweep_5"),
+    train: Sequence[str] = ("multisine_1", "multisine_3", "multisine_7", "sweep_5", "sweep_7"),
+    validation: Sequence[str] = ("multisine_5", "sweep_3"),
     levels: Sequence[int] | None = None,
     validation_level: int | None = None,
     download: bool = False,

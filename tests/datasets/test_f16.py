@@ -54,7 +54,8 @@ def numbered():
 
 
 def test_split(numbered):
-    data = f16.load(root=numbered, train=["multisine_1", "multisine_7", "sweep_3"])
+    fitted, chosen_by = ["multisine_1", "multisine_7", "sweep_3"], ["multisine_5", "sweep_5"]
+    data = f16.load(root=numbered, train=fitted, validation=chosen_by)
     assert [r.name for r in data.train] == [
         "train_multisine_1", "train_multisine_7", "train_sweep_3",
     ]  # fmt: skip
@@ -102,8 +103,8 @@ def test_zeros_that_fill_a_sweep_are_no_measurement(tmp_path, numbered):
     signals[:, 300] = 0
     for level in (2, 5):
         write(tmp_path, level, signals[:1], signals[1:], "SineSw")
-    data = f16.load(root=tmp_path)
-    assert data.validation[1].samples == 400
+    data = f16.load(root=tmp_path, levels=[1], validation=["sweep_5"])
+    assert data.validation[0].samples == 400
     assert next(r for r in data.tests if r.name == "sweep_2").samples == 500
 
 
@@ -134,7 +135,7 @@ def test_published(numbered):
         ({"train": []}, "give one or more to train"),
         ({"train": ["multisine_2"]}, "train is .'multisine_2'.; give a list of multisine_1"),
         ({"train": "sweep_1"}, "train is sweep_1; give a list of"),
-        ({"train": ["sweep_5"]}, "each once in all"),
+        ({"train": ["sweep_5"], "validation": ["sweep_5"]}, "each once in all"),
         ({"validation": [5]}, "validation is .5.; give a list of"),
     ],
 )
