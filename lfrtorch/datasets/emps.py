@@ -74,7 +74,7 @@ def load(
     samples, which are not scored. Those of the validation record are the last ones of training.
 
     Args:
-        validation: fraction of the estimation samples, the last of them, that validate.
+        validation: fraction of the estimation samples, the last of them, that validate; 0 for none.
         warm_up: first samples of the validation record, which its start state is fitted to and
             which train, too; by default as many as the test has.
         download: whether missing files are downloaded, by the package nonlinear_benchmarks.
@@ -97,7 +97,7 @@ def load(
         FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("warm_up", warm_up, 1)
-    held_out = official.held_out(_SAMPLES, validation)
+    held_out = official.held_out(_SAMPLES, validation) if validation else 0
     trained = _SAMPLES - held_out
     if warm_up > trained:
         raise InputError(
@@ -118,7 +118,10 @@ def load(
     return Dataset(
         name="emps",
         train=[part(estimation, 0, trained, warm_up=0, name="train")],
-        validation=[part(estimation, trained, _SAMPLES, warm_up=warm_up, name="validation")],
+        validation=[
+            part(estimation, trained, _SAMPLES, warm_up=warm_up, name="validation")
+            for _ in range(held_out > 0)
+        ],
         tests=tests,
         published=_PUBLISHED,
         notes=notes,
