@@ -50,6 +50,7 @@ _KINDS = {"multisine": "FullMSine", "sweep": "SineSw"}
 _FS = 400.0  # Hz
 _PERIOD, _PERIODS = 8192, 9  # samples of a multisine, and how many; the first is a transient
 _ESTIMATION, _TESTS = (1, 3, 5, 7), (2, 4, 6)  # levels
+_MULTISINES = tuple(f"multisine_{level}" for level in _ESTIMATION)
 _SKIP = 50  # samples, unscored, of records from rest
 
 
@@ -79,8 +80,8 @@ _NOTE = "RMSE is that of the three accelerations together; published figures are
 
 def load(
     *,
-    train: Sequence[str] = ("multisine_1", "multisine_3", "multisine_7", "sweep_5", "sweep_7"),
-    validation: Sequence[str] = ("multisine_5", "sweep_3"),
+    train: Sequence[str] = (*_MULTISINES, "sweep_3", "sweep_7"),
+    validation: Sequence[str] = ("sweep_5",),
     levels: Sequence[int] | None = None,
     validation_level: int | None = None,
     download: bool = False,
