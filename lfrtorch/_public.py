@@ -21,6 +21,7 @@ from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.model import Model, load, simulate_blocks
 
 # fits
+from lfrtorch.fitting.distillation import distil
 from lfrtorch.fitting.inference import infer
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
@@ -73,6 +74,7 @@ __all__ = [
     "SizesSearch",
     "Snapshots",
     "datasets",
+    "distil",
     "distributed",
     "estimate_bla",
     "estimate_frf",

@@ -21,8 +21,9 @@ from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
+from lfrtorch.fitting.distillation import distil
 from lfrtorch.fitting.inference import infer
-from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.multistart import AS_GOOD, fit
 from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.settings import Settings
@@ -30,6 +31,7 @@ from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import FitResult, Stop, StoppedError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
@@ -171,6 +173,8 @@ def _identified(
         stop=stop,
     )
     observer.end(result)
+    if settings.distil:
+        result = distilled(dataset, settings, result, observer, ranks=ranks, stop=stop)
     again = None
     if settings.refit:
         result, again = refitted(whole, settings, result, observer, ranks=ranks, stop=stop)
@@ -262,6 +266,50 @@ def _beginning(record: Record, part: float) -> Record:
     """What is skipped, and a part of the other samples."""
     end = record.skip + math.ceil(part * (record.samples - record.skip))
     return replace(record, u=record.u[:end], y=record.y[:end], period=None)
+
+
+def distilled(
+    dataset: Dataset,
+    settings: Settings,
+    result: FitResult,
+    observer: Observer,
+    *,
+    ranks: Ranks,
+    stop: Stop | None,
+) -> FitResult:
+    """The fit with one model in the place of a mean, if it does as well on validation."""
+    if result.reason in CUT_SHORT:
+        return result
+    if not result.members:
+        observer.say("note: distil: the model is no mean of several starts; it stays")
+        return result
+    options: Any = {"trainer": settings.trainer, "seed": settings.seed, "ranks": ranks}
+    try:
+        one = distil(
+            result,
+            dataset.train,
+            dataset.validation,
+            **options,
+            monitor=observer.searching(),
+            stop=stop,
+        )
+    except (KeyboardInterrupt, StoppedError):
+        return replace(result, reason=Reason.INTERRUPTED)
+    if one.reason in CUT_SHORT:
+        return replace(result, reason=one.reason, detail=one.detail)
+    judged = dataset.validation or dataset.train
+    problems = [SimulationProblem.judge(m, judged) for m in (one.model, result.model)]
+    costs = [problem.cost(problem.residual(problem.theta)) for problem in problems]
+    found, mean = ranks.first(torch.tensor(costs, dtype=torch.float64)).sqrt().tolist()
+    taken = found <= AS_GOOD * mean or not dataset.validation
+    on = "validation" if dataset.validation else "training"
+    observer.say(
+        f"one model for the mean of {result.averaged}: its error on {on} is "
+        f"{number(found / mean)} of the mean's{'' if taken else '; the mean stays'}"
+    )
+    if not taken:
+        return result
+    return replace(result, model=one.model, averaged=1, members=(), distilled=result.averaged)
 
 
 def refitted(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -291,6 +292,22 @@ def test_a_part_has_the_shortest_records():
     short = part_of(records, 0.05)  # less than one record: of each that much beyond what it skips
     assert [r.samples for r in short] == [39, 24, 39, 24, 24, 39]
     assert all(np.array_equal(a.y, b.y[: a.samples]) for a, b in zip(short, records, strict=True))
+
+
+def test_one_model_takes_the_place_of_a_mean_if_it_does_as_well(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    asked = settings(starts=2, average=2, distil=True)
+    run = identify(replace(dataset, validation=[]), asked)  # the mean is taken
+    assert run.model.sizes["nx"] == 1
+    assert run.metrics["distilled"] == 2
+    assert "stands for the mean of the best 2 starts" in str(run)
+    identify(dataset, settings(distil=True), observer=Console())
+    assert "note: distil: the model is no mean" in capsys.readouterr().out
+    monkeypatch.setattr("lfrtorch.fitting.multistart.AS_GOOD", 10.0)
+    for ratio, states in ((10.0, 1), (0.0, 2)):
+        monkeypatch.setattr("lfrtorch.job.AS_GOOD", ratio)
+        assert identify(dataset, asked).model.sizes["nx"] == states
 
 
 def test_a_refit_is_scored_on_tests_and_validation_is_that_before(

@@ -54,7 +54,7 @@ def configured(cfg: DictConfig) -> Settings:
 
 AS_THEY_ARE = (
     "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "z_feedthrough", "activation",
-    "degree", "ridge", "average", "refit", "first_part", "first_iterations", "starts",
+    "degree", "ridge", "average", "distil", "refit", "first_part", "first_iterations", "starts",
     "seed", "device",
 )  # fmt: skip
 """Settings that are the words of the configuration."""

@@ -90,6 +90,8 @@ class Settings:
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
+        distil: whether one model takes the place of a mean of several if it does as well, see
+            :func:`lfrtorch.distil`.
         refit: whether the model that validation chose is fitted to all estimation records at last,
             see :func:`lfrtorch.refit`.
         first_part: part of the training samples that the first iterations fit, which cost as much
@@ -130,6 +132,7 @@ class Settings:
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
     ridge: Ridge = 0.0
     average: int = 1
+    distil: bool = False
     refit: bool = False
     first_part: float = 1.0
     first_iterations: int = 40
@@ -157,7 +160,7 @@ class Settings:
         for name in ("nx_max", "starts", "average"):
             integer(name, getattr(self, name), 1)
         integer("seed", self.seed, 0)
-        for name in ("refit", "z_feedthrough"):
+        for name in ("distil", "refit", "z_feedthrough"):
             if not isinstance(given := getattr(self, name), bool):
                 raise InputError(f"{name} is {given!r}; give True or False.")
         known = [*signature(estimate_bla).parameters][2:]

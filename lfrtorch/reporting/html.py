@@ -367,6 +367,8 @@ def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict
         summary += f" The best of {len(ranking)} starts."
     if metrics["averaged"] > 1:
         summary += f" The model is the mean of the best {metrics['averaged']}, side by side."
+    if metrics["distilled"]:
+        summary += f" The model stands for the mean of the best {metrics['distilled']}."
     if metrics["refit"] is not None:
         summary += f" {REFITTED}"
     return {"summary": summary, "head": head, "starts": starts, "others": others}

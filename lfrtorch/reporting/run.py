@@ -82,6 +82,8 @@ class Run:
             parts.append(scores.starts_table(self.metrics) + "\n")
         if fit.averaged > 1:
             parts.append(f"The model is the mean of the best {fit.averaged} starts.\n")
+        if fit.distilled:
+            parts.append(f"The model stands for the mean of the best {fit.distilled} starts.\n")
         if self.refit is not None:
             parts.append(f"{scores.REFITTED}\n")
         parts.append(scores.table(self.metrics, self.dataset.published))

@@ -190,6 +190,7 @@ def metrics(
         "stable_to": largest_stable_amplitude(model, dataset.train),
         "starts": max(1, len(result.starts)),
         "averaged": result.averaged,
+        "distilled": result.distilled,
         "ranking": [{"seed": seeds[start.number], **asdict(start)} for start in result.starts],
     }
     return _finite(entries)
