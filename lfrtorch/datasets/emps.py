@@ -74,7 +74,9 @@ def load(
     samples, which are not scored. Those of the validation record are the last ones of training.
 
     Args:
-        validation: fraction of the estimation samples, the last of them, that validate; 0 for none.
+        validation: fraction of the estimation samples, the last of them, that validate. With 0 all
+            train, and random starts are judged on them as the test is scored: from a start state
+            that is fitted to the first samples alone.
         warm_up: first samples of the validation record, which its start state is fitted to and
             which train, too; by default as many as the test has.
         download: whether missing files are downloaded, by the package nonlinear_benchmarks.
@@ -123,6 +125,10 @@ def load(
             for _ in range(held_out > 0)
         ],
         tests=tests,
+        selection=[
+            part(estimation, warm_up, _SAMPLES, warm_up=warm_up, name="from the first samples")
+            for _ in range(held_out == 0)
+        ],
         published=_PUBLISHED,
         notes=notes,
         leaderboard=tests,

@@ -88,6 +88,9 @@ def test_the_archive_does_as_well(tmp_path):
 def test_all_samples_train(numbered):
     data = emps.load(root=numbered, validation=0)
     assert (data.train[0].samples, data.validation) == (SAMPLES, [])
+    (judged,) = data.selection
+    assert (judged.samples, scored(judged)) == (SAMPLES, (21, SAMPLES))
+    assert not emps.load(root=numbered).selection
 
 
 @pytest.mark.parametrize(
