@@ -61,7 +61,7 @@ _PUBLISHED = (
 
 def load(
     *,
-    validation: float = 0.2,
+    validation: float = 0.0,
     warm_up: int = _WINDOW,
     download: bool = False,
     root: str | Path | None = None,
@@ -84,8 +84,8 @@ def load(
             ``EMPS/EMPS.zip`` with both in it; by default the cache folder of nonlinear_benchmarks.
 
     Shape:
-        u (V), y (m) of training: (19873, 1); of validation: (4988, 1), 4968 of them scored; of the
-        test: (24841, 1), 24821 scored.
+        u (V), y (m) of training: (24841, 1), or (19873, 1) with ``validation=0.2``; of validation:
+        (4988, 1), 4968 of them scored; of the test: (24841, 1), 24821 scored.
 
     Raises:
         ValueError: an argument out of range, or a file that cannot be used.

@@ -47,7 +47,7 @@ def scored(record):
 
 
 def test_split(numbered):
-    data = emps.load(root=numbered)
+    data = emps.load(root=numbered, validation=0.2)
     (training,), (validation,), (test,) = data.train, data.validation, data.tests
     assert [r.name for r in (training, validation, test)] == ["train", "validation", "test"]
     assert scored(training) == (1, 19_873)
@@ -81,16 +81,16 @@ def test_the_archive_does_as_well(tmp_path):
             packed.write(tmp_path / file, Path(file).name)
             (tmp_path / file).unlink()
     data = emps.load(root=tmp_path)
-    assert scored(data.train[0]) == (1, 19_873)
+    assert scored(data.train[0]) == (1, SAMPLES)
     assert scored(data.tests[0]) == (-21, -SAMPLES)
 
 
 def test_all_samples_train(numbered):
-    data = emps.load(root=numbered, validation=0)
+    data = emps.load(root=numbered)
     assert (data.train[0].samples, data.validation) == (SAMPLES, [])
     (judged,) = data.selection
     assert (judged.samples, scored(judged)) == (SAMPLES, (21, SAMPLES))
-    assert not emps.load(root=numbered).selection
+    assert not emps.load(root=numbered, validation=0.2).selection
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,10 @@ def test_all_samples_train(numbered):
     [
         ({"validation": 1.0}, "leaves 0 of the 24841"),
         ({"warm_up": 0}, "warm_up is 0"),
-        ({"warm_up": 19_874}, "warm_up is 19874, and there are 19873 samples before"),
+        (
+            {"validation": 0.2, "warm_up": 19_874},
+            "warm_up is 19874, and there are 19873 samples before",
+        ),
         ({"download": "no"}, "download is 'no'; give True or False"),
     ],
 )
@@ -116,7 +119,7 @@ def test_a_missing_estimation_file_is_one_message(numbered):
 def test_a_missing_test_file_is_a_note(numbered):
     (numbered / TEST).unlink()
     data = emps.load(root=numbered)
-    assert (data.tests, data.leaderboard, data.train[0].samples) == ([], [], 19_873)
+    assert (data.tests, data.leaderboard, data.train[0].samples) == ([], [], SAMPLES)
     (note,) = data.notes
     assert note.startswith("no test records: DATA_EMPS_PULSES.mat")
     (numbered / TEST).write_bytes(b"text " * 99)
