@@ -13,25 +13,22 @@ from typing import Any, cast
 import torch
 
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.reasons import CUT_SHORT, Reason
 from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import each_alone
-from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
-from lfrtorch.fitting.distillation import distil
+from lfrtorch.fitting.first_fit import begun_on_part, part_of
 from lfrtorch.fitting.inference import infer
-from lfrtorch.fitting.multistart import AS_GOOD, fit
+from lfrtorch.fitting.last_fits import distilled, refitted
+from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.observer import LineObserver, Observer
-from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
-from lfrtorch.fitting.trainer import FitResult, Stop, StoppedError
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.fitting.trainer import FitResult, Stop
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
@@ -39,7 +36,7 @@ from lfrtorch.linear.order_scan import OrderScan, scan_orders
 from lfrtorch.linear.requirements import check_excitation, excited_directions
 from lfrtorch.linear.score_window import with_score_windows
 from lfrtorch.model import Model
-from lfrtorch.records import Record, common_unit
+from lfrtorch.records import Record
 from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import evidence
 from lfrtorch.reporting.run import Run
@@ -181,190 +178,6 @@ def _identified(
     return scored_run(
         dataset, settings, linear, result, order_scan=order_scan, size_search=sizes, again=again
     )
-
-
-def begun_on_part(
-    dataset: Dataset,
-    settings: Settings,
-    models: list[Model],
-    observer: Observer,
-    *,
-    ranks: Ranks,
-    stop: Stop | None,
-) -> tuple[Settings, list[Model]]:
-    """The best start after the first iterations, on a part of the training records.
-
-    Args:
-        dataset, ranks, stop: see :func:`identify`.
-        settings: name the part.
-        models: of all starts.
-        observer: who is told.
-
-    Returns:
-        The settings, with the seed of the start that is kept, and its model.
-    """
-    train = dataset.train
-    part = part_of(train, settings.first_part)
-    samples, all_samples = (sum(r.samples for r in records) for records in (part, train))
-    if len(part) < ranks.world or samples == all_samples:
-        observer.say(
-            f"note: first_part is {settings.first_part}, and there are {len(train)} training "
-            "record(s): all are fitted from the first iteration"
-        )
-        return settings, models
-    trainer: Any = settings.trainer
-    monitor = observer.searching()
-    result = fit(
-        models,
-        part,
-        dataset.validation,
-        dataset.selection,
-        trainer=replace(trainer, max_iter=settings.first_iterations),
-        ridge=settings.ridge,
-        monitors=None if monitor is None else [[monitor]] * len(models),
-        ranks=ranks,
-        stop=stop,
-    )
-    if result.reason in CUT_SHORT:
-        raise StoppedError("stopped during the first iterations, on a part of the records")
-    best = result.starts[0].number if result.starts else 0
-    seed = settings.seeds[best]
-    chosen = result.history[result.chosen_iteration]
-    unit = common_unit(result.model.outputs)
-    observer.say(
-        f"first {result.iterations} iterations on {samples} of {all_samples} training samples: "
-        f"{quantity(result.seconds, 's')}, error {quantity(chosen.train, unit)}, "
-        f"seed {seed}"
-    )
-    return replace(settings, seed=seed, starts=1), [result.model]
-
-
-def part_of(records: Sequence[Record], part: float) -> list[Record]:
-    """Records with a part of all samples: the shortest, or the beginning of each.
-
-    Of records of one length some are taken, spread evenly. If even the shortest record has more
-    samples than the part, that is the beginning of each record, unless it is in steady state.
-
-    Args:
-        records: of any lengths.
-        part: of their samples, more than 0, 1 at most.
-    """
-    room, found = part * sum(record.samples for record in records), []
-    if room < min(r.samples for r in records) and all(r.start != "periodic" for r in records):
-        return [_beginning(record, part) for record in records]
-    for samples in sorted({record.samples for record in records}):
-        alike = [record for record in records if record.samples == samples]
-        count = min(len(alike), max(int(not found), round(room / samples)))
-        found += [alike[i * len(alike) // count] for i in range(count)]
-        room -= count * samples
-        if count < len(alike):
-            break
-    return found
-
-
-def _beginning(record: Record, part: float) -> Record:
-    """What is skipped, and a part of the other samples."""
-    end = record.skip + math.ceil(part * (record.samples - record.skip))
-    return replace(record, u=record.u[:end], y=record.y[:end], period=None)
-
-
-def distilled(
-    dataset: Dataset,
-    settings: Settings,
-    result: FitResult,
-    observer: Observer,
-    *,
-    ranks: Ranks,
-    stop: Stop | None,
-) -> FitResult:
-    """The fit with one model in the place of a mean, if it does as well on validation."""
-    if result.reason in CUT_SHORT:
-        return result
-    if not result.members:
-        observer.say("note: distil: the model is no mean of several starts; it stays")
-        return result
-    options: Any = {"trainer": settings.trainer, "seed": settings.seed, "ranks": ranks}
-    try:
-        one = distil(
-            result,
-            dataset.train,
-            dataset.validation,
-            **options,
-            monitor=observer.searching(),
-            stop=stop,
-        )
-    except (KeyboardInterrupt, StoppedError):
-        return replace(result, reason=Reason.INTERRUPTED)
-    if one.reason in CUT_SHORT:
-        return replace(result, reason=one.reason, detail=one.detail)
-    judged = dataset.validation or dataset.train
-    problems = [SimulationProblem.judge(m, judged) for m in (one.model, result.model)]
-    costs = [problem.cost(problem.residual(problem.theta)) for problem in problems]
-    found, mean = ranks.first(torch.tensor(costs, dtype=torch.float64)).sqrt().tolist()
-    taken = found <= AS_GOOD * mean or not dataset.validation
-    on = "validation" if dataset.validation else "training"
-    observer.say(
-        f"one model for the mean of {result.averaged}: its error on {on} is "
-        f"{number(found / mean)} of the mean's{'' if taken else '; the mean stays'}"
-    )
-    if not taken:
-        return result
-    return replace(result, model=one.model, averaged=1, members=(), distilled=result.averaged)
-
-
-def refitted(
-    dataset: Dataset,
-    settings: Settings,
-    result: FitResult,
-    observer: Observer,
-    *,
-    ranks: Ranks,
-    stop: Stop | None,
-) -> tuple[FitResult, FitResult | None]:
-    """The fit and that to all estimation records; None if the model that was chosen stays.
-
-    A fit that was interrupted here has that for its reason.
-
-    Args:
-        dataset: the records without windows for scores: what need not be skipped is fitted.
-        settings, result, ranks, stop: of the fit.
-        observer: who is told.
-    """
-    held_out = [*dataset.validation, *dataset.selection]
-    if result.reason in CUT_SHORT:
-        return result, None
-    if not held_out:
-        observer.say("note: refit: there are no validation records, so all were fitted before")
-        return result, None
-    options: Any = {"trainer": settings.trainer, "ridge": settings.ridge, "ranks": ranks}
-    if settings.first_part < 1.0:  # as many as cost the same with all records
-        before = round(settings.first_part * settings.first_iterations)
-        options["iterations"] = before + result.chosen_iteration
-    try:
-        again = refit(
-            result, dataset.train, held_out, **options, monitor=observer.searching(), stop=stop
-        )
-    except (KeyboardInterrupt, StoppedError):
-        return replace(result, reason=Reason.INTERRUPTED), None
-    if again.reason in CUT_SHORT:
-        return replace(result, reason=again.reason, detail=again.detail), None
-    records = [*dataset.train, *held_out]
-    margins = torch.tensor(
-        [largest_stable_amplitude(m, records) for m in (again.model, result.model)]
-    )
-    if bool(torch.lt(*ranks.first(margins))):
-        observer.say(
-            "note: refit: the model would become unstable on louder inputs; that before it stays"
-        )
-        return result, None
-    before, after = (again.history[i].train for i in (0, again.chosen_iteration))
-    unit = common_unit(again.model.outputs)
-    observer.say(
-        f"refit to all estimation records: {again.iterations} iterations, "
-        f"{quantity(again.seconds, 's')}, their error {quantity(before, unit)} -> "
-        f"{quantity(after, unit)}; validation errors are those before it"
-    )
-    return result, again
 
 
 def windowed(

@@ -27,10 +27,11 @@ from lfrtorch import (
 )
 from lfrtorch.cli import config, fit
 from lfrtorch.distributed import Ranks
+from lfrtorch.fitting.first_fit import part_of
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.job import choose_sizes, linear_records, part_of
+from lfrtorch.job import choose_sizes, linear_records
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.reporting import Console, plots, write
 
@@ -306,7 +307,7 @@ def test_one_model_takes_the_place_of_a_mean_if_it_does_as_well(
     assert "note: distil: the model is no mean" in capsys.readouterr().out
     monkeypatch.setattr("lfrtorch.fitting.multistart.AS_GOOD", 10.0)
     for ratio, states in ((10.0, 1), (0.0, 2)):
-        monkeypatch.setattr("lfrtorch.job.AS_GOOD", ratio)
+        monkeypatch.setattr("lfrtorch.fitting.last_fits.AS_GOOD", ratio)
         assert identify(dataset, asked).model.sizes["nx"] == states
 
 
@@ -352,7 +353,7 @@ def test_a_refit_that_cannot_help_leaves_the_model(
     assert run.refit is None
     assert "note: refit: there are no validation records" in capsys.readouterr().out
     margins = iter([1.0, 2.0])
-    monkeypatch.setattr("lfrtorch.job.largest_stable_amplitude", lambda *_: next(margins))
+    monkeypatch.setattr("lfrtorch.fitting.last_fits.largest_stable_amplitude", lambda *_: next(margins))
     run = identify(dataset, settings(refit=True), observer=Console())
     assert run.model is run.fit.model
     assert "unstable on louder inputs" in capsys.readouterr().out

@@ -1,0 +1,104 @@
+"""The first iterations of a fit, on a part of the training samples, where they cost less."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from lfrtorch._support.reasons import CUT_SHORT
+from lfrtorch._support.tables import quantity
+from lfrtorch.dataset import Dataset
+from lfrtorch.distributed import Ranks
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.observer import Observer
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.trainer import Stop, StoppedError
+from lfrtorch.model import Model
+from lfrtorch.records import Record, common_unit
+
+
+def begun_on_part(
+    dataset: Dataset,
+    settings: Settings,
+    models: list[Model],
+    observer: Observer,
+    *,
+    ranks: Ranks,
+    stop: Stop | None,
+) -> tuple[Settings, list[Model]]:
+    """The best start after the first iterations, on a part of the training records.
+
+    Args:
+        dataset, ranks, stop: see :func:`lfrtorch.identify`.
+        settings: name the part.
+        models: of all starts.
+        observer: who is told.
+
+    Returns:
+        The settings, with the seed of the start that is kept, and its model.
+    """
+    train = dataset.train
+    part = part_of(train, settings.first_part)
+    samples, all_samples = (sum(r.samples for r in records) for records in (part, train))
+    if len(part) < ranks.world or samples == all_samples:
+        observer.say(
+            f"note: first_part is {settings.first_part}, and there are {len(train)} training "
+            "record(s): all are fitted from the first iteration"
+        )
+        return settings, models
+    trainer: Any = settings.trainer
+    monitor = observer.searching()
+    result = fit(
+        models,
+        part,
+        dataset.validation,
+        dataset.selection,
+        trainer=replace(trainer, max_iter=settings.first_iterations),
+        ridge=settings.ridge,
+        monitors=None if monitor is None else [[monitor]] * len(models),
+        ranks=ranks,
+        stop=stop,
+    )
+    if result.reason in CUT_SHORT:
+        raise StoppedError("stopped during the first iterations, on a part of the records")
+    best = result.starts[0].number if result.starts else 0
+    seed = settings.seeds[best]
+    chosen = result.history[result.chosen_iteration]
+    unit = common_unit(result.model.outputs)
+    observer.say(
+        f"first {result.iterations} iterations on {samples} of {all_samples} training samples: "
+        f"{quantity(result.seconds, 's')}, error {quantity(chosen.train, unit)}, "
+        f"seed {seed}"
+    )
+    return replace(settings, seed=seed, starts=1), [result.model]
+
+
+def part_of(records: Sequence[Record], part: float) -> list[Record]:
+    """Records with a part of all samples: the shortest, or the beginning of each.
+
+    Of records of one length some are taken, spread evenly. If even the shortest record has more
+    samples than the part, that is the beginning of each record, unless it is in steady state.
+
+    Args:
+        records: of any lengths.
+        part: of their samples, more than 0, 1 at most.
+    """
+    room, found = part * sum(record.samples for record in records), []
+    if room < min(r.samples for r in records) and all(r.start != "periodic" for r in records):
+        return [_beginning(record, part) for record in records]
+    for samples in sorted({record.samples for record in records}):
+        alike = [record for record in records if record.samples == samples]
+        count = min(len(alike), max(int(not found), round(room / samples)))
+        found += [alike[i * len(alike) // count] for i in range(count)]
+        room -= count * samples
+        if count < len(alike):
+            break
+    return found
+
+
+def _beginning(record: Record, part: float) -> Record:
+    """What is skipped, and a part of the other samples."""
+    end = record.skip + math.ceil(part * (record.samples - record.skip))
+    return replace(record, u=record.u[:end], y=record.y[:end], period=None)

@@ -1,0 +1,143 @@
+"""What may follow a fit: one model in the place of a mean, and a fit to all estimation records."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import torch
+
+from lfrtorch._support.reasons import CUT_SHORT, Reason
+from lfrtorch._support.tables import number, quantity
+from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
+from lfrtorch.dataset import Dataset
+from lfrtorch.distributed import Ranks
+from lfrtorch.fitting.distillation import distil
+from lfrtorch.fitting.multistart import AS_GOOD
+from lfrtorch.fitting.observer import Observer
+from lfrtorch.fitting.refit import refit
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.trainer import FitResult, Stop, StoppedError
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.records import common_unit
+
+
+def distilled(
+    dataset: Dataset,
+    settings: Settings,
+    result: FitResult,
+    observer: Observer,
+    *,
+    ranks: Ranks,
+    stop: Stop | None,
+) -> FitResult:
+    """The fit with one model in the place of a mean, if it does as well on validation."""
+    if result.reason in CUT_SHORT:
+        return result
+    if not result.members:
+        observer.say("note: distil: the model is no mean of several starts; it stays")
+        return result
+    one = _whole_or_cut(
+        result,
+        partial(
+            distil,
+            result,
+            dataset.train,
+            dataset.validation,
+            trainer=settings.trainer,
+            seed=settings.seed,
+            monitor=observer.searching(),
+            ranks=ranks,
+            stop=stop,
+        ),
+    )
+    if one.reason in CUT_SHORT:
+        return one
+    judged = dataset.validation or dataset.train
+    problems = [SimulationProblem.judge(m, judged) for m in (one.model, result.model)]
+    costs = [problem.cost(problem.residual(problem.theta)) for problem in problems]
+    found, mean = ranks.first(torch.tensor(costs, dtype=torch.float64)).sqrt().tolist()
+    taken = found <= AS_GOOD * mean or not dataset.validation
+    on = "validation" if dataset.validation else "training"
+    observer.say(
+        f"one model for the mean of {result.averaged}: its error on {on} is "
+        f"{number(found / mean)} of the mean's{'' if taken else '; the mean stays'}"
+    )
+    if not taken:
+        return result
+    return replace(result, model=one.model, averaged=1, members=(), distilled=result.averaged)
+
+
+def refitted(
+    dataset: Dataset,
+    settings: Settings,
+    result: FitResult,
+    observer: Observer,
+    *,
+    ranks: Ranks,
+    stop: Stop | None,
+) -> tuple[FitResult, FitResult | None]:
+    """The fit and that to all estimation records; None if the model that was chosen stays.
+
+    A fit that was interrupted here has that for its reason.
+
+    Args:
+        dataset: the records without windows for scores: what need not be skipped is fitted.
+        settings, result, ranks, stop: of the fit.
+        observer: who is told.
+    """
+    held_out = [*dataset.validation, *dataset.selection]
+    if result.reason in CUT_SHORT:
+        return result, None
+    if not held_out:
+        observer.say("note: refit: there are no validation records, so all were fitted before")
+        return result, None
+    iterations = result.chosen_iteration
+    if settings.first_part < 1.0:  # as many as cost the same with all records
+        iterations += round(settings.first_part * settings.first_iterations)
+    again = _whole_or_cut(
+        result,
+        partial(
+            refit,
+            result,
+            dataset.train,
+            held_out,
+            trainer=settings.trainer,
+            ridge=settings.ridge,
+            iterations=iterations,
+            monitor=observer.searching(),
+            ranks=ranks,
+            stop=stop,
+        ),
+    )
+    if again.reason in CUT_SHORT:
+        return again, None
+    records = [*dataset.train, *held_out]
+    margins = torch.tensor(
+        [largest_stable_amplitude(m, records) for m in (again.model, result.model)]
+    )
+    if bool(torch.lt(*ranks.first(margins))):
+        observer.say(
+            "note: refit: the model would become unstable on louder inputs; that before it stays"
+        )
+        return result, None
+    before, after = (again.history[i].train for i in (0, again.chosen_iteration))
+    unit = common_unit(again.model.outputs)
+    observer.say(
+        f"refit to all estimation records: {again.iterations} iterations, "
+        f"{quantity(again.seconds, 's')}, their error {quantity(before, unit)} -> "
+        f"{quantity(after, unit)}; validation errors are those before it"
+    )
+    return result, again
+
+
+def _whole_or_cut(before: FitResult, again: Callable[[], FitResult]) -> FitResult:
+    """A fit that follows another one; if it was cut short, the one before with that reason."""
+    try:
+        result = again()
+    except (KeyboardInterrupt, StoppedError):
+        return replace(before, reason=Reason.INTERRUPTED)
+    if result.reason in CUT_SHORT:
+        return replace(before, reason=result.reason, detail=result.detail)
+    return result
