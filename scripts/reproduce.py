@@ -47,7 +47,7 @@ STAND_IN = "stand-in"
 
 CASES = {
     "boucwen": ["+bench=boucwen"],
-    "boucwen_nz1": ["+bench=boucwen", "nz=1"],
+    "boucwen_nz1": ["+bench=boucwen", "nz=1", "nn=15", "refit=false"],
     "boucwen_record": ["+bench=boucwen_record"],
     "parwh": ["+bench=parwh"],
     "parwh_stand_in": ["+bench=parwh", f"data.source={STAND_IN}"],
