@@ -19,6 +19,7 @@ from scipy.sparse.linalg import ArpackError, eigsh
 from torch import Tensor
 
 from lfrtorch._support.threads import spread
+from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 
 MERGED = 16
@@ -28,6 +29,8 @@ PIECES, TALL = 16, 8
 """Rows are cut into at most 16 pieces for the threads, each at least 8 times as tall as wide: the
 merge of their triangles then takes at most an eighth of the work."""
 
+WIDE, PANELS = 256, 16
+"""JᵀJ of more columns, in rows too few for pieces, is found in panels that the threads share."""
 
 KRYLOV = 400
 """Parameters from which the largest eigenvalue is found without the others."""
@@ -214,7 +217,14 @@ class GramAccumulator:
 
     def fold(self, rows: Float[Tensor, "m n"]) -> None:
         """Add rows."""
-        self.add(*_of_pieces(_square, rows))
+        n = rows.shape[1]
+        if rows.device.type != "cpu" or n < WIDE or _pieces(rows) > 1:
+            self.add(*_of_pieces(_square, rows))
+            return
+        if not self._parts:
+            self._parts = [rows.new_zeros(n, n)]
+        edges = np.linspace(0, n, PANELS + 1).astype(int)
+        spread(_add_panels, PANELS // 2, edges, rows.numpy(), self._parts[0].numpy())
 
     def absorb(
         self,
@@ -261,11 +271,15 @@ def _of_pieces(
 
     The pieces do not depend on the number of threads, and so neither do the digits of their sum.
     """
-    most = PIECES if rows.device.type == "cpu" else 1
-    pieces = rows.tensor_split(max(1, min(most, len(rows) // (TALL * rows.shape[1]))))
+    pieces = rows.tensor_split(_pieces(rows))
     parts: list[Tensor] = [rows[:0]] * len(pieces)
     spread(kernel, len(pieces), pieces, parts)
     return parts
+
+
+def _pieces(rows: Tensor) -> int:
+    most = PIECES if rows.device.type == "cpu" else 1
+    return max(1, min(most, len(rows) // (TALL * rows.shape[1])))
 
 
 def _triangularise(job: int, pieces: Sequence[Tensor], parts: list[Tensor]) -> None:
@@ -274,6 +288,17 @@ def _triangularise(job: int, pieces: Sequence[Tensor], parts: list[Tensor]) -> N
 
 def _square(job: int, pieces: Sequence[Tensor], parts: list[Tensor]) -> None:
     parts[job] = product(pieces[job].mT, pieces[job])
+
+
+def _add_panels(job: int, edges: Array, rows: Array, G: Array) -> None:
+    """Add two panels of rowsᵀ rows to G: one wide and one narrow, so that all jobs are alike."""
+    for panel in (job, PANELS - 1 - job):
+        first, last = edges[panel], edges[panel + 1]
+        own = rows[:, first:last]
+        beside = own.T @ rows[:, :first]
+        G[first:last, first:last] += own.T @ own
+        G[first:last, :first] += beside
+        G[:first, first:last] += beside.T
 
 
 def product(left: Float[Tensor, "m k"], right: Float[Tensor, "k n"]) -> Float[Tensor, "m n"]:

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from lfrtorch.least_squares.linear_systems import (
     KRYLOV,
+    WIDE,
     CholeskySystem,
     GramAccumulator,
     QRAccumulator,
@@ -32,6 +33,18 @@ def test_blocks_are_one_piece(kind, threads: int, monkeypatch):
     for block in rows.split([1, 3, 40, 200, 56]):
         factor.fold(block)
     assert_close(squares(factor), rows.mT @ rows, rtol=1e-12, atol=1e-11)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_blocks_of_many_columns(threads: int, monkeypatch):
+    """In panels, and in pieces where a block is tall; more columns than a panel count divides."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    n = WIDE + 3
+    rows, factor = normal(20 * n, n), GramAccumulator()
+    for block in rows.split([n, 2, 18 * n, n - 2]):
+        factor.fold(block)
+    assert_close(factor.G, rows.mT @ rows, rtol=1e-11, atol=1e-9)
+    assert torch.equal(factor.G, factor.G.mT)
 
 
 def test_many_small_blocks_do_not_pile_up():
