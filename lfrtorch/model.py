@@ -67,12 +67,18 @@ class Model:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a map of the user's own."""
+        """nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a map of the user's own.
+
+        The number of hidden layers is among them if there are several.
+        """
         cell = self.lfr.cell
         sizes = {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw}
         if isinstance(cell.static, Polynomial):
             return sizes | {"degree": cell.static.degree}
-        return sizes | {"nn": len(cell.static.bz) if is_network(cell.static) else 0}
+        if not is_network(cell.static):
+            return sizes | {"nn": 0}
+        layers = {"layers": cell.static.layers} if cell.static.layers > 1 else {}
+        return sizes | {"nn": len(cell.static.bz)} | layers
 
     @property
     def parameters(self) -> int:
@@ -216,6 +222,8 @@ class Model:
         if is_network(cell.static):
             static = {"type": "Network", "nn": len(cell.static.bz)}
             static["activation"] = cell.static.activation
+            if cell.static.layers > 1:
+                static["layers"] = cell.static.layers
         elif type(cell.static) is Polynomial:
             static = {"type": "Polynomial", "degree": cell.static.degree}
         elif cell.static is not None:
@@ -320,7 +328,10 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         )
         match made:
             case {"type": "Network", "nn": nn, "activation": activation}:
-                static = Network(sizes["nz"], sizes["nw"], nn, activation, dtype=dtype)
+                layers = made.get("layers", 1)
+                static = Network(
+                    sizes["nz"], sizes["nw"], nn, activation, layers=layers, dtype=dtype
+                )
             case {"type": "Polynomial", "degree": degree}:
                 static = Polynomial(sizes["nz"], sizes["nw"], degree, dtype=dtype)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)

@@ -53,9 +53,9 @@ def configured(cfg: DictConfig) -> Settings:
 
 
 AS_THEY_ARE = (
-    "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "z_feedthrough", "activation",
-    "degree", "ridge", "average", "distil", "refit", "first_part", "first_iterations", "starts",
-    "seed", "device",
+    "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "layers", "z_feedthrough",
+    "activation", "degree", "ridge", "average", "distil", "refit", "first_part",
+    "first_iterations", "starts", "seed", "device",
 )  # fmt: skip
 """Settings that are the words of the configuration."""
 
@@ -76,7 +76,7 @@ def opened(cfg: DictConfig) -> lfrtorch.Model:
             "lfrtorch fit, or leave it out, as a fit starts from a linear model of its own."
         )
     model = lfrtorch.load(cfg.init_from, static=own)
-    for name, size in model.sizes.items():
+    for name, size in {"layers": 1, **model.sizes}.items():
         if cfg[name] not in (size, None):
             print(
                 f"note: {name} is {size}, that of the model in '{cfg.init_from}', not {cfg[name]}"

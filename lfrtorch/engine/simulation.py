@@ -197,8 +197,10 @@ def _compiled(
     near.x[:, 0] = x0
     static, activation, growth = cell.static, "tanh", np.zeros((0, 2), np.int64)
     vectors, matrices = [u.new_zeros(0), u.new_zeros(cell.nw)], [u.new_zeros(0, 0)] * 2
+    inner: list[Tensor] = []
     if is_network(static):
         vectors, matrices = [static.bz, static.bw], [static.Wz.mT, static.Ww]
+        inner = [part for W, b in static.inner for part in (W.mT, b if b.ndim == 3 else b[None])]
         activation = static.activation
     elif is_polynomial(static):
         matrices[1], growth = static.C, np.array(static.growth)
@@ -206,6 +208,8 @@ def _compiled(
     # A leading axis, for one model or one a record.
     weights = [m if m.ndim == 3 else m.unsqueeze(0) for m in (*lti, *matrices)]
     weights += [v if v.ndim == 3 else v[None, None] for v in vectors]
+    layers = torch.cat(inner or [u.new_zeros(0, 0)], dim=-2)
+    weights.append(layers if layers.ndim == 3 else layers.unsqueeze(0))
     weights = [w.expand(len(weights[0]), -1, -1) for w in weights]  # zeros in the place of others
     met_within = MET_ROUNDING * torch.finfo(u.dtype).eps
     arguments = [to_numpy(u), *map(to_numpy, weights), ACTIVATION_CODES[activation], growth]

@@ -322,6 +322,7 @@ def infer(
     nw: int,
     nn: int | None = None,
     activation: str = "tanh",
+    layers: int = 1,
     static: Module | None = None,
     degree: int = 4,
     seed: int = 0,
@@ -342,9 +343,9 @@ def infer(
         bla: stable linear model, best in balanced coordinates.
         records: the data that are to be fitted, in steady state (``start="periodic"``).
         nz, nw: inputs and outputs of the static nonlinearity.
-        nn, activation: neurons of the hidden layer and their function.
-        static: the map z -> w in the layer's place, copied: a ``Network``, a ``Polynomial`` or any
-            module from (..., nz) to (..., nw) whose weights a search can find from where they are.
+        nn, activation, layers: neurons of each hidden layer, their function, and how many layers.
+        static: the map z -> w in the network's place, copied: a ``Network``, a ``Polynomial`` or
+            any module from (..., nz) to (..., nw) whose weights a search can find.
         degree: of the polynomial that is learnt.
         seed: of the random weights, and of the choice of lines and samples.
         dtype: of the weights.
@@ -368,7 +369,16 @@ def infer(
                 "(start='periodic'): use initialise(method='zero_output'), init=zero_output."
             )
     plain = initialise(
-        bla, data, nz=nz, nw=nw, nn=nn, activation=activation, static=static, seed=seed, dtype=dtype
+        bla,
+        data,
+        nz=nz,
+        nw=nw,
+        nn=nn,
+        activation=activation,
+        layers=layers,
+        static=static,
+        seed=seed,
+        dtype=dtype,
     )
     assert plain.lfr.cell.static is not None
     if not list(plain.lfr.cell.static.parameters()):

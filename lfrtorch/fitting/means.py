@@ -24,7 +24,8 @@ def mean_model(models: Sequence[Model]) -> Model:
     neurons of all: A, Bw, Cz, Wz and Ww are block diagonal.
 
     Args:
-        models: of the same data, each with a network of the same activation; they are copied.
+        models: of the same data, each with a network of the same activation and number of layers;
+            they are copied.
 
     Raises:
         ValueError: no model, or models of other channels, scales, rates or static maps.
@@ -45,8 +46,11 @@ def mean_model(models: Sequence[Model]) -> Model:
                 f"the mean is of models with a network, and one of these has {static!r} as its "
                 "static nonlinearity; average the simulated outputs instead."
             )
-        if networks and static.activation != networks[0].activation:
-            raise InputError("the models have networks of different activations; give one kind.")
+        kind = static.activation, static.layers
+        if networks and kind != (networks[0].activation, networks[0].layers):
+            raise InputError(
+                "the models have networks of different activations or layers; give one kind."
+            )
         if not _alike(model, first):
             raise InputError(
                 "the models have other channels, scales or rates than each other; give models "
@@ -68,7 +72,8 @@ def mean_model(models: Sequence[Model]) -> Model:
     nx, nz, nw = (sum(getattr(cell, n) for cell in cells) for n in ("nx", "nz", "nw"))
     nn = sum(len(network.bz) for network in networks)
     like = {"device": cells[0].A.device, "dtype": cells[0].A.dtype}
-    network = Network(nz, nw, nn, networks[0].activation, **like)
+    activation, layers = networks[0].activation, networks[0].layers
+    network = Network(nz, nw, nn, activation, layers=layers, **like)
     cell = LFRCell(cells[0].nu, cells[0].ny, nx, nz, nw, network, **like)
     with torch.no_grad():
         cell.A.copy_(blocks(lambda c: c.A))
@@ -79,10 +84,9 @@ def mean_model(models: Sequence[Model]) -> Model:
         cell.Cy.copy_(beside(lambda c: c.Cy))
         cell.Dyw.copy_(beside(lambda c: c.Dyw))
         cell.Dyu.copy_(torch.stack([c.Dyu for c in cells]).mean(dim=0))
-        network.Wz.copy_(torch.block_diag(*(n.Wz for n in networks)))
-        network.Ww.copy_(torch.block_diag(*(n.Ww for n in networks)))
-        network.bz.copy_(torch.cat([n.bz for n in networks]))
-        network.bw.copy_(torch.cat([n.bw for n in networks]))
+        for name, weight in network.named_parameters():
+            parts = [n.get_parameter(name) for n in networks]
+            weight.copy_(torch.block_diag(*parts) if weight.ndim == 2 else torch.cat(parts))
     cell.Dzu.requires_grad_(any(c.Dzu.requires_grad for c in cells))
     return replace(first, lfr=LFR(cell))
 

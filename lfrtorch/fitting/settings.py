@@ -75,7 +75,9 @@ class Settings:
             Required, unless ``init_from`` brings it.
         nx_max: highest order that ``nx="auto"`` tries.
         nz, nw: inputs and outputs of the static nonlinearity; ``"auto"`` searches for them.
-        nn, activation: neurons of ``static="network"``, or ``"auto"``, and their function.
+        nn, activation: neurons of each layer of ``static="network"``, or ``"auto"``, and their
+            function.
+        layers: its hidden layers.
         degree: of ``static="polynomial"``, or ``"auto"``.
         static: ``"network"``, ``"polynomial"``, or what makes a map of one's own: called with the
             keywords nz and nw it returns a module from (..., nz) to (..., nw), for example the
@@ -121,6 +123,7 @@ class Settings:
     nw: Size = 1
     nn: Size = 15
     activation: str = "tanh"
+    layers: int = 1
     degree: Size = 3
     static: Literal["network", "polynomial"] | Callable[..., Module] = "network"
     init: Literal["zero_output", "paper", "inference"] = "zero_output"
@@ -155,9 +158,10 @@ class Settings:
             )
         if self.init_from is None:
             self._check_sizes()
-        for name, size in () if self.init_from is None else self.init_from.sizes.items():
-            object.__setattr__(self, name, size)
-        for name in ("nx_max", "starts", "average"):
+        if self.init_from is not None:
+            for name, size in {"layers": 1, **self.init_from.sizes}.items():
+                object.__setattr__(self, name, size)
+        for name in ("layers", "nx_max", "starts", "average"):
             integer(name, getattr(self, name), 1)
         integer("seed", self.seed, 0)
         for name in ("distil", "refit", "z_feedthrough"):
@@ -227,7 +231,7 @@ class Settings:
     def size_names(self) -> tuple[str, ...]:
         """Sizes of the static nonlinearity: nz, nw, and nn or degree."""
         if self.init_from is not None:
-            return tuple(name for name in self.init_from.sizes if name != "nx")
+            return tuple(n for n in self.init_from.sizes if n not in ("nx", "layers"))
         return ("nz", "nw", *(size for kind, size in LAST_SIZE.items() if self.static == kind))
 
     @property
@@ -252,7 +256,7 @@ class Settings:
     def static_map(self) -> dict[str, Any]:
         """The arguments of :func:`lfrtorch.initialise` that say which static map there is."""
         if self.static == "network":
-            return {"nn": self.nn, "activation": self.activation}
+            return {"nn": self.nn, "activation": self.activation, "layers": self.layers}
         if self.static == "polynomial":
             assert isinstance(self.nz, int)
             assert isinstance(self.nw, int)

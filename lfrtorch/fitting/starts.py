@@ -43,6 +43,7 @@ def initialise(
     nw: int,
     nn: int | None = None,
     activation: str = "tanh",
+    layers: int = 1,
     static: Module | None = None,
     method: Literal["zero_output", "paper"] = "zero_output",
     seed: int = 0,
@@ -59,8 +60,9 @@ def initialise(
 
     Signals and states are scaled to unit standard deviation over the records, and so is every z:
     C*, D* ~ U(-1, 1), then Cz, Dzu = C*, D* over the standard deviation of C* x + D* u. The static
-    map is one hidden layer, Wz and bz ~ U(-1, 1), bw = 0, or a module of the caller's own with its
-    weights as they are. The two methods differ in what keeps w out of the start:
+    map is a ``Network`` with its own draw (Wz and bz ~ U(-1, 1), bw = 0), or a module of the
+    caller's own with its weights as they are. The two methods differ in what keeps w out of the
+    start:
 
     - ``"paper"``: Bw = Dyw = 0 and Ww ~ U(-1, 1) (Schoukens and Tóth 2020);
     - ``"zero_output"``: Ww = 0 and Bw, Dyw ~ U(-0.3, 0.3) (after Schoukens 2021), for a polynomial
@@ -85,9 +87,9 @@ def initialise(
         bla: stable linear model, best in balanced coordinates.
         records: the data that are to be fitted.
         nz, nw: inputs and outputs of the static nonlinearity.
-        nn, activation: neurons of the hidden layer and their function.
-        static: the map z -> w in the layer's place, copied: a ``Network``, a ``Polynomial`` or any
-            module from (..., nz) to (..., nw); nn and activation are then of no use.
+        nn, activation, layers: neurons of each hidden layer, their function, and how many layers.
+        static: the map z -> w in the network's place, copied: a ``Network``, a ``Polynomial`` or
+            any module from (..., nz) to (..., nw); nn, activation and layers are then of no use.
         method: which of the two starts.
         seed: of the random weights.
         minor: what counts as next to nothing: the part of a mode in the output over the model's
@@ -135,7 +137,7 @@ def initialise(
     if static is None:
         integer("nn", nn, 1)
         assert nn is not None
-        static = Network(nz, nw, nn, activation, dtype=dtype)
+        static = Network(nz, nw, nn, activation, layers=layers, dtype=dtype)
         static.reset_parameters(generator)
     else:
         static = deepcopy(static).to(dtype)

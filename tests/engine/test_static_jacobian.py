@@ -34,8 +34,8 @@ class Cube(nn.Module):
         return z**3
 
 
-def network(activation: str) -> Network:
-    static = Network(nz, nw, 4, activation, dtype=torch.float64)
+def network(activation: str, layers: int = 1) -> Network:
+    static = Network(nz, nw, 4, activation, layers=layers, dtype=torch.float64)
     for p, weight in zip(static.parameters(), weights_of(static).values(), strict=True):
         p.data = weight
     return static
@@ -75,8 +75,9 @@ def check(jacobian: StaticJacobian, static: nn.Module, weights: list[dict[str, T
 
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
-def test_network(activation: str):
-    static, z = network(activation), normal(R, T, nz)
+@pytest.mark.parametrize("layers", [1, 2, 4])
+def test_network(activation: str, layers: int):
+    static, z = network(activation, layers), normal(R, T, nz)
     weights = weights_of(static)
     check(linearise_static(static, z, weights), static, [weights, weights], z)
 
@@ -128,9 +129,10 @@ def test_values_and_slopes_of_own_weights_for_every_record():
     )
 
 
-def test_network_with_own_weights_for_every_record():
-    base, z = network("tanh"), normal(R, T, nz)
+@pytest.mark.parametrize("layers", [1, 3])
+def test_network_with_own_weights_for_every_record(layers: int):
+    base, z = network("tanh", layers), normal(R, T, nz)
     each = [weights_of(base, seed=10 * r + 1) for r in range(R)]
     stacked = {name: torch.stack([w[name] for w in each]) for name in each[0]}
-    stacked |= {name: stacked[name].unsqueeze(1) for name in ("bz", "bw")}
+    stacked |= {name: w.unsqueeze(1) for name, w in stacked.items() if w.ndim == 2}
     check(linearise_static(base, z, stacked), base, each, z)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Polynomial
+from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.least_squares.joint import JointProblem, stacked
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
@@ -31,7 +31,12 @@ class Bend(nn.Module):
 
 pytestmark = pytest.mark.numeric
 
-STATICS = {"network": lambda: None, "polynomial": lambda: Polynomial(2, 1, 2), "own": Bend}
+STATICS = {
+    "network": lambda: None,
+    "layers": lambda: Network(2, 1, 3, layers=2),
+    "polynomial": lambda: Polynomial(2, 1, 2),
+    "own": Bend,
+}
 KINDS = pytest.mark.parametrize("kind", sorted(STATICS))
 
 

@@ -64,9 +64,9 @@ def refused(folder: Path, message: str):
 
 @pytest.mark.numeric
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("activation", ["tanh", "relu"])
-def test_the_same_bits_come_back(tmp_path: Path, activation: str, dtype: torch.dtype):
-    model = small(activation=activation, dtype=dtype)
+@pytest.mark.parametrize(("activation", "layers"), [("tanh", 1), ("relu", 1), ("tanh", 3)])
+def test_the_same_bits_come_back(tmp_path: Path, activation: str, layers: int, dtype: torch.dtype):
+    model = small(activation=activation, layers=layers, dtype=dtype)
     back = load(model.save(tmp_path / "saved"))
     mine, other = model.lfr.state_dict(), back.lfr.state_dict()
     assert mine.keys() == other.keys()
