@@ -353,7 +353,9 @@ def test_a_refit_that_cannot_help_leaves_the_model(
     assert run.refit is None
     assert "note: refit: there are no validation records" in capsys.readouterr().out
     margins = iter([1.0, 2.0])
-    monkeypatch.setattr("lfrtorch.fitting.last_fits.largest_stable_amplitude", lambda *_: next(margins))
+    monkeypatch.setattr(
+        "lfrtorch.fitting.last_fits.largest_stable_amplitude", lambda *_: next(margins)
+    )
     run = identify(dataset, settings(refit=True), observer=Console())
     assert run.model is run.fit.model
     assert "unstable on louder inputs" in capsys.readouterr().out
