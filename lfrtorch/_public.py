@@ -1,6 +1,6 @@
 """The public names: the first that is asked for imports them all, and torch with them."""
 
-from lfrtorch import datasets, distributed, reporting
+from lfrtorch import datasets, distributed, export, reporting
 
 # data
 from lfrtorch.dataset import Dataset, Published
@@ -78,6 +78,7 @@ __all__ = [
     "distributed",
     "estimate_bla",
     "estimate_frf",
+    "export",
     "fit",
     "identify",
     "infer",

@@ -16,7 +16,9 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 
-COMMAND = re.compile(r"^    lfrtorch (fit|linear|simulate|evaluate) (.+?)(?: +#.*)?$", re.MULTILINE)
+COMMAND = re.compile(
+    r"^    lfrtorch (fit|linear|simulate|evaluate|export) (.+?)(?: +#.*)?$", re.MULTILINE
+)
 COMMANDS = sorted(
     {
         found

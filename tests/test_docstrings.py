@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import lfrtorch
-from lfrtorch import FRF, LinearModel, Model, analysis, datasets, distributed
+from lfrtorch import FRF, LinearModel, Model, analysis, datasets, distributed, export
 from lfrtorch.reporting import linear_plots, plots, survey_plots
 
 REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "api" / "lfrtorch.md"
@@ -22,7 +22,7 @@ MODULES = [
     *(importlib.import_module(f"{analysis.__name__}.{m.name}")
       for m in pkgutil.iter_modules(analysis.__path__)),
     *(getattr(datasets, name) for name in datasets.__all__),
-    distributed, plots, linear_plots, survey_plots,
+    distributed, export, plots, linear_plots, survey_plots,
 ]  # fmt: skip
 
 WITHOUT = {"distributed.ProcessGroup"}

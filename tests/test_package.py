@@ -48,7 +48,8 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     names = {name for name in ZipFile(wheel).namelist() if ".dist-info/" not in name}
     sources = {str(path.relative_to(ROOT)) for path in (ROOT / "lfrtorch").rglob("*.py")}
     settings = {f"lfrtorch/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
-    others = {"lfrtorch/py.typed", "lfrtorch/reporting/templates/report.html"}
+    templates = (ROOT / "lfrtorch").rglob("templates/*")
+    others = {"lfrtorch/py.typed", *(str(path.relative_to(ROOT)) for path in templates)}
     assert names == sources | settings | others
 
 

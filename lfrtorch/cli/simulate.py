@@ -52,9 +52,7 @@ def simulate(cfg: DictConfig) -> None:
     require(cfg)
     pairs = targets(cfg)
     model = opened(str(cfg.checkpoint))
-    sizes = ", ".join(f"{name} {size}" for name, size in model.sizes.items() if size)
-    u, y = (", ".join(map(str, channels)) for channels in (model.inputs, model.outputs))
-    print(f"{cfg.checkpoint}: {u} -> {y} at {model.fs:g} Hz, {sizes}")
+    print(introduced(str(cfg.checkpoint), model))
     check_rate(cfg, model)
     rows = []
     for path, out in pairs:
@@ -259,6 +257,13 @@ def opened(folder: str) -> lfrtorch.Model:
     if "linear" in description:
         return lfrtorch.LinearModel.load(folder).to_model()
     return lfrtorch.load(folder)
+
+
+def introduced(folder: str, model: lfrtorch.Model) -> str:
+    """Channels, rate and sizes in a line."""
+    sizes = ", ".join(f"{name} {size}" for name, size in model.sizes.items() if size)
+    u, y = (", ".join(map(str, channels)) for channels in (model.inputs, model.outputs))
+    return f"{folder}: {u} -> {y} at {model.fs:g} Hz, {sizes}"
 
 
 def require(cfg: DictConfig) -> None:

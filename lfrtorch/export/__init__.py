@@ -1,0 +1,6 @@
+"""A model as a program of other tools, in physical units: C and more to come."""
+
+from lfrtorch.export.c_source import c_source
+from lfrtorch.export.targets import TARGETS, write
+
+__all__ = ["TARGETS", "c_source", "write"]

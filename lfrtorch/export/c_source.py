@@ -1,0 +1,138 @@
+"""A model as C99 that needs nothing but math.h."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from lfrtorch._support.types import Array
+from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+
+ACTIVATIONS = {
+    "tanh": ("tanh(v[i])", "1.0 - h[i] * h[i]"),
+    "sigmoid": ("1.0 / (1.0 + exp(-v[i]))", "h[i] * (1.0 - h[i])"),
+    "relu": ("v[i] < 0.0 ? 0.0 : v[i]", "v[i] > 0.0 ? 1.0 : 0.0"),
+    "rbf": ("exp(-v[i] * v[i])", "-2.0 * v[i] * h[i]"),
+    "softplus": (
+        "(v[i] < 0.0 ? 0.0 : v[i]) + log1p(exp(-fabs(v[i])))",
+        "1.0 / (1.0 + exp(-v[i]))",
+    ),
+}
+"""h = σ(v) and σ'(v); a v that is not a number stays one."""
+
+LINE = 96
+"""Most columns of a line of numbers."""
+
+
+def c_source(model: Model | LinearModel, name: str = "model") -> tuple[str, str]:
+    """A model as C99: one step, its Jacobians, and the state at rest.
+
+    ``NAME_step`` is one sample in physical units, ``NAME_jacobians`` the matrices of the model
+    linearised at a state and an input, ``NAME_reset`` the state 0. Sizes and the sampling time
+    are macros, as ``NAME_NX`` and ``NAME_TS``. The code allocates nothing and keeps no state of
+    its own. It computes in double precision.
+
+    Args:
+        model: what is exported.
+        name: beginning of all names of the code.
+
+    Returns:
+        The texts of ``NAME.h`` and ``NAME.c``.
+
+    Raises:
+        ValueError: a static map of the user's own class, or a name that is no identifier.
+
+    Example:
+        >>> header, source = lfrtorch.export.c_source(model, "actuator")
+        >>> [line for line in header.splitlines() if line.startswith("#define ACTUATOR_T")]
+        ['#define ACTUATOR_TS 0.01 /* sampling time, s */']
+        >>> [line for line in source.splitlines() if line.startswith("#include")]
+        ['#include "actuator.h"', '#include <math.h>']
+    """
+    import jinja2
+
+    check_name(name)
+    e = equations(model)
+    known = {"name": name, "NAME": name.upper(), "ts": repr(1.0 / e.fs), **e.sizes}
+    known |= {"about": comment(e.about(name)), "static": e.static, "arrays": list(_arrays(e))}
+    inner = {"NZ": e.sizes["nz"], "NW": e.sizes["nw"]} if e.static else {}
+    match e.static:
+        case Layers():
+            known["value"], known["slope"] = ACTIVATIONS[e.static.activation]
+            known |= {"activation": e.static.activation, "layers": e.static.names[:-1]}
+            inner["NN"] = len(e.static.b[0])
+        case Monomials():
+            known["monomials"] = True
+            inner |= {"NM": e.static.C.shape[1], "NS": len(e.static.slopes)}
+    known["inner"] = inner.items()
+    templates = jinja2.Environment(
+        loader=jinja2.PackageLoader("lfrtorch.export"),
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+    )  # fmt: skip
+    header, source = (templates.get_template(f"model.{kind}").render(known) for kind in "hc")
+    return header, source
+
+
+def _arrays(e: Equations) -> Iterator[str]:
+    """All constants, in the order in which the equations name them."""
+    for name, size in (
+        ("u_offset", "NU"), ("y_offset", "NY"), ("A", "NX * NX"), ("Bu", "NX * NU"),
+        ("Cy", "NY * NX"), ("Dyu", "NY * NU"), ("Cz", "NZ * NX"), ("Dzu", "NZ * NU"),
+        ("Bw", "NX * NW"), ("Dyw", "NY * NW"),
+    ):  # fmt: skip
+        value = getattr(e, name)
+        if value.size:
+            yield constant(name, size, value)
+    match e.static:
+        case Layers():
+            sizes = ["NN * NZ", *["NN * NN"] * (len(e.static.W) - 2), "NW * NN"]
+            weights = zip(e.static.names, sizes, e.static.W, e.static.b, strict=True)
+            for (W, b), size, weight, bias in weights:
+                yield constant(W, size, weight)
+                yield constant(b, size[:2], bias)
+        case Monomials():
+            yield constant("C", "NW * NM", e.static.C)
+            growth, slopes = (
+                braces([[f"{{{', '.join(map(str, row))}}}" for row in rows]])
+                for rows in (e.static.growth, e.static.slopes)
+            )
+            yield "/* Monomial i + 1 is one monomial times one z. */"
+            yield f"static const int growth[NM - 1][2] = {growth};"
+            yield "/* (n, j, e, m): the derivative of monomial n by z[j] is e times monomial m. */"
+            yield f"static const int slopes[NS][4] = {slopes};"
+
+
+def constant(name: str, size: str, value: Array) -> str:
+    """A vector or a matrix, row by row."""
+    rows = [[repr(float(number)) for number in row] for row in np.atleast_2d(value)]
+    return f"static const double {name}[{size}] = {braces(rows)};"
+
+
+def braces(rows: Sequence[Sequence[str]]) -> str:
+    """Numbers in braces, each row from a new line; each of them is read back to the same bits."""
+    lines = []
+    for row in rows:
+        line = "   "
+        for number in row:
+            if len(line) + len(number) + 2 > LINE:
+                lines.append(line)
+                line = "   "
+            line += f" {number},"
+        lines.append(line)
+    return "\n".join(["{", *lines, "}"])
+
+
+def comment(lines: Sequence[str]) -> str:
+    """Lines as a comment."""
+    return "\n".join(["/*", *(f" * {plain(line)}".rstrip() for line in lines), " */"])
+
+
+def plain(text: str) -> str:
+    """A text in one line that neither ends a comment of C nor begins one."""
+    text = "".join(sign if sign.isprintable() else " " for sign in text)
+    for pair in ("*/", "/*", "??"):
+        text = text.replace(pair, " ".join(pair))
+    return text

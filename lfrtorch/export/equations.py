@@ -1,0 +1,212 @@
+"""The equations of a model in physical units: what every export writes down."""
+
+from __future__ import annotations
+
+import keyword
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from importlib.metadata import version
+
+import numpy as np
+from torch import Tensor
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
+from lfrtorch.engine.nonlinearity import is_network, is_polynomial
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+from lfrtorch.records import Channel
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """w = W h + b with the last W and b, where h = σ(W h + b) of the layers before and first h = z.
+
+    Args:
+        W, b: of all layers, the first one first.
+        activation: σ, a name of ``Network``.
+    """
+
+    W: tuple[Array, ...]
+    b: tuple[Array, ...]
+    activation: str
+
+    @property
+    def names(self) -> list[tuple[str, str]]:
+        """The letters of the layers: Wz and bz, W2 and b2, .., Ww and bw."""
+        inner = [(f"W{layer}", f"b{layer}") for layer in range(2, len(self.W))]
+        return [("Wz", "bz"), *inner, ("Ww", "bw")]
+
+
+@dataclass(frozen=True, eq=False)
+class Monomials:
+    """w = C m(z).
+
+    Args:
+        C: (nw, monomials).
+        growth: a pair (m, j) for each monomial but the constant, which is monomial m times z_j.
+        slopes: entries (n, j, e, m): the derivative of monomial n by z_j is e times monomial m.
+    """
+
+    C: Array
+    growth: Sequence[tuple[int, int]]
+    slopes: Sequence[tuple[int, int, int, int]]
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """A model with u and y as measured and x in the coordinates of the model::
+
+        v  = u - u_offset
+        x+ = A  x + Bu  v + Bw  w
+        z  = Cz x + Dzu v
+        w  = f(z)
+        y  = Cy x + Dyu v + Dyw w + y_offset
+
+    Args:
+        A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw: matrices; nz = nw = 0 of a linear model.
+        u_offset, y_offset: operating point.
+        static: f; None for a linear model.
+        fs: sampling frequency in Hz.
+        inputs, outputs: channel names and units.
+    """
+
+    A: Array
+    Bu: Array
+    Bw: Array
+    Cz: Array
+    Dzu: Array
+    Cy: Array
+    Dyu: Array
+    Dyw: Array
+    u_offset: Array
+    y_offset: Array
+    static: Layers | Monomials | None
+    fs: float
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """nx, nu, ny, nz and nw."""
+        (nz, nx), (ny, nw) = self.Cz.shape, self.Dyw.shape
+        return {"nx": nx, "nu": len(self.u_offset), "ny": ny, "nz": nz, "nw": nw}
+
+    def about(self, name: str) -> list[str]:
+        """What a reader of the export should know: equations, channels, units, offsets, rate."""
+        match self.static:
+            case Layers(activation=sigma):
+                h = "z"
+                for W, b in self.static.names[:-1]:
+                    h = f"{sigma}({W} {h} + {b})"
+                static = [f"w      = f(z) = Ww {h} + bw"]
+            case Monomials():
+                static = ["w      = f(z) = C m, m = 1, z1, z2, .., z1 z1, z1 z2, .."]
+            case None:
+                static = []
+        z, w, bw = (["z      = Cz x + Dzu v"], " + Dyw w", " + Bw w") if static else ([], "", "")
+        kind = "nonlinear" if static else "linear"
+        return [
+            f"{name}: a {kind} state-space model in physical units, sampled at {self.fs:g} Hz,",
+            f"by lfrtorch {version('lfrtorch')}.",
+            "",
+            "    v      = u - u_offset",
+            *(f"    {line}" for line in z + static),
+            f"    y      = Cy x + Dyu v{w} + y_offset",
+            f"    x_next = A x + Bu v{bw}",
+            "",
+            *signals("u", self.inputs, self.u_offset),
+            *signals("y", self.outputs, self.y_offset),
+        ]
+
+
+def signals(letter: str, channels: Sequence[Channel], offset: Array) -> list[str]:
+    """A line for each channel: its place, name, unit and operating point."""
+    return [
+        f"{letter}[{i}]: {channel}, operating point {number:.6g}"
+        for i, (channel, number) in enumerate(zip(channels, offset, strict=True))
+    ]
+
+
+def equations(model: Model | LinearModel) -> Equations:
+    """The equations of a model.
+
+    Raises:
+        ValueError: a static map of the user's own class, or weights that are not finite.
+    """
+    model = model.to_model() if isinstance(model, LinearModel) else model
+    cell, s = model.lfr.cell, model.scaler
+    found = Equations(
+        A=numbers(cell.A),
+        Bu=numbers(cell.Bu) / s.u_scale,
+        Bw=numbers(cell.Bw),
+        Cz=numbers(cell.Cz),
+        Dzu=numbers(cell.Dzu) / s.u_scale,
+        Cy=numbers(cell.Cy) * s.y_scale[:, None],
+        Dyu=numbers(cell.Dyu) * s.y_scale[:, None] / s.u_scale,
+        Dyw=numbers(cell.Dyw) * s.y_scale[:, None],
+        u_offset=np.asarray(s.u_offset, dtype=np.float64),
+        y_offset=np.asarray(s.y_offset, dtype=np.float64),
+        static=static_map(model),
+        fs=model.fs,
+        inputs=model.inputs,
+        outputs=model.outputs,
+    )
+    parts: list[Array] = [a for part in (found, found.static) if part for a in arrays(part)]
+    if not all(np.isfinite(part).all() for part in parts):
+        raise InputError("the model has weights that are not finite; nothing can be exported.")
+    return found
+
+
+def static_map(model: Model) -> Layers | Monomials | None:
+    """f, as far as this package knows its equations."""
+    static = model.lfr.cell.static
+    if static is None:
+        return None
+    if is_network(static):
+        W = static.Wz, *(W for W, _ in static.inner), static.Ww
+        b = static.bz, *(b for _, b in static.inner), static.bw
+        return Layers(tuple(map(numbers, W)), tuple(map(numbers, b)), static.activation)
+    if is_polynomial(static):
+        return Monomials(numbers(static.C), static.growth, static.slopes)
+    raise InputError(
+        f"the static map is a {type(static).__name__}, a class of your own, whose equations are "
+        "not known; a Network or a Polynomial can be exported."
+    )
+
+
+def numbers(weight: Tensor) -> Array:
+    """A weight as an array of float64."""
+    return weight.detach().cpu().double().numpy()
+
+
+def arrays(part: Equations | Layers | Monomials) -> list[Array]:
+    """All arrays of a part."""
+    found: list[Array] = []
+    for field in fields(part):
+        value = getattr(part, field.name)
+        found += [a for a in (value if isinstance(value, tuple) else [value]) if is_array(a)]
+    return found
+
+
+def is_array(value: object) -> bool:
+    """Whether it is an array of numbers."""
+    return isinstance(value, np.ndarray)
+
+
+RESERVED = {
+    "case", "catch", "classdef", "else", "elseif", "end", "function", "otherwise", "parfor",
+    "persistent", "spmd", "switch", "hess", "jac", "null",
+}  # fmt: skip
+"""Words of MATLAB and CasADi that are no name, beside those of Python."""
+
+
+def check_name(name: str) -> None:
+    """Refuse what is no identifier in each of the languages with a ValueError."""
+    word = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and "__" not in name
+    if not word or keyword.iskeyword(name) or name in RESERVED:
+        raise InputError(
+            f"name is {name!r}; give letters, digits and single underscores, a letter first, and "
+            "no keyword of a language, as name=engine."
+        )

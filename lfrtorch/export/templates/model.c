@@ -1,0 +1,187 @@
+/* See {{ name }}.h. */
+#include "{{ name }}.h"
+
+#include <math.h>
+
+enum {
+    NX = {{ NAME }}_NX,
+    NU = {{ NAME }}_NU,
+    NY = {{ NAME }}_NY,
+{% for letters, size in inner %}
+    {{ letters }} = {{ size }},
+{% endfor %}
+};
+
+{% for array in arrays %}
+{{ array }}
+{% endfor %}
+
+/* to += M v, with M of rows x columns. */
+static void add(double *to, const double *M, const double *v, int rows, int columns)
+{
+    for (int i = 0; i < rows; i++)
+        for (int j = 0; j < columns; j++)
+            to[i] += M[i * columns + j] * v[j];
+}
+
+{% if static %}
+/* to += M N, with M of rows x inner and N of inner x columns. */
+static void add_product(double *to, const double *M, const double *N, int rows, int inner,
+    int columns)
+{
+    for (int i = 0; i < rows; i++)
+        for (int k = 0; k < inner; k++)
+            for (int j = 0; j < columns; j++)
+                to[i * columns + j] += M[i * inner + k] * N[k * columns + j];
+}
+
+{% endif %}
+static void copy(double *to, const double *from, int count)
+{
+    for (int i = 0; i < count; i++)
+        to[i] = from[i];
+}
+
+/* v = u - u_offset. */
+static void deviation(const double *u, double *v)
+{
+    for (int i = 0; i < NU; i++)
+        v[i] = u[i] - u_offset[i];
+}
+
+{% if layers %}
+/* h = {{ activation }}(W g + b), and with dg = dg/dz its derivatives dh = dh/dz, which may be left out (0). */
+static void layer(const double *W, const double *b, const double *g, const double *dg, int count,
+    double *h, double *dh)
+{
+    double v[NN];
+    copy(v, b, NN);
+    add(v, W, g, NN, count);
+    for (int i = 0; i < NN; i++)
+        h[i] = {{ value }};
+    if (!dh)
+        return;
+    for (int i = 0; i < NN * NZ; i++)
+        dh[i] = 0.0;
+    add_product(dh, W, dg, NN, count, NZ);
+    for (int i = 0; i < NN; i++)
+        for (int j = 0; j < NZ; j++)
+            dh[i * NZ + j] *= {{ slope }};
+}
+
+/* w = f(z). */
+static void map(const double *z, double *w)
+{
+    double h[{{ layers | length }}][NN];
+{% for W, b in layers %}
+{% if loop.first %}
+    layer({{ W }}, {{ b }}, z, 0, NZ, h[0], 0);
+{% else %}
+    layer({{ W }}, {{ b }}, h[{{ loop.index0 - 1 }}], 0, NN, h[{{ loop.index0 }}], 0);
+{% endif %}
+{% endfor %}
+    copy(w, bw, NW);
+    add(w, Ww, h[{{ layers | length - 1 }}], NW, NN);
+}
+
+/* J = dw/dz. */
+static void map_jacobian(const double *z, double *J)
+{
+    double h[{{ layers | length }}][NN], dz[NZ * NZ] = {0.0}, dh[{{ layers | length }}][NN * NZ];
+    for (int i = 0; i < NZ; i++)
+        dz[i * NZ + i] = 1.0;
+{% for W, b in layers %}
+{% if loop.first %}
+    layer({{ W }}, {{ b }}, z, dz, NZ, h[0], dh[0]);
+{% else %}
+{% set last, now = loop.index0 - 1, loop.index0 %}
+    layer({{ W }}, {{ b }}, h[{{ last }}], dh[{{ last }}], NN, h[{{ now }}], dh[{{ now }}]);
+{% endif %}
+{% endfor %}
+    for (int i = 0; i < NW * NZ; i++)
+        J[i] = 0.0;
+    add_product(J, Ww, dh[{{ layers | length - 1 }}], NW, NN, NZ);
+}
+
+{% endif %}
+{% if monomials %}
+/* m = 1, z1, z2, .., z1 z1, z1 z2, ..: each is an earlier one times one z. */
+static void products(const double *z, double *m)
+{
+    m[0] = 1.0;
+    for (int i = 1; i < NM; i++)
+        m[i] = m[growth[i - 1][0]] * z[growth[i - 1][1]];
+}
+
+/* w = f(z). */
+static void map(const double *z, double *w)
+{
+    double m[NM];
+    products(z, m);
+    for (int i = 0; i < NW; i++)
+        w[i] = 0.0;
+    add(w, C, m, NW, NM);
+}
+
+/* J = dw/dz. */
+static void map_jacobian(const double *z, double *J)
+{
+    double m[NM];
+    products(z, m);
+    for (int i = 0; i < NW * NZ; i++)
+        J[i] = 0.0;
+    for (int s = 0; s < NS; s++)
+        for (int i = 0; i < NW; i++)
+            J[i * NZ + slopes[s][1]] += slopes[s][2] * C[i * NM + slopes[s][0]] * m[slopes[s][3]];
+}
+
+{% endif %}
+void {{ name }}_reset(double x[NX])
+{
+    for (int i = 0; i < NX; i++)
+        x[i] = 0.0;
+}
+
+void {{ name }}_step(const double x[NX], const double u[NU], double x_next[NX], double y[NY])
+{
+    double v[NU], next[NX] = {0.0};
+    deviation(u, v);
+    copy(y, y_offset, NY);
+    add(y, Cy, x, NY, NX);
+    add(y, Dyu, v, NY, NU);
+    add(next, A, x, NX, NX);
+    add(next, Bu, v, NX, NU);
+{% if static %}
+    double z[NZ] = {0.0}, w[NW];
+    add(z, Cz, x, NZ, NX);
+    add(z, Dzu, v, NZ, NU);
+    map(z, w);
+    add(y, Dyw, w, NY, NW);
+    add(next, Bw, w, NX, NW);
+{% endif %}
+    copy(x_next, next, NX);
+}
+
+void {{ name }}_jacobians(const double x[NX], const double u[NU], double dx_dx[NX * NX],
+    double dx_du[NX * NU], double dy_dx[NY * NX], double dy_du[NY * NU])
+{
+    copy(dx_dx, A, NX * NX);
+    copy(dx_du, Bu, NX * NU);
+    copy(dy_dx, Cy, NY * NX);
+    copy(dy_du, Dyu, NY * NU);
+{% if static %}
+    double v[NU], z[NZ] = {0.0}, J[NW * NZ], dw_dx[NW * NX] = {0.0}, dw_du[NW * NU] = {0.0};
+    deviation(u, v);
+    add(z, Cz, x, NZ, NX);
+    add(z, Dzu, v, NZ, NU);
+    map_jacobian(z, J);
+    add_product(dw_dx, J, Cz, NW, NZ, NX);
+    add_product(dw_du, J, Dzu, NW, NZ, NU);
+    add_product(dx_dx, Bw, dw_dx, NX, NW, NX);
+    add_product(dx_du, Bw, dw_du, NX, NW, NU);
+    add_product(dy_dx, Dyw, dw_dx, NY, NW, NX);
+    add_product(dy_du, Dyw, dw_du, NY, NW, NU);
+{% else %}
+    (void)x, (void)u; /* the model is linear: the same everywhere */
+{% endif %}
+}

@@ -1,0 +1,31 @@
+{{ about }}
+#ifndef {{ NAME }}_H
+#define {{ NAME }}_H
+
+#define {{ NAME }}_NX {{ nx }} /* states */
+#define {{ NAME }}_NU {{ nu }} /* inputs */
+#define {{ NAME }}_NY {{ ny }} /* outputs */
+#define {{ NAME }}_TS {{ ts }} /* sampling time, s */
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* The state to start from: x = 0, that of the operating point. */
+void {{ name }}_reset(double x[{{ NAME }}_NX]);
+
+/* The output y at this sample, and the state at the next one. x_next may be x itself. */
+void {{ name }}_step(const double x[{{ NAME }}_NX], const double u[{{ NAME }}_NU],
+    double x_next[{{ NAME }}_NX], double y[{{ NAME }}_NY]);
+
+/* The model linearised at x and u: its matrices A = dx_next/dx, B = dx_next/du, C = dy/dx and
+ * D = dy/du, row by row. */
+void {{ name }}_jacobians(const double x[{{ NAME }}_NX], const double u[{{ NAME }}_NU],
+    double dx_dx[{{ NAME }}_NX * {{ NAME }}_NX], double dx_du[{{ NAME }}_NX * {{ NAME }}_NU],
+    double dy_dx[{{ NAME }}_NY * {{ NAME }}_NX], double dy_du[{{ NAME }}_NY * {{ NAME }}_NU]);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

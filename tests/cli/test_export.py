@@ -1,0 +1,70 @@
+"""Exports from the command line: files, what is printed, messages; nothing half written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from exported import MODELS
+
+from lfrtorch import export as exports
+from lfrtorch.cli import export
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    MODELS["tanh"].save(tmp_path / "model")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    monkeypatch.setattr("sys.argv", ["lfrtorch export", *words])
+    export.launch()
+
+
+def test_c_is_written_with_its_use(folder: Path, monkeypatch, capsys):
+    run(monkeypatch, "checkpoint=model", "to=c", "name=engine", "out=firmware/src")
+    expected = exports.c_source(MODELS["tanh"], "engine")
+    found = [folder / "firmware" / "src" / f"engine.{kind}" for kind in "hc"]
+    assert tuple(path.read_text() for path in found) == expected
+    assert capsys.readouterr().out.splitlines() == [
+        "model: u1 (N), u2 (N) -> y1 (mm), y2 (mm), y3 (mm) at 100 Hz, nx 4, nz 2, nw 3, nn 5",
+        "written: firmware/src/engine.h, firmware/src/engine.c",
+        "use: engine_step(x, u, x_next, y);",
+    ]
+
+
+def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
+    (folder / "model.c").write_text("old")
+    run(monkeypatch, "checkpoint=model", "to=c", "overwrite=true")
+    assert "model_step" in (folder / "model.c").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["to=c"], "checkpoint is not set: add checkpoint=DIR"),
+        (["checkpoint=model"], "to is not set: add to=c"),
+        (["checkpoint=model", "to=rust"], "to is 'rust'; give one of c"),
+        (["checkpoint=model", "to=c", "name=1"], "name is '1'; give letters"),
+        (
+            ["checkpoint=model", "to=c", "name=there"],
+            "'there.c' exists; give another name, or overwr",
+        ),
+        (["checkpoint=none", "to=c"], "there is no 'none'"),
+        (["checkpoint=model", "to=c", "nane=x"], "did you mean name=x?"),
+    ],
+)
+def test_user_errors_are_one_message(
+    words: list[str], message: str, folder: Path, monkeypatch, capsys
+):
+    (folder / "there.c").write_text("")
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, *words)
+    printed = capsys.readouterr()
+    assert stop.value.code == 1
+    assert message in printed.err
+    assert "Traceback" not in printed.err
+    assert sorted(folder.rglob("*")) == before

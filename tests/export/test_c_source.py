@@ -1,0 +1,163 @@
+"""The C of a model, compiled without a warning and run beside the model."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from exported import MODELS, check_run, check_step, inputs, jacobians
+from reference import random_cell, random_model
+
+from lfrtorch import InputError
+from lfrtorch._support.types import Array
+from lfrtorch.export import c_source, write
+from lfrtorch.model import Model
+from lfrtorch.records import Channel
+
+GCC = shutil.which("gcc") or shutil.which("cc") or ""
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wshadow", "-Werror", "-pedantic"]
+
+needs_compiler = pytest.mark.skipif(not GCC, reason="there is no C compiler, gcc or cc")
+
+
+def compiled(folder: Path, models: dict[str, Model], *options: str) -> ctypes.CDLL:
+    """A library of several models."""
+    for name, model in models.items():
+        for kind, text in zip("hc", c_source(model, name), strict=True):
+            (folder / f"{name}.{kind}").write_text(text)
+    sources = [f"{name}.c" for name in models]
+    command = [GCC, *STRICT, *options, "-shared", "-fPIC", "-o", "models.so", *sources, "-lm"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    return ctypes.CDLL(str(folder / "models.so"))
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    return compiled(tmp_path_factory.mktemp("c"), MODELS)
+
+
+def call(library: ctypes.CDLL, function: str, *arrays: Array) -> None:
+    getattr(library, function)(*(a.ctypes.data_as(ctypes.c_void_p) for a in arrays))
+
+
+@needs_compiler
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", MODELS)
+def test_steps_are_those_of_the_model(name: str, library: ctypes.CDLL):
+    model = MODELS[name]
+
+    def step(x: Array, u: Array) -> tuple[Array, Array]:
+        x_next, y = np.full_like(x, np.nan), np.full(len(model.outputs), np.nan)
+        call(library, f"{name}_step", x, u, x_next, y)
+        return x_next, y
+
+    check_step(step, model)
+    check_run(step, model)
+
+
+@needs_compiler
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", MODELS)
+def test_jacobians_are_those_of_the_model(name: str, library: ctypes.CDLL):
+    model = MODELS[name]
+    u, x = inputs(model, 1)[0], np.random.default_rng(4).normal(size=model.lfr.cell.nx)
+    expected = jacobians(model, x, u)
+    found = [np.full_like(one, np.nan) for one in expected]
+    call(library, f"{name}_jacobians", x, u, *found)
+    for one, other in zip(found, expected, strict=True):
+        assert np.abs(one - other).max() <= 1e-12 * np.abs(other).max()
+
+
+@needs_compiler
+@pytest.mark.numeric
+def test_the_state_may_be_replaced_in_place(library: ctypes.CDLL):
+    u, x, y = inputs(MODELS["layers"], 1)[0], np.array([0.3, -0.2, 0.1]), np.empty(2)
+    x_next = np.empty(3)
+    call(library, "layers_step", x, u, x_next, y)
+    call(library, "layers_step", x, u, x, y)
+    assert np.array_equal(x, x_next)
+    call(library, "layers_reset", x)
+    assert not x.any()
+
+
+@needs_compiler
+@pytest.mark.parametrize("activation", ["sigmoid", "relu", "softplus"])
+def test_activations_far_out(activation: str, tmp_path: Path):
+    """No overflow, and a number that is none stays visible."""
+    model = random_model(random_cell(1, 1, 1, 1, 1, 3, activation=activation))
+    library = compiled(tmp_path, {"far": model})
+    for x, finite in ((1e6, True), (-1e6, True), (np.nan, False)):
+        x_next, y = np.empty(1), np.empty(1)
+        call(library, "far_step", np.array([x]), np.zeros(1), x_next, y)
+        with torch.no_grad():
+            v = -torch.tensor(model.scaler.u_offset / model.scaler.u_scale)
+            expected = model.lfr.cell(v, torch.tensor([x], dtype=torch.float64))[1].numpy()
+        assert np.allclose(x_next, expected, rtol=1e-12, equal_nan=True)
+        assert np.isfinite(y).all() == finite
+
+
+@needs_compiler
+def test_channels_of_any_name_stay_comments(tmp_path: Path):
+    model = MODELS["smallest"]
+    names = Channel("*/ #error /* ??/", "\\\nµm/°C\u202e"), Channel("y\n", "*/*")
+    odd = Model(model.lfr, model.scaler, model.fs, (names[0],), (names[1],))
+    compiled(tmp_path, {"odd": odd})
+    text = (tmp_path / "odd.h").read_text()
+    assert " * u[0]: * / #error / * ? ?/ (\\ µm/°C ), operating point 0.12573\n" in text
+
+
+def test_the_header_says_what_a_reader_needs():
+    header, source = c_source(MODELS["smallest"], "motor_2")
+    for text in (
+        "#define MOTOR_2_TS 0.0013333333333333333 /* sampling time, s */",
+        "#define MOTOR_2_NX 1 ",
+        " * motor_2: a nonlinear state-space model in physical units, sampled at 750 Hz,",
+        " *     w      = f(z) = Ww tanh(Wz z + bz) + bw",
+        " * u[0]: u1 (N), operating point 0.12573",
+        " * y[0]: y1 (mm), operating point 0.640",
+    ):
+        assert text in header
+    assert max(map(len, (header + source).splitlines())) <= 100
+    assert {line for line in source.splitlines() if "#include" in line} == {
+        '#include "motor_2.h"',
+        "#include <math.h>",
+    }
+
+
+@pytest.mark.parametrize("name", ["2nd", "a-b", "a b", "", "end", "lambda", "_x", "a__b", "é"])
+def test_names_that_are_no_identifiers_are_refused(name: str):
+    with pytest.raises(InputError, match="give letters, digits and single underscores"):
+        c_source(MODELS["linear"], name)
+
+
+def test_what_has_no_equations_is_refused():
+    own = random_model(random_cell(1, 1, 1, 1, 1, static=torch.nn.Linear(1, 1)))
+    with pytest.raises(InputError, match="the static map is a Linear, a class of your own"):
+        c_source(own)
+    lost = random_model(random_cell())
+    with torch.no_grad():
+        lost.lfr.cell.A[0, 0] = torch.nan
+    with pytest.raises(InputError, match="weights that are not finite"):
+        c_source(lost)
+
+
+@needs_compiler
+@pytest.mark.numeric
+def test_the_program_of_the_guide_simulates(tmp_path: Path):
+    guide = Path(__file__).resolve().parents[2] / "docs" / "guide" / "export.md"
+    program = guide.read_text(encoding="utf-8").split("```c\n")[1].split("```")[0]
+    (tmp_path / "main.c").write_text(program)
+    write(MODELS["smallest"], "c", tmp_path, name="engine")
+    command = [GCC, *STRICT, "main.c", "engine.c", "-lm", "-o", "run"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    printed = subprocess.run([tmp_path / "run"], capture_output=True, text=True, check=True).stdout
+    times, y = np.array([line.split() for line in printed.splitlines()], dtype=float).T
+    assert np.allclose(times, np.arange(100) / 750.0, rtol=1e-5)
+    u = np.repeat([1.0, 0.0], 50)
+    assert np.allclose(y, MODELS["smallest"].simulate(u)[:, 0], rtol=0, atol=1e-8)

@@ -1,0 +1,74 @@
+"""Models to export, and the model's own numbers that an export must have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from reference import polynomial_cell, random_cell, random_model
+from torch.func import jacrev
+
+from lfrtorch._support.types import Array
+from lfrtorch.engine.nonlinearity import ACTIVATIONS
+from lfrtorch.model import Model
+
+Step = Callable[[Array, Array], tuple[Array, Array]]
+"""(x, u) -> (x_next, y), physical units."""
+
+MODELS: dict[str, Model] = {
+    **{name: random_model(random_cell(2, 3, 4, 2, 3, 5, activation=name)) for name in ACTIVATIONS},
+    "layers": random_model(random_cell(3, 2, 3, 2, 1, 4, layers=3)),
+    "polynomial": random_model(polynomial_cell(2, 2, 3)),
+    "affine": random_model(polynomial_cell(1, 1, 1)),
+    "linear": random_model(random_cell(2, 2, 3, 0, 0)),
+    "smallest": random_model(random_cell(1, 1, 1, 1, 1, 1), fs=750.0),
+}
+"""Every activation, several layers, polynomials, no static map, one of everything."""
+
+
+def inputs(model: Model, T: int) -> Array:
+    """White noise about the operating point, (T, nu)."""
+    noise = np.random.default_rng(7).normal(size=(T, len(model.inputs)))
+    return model.scaler.u_offset + model.scaler.u_scale * noise
+
+
+def cell_step(model: Model, x: torch.Tensor, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """One sample by the cell of the model, physical units."""
+    s = {name: torch.tensor(value) for name, value in vars(model.scaler).items()}
+    y, x_next = model.lfr.cell((u - s["u_offset"]) / s["u_scale"], x)
+    return x_next, y * s["y_scale"] + s["y_offset"]
+
+
+def check_step(step: Step, model: Model) -> None:
+    """One sample from several states is that of the model to 1e-12."""
+    generator = np.random.default_rng(3)
+    for u in inputs(model, 5):
+        x = generator.normal(size=model.lfr.cell.nx)
+        with torch.no_grad():
+            expected = cell_step(model, torch.tensor(x), torch.tensor(u))
+        for found, one in zip(step(x, u), expected, strict=True):
+            assert found.shape == one.shape
+            assert np.abs(found - one.numpy()).max() <= 1e-12 * np.abs(one.numpy()).max()
+
+
+def check_run(step: Step, model: Model) -> None:
+    """A thousand samples from rest are those of the model to 1e-10 of the output's rms."""
+    u, x, y = inputs(model, 1000), np.zeros(model.lfr.cell.nx), []
+    for u_k in u:
+        x, y_k = step(x, u_k)
+        y.append(y_k)
+    check_output(np.array(y), model, u)
+
+
+def check_output(y: Array, model: Model, u: Array) -> None:
+    """An output from rest is that of the model to 1e-10 of its rms."""
+    expected = model.simulate(u)
+    assert y.shape == expected.shape
+    assert (np.abs(y - expected).max(axis=0) <= 1e-10 * expected.std(axis=0)).all()
+
+
+def jacobians(model: Model, x: Array, u: Array) -> list[Array]:
+    """dx+/dx, dx+/du, dy/dx and dy/du by torch."""
+    by = jacrev(lambda x, u: cell_step(model, x, u), argnums=(0, 1))
+    return [one.detach().numpy() for each in by(torch.tensor(x), torch.tensor(u)) for one in each]
