@@ -236,6 +236,8 @@ class Model:
             "inputs": [c._asdict() for c in self.inputs],
             "outputs": [c._asdict() for c in self.outputs],
         }
+        if not (cell.Dzu.requires_grad or cell.Dzu.any()):
+            description["z_feedthrough"] = False
         weights = dict(self.lfr.cell.state_dict())
         scaling = ("u_offset", "u_scale", "y_offset", "y_scale")
         weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in scaling}
@@ -336,6 +338,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
                 static = Polynomial(sizes["nz"], sizes["nw"], degree, dtype=dtype)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         cell.load_state_dict(weights)
+        cell.Dzu.requires_grad_(description.get("z_feedthrough", True))
         channels = [
             tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")
         ]

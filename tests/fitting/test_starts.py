@@ -21,7 +21,7 @@ from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rmse
-from lfrtorch.model import Model
+from lfrtorch.model import Model, load
 from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
@@ -316,8 +316,8 @@ def test_every_start_finds_a_nonlinearity_at_one_end(end: str):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_nonlinearity_of_the_states_alone(method):
-    """Dzu is 0 before and after a fit; else the start is that of any model."""
+def test_a_nonlinearity_of_the_states_alone(method, tmp_path):
+    """Dzu is 0 before and after a fit, and saved so; else the start is that of any model."""
     bla = estimate_bla(RECORDS, 3)
     models = [
         initialise(bla, RECORDS, **SIZES, method=method, seed=seed, z_feedthrough=False)
@@ -327,7 +327,7 @@ def test_a_nonlinearity_of_the_states_alone(method):
     assert np.allclose(models[0].simulate(RECORDS[1]), bla.simulate(RECORDS[1]))
     z = torch.cat([models[0].signals(record).z[0] for record in RECORDS])
     assert torch.allclose(z.std(dim=0, correction=0), torch.ones(2, dtype=z.dtype))
-    for model in (models[0], mean):
+    for model in (models[0], mean, load(models[1].save(tmp_path / "model"))):
         before = model.lfr.cell.Cz.detach().clone()
         fit(model, RECORDS, trainer=LevenbergMarquardt(max_iter=2), monitors=[])
         assert not model.lfr.cell.Dzu.any()
