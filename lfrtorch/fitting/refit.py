@@ -2,9 +2,9 @@
 
 The fit goes on from the model that was chosen, for as many iterations as the new samples are worth:
 if K iterations over n samples were best on validation, m samples more get K m / n, and no more than
-the fit was allowed. Many more would spoil short records, as K itself stops the fit before it learns
-their noise. A fit from the first start, for K iterations, may end in another minimum, and nothing
-is left to tell.
+the fit was allowed. A sample of weight 2, a mean of two periods, counts twice. Many more iterations
+would spoil short records, as K itself stops the fit before it learns their noise. A fit from the
+first start, for K iterations, may end in another minimum, and nothing is left to tell.
 """
 
 from __future__ import annotations
@@ -68,7 +68,10 @@ def refit(
         True
     """
     train, held_out = as_records(train), as_records(held_out)
-    seen, new = (sum(r.samples - r.skip for r in records) for records in (train, held_out))
+    seen, new = (
+        sum(float(np.mean(r.weight)) * (r.samples - r.skip) for r in records)
+        for records in (train, held_out)
+    )
     base: Any = LevenbergMarquardt() if trainer is None else trainer
     chosen = result.chosen_iteration if iterations is None else iterations
     limit = min(ceil(chosen * new / seen), base.limit)

@@ -70,6 +70,8 @@ def test_iterations_are_in_proportion_to_the_new_samples():
     for chosen, iterations in ((8, 2), (5, 2), (0, 0)):
         again = refit(replace(result, chosen_iteration=chosen), train, held_out)
         assert again.iterations == iterations
+    mean_of_four = replace(result, chosen_iteration=8)
+    assert refit(mean_of_four, replace(train, weight=4.0), held_out).iterations == 1
 
 
 @pytest.mark.numeric
