@@ -1,6 +1,6 @@
 """The public names: the first that is asked for imports them all, and torch with them."""
 
-from lfrtorch import datasets, distributed, export, reporting
+from lfrtorch import analysis, datasets, distributed, export, reporting
 
 # data
 from lfrtorch.dataset import Dataset, Published
@@ -73,6 +73,7 @@ __all__ = [
     "SizeSearch",
     "SizesSearch",
     "Snapshots",
+    "analysis",
     "datasets",
     "distil",
     "distributed",

@@ -41,7 +41,7 @@ from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import evidence
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
-from lfrtorch.reporting.simulations import respond
+from lfrtorch.reporting.simulations import respond, worst_residuals
 from lfrtorch.reporting.verdict import judge
 
 SEARCHED_STARTS = 2
@@ -225,6 +225,7 @@ def scored_run(
     last = None if again is None else again.model
     simulations = respond(result.model, linear, dataset, test_linear, refitted=last)
     verdict = judge(result, simulations)
+    residuals = worst_residuals(simulations)
     found = evidence(
         result,
         simulations,
@@ -245,6 +246,7 @@ def scored_run(
         search=size_search,
         verdict=verdict,
         refit=again,
+        residuals=residuals,
     )
     return Run(
         dataset=dataset,
@@ -256,6 +258,7 @@ def scored_run(
         fit=result,
         refit=again,
         simulations=simulations,
+        residuals=residuals,
         metrics=numbers,
         verdict=verdict,
         advice=advise(found),

@@ -204,7 +204,9 @@ def test_a_run_is_written_for_people_and_programs(
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics == {**run.metrics, "command": "a notebook"}
     assert logged.count("rmse/train") == len(run.fit.history)
-    for name in ("report.html", "figures/test.png"):
+    assert run.residuals is not None
+    assert list(metrics["residuals"]) == [run.residuals.worst] == ["test"]
+    for name in ("report.html", "figures/test.png", "figures/residuals.png"):
         assert (tmp_path / "run" / name).is_file()
     test = dataset.tests[0]
     for saved in (

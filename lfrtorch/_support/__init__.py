@@ -1,1 +1,1 @@
-"""What every room uses and no user sees: checks, errors, files, tables, threads, types."""
+"""What every room uses and no user sees: checks, drawing, errors, files, tables, threads, types."""

@@ -1,1 +1,5 @@
-"""What a fitted model is: its poles, and how loud its inputs may be."""
+"""What a fitted model is, and how far it may be trusted: residuals, poles, amplitudes."""
+
+from lfrtorch.analysis.residual_analysis import Residuals, residuals
+
+__all__ = ["Residuals", "residuals"]

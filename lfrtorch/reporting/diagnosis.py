@@ -16,15 +16,14 @@ from scipy.stats import f
 
 from lfrtorch._support.reasons import SPENT, Reason
 from lfrtorch._support.types import Array
+from lfrtorch.analysis.densities import noise_of_periods
 from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import UNLIKE
-from lfrtorch.linear.spectra import spectra_of_periods
 from lfrtorch.metrics import rms
 from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
-from lfrtorch.records import Record
 from lfrtorch.reporting.explained import explained_parts
 from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict
@@ -76,13 +75,6 @@ BEGINNING = 0.05
 
 LAST = 5
 """Iterations that the pace of a search is taken from, at least; of a long one the last tenth."""
-
-PARTS = 10
-"""Parts of time in which the differences between periods are looked at."""
-
-STEADY = 4.0
-"""Power of the differences between periods in a tenth of them over the median of all tenths, from
-which on they are no noise but a transient or a disturbance."""
 
 
 @dataclass(frozen=True)
@@ -319,22 +311,6 @@ def evidence(
     )
 
 
-def noise_of_periods(records: Sequence[Record]) -> Array | None:
-    """Standard deviation (ny,) of the noise in the outputs, from the differences between periods.
-
-    None if no record has two periods, if an input does not repeat, if the periods differ, or if
-    the differences are not steady: those of a transient or a disturbance are no noise.
-    """
-    try:
-        spectra = spectra_of_periods(records)
-    except ValueError:
-        return None
-    if not spectra.freedom or not all(_steady(record, spectra.N) for record in records):
-        return None
-    power = np.diagonal(spectra.C, axis1=1, axis2=2).real  # of each line
-    return np.sqrt(power[1:, : records[0].y.shape[1]].sum(axis=0))
-
-
 def falling(result: FitResult) -> float:
     """Part by which the error that chooses fell over a tenth of the iterations, at the last pace.
 
@@ -423,20 +399,6 @@ def _by_output(responses: Sequence[Response]) -> dict[str, float]:
     if len(outputs) == 1 or not np.isfinite(error).all():
         return {}
     return {c.name: float(e / b) for c, e, b in zip(outputs, error, linear, strict=True) if b > 0}
-
-
-def _steady(record: Record, N: int) -> bool:
-    """Whether the differences between successive periods of N samples have the same power in time.
-
-    The first of two periods may have a transient, which is no noise.
-    """
-    count = (record.samples - record.skip) // N
-    if count < 2:
-        return True
-    periods = record.y[record.samples - count * N :].reshape(count, N, -1)
-    power = np.diff(periods, axis=0).reshape((count - 1) * N, -1) ** 2
-    parts = np.array([part.mean(axis=0) for part in np.array_split(power, PARTS)])
-    return bool(np.all(parts.max(axis=0) <= STEADY * np.median(parts, axis=0)))
 
 
 def _transient(

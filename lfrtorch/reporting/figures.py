@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from matplotlib.figure import Figure
@@ -12,10 +11,9 @@ from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.metrics import nrmse
 from lfrtorch.records import Record
 from lfrtorch.reporting import linear_plots, plots
-from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.simulations import Response, ranked
 
 MOST_OUTPUTS, MOST_RECORDS = 4, 4
 """Outputs in one figure, and records of which the report has all views."""
@@ -54,11 +52,8 @@ def of_run(
 
 def of_records(simulated: Sequence[Response], dataset: Dataset) -> tuple[dict[str, Figure], Views]:
     """Errors of all tests, and all views of the records with the largest errors."""
-    uses = [use for use in ("test", "validation", "train") if any(r.use == use for r in simulated)]
-    ranked = [response for response in simulated if response.use == uses[0]]
-    ranked.sort(key=_relative, reverse=True)
     largest: dict[str, Response] = {}
-    for response in ranked:
+    for response in ranked(simulated):
         largest.setdefault(dataset.score_of(response.record), response)
     shown = list(largest.values())
     drawn: dict[str, Figure] = {}
@@ -74,12 +69,6 @@ def of_records(simulated: Sequence[Response], dataset: Dataset) -> tuple[dict[st
             if not plots.is_whole(record):
                 drawn[f"{record.name}_density"] = plots.density(*signals)
     return drawn, views
-
-
-def _relative(response: Response) -> float:
-    """The NL-LFR's error over the deviation of the output; infinite if it diverges."""
-    error = nrmse(response.record, response.y_hat)
-    return error if math.isfinite(error) else math.inf
 
 
 def of_record(

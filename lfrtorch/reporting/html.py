@@ -29,6 +29,8 @@ from lfrtorch._support.tables import (
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest, remark
+from lfrtorch.analysis.residual_analysis import LEGEND as RESIDUALS_LEGEND
+from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.size_search import LEGEND, size_table
 from lfrtorch.fitting.trainer import FitResult
@@ -81,6 +83,7 @@ def render(
     advice: Sequence[Advice],
     *,
     views: Mapping[str, Mapping[str, str]] | None = None,
+    residuals: Residuals | None = None,
     config: str = "",
 ) -> str:
     """The page.
@@ -97,6 +100,7 @@ def render(
         advice: what to try next.
         views: of each record that is shown, by its name, captions by the names of its figures. The
             first two of the first record follow the verdict.
+        residuals: of one record, if it has some; ``residuals`` among the images is theirs.
         config: of the run.
     """
     environment = jinja2.Environment(
@@ -118,6 +122,7 @@ def render(
         scores=_scores(metrics, dataset, responses),
         data=_data(dataset, responses),
         records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
+        residuals=_residuals(residuals),
         linear=_linear(bla, result),
         fit=_fit(metrics, result, bool(dataset.validation)),
         search=_search(metrics["sizes_search"]),
@@ -318,6 +323,19 @@ def _moments(x: Array) -> list[float]:
     mean, deviation = float(np.mean(x)), float(np.std(x))
     mean = 0.0 if abs(mean) < 1e-12 * deviation else mean
     return [mean, deviation, float(np.min(x)), float(np.max(x))]
+
+
+def _residuals(found: Residuals | None) -> dict[str, Any]:
+    if found is None:
+        return {}
+    head, rows = found.rows()
+    return {
+        "record": found.worst,
+        "head": head,
+        "rows": rows,
+        "sentences": found.sentences(),
+        "legend": RESIDUALS_LEGEND,
+    }
 
 
 def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import ArrayLike, NDArray
 
+from lfrtorch._support.drawing import plain_ticks
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import factor_of
 from lfrtorch._support.types import Array, Complex
@@ -17,7 +18,6 @@ from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.records import Channel
-from lfrtorch.reporting.plots import plain_ticks
 
 MEASURED, MODEL, DIFFERENCE = "#0072b2", "black", "#e69f00"
 TOTAL, NOISE, ODD, EVEN = "#d55e00", "0.5", "#d55e00", "#cc79a7"

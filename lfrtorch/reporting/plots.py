@@ -6,21 +6,24 @@ import io
 from collections.abc import Sequence
 
 import numpy as np
-import scipy
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, NullLocator
+from matplotlib.ticker import NullLocator
 
+from lfrtorch._support.drawing import (
+    LINEAR,
+    NL_LFR,
+    OUTPUT,
+    legend_above,
+    plain_ticks,
+    unit_axis,
+)
 from lfrtorch._support.tables import engineering, factor_of, quantity
 from lfrtorch._support.types import Array
+from lfrtorch.analysis.densities import power_density
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.metrics import rms
 from lfrtorch.records import Record
-
-OUTPUT, LINEAR, NL_LFR = "0.15", "#e69f00", "#0072b2"
-"""Colours of the measured output, the linear model and the NL-LFR, of Okabe and Ito's palette:
-colour-blind readers tell them apart, and they differ in lightness."""
 
 DPI = 150
 """Dots per inch of a figure that is written."""
@@ -33,9 +36,6 @@ SWINGS = 8
 
 CLOSE_UP, LARGEST_PART = (50, 2000), 0.25
 """Fewest and most samples of a close-up, and its largest part of a record if it has more."""
-
-SEGMENT, SHORTEST = 4096, 16
-"""Most and fewest samples of a segment that a power spectral density is averaged over."""
 
 NL_LFR_NAME = "NL-LFR"
 
@@ -111,7 +111,7 @@ def spectrum(
             ax.plot(f[1:-1], _decibel(signal)[1:-1], ".", ms=2, color=colour, label=label)
         unit = record.outputs[i].unit or "1"
         ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {unit})", xlim=(0, f[-1]))
-        _legend(ax, markerscale=5)
+        legend_above(ax, markerscale=5)
     _frequency_axis(record, figure.axes[-1])
     return figure
 
@@ -140,17 +140,15 @@ def density(
         >>> figure.savefig("density.png")
     """
     figure, axes = _panels(record, outputs)
-    scored = record.samples - record.skip
-    segment = min(SEGMENT, scored, max(SHORTEST, scored // 8))
     for i, ax in axes.items():
         for signal, label, colour in _signals(record, y_linear, y_hat, i):
-            f, power = scipy.signal.welch(signal, record.fs, nperseg=segment)
-            level = 10.0 * np.log10(np.maximum(power, np.finfo(float).tiny))
+            f, power = power_density(signal[:, None], record.fs)
+            level = 10.0 * np.log10(np.maximum(power[:, 0], np.finfo(float).tiny))
             ax.plot(f[1:], level[1:], color=colour, label=label)
         unit = factor_of(record.outputs[i].unit or "1")
         per = f"{unit}²/Hz" if record.fs != 1.0 else f"{unit}²"
         ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {per})", xlim=(0, record.fs / 2))
-        _legend(ax)
+        legend_above(ax)
     _frequency_axis(record, figure.axes[-1])
     return figure
 
@@ -301,7 +299,7 @@ def distribution(
         ax.set(yscale="log", ylabel="density, logarithmic", yticks=[])
         ax.yaxis.set_minor_locator(NullLocator())
         unit_axis(ax.xaxis, ax.get_xlim(), f"error of {output.name}", output.unit)
-        _legend(ax, ncols=1)
+        legend_above(ax, ncols=1)
     return figure
 
 
@@ -373,43 +371,6 @@ def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Fig
     return figure
 
 
-def unit_axis(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> None:
-    """Limits of an axis, its label, and ticks in the unit with an SI prefix.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from lfrtorch.reporting import plots
-        >>> ax = Figure().subplots()
-        >>> plots.unit_axis(ax.yaxis, (0.0, 2e-6), "displacement", "m")
-        >>> ax.get_ylabel()
-        'displacement (µm)'
-    """
-    low, high = limits
-    largest = max(abs(low), abs(high))
-    factor, shown = engineering([largest], unit)
-    digits = 4 + int(np.log10(largest / (high - low))) if high > low else 4
-    axis.set_view_interval(low, high, ignore=True)
-    axis.set_major_formatter(lambda tick, _: f"{factor * tick:.{digits}g}".replace("-", "−"))
-    axis.set_label_text(f"{name} ({shown})" if shown else name)
-
-
-def plain_ticks(axis: Axis) -> None:
-    """Numbers instead of powers of ten at a logarithmic axis; below a decade also between them.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from lfrtorch.reporting import plots
-        >>> ax = Figure().subplots()
-        >>> lines = ax.semilogy([0.02, 0.05])
-        >>> plots.plain_ticks(ax.yaxis)
-        >>> ax.yaxis.get_minor_formatter()(0.03)
-        '0.03'
-    """
-    low, high = axis.get_view_interval()
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter("{x:.3g}" if high < 10 * low else NullFormatter())
-
-
 def png(figure: Figure) -> bytes:
     """The figure as a PNG file.
 
@@ -476,7 +437,7 @@ def _overlay(
         for ax in (above, below):
             ax.margins(x=0)
             ax.grid(True, alpha=0.2)
-        _legend(above)
+        legend_above(above)
     figure.align_ylabels(axes)
     figure.suptitle(_title(record), fontsize="medium")
     axes[-1].set_xlabel("time in the record (s)" if record.fs != 1.0 else "sample of the record")
@@ -536,16 +497,6 @@ def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
 
 def _frequency_axis(record: Record, ax: Axes) -> None:
     ax.set_xlabel("frequency (Hz)" if record.fs != 1.0 else "frequency (1/sample)")
-
-
-def _legend(ax: Axes, *, ncols: int = 3, markerscale: float = 1.0) -> None:
-    """A legend above the panel, where it hides nothing, with lines thick enough to be seen."""
-    legend = ax.legend(
-        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=ncols, markerscale=markerscale,
-        frameon=False, borderaxespad=0.2, columnspacing=1.2, handlelength=1.8, fontsize="small",
-    )  # fmt: skip
-    for handle in legend.get_lines():
-        handle.set_linewidth(2)
 
 
 def _title(record: Record) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import LOUDER
+from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.size_search import SizeSearch
@@ -35,6 +36,7 @@ class Run:
         refit: the fit to all estimation records, if one was asked for. Its model is the run's, and
             is scored on the tests; training and validation errors are those of ``fit.model``.
         simulations: every record with both simulations.
+        residuals: of the record with the largest error, as the report shows them.
         metrics: what ``metrics.json`` holds: scores by record, sizes, the fit in numbers.
         verdict: whether the NL-LFR is worth more than the linear model.
         advice: what to try next, the most useful first.
@@ -58,6 +60,7 @@ class Run:
     fit: FitResult
     refit: FitResult | None = None
     simulations: list[Response]
+    residuals: Residuals | None = None
     metrics: Mapping[str, Any]
     verdict: Verdict
     advice: list[Advice]

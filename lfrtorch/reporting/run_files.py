@@ -57,6 +57,8 @@ def write(
             board.text(name, text, result.iterations)
     if draw:
         drawn, views = figures.of_run(result, run.linear, dataset, run.simulations)
+        if run.residuals is not None:
+            drawn["residuals"] = run.residuals.plot()
         images = {name: plots.png(figure) for name, figure in drawn.items()}
         (folder / "figures").mkdir(exist_ok=True)
         for name, image in images.items():
@@ -64,7 +66,7 @@ def write(
             board.image(f"summary/{name}", image, result.iterations)
         page = html.render(
             metrics, result, run.linear, dataset, run.simulations, images, run.verdict,
-            run.advice, views=views, config=config,
+            run.advice, views=views, residuals=run.residuals, config=config,
         )  # fmt: skip
         with whole_file(folder / "report.html") as path:
             path.write_text(page, encoding="utf-8")

@@ -15,6 +15,7 @@ from lfrtorch._support import tables
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
+from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import LISTED, Dataset, Published
 from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult
@@ -147,6 +148,7 @@ def metrics(
     search: SizeSearch | None = None,
     verdict: Verdict | None = None,
     refit: FitResult | None = None,
+    residuals: Residuals | None = None,
 ) -> dict:
     """What ``metrics.json`` holds, scores by test record; None if a number is not finite.
 
@@ -161,6 +163,7 @@ def metrics(
         verdict: on the fit.
         refit: the fit to all estimation records, if there was one. Its model is scored on the
             tests; validation errors are those before it.
+        residuals: of the record with the largest error.
     """
     model = result.model if refit is None else refit.model
     entries = evaluation(model, bla, dataset, own=own, command=command, chosen=result.model)
@@ -187,6 +190,7 @@ def metrics(
             "train_before": refit.history[0].train,
             "train": refit.history[refit.chosen_iteration].train,
         },
+        "residuals": {} if residuals is None else residuals.entries(),
         "stable_to": largest_stable_amplitude(model, dataset.train),
         "starts": max(1, len(result.starts)),
         "averaged": result.averaged,

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lfrtorch._support.types import Array
+from lfrtorch.analysis.residual_analysis import SHORTEST, Residuals, of_simulation
 from lfrtorch.dataset import Dataset
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.score_window import fitted
+from lfrtorch.metrics import nrmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -82,3 +85,27 @@ def respond(
             driven = fitted(record) if use == "train" else record
             found.append(Response(record, use, linear.simulate(driven), chosen.simulate(driven)))
     return found
+
+
+def ranked(responses: Sequence[Response]) -> list[Response]:
+    """The tests, without tests validation, else training; the largest error of the NL-LFR first."""
+    uses = [use for use in ("test", "validation", "train") if any(r.use == use for r in responses)]
+    return sorted(
+        (response for response in responses if response.use == uses[0]),
+        key=_relative,
+        reverse=True,
+    )
+
+
+def worst_residuals(responses: Sequence[Response]) -> Residuals | None:
+    """Residuals of the record with the largest error, of those that do not diverge."""
+    for response in ranked(responses):
+        if not response.diverged and len(response.scored) >= SHORTEST:
+            return Residuals(of_simulation(response.record, response.y_hat))
+    return None
+
+
+def _relative(response: Response) -> float:
+    """The NL-LFR's error over the deviation of the output; infinite if it diverges."""
+    error = nrmse(response.record, response.y_hat)
+    return error if math.isfinite(error) else math.inf

@@ -7,8 +7,9 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lfrtorch._support.drawing import unit_axis
 from lfrtorch._support.types import Array
-from lfrtorch.reporting.plots import envelope, unit_axis
+from lfrtorch.reporting.plots import envelope
 from lfrtorch.survey.measurement import Survey
 from lfrtorch.survey.signal import LEAST, SignalSurvey, longest_run
 

@@ -20,7 +20,7 @@ from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import html as html_report
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.simulations import Response, worst_residuals
 from lfrtorch.reporting.verdict import judge
 
 pytestmark = pytest.mark.numeric
@@ -153,6 +153,22 @@ def test_page_has_the_numbers_and_no_address_outside(single: Run):
         assert words in page.text
     order = [page.text.index(word) for word in ("What to try next", "Scores", "Data", "Best lin")]
     assert order == sorted(order)
+
+
+def test_residuals_of_the_worst_record_are_shown(single: Run):
+    found = worst_residuals(single.responses)
+    assert found is not None
+    assert found.worst == "test"
+    page = single.page(residuals=found)
+    assert "Residuals: test" in page.text
+    assert f"test, v: {found.parts[0].verdict}." in page.text
+    assert "Residuals" not in single.page().text
+    lost = [replace(r, y_hat=np.full_like(r.y_hat, math.inf)) for r in single.responses]
+    assert worst_residuals(lost) is None
+    (train,) = (r for r in single.responses if r.use == "train")
+    kept = worst_residuals([train])
+    assert kept is not None
+    assert kept.worst == "train"
 
 
 def test_sizes_that_were_tried(single: Run):

@@ -1,0 +1,64 @@
+"""What all figures share: colours, axes in units, legends."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.ticker import NullFormatter
+
+from lfrtorch._support.tables import engineering
+
+OUTPUT, LINEAR, NL_LFR = "0.15", "#e69f00", "#0072b2"
+"""Colours of the measured output, the linear model and the NL-LFR, of Okabe and Ito's palette:
+colour-blind readers tell them apart, and they differ in lightness."""
+
+CHANNELS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Colours of several channels, of the same palette."""
+
+
+def unit_axis(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> None:
+    """Limits of an axis, its label, and ticks in the unit with an SI prefix.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from lfrtorch._support import drawing
+        >>> ax = Figure().subplots()
+        >>> drawing.unit_axis(ax.yaxis, (0.0, 2e-6), "displacement", "m")
+        >>> ax.get_ylabel()
+        'displacement (µm)'
+    """
+    low, high = limits
+    largest = max(abs(low), abs(high))
+    factor, shown = engineering([largest], unit)
+    digits = 4 + int(np.log10(largest / (high - low))) if high > low else 4
+    axis.set_view_interval(low, high, ignore=True)
+    axis.set_major_formatter(lambda tick, _: f"{factor * tick:.{digits}g}".replace("-", "−"))
+    axis.set_label_text(f"{name} ({shown})" if shown else name)
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Numbers instead of powers of ten at a logarithmic axis; below a decade also between them.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from lfrtorch._support import drawing
+        >>> ax = Figure().subplots()
+        >>> lines = ax.semilogy([0.02, 0.05])
+        >>> drawing.plain_ticks(ax.yaxis)
+        >>> ax.yaxis.get_minor_formatter()(0.03)
+        '0.03'
+    """
+    low, high = axis.get_view_interval()
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("{x:.3g}" if high < 10 * low else NullFormatter())
+
+
+def legend_above(ax: Axes, *, ncols: int = 3, markerscale: float = 1.0) -> None:
+    """A legend above the panel, where it hides nothing, with lines thick enough to be seen."""
+    legend = ax.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=ncols, markerscale=markerscale,
+        frameon=False, borderaxespad=0.2, columnspacing=1.2, handlelength=1.8, fontsize="small",
+    )  # fmt: skip
+    for handle in legend.get_lines():
+        handle.set_linewidth(2)

@@ -1,0 +1,136 @@
+"""Power spectral densities: of signals, and of the noise that repeated periods show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from lfrtorch._support.types import Array
+from lfrtorch.linear.spectra import Spectra, spectra_of_periods
+from lfrtorch.records import Record
+
+SEGMENT, SHORTEST = 4096, 16
+"""Most and fewest samples of a segment that a power spectral density is averaged over."""
+
+STRETCHES = 256
+"""Most frequencies of the density of noise, which is a mean over the lines about each."""
+
+PARTS = 10
+"""Parts of time in which the differences between periods are looked at."""
+
+STEADY = 4.0
+"""Power of the differences between periods in a tenth of them over the median of all tenths, from
+which on they are no noise but a transient or a disturbance."""
+
+
+@dataclass(frozen=True, eq=False)
+class Densities:
+    """Power spectral densities in the output's unit squared per Hz.
+
+    Args:
+        frequencies: of output and error, Hz.
+        output, error: measured output and error.
+        noise_frequencies, noise: from the differences between periods, if the record repeats.
+
+    Shape:
+        frequencies, output, error: (F,), noise_frequencies, noise: (K,).
+
+    Example:
+        >>> (part,) = lfrtorch.analysis.residuals(bla, record).parts
+        >>> part.densities.error.shape == part.densities.frequencies.shape
+        True
+    """
+
+    frequencies: Float[Array, " F"]
+    output: Float[Array, " F"]
+    error: Float[Array, " F"]
+    noise_frequencies: Float[Array, " K"] | None = None
+    noise: Float[Array, " K"] | None = None
+
+
+def power_density(
+    signals: Float[Array, "T n"], fs: float
+) -> tuple[Float[Array, " F"], Float[Array, "F n"]]:
+    """Frequencies in Hz and power spectral densities of signals, by Welch's method.
+
+    Example:
+        >>> from lfrtorch.analysis.densities import power_density
+        >>> f, density = power_density(record.y, record.fs)
+        >>> f[-1], np.allclose(density.sum() * f[1], record.y.var(), rtol=0.2)
+        (np.float64(50.0), True)
+    """
+    T = len(signals)
+    segment = min(SEGMENT, T, max(SHORTEST, T // 8))
+    f, density = scipy.signal.welch(signals, fs, nperseg=segment, axis=0)
+    return f, density
+
+
+def noise_of_periods(records: Sequence[Record]) -> Float[Array, " ny"] | None:
+    """Standard deviation of the noise in the outputs, from the differences between periods.
+
+    None if no record has two periods, if an input does not repeat, if the periods differ, or if
+    the differences are not steady: those of a transient or a disturbance are no noise.
+
+    Example:
+        >>> from lfrtorch.analysis.densities import noise_of_periods
+        >>> noise = 0.1 * np.random.default_rng(0).standard_normal(800)
+        >>> twice = lfrtorch.Record(np.tile(u, 2), np.tile(y, 2) + noise, period=400)
+        >>> noise_of_periods([twice]).round(2).tolist()
+        [0.1]
+    """
+    spectra = _steady_spectra(records)
+    return None if spectra is None else np.sqrt(_noise_power(spectra).sum(axis=0))
+
+
+def noise_density(
+    record: Record,
+) -> tuple[Float[Array, " F"], Float[Array, "F ny"]] | None:
+    """Frequencies in Hz and power spectral densities of that noise, or None.
+
+    Example:
+        >>> from lfrtorch.analysis.densities import noise_density
+        >>> noise_density(record) is None  # it has one period
+        True
+    """
+    spectra = _steady_spectra([record])
+    if spectra is None:
+        return None
+    power = _noise_power(spectra)
+    width = -(-len(power) // STRETCHES)
+    whole = len(power) // width * width
+    lines = np.arange(1, len(power) + 1)
+    f = spectra.frequencies(lines)[:whole].reshape(-1, width).mean(axis=1)
+    return f, power[:whole].reshape(len(f), width, -1).mean(axis=1) / spectra.resolution
+
+
+def _steady_spectra(records: Sequence[Record]) -> Spectra | None:
+    """Spectra of periods whose differences are noise."""
+    try:
+        spectra = spectra_of_periods(records)
+    except ValueError:
+        return None
+    steady = spectra.freedom and all(_steady(record, spectra.N) for record in records)
+    return spectra if steady else None
+
+
+def _noise_power(spectra: Spectra) -> Float[Array, "F ny"]:
+    """Variance of the noise of the outputs at lines 1, 2, ..."""
+    return np.diagonal(spectra.C, axis1=1, axis2=2).real[1:, : spectra.Y.shape[2]]
+
+
+def _steady(record: Record, N: int) -> bool:
+    """Whether the differences between successive periods of N samples have the same power in time.
+
+    The first of two periods may have a transient, which is no noise.
+    """
+    count = (record.samples - record.skip) // N
+    if count < 2:
+        return True
+    periods = record.y[record.samples - count * N :].reshape(count, N, -1)
+    power = np.diff(periods, axis=0).reshape((count - 1) * N, -1) ** 2
+    parts = np.array([part.mean(axis=0) for part in np.array_split(power, PARTS)])
+    return bool(np.all(parts.max(axis=0) <= STEADY * np.median(parts, axis=0)))

@@ -1,0 +1,144 @@
+"""The residuals of one output in one record, and what they say in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lfrtorch._support.tables import number
+from lfrtorch._support.types import Array, Integers
+from lfrtorch.analysis.correlation import Correlation
+from lfrtorch.analysis.densities import Densities
+from lfrtorch.metrics import rms
+from lfrtorch.records import Channel
+
+LEVEL = 0.01
+"""Probability of a test up to which its hypothesis, independence, is given up."""
+
+ROUNDING = 1e-12
+"""Errors below this part of the output's rms are rounding errors, and so are such means."""
+
+RUNS = 3
+"""Most runs of lags that a sentence lists."""
+
+
+@dataclass(frozen=True, eq=False)
+class OutputResiduals:
+    """Residuals of one output in one record, in its unit.
+
+    Args:
+        record: its name.
+        output: the channel.
+        inputs: channels of the inputs.
+        error: measured less simulated output, after the skip window.
+        fit: 100 (1 - |y - y_hat| / |y - mean y|) in %, as MATLAB's ``compare`` gives it; NaN for a
+            constant output.
+        whiteness: correlation of the error with its own past.
+        linear: of the error with each input.
+        even: of the error with the square of each input: even nonlinearities that are left.
+        odd: of error times simulated output with the square of each input: odd ones, or a gain.
+        densities: spectra of output, error and noise.
+        noise: standard deviation of the noise, if the record repeats.
+
+    Shape:
+        error: (S,) for S scored samples.
+
+    Example:
+        >>> (part,) = lfrtorch.analysis.residuals(bla, record).parts
+        >>> part.error.shape, bool(part.rms < record.y.std()), sorted(part.p)
+        ((400,), True, ['even', 'inputs', 'odd', 'white'])
+    """
+
+    record: str
+    output: Channel
+    inputs: tuple[Channel, ...]
+    error: Float[Array, " S"]
+    fit: float
+    whiteness: Correlation
+    linear: tuple[Correlation, ...]
+    even: tuple[Correlation, ...]
+    odd: tuple[Correlation, ...]
+    densities: Densities
+    noise: float | None
+    exact: bool = False
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the error."""
+        return float(rms(self.error))
+
+    @property
+    def bias(self) -> float:
+        """Mean of the error; 0 if it is a rounding error."""
+        mean = float(np.mean(self.error))
+        return 0.0 if abs(mean) <= ROUNDING * self.rms else mean
+
+    @property
+    def diverges(self) -> bool:
+        """Whether the simulation is not finite."""
+        return not bool(np.isfinite(self.error).all())
+
+    @property
+    def p(self) -> dict[str, float]:
+        """Probabilities of the tests ``white``, ``inputs``, ``even`` and ``odd``.
+
+        Those of several inputs are the least, times the number of inputs.
+        """
+        groups = {"inputs": self.linear, "even": self.even, "odd": self.odd}
+        return {"white": self.whiteness.p} | {
+            name: min(1.0, len(each) * min(c.p for c in each)) for name, each in groups.items()
+        }
+
+    @property
+    def verdict(self) -> str:
+        """What is left in the error, in words."""
+        if self.diverges:
+            return "the simulation diverges"
+        if self.exact:
+            return "no error beyond rounding"
+        found = []
+        white = self.whiteness.p > LEVEL
+        if not white:
+            found.append(f"not white: {_where(self.whiteness)}")
+        for said, each in (
+            ("depends on {} still", self.linear),
+            ("an even nonlinearity of {} is left", self.even),
+            ("an odd nonlinearity or a gain of {} is left", self.odd),
+        ):
+            found += [
+                f"{said.format(channel.name)}: {_where(c)}"
+                for channel, c in zip(self.inputs, each, strict=True)
+                if len(each) * c.p <= LEVEL
+            ]
+        beside = ""
+        if self.noise:
+            beside = f"{number(self.rms / self.noise)} times the noise; "
+        if not found:
+            return f"{beside}white, and independent of the inputs"
+        if white:
+            found.insert(0, "white")
+        elif len(found) == 1:
+            found.append("independent of the inputs")
+        return beside + "; ".join(found)
+
+
+def _where(found: Correlation) -> str:
+    """The largest correlation with its lag, and the lags beyond the bounds."""
+    value, bound = found.at(found.largest)
+    beyond = f"; beyond it at lags {runs(found.outside)}" if len(found.outside) > 1 else ""
+    return f"{value:.2f} at lag {found.largest} (bound {bound:.2f}{beyond})"
+
+
+def runs(lags: Integers) -> str:
+    """Numbers that rise as runs, the first ones if they are many.
+
+    Example:
+        >>> from lfrtorch.analysis.output_residuals import runs
+        >>> runs(np.array([0, 1, 2, 5, 8, 9, 12]))
+        '0 to 2, 5, 8 to 9, ...'
+    """
+    parts = np.split(lags, 1 + np.flatnonzero(np.diff(lags) > 1))
+    said = [f"{p[0]} to {p[-1]}" if len(p) > 1 else f"{p[0]}" for p in parts[:RUNS] if len(p)]
+    return ", ".join(said + ["..."] * (len(parts) > RUNS))

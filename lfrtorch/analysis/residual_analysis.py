@@ -1,0 +1,273 @@
+"""What the errors of a simulation still hold: are they white, and independent of the inputs?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import in_lines, number, quantity, table
+from lfrtorch._support.types import Array
+from lfrtorch.analysis.correlation import (
+    autocorrelation,
+    lags_for,
+    white_cross_correlation,
+    whitened,
+)
+from lfrtorch.analysis.densities import (
+    Densities,
+    noise_density,
+    noise_of_periods,
+    power_density,
+)
+from lfrtorch.analysis.output_residuals import ROUNDING, OutputResiduals
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.metrics import rms
+from lfrtorch.model import Model
+from lfrtorch.records import Record, as_records
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LEAST = 1e-4
+"""Smallest probability that is printed."""
+
+SHORTEST = 20
+"""Fewest scored samples of a record."""
+
+MOST_ROWS = 24
+"""Most rows of a printed table, those of the least fit."""
+
+LEGEND = (
+    "fit: 100 (1 - |y - y_hat| / |y - mean y|), scored samples. white, inputs, even, odd: "
+    "probability of such correlations by chance, of the errors with themselves, the inputs and "
+    "their squares, and of errors times outputs with the squares."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals of a model; ``print(residuals)`` shows them as a table with a verdict for each.
+
+    Args:
+        parts: one for each output of each record.
+
+    Example:
+        >>> found = lfrtorch.analysis.residuals(bla, record)
+        >>> part = found.parts[0]
+        >>> bool(70 < part.fit < 100), part.whiteness.values.shape, part.linear[0].values.shape
+        (True, (10,), (21,))
+    """
+
+    parts: tuple[OutputResiduals, ...]
+
+    @property
+    def worst(self) -> str:
+        """Name of the record with the least fit of an output; of one that diverges, if any."""
+        return min(self.parts, key=_goodness).record
+
+    def of(self, record: str) -> tuple[OutputResiduals, ...]:
+        """The parts of one record.
+
+        Raises:
+            ValueError: there is none of that name.
+        """
+        found = tuple(part for part in self.parts if part.record == record)
+        if not found:
+            names = ", ".join(dict.fromkeys(part.record for part in self.parts))
+            raise InputError(f"there is no record '{record}' among the residuals; give of {names}.")
+        return found
+
+    def rows(self) -> tuple[list[str], list[list[str | int | float]]]:
+        """Head and rows of the table, the parts in their order; of many those of the least fit."""
+        shown = self.parts
+        if len(shown) > MOST_ROWS:
+            kept = {id(part) for part in sorted(shown, key=_goodness)[:MOST_ROWS]}
+            shown = tuple(part for part in shown if id(part) in kept)
+        known = any(part.noise is not None for part in shown)
+        head = ["record", "output", "samples", "fit (%)", "rms", "bias", *["noise"] * known]
+        rows = [
+            [
+                part.record,
+                part.output.name,
+                len(part.error),
+                part.fit,
+                *(
+                    quantity(value, part.output.unit)
+                    for value in [part.rms, part.bias, *[part.noise] * known]
+                ),
+                *(probability(p) for p in part.p.values()),
+            ]
+            for part in shown
+        ]
+        return [*head, "white", "inputs", "even", "odd"], rows
+
+    def sentences(self) -> list[str]:
+        """A verdict for each row of the table."""
+        _, rows = self.rows()
+        shown = {(row[0], row[1]) for row in rows}
+        return [
+            f"{part.record}, {part.output.name}: {part.verdict}."
+            for part in self.parts
+            if (part.record, part.output.name) in shown
+        ]
+
+    def entries(self) -> dict[str, dict[str, Any]]:
+        """The numbers by record and output, for ``metrics.json``."""
+        found: dict[str, dict[str, Any]] = {}
+        for part in self.parts:
+            found.setdefault(part.record, {})[part.output.name] = {
+                "fit": part.fit,
+                "rms": part.rms,
+                "bias": part.bias,
+                "noise": part.noise,
+                "p": part.p,
+                "verdict": part.verdict,
+            }
+        return found
+
+    def __str__(self) -> str:
+        head, rows = self.rows()
+        left = len(self.parts) - len(rows)
+        more = [f"{left} more of a better fit."] if left else []
+        said = [in_lines(sentence) for sentence in (*more, *self.sentences(), LEGEND)]
+        return "\n".join([table(head, rows), "", *said])
+
+    def __repr__(self) -> str:
+        return f"Residuals({len(self.parts)} outputs of records, the worst in '{self.worst}')"
+
+    def plot(self, record: str | None = None) -> Figure:
+        """Figure of a record: correlations with their bounds, and spectra, a row an output.
+
+        Args:
+            record: its name. Default: that with the least fit.
+
+        Example:
+            >>> figure = lfrtorch.analysis.residuals(bla, record).plot()
+            >>> figure.savefig("residuals.png")
+        """
+        from lfrtorch.analysis.residual_plots import residual_figure  # matplotlib takes its time
+
+        return residual_figure(self.of(self.worst if record is None else record))
+
+
+def residuals(
+    model: Model | LinearModel, records: Record | Sequence[Record], *, lags: int | None = None
+) -> Residuals:
+    """Residual analysis of simulations: fit, whiteness, what the errors still have of the inputs.
+
+    Each output of each record has its own tests, so that records of several levels tell at which
+    level a model fails. Samples that a record skips are left out. Correlations with inputs are
+    those of signals made white (see :func:`lfrtorch.analysis.correlation.cross_correlation`).
+    Records that the model was not fitted to tell most.
+
+    Args:
+        model: nonlinear or linear.
+        records: one or several.
+        lags: of the correlations. Default: 25, fewer in less than 1000 samples.
+
+    Raises:
+        ValueError: a record of other channels or another rate than the model's, or of less than 20
+            scored samples.
+
+    References:
+        Ljung, "System Identification: Theory for the User", 2nd ed., 1999, section 16.6.
+        Billings and Voon, "Correlation based model validity tests for non-linear models",
+        International Journal of Control 44(1), 1986 (even).
+        Billings and Zhu, "Nonlinear model validation using correlation tests", International
+        Journal of Control 60(6), 1994 (odd).
+
+    Example:
+        >>> print(lfrtorch.analysis.residuals(bla, record))  # the record saturates
+        record    output      samples  fit (%)  rms ...
+    """
+    if not isinstance(model, Model | LinearModel):
+        raise InputError(f"model is of type {type(model).__name__}; give a Model or a LinearModel.")
+    listed = as_records(records)
+    return Residuals(
+        tuple(
+            part
+            for record in listed
+            for part in of_simulation(record, model.simulate(record), lags=lags)
+        )
+    )
+
+
+def of_simulation(
+    record: Record, y_hat: Float[Array, "T ny"], *, lags: int | None = None
+) -> tuple[OutputResiduals, ...]:
+    """The residuals of each output of a record that is simulated already.
+
+    Example:
+        >>> from lfrtorch.analysis.residual_analysis import of_simulation
+        >>> (part,) = of_simulation(record, record.y)
+        >>> part.fit, part.verdict
+        (100.0, 'no error beyond rounding')
+    """
+    y, u = record.y[record.skip :], record.u[record.skip :]
+    if len(y) < SHORTEST:
+        raise InputError(
+            f"record '{record.name}' has {len(y)} scored samples; residuals need {SHORTEST} at "
+            "least: give a longer record, or skip less."
+        )
+    errors = y - y_hat[record.skip :]
+    K = lags_for(len(y), lags)
+    linear = [whitened(channel) for channel in u.T]
+    squares = [whitened(channel) for channel in ((u - u.mean(axis=0)) ** 2).T]
+    deviation = np.std(y, axis=0)
+    f, of_y = power_density(y, record.fs)
+    noise, of_noise = noise_of_periods([record]), noise_density(record)
+    found = []
+    for i, output in enumerate(record.outputs):
+        error = errors[:, i]
+        finite, size = np.isfinite(error).all(), float(rms(error))
+        exact = bool(finite and size <= ROUNDING * float(rms(y[:, i])))
+        simulated, tested = y_hat[record.skip :, i], error
+        if exact or not finite:
+            simulated, tested = np.zeros((2, len(y)))
+        tested = tested - tested.mean()
+        e, ey = whitened(tested), whitened(tested * (simulated - simulated.mean()))
+        spread = float(deviation[i])
+        fit = 100.0 * (1.0 - size / spread) if spread > 0 else math.nan
+        found.append(
+            OutputResiduals(
+                record=record.name,
+                output=output,
+                inputs=record.inputs,
+                error=error,
+                fit=fit if finite else -math.inf,
+                whiteness=autocorrelation(tested, K),
+                linear=tuple(white_cross_correlation(e, x, K) for x in linear),
+                even=tuple(white_cross_correlation(e, x, K) for x in squares),
+                odd=tuple(white_cross_correlation(ey, x, K) for x in squares),
+                densities=Densities(
+                    f,
+                    of_y[:, i],
+                    power_density(error[:, None], record.fs)[1][:, 0] if finite else np.nan * f,
+                    *(() if of_noise is None else (of_noise[0], of_noise[1][:, i])),
+                ),
+                noise=None if noise is None else float(noise[i]),
+                exact=exact,
+            )
+        )
+    return tuple(found)
+
+
+def probability(p: float) -> str:
+    """A probability in two digits, or that it is below the least one printed.
+
+    Example:
+        >>> from lfrtorch.analysis.residual_analysis import probability
+        >>> probability(0.1234), probability(1e-9)
+        ('0.12', '< 0.0001')
+    """
+    return number(p, 2) if p >= LEAST else f"< {LEAST:.4f}"
+
+
+def _goodness(part: OutputResiduals) -> float:
+    return part.fit if not math.isnan(part.fit) else math.inf
