@@ -1,6 +1,7 @@
 """A model as a program of other tools, in physical units: C and more to come."""
 
 from lfrtorch.export.c_source import c_source
+from lfrtorch.export.casadi_function import casadi_function
 from lfrtorch.export.targets import TARGETS, write
 
-__all__ = ["TARGETS", "c_source", "write"]
+__all__ = ["TARGETS", "c_source", "casadi_function", "write"]

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -119,6 +120,19 @@ class Equations:
             *signals("u", self.inputs, self.u_offset),
             *signals("y", self.outputs, self.y_offset),
         ]
+
+    def description(self, name: str) -> dict[str, Any]:
+        """What a file of numbers alone does not say, for JSON."""
+        sides = ("inputs", self.inputs, self.u_offset), ("outputs", self.outputs, self.y_offset)
+        return {
+            "name": name,
+            "fs": self.fs,
+            "states": self.sizes["nx"],
+            **{
+                side: [c._asdict() | {"offset": o} for c, o in zip(channels, offset, strict=True)]
+                for side, channels, offset in sides
+            },
+        }
 
 
 def signals(letter: str, channels: Sequence[Channel], offset: Array) -> list[str]:

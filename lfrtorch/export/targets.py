@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
+from lfrtorch._support import checkpoint
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
-from lfrtorch.export.equations import check_name
+from lfrtorch.export.casadi_function import casadi_function
+from lfrtorch.export.equations import check_name, equations
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
@@ -18,22 +22,31 @@ class Target(NamedTuple):
     """One kind of export.
 
     Args:
-        extensions: of the files NAME.h, ..
-        files: their contents.
+        endings: of the files NAME.h, ..
+        write: model, name and paths -> files there.
         use: a line of a program that uses it, with {name} and the {path} of the first file.
     """
 
-    extensions: tuple[str, ...]
-    files: Callable[[Model | LinearModel, str], list[bytes]]
+    endings: tuple[str, ...]
+    write: Callable[[Model | LinearModel, str, list[Path]], None]
     use: str
 
 
-def _c(model: Model | LinearModel, name: str) -> list[bytes]:
-    return [text.encode() for text in c_source(model, name)]
+def _c(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
+    for path, text in zip(paths, c_source(model, name), strict=True):
+        path.write_text(text, encoding="utf-8")
+
+
+def _casadi(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
+    casadi_function(model, name).save(str(paths[0]))
+    paths[1].write_text(json.dumps(equations(model).description(name), indent=2) + "\n")
 
 
 TARGETS = {
-    "c": Target(("h", "c"), _c, "{name}_step(x, u, x_next, y);"),
+    "c": Target((".h", ".c"), _c, "{name}_step(x, u, x_next, y);"),
+    "casadi": Target(
+        (".casadi", "_channels.json"), _casadi, "x_next, y = casadi.Function.load('{path}')(x, u)"
+    ),
 }
 """All kinds of export."""
 
@@ -50,7 +63,8 @@ def write(
 
     Args:
         model: what is exported.
-        to: ``"c"``: ``NAME.h`` and ``NAME.c``.
+        to: ``"c"``: ``NAME.h`` and ``NAME.c``; ``"casadi"``: ``NAME.casadi``, which
+            ``casadi.Function.load`` reads, and ``NAME_channels.json`` with channels and rate.
         folder: where to; it is made if need be.
         name: of the files, and in them.
         overwrite: whether files that exist may be replaced.
@@ -59,8 +73,9 @@ def write(
         The files.
 
     Raises:
-        ValueError: an unknown target, a name that is no identifier, a file that exists, or a static
-            map of the user's own class.
+        ValueError: an unknown target, one whose package is not installed, a name that is no
+            identifier, a file that exists, the folder of a checkpoint, or a static map of the
+            user's own class.
 
     Example:
         >>> [path.name for path in lfrtorch.export.write(model, "c", "made", name="actuator")]
@@ -70,11 +85,14 @@ def write(
         raise InputError(f"to is {to!r}; give one of {', '.join(TARGETS)}.")
     check_name(name)
     target = TARGETS[to]
-    paths = [Path(folder) / f"{name}.{extension}" for extension in target.extensions]
+    if (Path(folder) / checkpoint.DESCRIPTION).is_file():
+        raise InputError(
+            f"'{folder}' is a checkpoint, which holds nothing else; give another folder."
+        )
+    paths = [Path(folder) / f"{name}{ending}" for ending in target.endings]
     if not overwrite:
         for path in paths:
             refuse_existing(path, "overwrite=True")
-    for path, content in zip(paths, target.files(model, name), strict=True):
-        with whole_file(path) as fresh:
-            fresh.write_bytes(content)
+    with ExitStack() as all_or_none:
+        target.write(model, name, [all_or_none.enter_context(whole_file(p)) for p in paths])
     return paths
