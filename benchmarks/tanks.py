@@ -7,8 +7,8 @@ and the model simulates the record through what was left out. All begin at the l
 whole record, as that of seven eighths may spend a mode on drift. Prints the RMSE over all eighths,
 V: of the median start, and of the mean of all starts that stay stable on inputs twice as loud; and
 that of this mean over the six eighths without a level of 10 V. With --distil, for the settings of
-the benchmark and each eighth: of the best start in training, of the mean of all, and of one model in
-its place. The official test record is not looked at.
+the benchmark and each eighth: of the best start in training, of the mean of all, and of one model
+in its place. The official test record is not looked at.
 """
 
 from __future__ import annotations
