@@ -32,7 +32,7 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
         >>> f
         Function(actuator:(x,u)->(x_next,y) SXFunction)
         >>> x_next, y = f(0, 0.5)
-        >>> abs(float(y) - model.simulate([0.5])[0, 0]) < 1e-12
+        >>> bool(abs(float(y) - model.simulate([0.5])[0, 0]) < 1e-12)
         True
     """
     ca = imported("casadi", "casadi")
