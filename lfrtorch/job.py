@@ -221,6 +221,12 @@ def scored_run(
         dataset, settings, linear, result, order_scan, size_search: what was found.
         again: the fit to all estimation records.
     """
+    samples = sum(record.samples for record in dataset.train)
+    fitted_to = f"{dataset.name}: {len(dataset.train)} record(s), {samples} samples"
+    result = replace(result, model=replace(result.model, fitted_to=fitted_to))
+    if again is not None:
+        fitted_to += " and all other estimation records"
+        again = replace(again, model=replace(again.model, fitted_to=fitted_to))
     test_linear = linear_models_of_tests(dataset, settings)
     last = None if again is None else again.model
     simulations = respond(result.model, linear, dataset, test_linear, refitted=last)

@@ -17,9 +17,11 @@ from lfrtorch._support import checkpoint
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.description import in_columns, levels, listed, system_lines
 from lfrtorch.engine.initial_state import simulate_estimated
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network
+from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.records import (
     Channel,
@@ -51,12 +53,18 @@ class Model:
         scaler: physical to normalised units, at both ends.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
+        fitted_to: the data in words, for ``print(model)``.
+
+    ``print(model)`` shows sizes, channels, poles and gains: of the linear part A, Bu, Cy, Dyu, and
+    of the model linearised at rest at the inputs' offsets.
 
     Example:
         >>> model.sizes, model.parameter_count
         ({'nx': 1, 'nz': 1, 'nw': 1, 'nn': 4}, 21)
         >>> model.inputs, model.fs
         ((Channel(name='u', unit=''),), 100.0)
+        >>> model
+        Model(u -> y, 100 Hz, nx=1, nz=1, nw=1, nn=4)
     """
 
     lfr: LFR
@@ -64,6 +72,40 @@ class Model:
     fs: float
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
+    fitted_to: str = ""
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{name}={size}" for name, size in self.sizes.items())
+        return f"Model({listed(self.inputs)} -> {listed(self.outputs)}, {self.fs:g} Hz, {sizes})"
+
+    def __str__(self) -> str:
+        cell, scaler = double(self.lfr.cell), self.scaler
+        offset = cell.A.new_zeros(cell.nu)
+        systems, rest = {"": linear_part(cell).physical(scaler)}, ""
+        if cell.static is not None:
+            x = equilibrium(cell, offset)
+            systems = {"linear part": systems[""]}
+            if x is None:
+                rest = "none found at the inputs' offsets"
+            else:
+                systems["at rest"] = linearised_at(cell, offset, x).physical(scaler)
+        sizes = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
+        counts = f"{self.parameter_count} parameters, {self.net_parameter_count} net"
+        facts = [
+            ("sampled at", f"{self.fs:g} Hz"),
+            ("inputs", levels(self.inputs, scaler.u_offset, scaler.u_scale)),
+            ("outputs", levels(self.outputs, scaler.y_offset, scaler.y_scale)),
+            ("sizes", f"{sizes}; {counts}"),
+            ("static map", "" if cell.static is None else str(cell.static).split("\n")[0]),
+            ("fitted to", self.fitted_to),
+            ("rest", rest),
+        ]
+        lines = [
+            f"{'Linear' if cell.static is None else 'NL-LFR'} model",
+            *in_columns(facts),
+            *system_lines(systems, self.fs, self.inputs, self.outputs),
+        ]
+        return "\n".join(lines)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -238,6 +280,8 @@ class Model:
         }
         if not (cell.Dzu.requires_grad or cell.Dzu.any()):
             description["z_feedthrough"] = False
+        if self.fitted_to:
+            description["fitted_to"] = self.fitted_to
         weights = dict(self.lfr.cell.state_dict())
         scaling = ("u_offset", "u_scale", "y_offset", "y_scale")
         weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in scaling}
@@ -348,7 +392,9 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             raise InputError("scales or channels are more or fewer than inputs and outputs")
         if not (math.isfinite(fs) and fs > 0):
             raise InputError(f"fs is {fs}")
-        return Model(LFR(cell), scaler, fs, *channels)
+        inputs, outputs = channels
+        fitted_to = str(description.get("fitted_to", ""))
+        return Model(LFR(cell), scaler, fs, inputs, outputs, fitted_to)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise InputError(
             f"'{folder}' is damaged: its description and weights do not fit ({error})."

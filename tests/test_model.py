@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,17 @@ from reference import measure, normal, random_cell, random_model
 from torch import Tensor
 from torch.testing import assert_close
 
+from lfrtorch._support.tables import UNKNOWN
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.newton import newton_states
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation import simulate, steady_state
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rmse
-from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.model import Model, load
+from lfrtorch.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
 
@@ -250,3 +253,55 @@ def test_the_old_name_of_the_count_says_the_new_one():
     for name in ("parameters", "parameters_net"):
         with pytest.raises(AttributeError, match="parameter_count"):
             getattr(random_model(random_cell()), name)
+
+
+# --- what print shows ------------------------------------------------------------------------
+
+
+def test_a_model_is_printed_in_a_few_lines(tmp_path: Path):
+    large = random_model(random_cell(nu=5, ny=5, nx=60, nz=6, nw=6, nn=40, layers=2))
+    large = replace(large, fitted_to="lab: 3 record(s), 900 samples")
+    shown = str(large).splitlines()
+    assert len(shown) <= 25
+    assert max(map(len, shown)) <= 110
+    for words in ("u1", "6 poles of the largest radius", "first 4 of 25 gains", "lab: 3 record(s)"):
+        assert any(words in line for line in shown), words
+    assert "\n" not in repr(large)
+    large.save(tmp_path / "model")
+    assert load(tmp_path / "model").fitted_to == large.fitted_to
+    small = random_model(random_cell())
+    assert "fitted to" not in str(small)
+    small.save(tmp_path / "model")
+    assert load(tmp_path / "model").fitted_to == ""
+
+
+def test_poles_and_gains_are_those_of_a_known_oscillator():
+    """5 Hz, 10 % damping, and an output of 4 mm under a constant 2 N."""
+    s = 2 * np.pi * 5.0 * complex(-0.1, np.sqrt(1 - 0.01))
+    z = np.exp(s / 100.0)
+    A = np.array([[z.real, z.imag], [-z.imag, z.real]])
+    B = np.array([[1.0], [0.0]])
+    C = 2.0 * (np.eye(2) - A)[:1]
+    channels = (Channel("force", "N"),), (Channel("x", "mm"),)
+    linear = LinearModel(A, B, C, np.zeros((1, 1)), 100.0, np.ones(1), np.zeros(1), *channels)
+    for text in (str(linear), str(linear.to_model())):
+        lines = text.splitlines()
+        row = lines[1 + next(i for i, line in enumerate(lines) if line.startswith("---"))].split()
+        assert row[:2] == ["5.000", "0.100"]
+        assert lines[-1].split() == ["x", "/", "force", "mm/N", "2.00"]
+        assert "force 1.00" in text
+    integrator = replace(linear, A=np.eye(2))
+    assert str(integrator).endswith(UNKNOWN)
+    assert repr(linear) == "LinearModel(force (N) -> x (mm), 100 Hz, nx=2)"
+
+
+def test_a_model_without_a_rest_says_so():
+    cell = LFRCell(1, 1, 1, 1, 1, Polynomial(1, 1, 2)).double()
+    assert isinstance(cell.static, Polynomial)
+    with torch.no_grad():  # x+ = x + 1 + x²
+        for one in (cell.A, cell.Bw, cell.Cz, cell.static.C):
+            one.fill_(1.0)
+        cell.static.C[0, 1] = 0.0
+    shown = str(random_model(cell))
+    assert "none found" in shown
+    assert "at rest" not in shown

@@ -14,9 +14,12 @@ from numpy.typing import ArrayLike
 
 from lfrtorch._support import checkpoint
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.description import in_columns, listed, offsets, system_lines
 from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.operating_point import StateSpace
 from lfrtorch.linear.resolvent import frequency_response, response_jacobian, solve_resolvents
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, Scaler, without_coordinates
@@ -77,6 +80,8 @@ class LinearModel:
     Example:
         >>> bla.nx, bla.A.shape, bla.fs
         (1, (1, 1), 100.0)
+        >>> bla
+        LinearModel(u -> y, 100 Hz, nx=1)
         >>> slow = lfrtorch.LinearModel(
         ...     np.array([[0.9]]), np.array([[1.0]]), np.array([[0.1]]), np.array([[0.0]]), fs=10.0,
         ...     u_offset=np.zeros(1), y_offset=np.zeros(1), inputs=bla.inputs, outputs=bla.outputs,
@@ -98,6 +103,27 @@ class LinearModel:
     innovation_covariance: Float[Array, "ny ny"] | None = None
     covariance: Float[Array, "P P"] | None = None
     fit: LinearFit | None = None
+
+    def __repr__(self) -> str:
+        signals = f"{listed(self.inputs)} -> {listed(self.outputs)}"
+        return f"LinearModel({signals}, {self.fs:g} Hz, nx={self.nx})"
+
+    def __str__(self) -> str:
+        fit = self.fit
+        facts = [
+            ("sampled at", f"{self.fs:g} Hz"),
+            ("inputs", offsets(self.inputs, self.u_offset)),
+            ("outputs", offsets(self.outputs, self.y_offset)),
+            ("order", f"{self.nx}"),
+            ("fit", fit and f"{fit.criterion} error {number(fit.rmse)} (normalised), {fit.reason}"),
+        ]
+        system = {"": StateSpace(self.A, self.B, self.C, self.D)}
+        lines = [
+            "Linear model",
+            *in_columns(facts),
+            *system_lines(system, self.fs, self.inputs, self.outputs),
+        ]
+        return "\n".join(lines)
 
     @property
     def nx(self) -> int:

@@ -1,0 +1,126 @@
+"""A linear system in a few lines of text: its poles and its gains at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
+
+import numpy as np
+
+from lfrtorch._support.roots import frequency_and_damping
+from lfrtorch._support.tables import Cell, factor_of, number, radius, table
+from lfrtorch._support.types import Array
+from lfrtorch.engine.operating_point import StateSpace
+from lfrtorch.records import Channel
+
+MOST_POLES, MOST_GAINS = 6, 4
+"""Rows of the tables; of more poles those of the largest radius."""
+
+INTEGRATES = 1e-9
+"""Distance of a pole from 1 up to which there is no gain at rest."""
+
+ROUNDING = 1e-12
+"""An offset below this part of the rms about it is a rounding error."""
+
+LISTED = 4
+"""Most channels of a side that a line names."""
+
+
+def listed(channels: Sequence[Channel]) -> str:
+    """The channels with their units, the first ones if they are many."""
+    more = ["..."] * (len(channels) > LISTED)
+    return ", ".join([*map(str, channels[:LISTED]), *more])
+
+
+def levels(channels: Sequence[Channel], offset: Array, scale: Array) -> str:
+    """Offset and rms about it of each channel, the first ones if they are many."""
+    numbers = [
+        f"{number(0.0 if abs(o) < ROUNDING * s else o)} ± {number(s)}"
+        for o, s in zip(offset, scale, strict=True)
+    ]
+    return _each(channels, numbers)
+
+
+def offsets(channels: Sequence[Channel], offset: Array) -> str:
+    """Offset of each channel, the first ones if they are many."""
+    return _each(channels, [number(o) for o in offset])
+
+
+def _each(channels: Sequence[Channel], numbers: Sequence[str]) -> str:
+    said = [
+        f"{channel.name} {value} {channel.unit}".rstrip()
+        for channel, value in zip(channels[:LISTED], numbers, strict=False)
+    ]
+    return ", ".join(said + ["..."] * (len(channels) > LISTED))
+
+
+def in_columns(facts: Sequence[tuple[str, str | None]]) -> list[str]:
+    """Lines of a name and what is said of it; those without a text are left out."""
+    width = max(len(name) for name, _ in facts)
+    return [f"{name:<{width}}  {text}" for name, text in facts if text]
+
+
+def system_lines(
+    systems: Mapping[str, StateSpace],
+    fs: float,
+    inputs: Sequence[Channel],
+    outputs: Sequence[Channel],
+) -> list[str]:
+    """Tables of poles and of gains at rest of systems by name, side by side.
+
+    Args:
+        systems: in physical units.
+        fs: sampling frequency in Hz.
+        inputs, outputs: channels.
+    """
+    head, columns, count = [], [], 0
+    for name, system in systems.items():
+        roots = frequency_and_damping(np.linalg.eigvals(system.A).astype(complex), fs)
+        count = max(count, len(roots))
+        kept = sorted(roots, key=lambda root: -(root["radius"] or 0.0))[:MOST_POLES]
+        shown = [root for root in roots if root in kept]
+        head += [f"{name}: pole (Hz)" if name else "pole (Hz)", "damping", "radius"]
+        columns.append(
+            [
+                [number(root["frequency"], 4), number(root["damping"], 3), radius(root["radius"])]
+                for root in shown
+            ]
+        )
+    rows = [
+        [text for part in row for text in part]
+        for row in zip_longest(*columns, fillvalue=["", "", ""])
+    ]
+    lines = ["", *table(head, rows).splitlines()]
+    if count > MOST_POLES:
+        lines.append(f"The {MOST_POLES} poles of the largest radius; a pair counts once.")
+    pairs = [(i, j) for i in range(len(outputs)) for j in range(len(inputs))]
+    gains = {name: _gain(system) for name, system in systems.items()}
+    heads = [f"{name}: gain" if name else "gain" for name in systems]
+    body: list[list[Cell]] = [
+        [
+            f"{outputs[i].name} / {inputs[j].name}",
+            _unit(outputs[i].unit, inputs[j].unit),
+            *(None if gain is None else float(gain[i, j]) for gain in gains.values()),
+        ]
+        for i, j in pairs[:MOST_GAINS]
+    ]
+    units = any(row[1] for row in body)
+    kept_cells = [row if units else [row[0], *row[2:]] for row in body]
+    lines += ["", *table(["constant input", *["unit"] * units, *heads], kept_cells).splitlines()]
+    if len(pairs) > MOST_GAINS:
+        lines.append(f"The first {MOST_GAINS} of {len(pairs)} gains.")
+    return lines
+
+
+def _gain(system: StateSpace) -> Array | None:
+    """C (I - A)⁻¹ B + D; None of a system that integrates."""
+    A, B, C, D = system
+    if (np.abs(np.linalg.eigvals(A) - 1.0) < INTEGRATES).any():
+        return None
+    return C @ np.linalg.solve(np.eye(len(A)) - A, B) + D
+
+
+def _unit(output: str, source: str) -> str:
+    if not (output or source):
+        return ""
+    return f"{factor_of(output) or '1'}/{factor_of(source)}" if source else output

@@ -1,0 +1,121 @@
+"""The model about an operating point: where a constant input holds it, and its linearisation there.
+
+At rest x = f(x, u). Newton's method on the gap f(x, u) - x takes steps d with (I - F) d = gap,
+F = ∂f/∂x, halved until the gap shrinks.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lfrtorch._support.types import Array
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linearised import of_static
+from lfrtorch.engine.simulation import simulate
+from lfrtorch.engine.static_jacobian import linearise_static
+from lfrtorch.records import Scaler
+
+MAX_NEWTON, HALVINGS = 50, 30
+"""Most steps of Newton's method, and most times that a step is halved."""
+
+TOLERANCE = 1e-10
+"""Largest |f(x, u) - x| relative to 1 + max |x| at rest (states have unit rms)."""
+
+SINGULAR = 1e-12
+"""Singular values of I - F below this part of the largest are those of integrators: any of their
+states may be at rest."""
+
+SETTLING = 1000
+"""Samples that a simulation has to come near its rest, if Newton's method does not find one."""
+
+
+class StateSpace(NamedTuple):
+    """Matrices of x+ = A x + B u, y = C x + D u."""
+
+    A: Float[Array, "nx nx"]
+    B: Float[Array, "nx nu"]
+    C: Float[Array, "ny nx"]
+    D: Float[Array, "ny nu"]
+
+    def physical(self, scaler: Scaler) -> StateSpace:
+        """The same between signals in physical units; the states stay."""
+        u, y = scaler.u_scale, scaler.y_scale[:, None]
+        return StateSpace(self.A, self.B / u, y * self.C, y * self.D / u)
+
+
+def double(cell: LFRCell) -> LFRCell:
+    """The cell on the CPU in float64."""
+    if cell.A.dtype == torch.float64 and cell.A.device.type == "cpu":
+        return cell
+    return deepcopy(cell).to(device="cpu", dtype=torch.float64)
+
+
+def linear_part(cell: LFRCell) -> StateSpace:
+    """A, Bu, Cy and Dyu: the model without its static nonlinearity."""
+    return _arrays(cell.A, cell.Bu, cell.Cy, cell.Dyu)
+
+
+@torch.no_grad()
+def linearised_at(cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"]) -> StateSpace:
+    """Derivatives of the next state and the output at an input and a state.
+
+    With J = ∂w/∂z they are A + Bw J Cz, Bu + Bw J Dzu, Cy + Dyw J Cz and Dyu + Dyw J Dzu.
+    """
+    z, _ = cell.internal(u, x)
+    weights = {name: p.detach() for name, p in cell.named_parameters()}
+    J = linearise_static(cell.static, z[None, None], of_static(weights)).J[0, 0]
+    Bw, Dyw = cell.Bw @ J, cell.Dyw @ J
+    return _arrays(
+        cell.A + Bw @ cell.Cz,
+        cell.Bu + Bw @ cell.Dzu,
+        cell.Cy + Dyw @ cell.Cz,
+        cell.Dyu + Dyw @ cell.Dzu,
+    )
+
+
+@torch.no_grad()
+def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] | None:
+    """The state in which the constant input holds the model; None if none is found.
+
+    Newton's method begins at x = 0, and then at the end of a simulation from there. The rest may be
+    unstable. If there are several, it is the one that the search comes to.
+    """
+    x = _newton(cell, u, u.new_zeros(cell.nx))
+    if x is None:
+        constant = u.expand(1, SETTLING, -1).contiguous()
+        end = simulate(cell, constant, u.new_zeros(1, cell.nx)).x[0, -1]
+        x = _newton(cell, u, end) if torch.isfinite(end).all() else None
+    return x
+
+
+def _newton(
+    cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"]
+) -> Float[Tensor, " nx"] | None:
+    """The rest that Newton's method comes to from x."""
+    identity = torch.eye(cell.nx, dtype=u.dtype)
+    gap = cell(u, x)[1] - x
+    for _ in range(MAX_NEWTON):
+        if gap.abs().max() <= TOLERANCE * (1.0 + x.abs().max()):
+            return x
+        F = torch.as_tensor(linearised_at(cell, u, x).A)
+        step = torch.linalg.pinv(identity - F, rtol=SINGULAR) @ gap
+        for _ in range(HALVINGS):
+            closer = x + step
+            left = cell(u, closer)[1] - closer
+            if left.norm() < gap.norm():  # False for NaN
+                break
+            step = step / 2
+        else:
+            return None
+        x, gap = closer, left
+    return None
+
+
+def _arrays(*matrices: Tensor) -> StateSpace:
+    return StateSpace(*(np.asarray(m.detach().double().cpu().numpy()) for m in matrices))
