@@ -2,6 +2,7 @@
 
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function
+from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.export.targets import TARGETS, write
 
-__all__ = ["TARGETS", "c_source", "casadi_function", "write"]
+__all__ = ["TARGETS", "c_source", "casadi_function", "onnx_models", "write"]

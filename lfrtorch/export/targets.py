@@ -14,6 +14,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function
 from lfrtorch.export.equations import check_name, equations
+from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
@@ -42,10 +43,20 @@ def _casadi(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
     paths[1].write_text(json.dumps(equations(model).description(name), indent=2) + "\n")
 
 
+def _onnx(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
+    for path, graph in zip(paths, onnx_models(model, name), strict=True):
+        path.write_bytes(graph.SerializeToString())
+
+
 TARGETS = {
     "c": Target((".h", ".c"), _c, "{name}_step(x, u, x_next, y);"),
     "casadi": Target(
         (".casadi", "_channels.json"), _casadi, "x_next, y = casadi.Function.load('{path}')(x, u)"
+    ),
+    "onnx": Target(
+        (".onnx", "_simulate.onnx"),
+        _onnx,
+        "x_next, y = onnxruntime.InferenceSession('{path}').run(None, {{'x': x, 'u': u}})",
     ),
 }
 """All kinds of export."""
@@ -64,7 +75,8 @@ def write(
     Args:
         model: what is exported.
         to: ``"c"``: ``NAME.h`` and ``NAME.c``; ``"casadi"``: ``NAME.casadi``, which
-            ``casadi.Function.load`` reads, and ``NAME_channels.json`` with channels and rate.
+            ``casadi.Function.load`` reads, and ``NAME_channels.json`` with channels and rate;
+            ``"onnx"``: ``NAME.onnx`` for a sample and ``NAME_simulate.onnx``.
         folder: where to; it is made if need be.
         name: of the files, and in them.
         overwrite: whether files that exist may be replaced.

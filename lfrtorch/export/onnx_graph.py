@@ -1,0 +1,176 @@
+"""A model as graphs of ONNX in float64: one sample, and a whole simulation."""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from lfrtorch._support.types import Array
+from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
+from lfrtorch.export.optional import imported
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+
+OPSET, IR = 17, 8
+"""Operators and file format of 2022, which every runtime since then reads."""
+
+
+def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, Any]:
+    """A model as two graphs of ONNX, float64 and physical units.
+
+    The first is one sample, (x, u) -> (x_next, y). The second is a simulation, (x0, u) ->
+    (x_end, y), by the operator Scan over the samples. Both take several states and inputs at once,
+    along the first axis. The metadata have the sampling frequency, and names, units and offsets of
+    the channels as JSON.
+
+    Args:
+        model: what is exported.
+        name: of the graphs.
+
+    Shape:
+        sample: x (n, nx), u (n, nu) -> x_next (n, nx), y (n, ny);
+        simulation: x0 (n, nx), u (n, T, nu) -> x_end (n, nx), y (n, T, ny).
+
+    Returns:
+        Two ``onnx.ModelProto``.
+
+    Raises:
+        ValueError: onnx is not installed, a static map of the user's own class, or a name that is
+            no identifier.
+
+    Example:
+        >>> sample, simulation = lfrtorch.export.onnx_models(model, "actuator")
+        >>> [one.name for one in sample.graph.input], [one.name for one in simulation.graph.output]
+        (['x', 'u'], ['x_end', 'y'])
+    """
+    check_name(name)
+    e, graph = equations(model), Graph(imported("onnx", "onnx"))
+    _sample(e, graph)
+    sample, simulation = graph.sample(e, name), graph.simulation(e, name)
+    return graph.model(sample, e, name), graph.model(simulation, e, name)
+
+
+def _sample(e: Equations, graph: Graph) -> None:
+    """The nodes from x and u to x_next and y."""
+    v = graph.node("Sub", "u", graph.constant("u_offset", e.u_offset), to="v")
+
+    def combined(to: str, matrices: dict[str, str], *offset: str) -> str:
+        """The sum of matrices times signals, which are rows, and perhaps an offset."""
+        terms = [
+            graph.node("MatMul", signal, graph.constant(letters, getattr(e, letters).T))
+            for letters, signal in matrices.items()
+        ]
+        return graph.node("Sum", *terms, *offset, to=to)
+
+    x_next, y = {"A": "x", "Bu": v}, {"Cy": "x", "Dyu": v}
+    if e.static:
+        z, f = combined("z", {"Cz": "x", "Dzu": v}), e.static
+        w = _network(graph, f, z) if isinstance(f, Layers) else _polynomial(graph, f, z)
+        x_next["Bw"], y["Dyw"] = w, w
+    combined("x_next", x_next)
+    combined("y", y, graph.constant("y_offset", e.y_offset))
+
+
+def _network(graph: Graph, static: Layers, z: str) -> str:
+    """w = Ww h + bw."""
+    signal = z
+    for (W, b), weight, bias in zip(static.names, static.W, static.b, strict=True):
+        if W != "Wz":
+            signal = _activation(graph, static.activation, signal)
+        product = graph.node("MatMul", signal, graph.constant(W, weight.T))
+        signal = graph.node("Add", product, graph.constant(b, bias))
+    return signal
+
+
+def _activation(graph: Graph, name: str, v: str) -> str:
+    """σ(v)."""
+    node = graph.node
+    match name:
+        case "rbf":
+            return node("Exp", node("Neg", node("Mul", v, v)))
+        case "softplus":  # the operator of that name has no float64 in every runtime
+            one = graph.constant("one", np.ones(1))
+            rest = node("Log", node("Add", one, node("Exp", node("Neg", node("Abs", v)))))
+            return node("Add", node("Relu", v), rest)
+    return node({"tanh": "Tanh", "sigmoid": "Sigmoid", "relu": "Relu"}[name], v)
+
+
+def _polynomial(graph: Graph, static: Monomials, z: str) -> str:
+    """w = C m; the constant monomial is a bias."""
+    nz = 1 + max(j for _, j in static.growth)
+    each = graph.split("Split", z, to=[f"z{j}" for j in range(nz)], axis=-1)
+    m: list[str] = [""]
+    for before, j in static.growth:
+        m.append(graph.node("Mul", m[before], each[j]) if before else each[j])
+    products = graph.node("Concat", *m[1:], axis=-1)
+    w = graph.node("MatMul", products, graph.constant("C", static.C[:, 1:].T))
+    return graph.node("Add", w, graph.constant("c", static.C[:, 0]))
+
+
+class Graph:
+    """Nodes and constants that become a model of ONNX.
+
+    Args:
+        onnx: the package.
+    """
+
+    def __init__(self, onnx: Any) -> None:
+        self.onnx = onnx
+        self.nodes: list[Any] = []
+        self.constants: dict[str, Any] = {}
+
+    def constant(self, name: str, value: Array) -> str:
+        """Keep a constant; its name."""
+        self.constants[name] = self.onnx.numpy_helper.from_array(np.ascontiguousarray(value), name)
+        return name
+
+    def node(self, operator: str, *inputs: str, to: str = "", **options: Any) -> str:
+        """Add a node; the name of its output."""
+        return self.split(operator, *inputs, to=[to or f"v{len(self.nodes)}"], **options)[0]
+
+    def split(self, operator: str, *inputs: str, to: list[str], **options: Any) -> list[str]:
+        """Add a node of several outputs; their names."""
+        self.nodes.append(self.onnx.helper.make_node(operator, inputs, to, **options))
+        return to
+
+    def signal(self, name: str, *shape: int | str) -> Any:
+        """An input or an output of float64."""
+        kind = self.onnx.TensorProto.DOUBLE
+        return self.onnx.helper.make_tensor_value_info(name, kind, shape)
+
+    def sample(self, e: Equations, name: str) -> Any:
+        """x, u -> x_next, y."""
+        nx, nu, ny = (e.sizes[size] for size in ("nx", "nu", "ny"))
+        inputs = [self.signal("x", "n", nx), self.signal("u", "n", nu)]
+        outputs = [self.signal("x_next", "n", nx), self.signal("y", "n", ny)]
+        return self.onnx.helper.make_graph(
+            self.nodes, name, inputs, outputs, list(self.constants.values())
+        )
+
+    def simulation(self, e: Equations, name: str) -> Any:
+        """x0, u -> x_end, y, with the sample as the body of a Scan over the axis of time."""
+        nx, nu, ny = (e.sizes[size] for size in ("nx", "nu", "ny"))
+        scan = self.onnx.helper.make_node(
+            "Scan", ["x0", "u"], ["x_end", "y"], body=self.sample(e, f"{name}_sample"),
+            num_scan_inputs=1, scan_input_axes=[1], scan_output_axes=[1],
+        )  # fmt: skip
+        inputs = [self.signal("x0", "n", nx), self.signal("u", "n", "T", nu)]
+        outputs = [self.signal("x_end", "n", nx), self.signal("y", "n", "T", ny)]
+        return self.onnx.helper.make_graph([scan], name, inputs, outputs)
+
+    def model(self, graph: Any, e: Equations, name: str) -> Any:
+        """A graph with its operators' version and the metadata."""
+        model = self.onnx.helper.make_model(
+            graph,
+            ir_version=IR,
+            opset_imports=[self.onnx.helper.make_opsetid("", OPSET)],
+            producer_name="lfrtorch",
+            producer_version=version("lfrtorch"),
+            doc_string="\n".join(e.about(name)),
+        )
+        described = {key: json.dumps(value) for key, value in e.description(name).items()}
+        self.onnx.helper.set_model_props(model, described)
+        return model
