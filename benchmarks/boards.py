@@ -28,7 +28,6 @@ Sizes = tuple[int, ...]
 MIRROR_ITERATIONS = 15
 MIRROR: tuple[Sizes, ...] = (
     (4, 4, 20, 1, 0),
-    (8, 6, 40, 1, 0),
     (12, 8, 30, 1, 0),
     (12, 8, 30, 1, 6),
     (12, 8, 15, 2, 6),
