@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from numpy.typing import ArrayLike, NDArray
 
-from lfrtorch._support.tables import engineering
+from lfrtorch._support.tables import engineering, factor_of
+from lfrtorch._support.types import Array
 
 OUTPUT, LINEAR, NL_LFR = "0.15", "#e69f00", "#0072b2"
 """Colours of the measured output, the linear model and the NL-LFR, of Okabe and Ito's palette:
@@ -15,6 +17,10 @@ colour-blind readers tell them apart, and they differ in lightness."""
 
 CHANNELS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Colours of several channels, of the same palette."""
+
+
+LOG_DECADES = 1.5
+"""Width of a band from which on the frequency axis is logarithmic."""
 
 
 def unit_axis(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> None:
@@ -62,3 +68,41 @@ def legend_above(ax: Axes, *, ncols: int = 3, markerscale: float = 1.0) -> None:
     )  # fmt: skip
     for handle in legend.get_lines():
         handle.set_linewidth(2)
+
+
+def is_wide(first: float, last: float) -> bool:
+    """Whether the frequency axis of a band is logarithmic."""
+    return first > 0 and last > first * 10**LOG_DECADES
+
+
+def frequency_axis(grid: NDArray[np.object_], first: float, last: float) -> None:
+    """The frequency axis of all panels, in Hz, with its label below the last row."""
+    for ax in grid.ravel():
+        if is_wide(first, last):
+            ax.set_xscale("log")
+            steps = (1.0,) if last > first * 1e3 else (1.0, 2.0, 5.0)
+            ax.xaxis.set_major_locator(LogLocator(subs=steps))
+            ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            ax.xaxis.set_minor_formatter(NullFormatter())
+        if last > first:
+            ax.set_xlim(first, last)
+        ax.grid(True, which="major", alpha=0.2)
+    for ax in grid[-1]:
+        ax.set_xlabel("frequency (Hz)")
+
+
+def decibel(amplitude: ArrayLike) -> Array:
+    """Amplitude in dB; an amplitude of 0 leaves a gap."""
+    amplitude = np.abs(np.asarray(amplitude))
+    return 20.0 * np.log10(np.where(amplitude > 0, amplitude, np.nan))
+
+
+def unit_label(what: str, output: str, source: str) -> str:
+    """The label of a gain in dB, of the units of output and input."""
+    per = "/".join(factor_of(unit or "1") for unit in (output, source))
+    return f"{what} (dB{reference(per if output or source else '')})"
+
+
+def reference(unit: str) -> str:
+    """What 0 dB is, for a label."""
+    return f", re 1 {unit}" if unit else ""

@@ -1,5 +1,40 @@
-"""What a fitted model is, and how far it may be trusted: residuals, poles, amplitudes."""
+"""What a fitted model is, and how far it may be trusted: figure, residuals, poles."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from lfrtorch.analysis.linearisation import linearise
 from lfrtorch.analysis.residual_analysis import Residuals, residuals
+from lfrtorch.model import Model
+from lfrtorch.records import Record
 
-__all__ = ["Residuals", "residuals"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Residuals", "linearise", "plot", "residuals"]
+
+
+def plot(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
+    """Figure of a model: frequency responses, poles, and the nonlinearity of its static map.
+
+    Responses and poles are those of the linear part and of the model linearised at rest at the
+    inputs' offsets. The static map is drawn less the affine map that is nearest to it over the
+    data, as that belongs to the linear part: over z1, over the plane of z1 and z2, or of more z
+    along the direction in which it is the least linear.
+
+    Args:
+        model: nonlinear.
+        records: data that say where z is. Default: white noise of the rms of the training inputs.
+
+    Raises:
+        ValueError: records of other channels than the model's, or a model that diverges on them.
+
+    Example:
+        >>> figure = lfrtorch.analysis.plot(model, record)
+        >>> figure.savefig("model.png")
+    """
+    from lfrtorch.analysis.model_plots import model_figure  # matplotlib takes its time
+
+    return model_figure(model, records)

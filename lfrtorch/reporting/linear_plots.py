@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
-from numpy.typing import ArrayLike, NDArray
+from matplotlib.ticker import MaxNLocator
 
-from lfrtorch._support.drawing import plain_ticks
+from lfrtorch._support.drawing import (
+    decibel,
+    frequency_axis,
+    is_wide,
+    plain_ticks,
+    reference,
+    unit_label,
+)
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.tables import factor_of
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
-from lfrtorch.records import Channel
 
 MEASURED, MODEL, DIFFERENCE = "#0072b2", "black", "#e69f00"
 TOTAL, NOISE, ODD, EVEN = "#d55e00", "0.5", "#d55e00", "#cc79a7"
@@ -25,9 +27,6 @@ TOTAL, NOISE, ODD, EVEN = "#d55e00", "0.5", "#d55e00", "#cc79a7"
 
 GRID = 500
 """Frequencies at which a model is drawn, beside those of its poles."""
-
-LOG_DECADES = 1.5
-"""Band from which on the frequency axis is logarithmic."""
 
 LOWEST = 1e-3
 """First frequency of a model drawn alone, relative to half the sampling frequency."""
@@ -80,8 +79,8 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
             angle = np.unwrap(np.angle(fit))
             if frf is not None and lines is not None:
                 G = frf.G[:, i, j]
-                _dots(magnitude, frf.frequencies, _decibel(G), "nonparametric", MEASURED)
-                difference = _decibel(G - fit[lines])
+                _dots(magnitude, frf.frequencies, decibel(G), "nonparametric", MEASURED)
+                difference = decibel(G - fit[lines])
                 _dots(magnitude, frf.frequencies, difference, "difference", DIFFERENCE)
                 for variance, label, colour in (
                     (frf.var_total, "total std", TOTAL),
@@ -93,22 +92,22 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
                 # Measured phases stand in the turn of the model's: noise makes no jumps of 360°.
                 turned = angle[lines] + np.angle(G * fit[lines].conj())
                 _dots(phase, frf.frequencies, np.degrees(turned), "nonparametric", MEASURED)
-            magnitude.plot(f, _decibel(fit), lw=1.0, color=MODEL, label="model")
+            magnitude.plot(f, decibel(fit), lw=1.0, color=MODEL, label="model")
             phase.plot(f, np.degrees(angle), lw=1.0, color=MODEL, label="model")
-            limits = _limit(magnitude, _decibel(fit))
+            limits = _limit(magnitude, decibel(fit))
             if std is not None:
                 low, high = (centre[:, i, j] + sign * 2 * std[:, i, j] for sign in (-1, 1))
                 low = np.maximum(low, 10 ** (-RANGE / 20) * high.max())
-                band = _decibel(low), _decibel(high)
+                band = decibel(low), decibel(high)
                 magnitude.fill_between(
                     smooth, *band, color=MODEL, alpha=0.25, lw=0, label="model ± 2 std"
                 )
                 magnitude.set_ylim(limits)  # a band may reach down to zero
             title = f"{output.name} / {source.name}"
-            magnitude.set(title=title, ylabel=_unit_label("magnitude", output, source))
+            magnitude.set(title=title, ylabel=unit_label("magnitude", output.unit, source.unit))
             phase.set(ylabel="phase (deg)")
             phase.yaxis.set_major_locator(MaxNLocator(5, steps=TURNS))
-    _frequency_axis(grid, f[0], f[-1])
+    frequency_axis(grid, f[0], f[-1])
     _legend(figure, grid[0, 0])
     return figure
 
@@ -179,13 +178,13 @@ def distortion(frf: FRF) -> Figure:
             (levels.odd, "odd distortion and noise", ODD, "^"),
             (levels.even, "even distortion and noise", EVEN, "v"),
         ):
-            power = _decibel(np.sqrt(level.power[:, i]))
+            power = decibel(np.sqrt(level.power[:, i]))
             _dots(ax, level.frequencies, power, label, colour, marker)
         noise = _mean(levels.output.frequencies, levels.output.noise[:, i])
         ax.plot(*noise, lw=1.2, color=NOISE, label="noise")
         _limit(ax)
-        ax.set(ylabel=f"{output.name} (dB{_reference(output.unit)} rms)")
-    _frequency_axis(grid, frf.frequencies[0], frf.frequencies[-1])
+        ax.set(ylabel=f"{output.name} (dB{reference(output.unit)} rms)")
+    frequency_axis(grid, frf.frequencies[0], frf.frequencies[-1])
     _legend(figure, grid[0, 0])
     return figure
 
@@ -247,29 +246,10 @@ def frequencies(model: LinearModel, frf: FRF | None = None) -> Array:
     """
     lines = np.array([LOWEST, 1.0]) * model.fs / 2 if frf is None else frf.frequencies
     first, last = float(lines[0]), float(lines[-1])
-    spaced = np.geomspace if _wide(first, last) else np.linspace
+    spaced = np.geomspace if is_wide(first, last) else np.linspace
     resonances = np.abs(np.angle(model.poles)) * model.fs / (2 * np.pi)
     f = np.union1d(spaced(first, last, GRID), resonances)
     return f[(f >= first) & (f <= last)]
-
-
-def _wide(first: float, last: float) -> bool:
-    return first > 0 and last > first * 10**LOG_DECADES
-
-
-def _frequency_axis(grid: NDArray[np.object_], first: float, last: float) -> None:
-    for ax in grid.ravel():
-        if _wide(first, last):
-            ax.set_xscale("log")
-            steps = (1.0,) if last > first * 1e3 else (1.0, 2.0, 5.0)
-            ax.xaxis.set_major_locator(LogLocator(subs=steps))
-            ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            ax.xaxis.set_minor_formatter(NullFormatter())
-        if last > first:
-            ax.set_xlim(first, last)
-        ax.grid(True, which="major", alpha=0.2)
-    for ax in grid[-1]:
-        ax.set_xlabel("frequency (Hz)")
 
 
 def _dots(ax: Axes, f: Array, level: Array, label: str, colour: str, marker: str = ".") -> None:
@@ -278,11 +258,11 @@ def _dots(ax: Axes, f: Array, level: Array, label: str, colour: str, marker: str
 
 def _mean(f: Array, variance: Array) -> tuple[Array, Array]:
     """Frequencies and dB of a variance, its mean over each stretch of the axis that has lines."""
-    spaced = np.geomspace if _wide(f[0], f[-1]) else np.linspace
+    spaced = np.geomspace if is_wide(f[0], f[-1]) else np.linspace
     stretch = np.searchsorted(spaced(f[0], f[-1], STRETCHES + 1)[1:-1], f, side="right")
     _, first, count = np.unique(stretch, return_index=True, return_counts=True)
     at, mean = (np.add.reduceat(values, first) / count for values in (f, variance))
-    return at, _decibel(np.sqrt(mean))
+    return at, decibel(np.sqrt(mean))
 
 
 def _legend(figure: Figure, ax: Axes) -> None:
@@ -296,19 +276,3 @@ def _limit(ax: Axes, model: Array | None = None) -> tuple[float, float]:
     drawn = np.zeros(0) if model is None else model[np.isfinite(model)]
     high = min(high, drawn.max() + ABOVE) if len(drawn) else high
     return ax.set_ylim(min(max(low, high - RANGE), high - ABOVE), high)
-
-
-def _decibel(amplitude: ArrayLike) -> Array:
-    """Amplitude in dB; an amplitude of 0 leaves a gap."""
-    amplitude = np.abs(np.asarray(amplitude))
-    return 20.0 * np.log10(np.where(amplitude > 0, amplitude, np.nan))
-
-
-def _unit_label(what: str, output: Channel, source: Channel) -> str:
-    units: Sequence[str] = (output.unit, source.unit)
-    per = "/".join(factor_of(unit or "1") for unit in units)
-    return f"{what} (dB{_reference(per if any(units) else '')})"
-
-
-def _reference(unit: str) -> str:
-    return f", re 1 {unit}" if unit else ""

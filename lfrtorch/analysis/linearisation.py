@@ -1,0 +1,106 @@
+"""The linear models inside a nonlinear one: its linear part, and what it is about a point."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import quantity
+from lfrtorch._support.types import Array
+from lfrtorch.engine.operating_point import StateSpace, double, equilibrium, linearised_at
+from lfrtorch.engine.operating_point import linear_part as linear_part_of
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+from lfrtorch.records import Channel
+
+
+def linearise(
+    model: Model, u: ArrayLike | None = None, *, x: ArrayLike | None = None
+) -> LinearModel:
+    """The model linearised about an operating point, in physical units.
+
+    With u0 and the state x0 that it holds the model in, x0 = f(x0, u0), the deviations obey::
+
+        x+ = A x + B (u - u0)
+        y  = C x + D (u - u0) + y0
+
+    to first order: the error is quadratic in them. ``to_scipy`` and ``to_control`` of the result
+    hand the matrices on. The rest may be unstable, and is then of use to a controller.
+
+    Args:
+        model: nonlinear.
+        u: constant input u0, physical units. Default: the inputs' offsets in the data.
+        x: state x0 in the model's coordinates, as ``model.signals(record).x[0, k]``. If u0 does not
+            hold the model there, the result is of the deviations from the trajectory that passes
+            through it. Default: the state at rest, by Newton's method; if there are several, the
+            one it comes to from x = 0.
+
+    Shape:
+        u: (nu,) or a number for one input, x: (nx,).
+
+    Raises:
+        ValueError: no state is at rest under u, or wrong shapes.
+
+    Example:
+        >>> local = lfrtorch.analysis.linearise(model, 0.5)
+        >>> local.u_offset.tolist(), bool(np.abs(local.poles).max() < 1)
+        ([0.5], True)
+        >>> system = local.to_scipy()
+    """
+    cell, scaler = double(model.lfr.cell), model.scaler
+    u0 = scaler.u_offset if u is None else _vector("u", u, cell.nu, "the model has {} input(s)")
+    v: Tensor = torch.as_tensor((u0 - scaler.u_offset) / scaler.u_scale)
+    if x is None:
+        found = equilibrium(cell, v)
+        if found is None:
+            raise InputError(
+                f"no state at rest was found under {_levels(model.inputs, u0)}; the offsets are "
+                f"{_levels(model.inputs, scaler.u_offset)}.\nGive an input nearer to these, or a "
+                "state: linearise(model, u, x=...)."
+            )
+    else:
+        found = torch.as_tensor(_vector("x", x, cell.nx, "the model has {} states"))
+    with torch.no_grad():
+        y0 = scaler.restore_y(cell(v, found)[0].numpy())
+    return _linear_model(model, linearised_at(cell, v, found), np.array(u0), y0)
+
+
+def linear_part(model: Model) -> LinearModel:
+    """A, Bu, Cy and Dyu of a model, in physical units: what it is without its static map.
+
+    Example:
+        >>> from lfrtorch.analysis.linearisation import linear_part
+        >>> linear_part(model).nx
+        1
+    """
+    system = linear_part_of(double(model.lfr.cell))
+    return _linear_model(model, system, model.scaler.u_offset, model.scaler.y_offset)
+
+
+def _linear_model(model: Model, system: StateSpace, u0: Array, y0: Array) -> LinearModel:
+    return LinearModel(
+        *system.physical(model.scaler), model.fs, u0, y0, model.inputs, model.outputs
+    )
+
+
+def _vector(name: str, given: ArrayLike, size: int, expected: str) -> Array:
+    """The numbers of an argument; refuse another shape and numbers that are not finite."""
+    if isinstance(given, Tensor):
+        given = given.detach().cpu().numpy()
+    try:
+        found = np.atleast_1d(np.asarray(given, dtype=np.float64))
+    except (TypeError, ValueError):
+        found = np.full((0, 0), np.nan)
+    if found.shape != (size,) or not np.isfinite(found).all():
+        raise InputError(
+            f"{name} is {given!r}; {expected.format(size)}: give as many finite numbers."
+        )
+    return found
+
+
+def _levels(channels: tuple[Channel, ...], values: Array) -> str:
+    pairs = zip(channels, values, strict=True)
+    return ", ".join(f"{c.name} = {quantity(float(v), c.unit)}" for c, v in pairs)

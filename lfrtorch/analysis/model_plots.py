@@ -1,0 +1,256 @@
+"""Figure of a model: frequency responses, poles, and the nonlinearity of its static map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from numpy.typing import NDArray
+
+from lfrtorch._support.drawing import (
+    LINEAR,
+    NL_LFR,
+    OUTPUT,
+    decibel,
+    frequency_axis,
+    unit_label,
+)
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import percent
+from lfrtorch._support.types import Array
+from lfrtorch.analysis.linearisation import linear_part, linearise
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linearised import of_static
+from lfrtorch.engine.operating_point import double
+from lfrtorch.engine.static_jacobian import linearise_static
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.metrics import rms
+from lfrtorch.model import Model
+from lfrtorch.records import Record, as_records
+
+MOST_CHANNELS, MOST_MAPS = 4, 4
+"""Frequency responses and outputs of the static map that are drawn."""
+
+MOST_SAMPLES = 20_000
+"""Samples of the data that say where the static map is drawn."""
+
+NOISE_SAMPLES = 4000
+"""Samples of white noise that do, without data."""
+
+GRID = 121
+"""Points of a curve, and of each side of a plane."""
+
+LOWEST, FREQUENCIES = 1e-3, 500
+"""First frequency relative to half the sampling frequency, and how many."""
+
+FLAT = 1e-9
+"""Least variance of z in a direction, relative to the largest."""
+
+HEIGHT, LEAST_HEIGHT = 2.7, 3.6
+"""Of a panel, and of the figure, in inches."""
+
+
+class Visited(NamedTuple):
+    """Where the static map is used, and the affine map that is the nearest to it there.
+
+    Args:
+        z: inputs (S, nz).
+        slope, offset: of w = slope z + offset, (nw, nz) and (nw,).
+        nonlinear: part of the rms of w (about its mean) that this leaves, (nw,).
+        known: whether z are those of data.
+
+    Example:
+        >>> from lfrtorch.analysis.model_plots import visited
+        >>> where = visited(model, model.lfr.cell, record)
+        >>> where.known, where.nonlinear.shape
+        (True, (1,))
+    """
+
+    z: Float[Array, "S nz"]
+    slope: Float[Array, "nw nz"]
+    offset: Float[Array, " nw"]
+    nonlinear: Float[Array, " nw"]
+    known: bool
+
+
+def model_figure(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
+    """See :func:`lfrtorch.analysis.plot`.
+
+    Example:
+        >>> from lfrtorch.analysis.model_plots import model_figure
+        >>> len(model_figure(model).axes)  # a response, the poles, a map over its density
+        4
+    """
+    systems = {"linear part": linear_part(model)}
+    with suppress(InputError):  # it may have no rest at the offsets
+        systems["at rest"] = linearise(model)
+    cell = double(model.lfr.cell)
+    pairs = [(i, j) for i in range(cell.ny) for j in range(cell.nu)][:MOST_CHANNELS]
+    maps = min(cell.nw, MOST_MAPS)
+    height = max(LEAST_HEIGHT, HEIGHT * max(len(pairs), -(-maps // 2)))
+    widths = [4.5, 3.5, *([4.0 if maps == 1 else 6.5] if maps else [])]
+    figure = Figure(figsize=(sum(widths), height), layout="constrained")
+    parts: NDArray[np.object_] = figure.subfigures(
+        1, len(widths), squeeze=False, width_ratios=widths
+    )[0]
+    _responses(parts[0], systems, pairs)
+    _poles(parts[1], systems)
+    if maps:
+        _maps(parts[2], cell, visited(model, cell, records), maps)
+    return figure
+
+
+def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | None) -> Visited:
+    """Inputs of the static map along simulations, and its nearest affine map there.
+
+    Example:
+        >>> from lfrtorch.analysis.model_plots import visited
+        >>> found = visited(model, model.lfr.cell, record)
+        >>> found.z.shape, found.slope.shape
+        ((400, 1), (1, 1))
+    """
+    if records is None:
+        noise = np.random.default_rng(0).standard_normal((NOISE_SAMPLES, cell.nu))
+        signals = [model.scaler.u_offset + model.scaler.u_scale * noise]
+    else:
+        signals = as_records(records)
+    z = np.concatenate([model.signals(one).z[0].double().numpy() for one in signals])
+    z = z[:: 1 + len(z) // MOST_SAMPLES]
+    if not np.isfinite(z).all():
+        raise InputError(
+            "the model diverges on the records; give others." if records is not None else
+            "the model diverges under white noise of the training inputs' rms; give records."
+        )  # fmt: skip
+    w = _static(cell, z)
+    affine = np.hstack([z, np.ones((len(z), 1))])
+    solution: Array = np.asarray(np.linalg.lstsq(affine, w, rcond=None)[0], dtype=np.float64)
+    deviation = np.std(w, axis=0)
+    left = rms(w - affine @ solution, axis=0) / np.where(deviation > 0, deviation, 1.0)
+    return Visited(z, solution[:-1].T, solution[-1], left, records is not None)
+
+
+@torch.no_grad()
+def _static(cell: LFRCell, z: Float[Array, "S nz"]) -> Float[Array, "S nw"]:
+    assert cell.static is not None
+    return cell.static(torch.as_tensor(z)).numpy()
+
+
+def _responses(
+    part: SubFigure, systems: Mapping[str, LinearModel], pairs: Sequence[tuple[int, int]]
+) -> None:
+    """Magnitudes of the channels of each system."""
+    first = next(iter(systems.values()))
+    resonances = np.concatenate([np.abs(np.angle(s.poles)) for s in systems.values()])
+    last = first.fs / 2
+    f = np.union1d(
+        np.geomspace(LOWEST * last, last, FREQUENCIES), resonances * first.fs / (2 * np.pi)
+    )
+    f = f[f >= LOWEST * last]
+    axes = part.subplots(len(pairs), 1, squeeze=False, sharex=True)
+    for ax, (i, j) in zip(axes[:, 0], pairs, strict=True):
+        for name, system in systems.items():
+            colour = LINEAR if name == "linear part" else NL_LFR
+            level = decibel(system.frf(f)[:, i, j])
+            ax.plot(f, level, color=colour, lw=1.2, label=name)
+        output, source = first.outputs[i], first.inputs[j]
+        ax.set_title(f"{output.name} / {source.name}", fontsize="medium")
+        ax.set_ylabel(unit_label("magnitude", output.unit, source.unit))
+    frequency_axis(axes, f[0], f[-1])
+    axes[0, 0].legend(fontsize="small")
+
+
+def _poles(part: SubFigure, systems: Mapping[str, LinearModel]) -> None:
+    """Poles in the z plane, with the unit circle."""
+    ax: Axes = part.subplots()
+    angle = np.linspace(0, 2 * np.pi, 361)
+    ax.plot(np.cos(angle), np.sin(angle), lw=0.8, color="0.6")
+    ax.axhline(0, lw=0.5, color="0.8", zorder=0)
+    ax.axvline(0, lw=0.5, color="0.8", zorder=0)
+    for name, system in systems.items():
+        colour, marker = (LINEAR, "+") if name == "linear part" else (NL_LFR, "x")
+        ax.plot(system.poles.real, system.poles.imag, marker, ms=7, color=colour)
+    ax.set(aspect="equal", xlabel="real part", ylabel="imaginary part")
+    ax.set_title("poles in the z plane", fontsize="medium")
+
+
+def _maps(part: SubFigure, cell: LFRCell, where: Visited, count: int) -> None:
+    """What the static map is beyond an affine one, a panel for each w."""
+    z, nz = where.z, where.z.shape[1]
+    low, high = z.min(axis=0), z.max(axis=0)
+    columns = 1 if count == 1 else 2
+    axes = np.ravel(part.subplots(-(-count // columns), columns, squeeze=False))
+    for ax in axes[count:]:
+        ax.set_axis_off()
+
+    def beyond(points: Float[Array, "S nz"]) -> Float[Array, "S nw"]:
+        return _static(cell, points) - points @ where.slope.T - where.offset
+
+    sides = [np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)]
+    for j, ax in enumerate(axes[:count]):
+        title = f"w{j + 1}: {percent(where.nonlinear[j])} nonlinear"
+        if nz == 1:
+            ax.plot(sides[0], beyond(sides[0][:, None])[:, j], color=NL_LFR, lw=1.2)
+            ax.axhline(0, lw=0.5, color="0.8", zorder=0)
+            ax.set_xlabel("z1 (grey: density)")
+            density = ax.twinx()
+            density.hist(z[:, 0], bins=60, color="0.85", density=True)
+            density.set(yticks=[], ylim=(0, 4 * density.get_ylim()[1]))
+            ax.set_zorder(density.get_zorder() + 1)
+            ax.patch.set_visible(False)
+        elif nz == 2:
+            plane = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
+            values = beyond(plane.reshape(-1, 2))[:, j].reshape(GRID, GRID)
+            reach = float(np.abs(values).max()) or 1.0
+            image = ax.pcolormesh(
+                *sides, values.T, cmap="coolwarm", vmin=-reach, vmax=reach, rasterized=True
+            )
+            part.colorbar(image, ax=ax)
+            ax.plot(z[:, 0], z[:, 1], ",", color=OUTPUT, alpha=0.3)
+            ax.set(xlabel="z1", ylabel="z2", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        else:
+            at, share = most_nonlinear(cell, where, j)
+            ax.plot(at, beyond(z)[:, j], ".", ms=1.0, color=NL_LFR, rasterized=True)
+            ax.axhline(0, lw=0.5, color="0.8", zorder=0)
+            ax.set_xlabel(f"direction of z with {percent(share)} of it")
+        ax.set_title(title, fontsize="medium")
+    where_from = "over the data" if where.known else "under white noise"
+    part.suptitle(f"static map less its linear part, {where_from}", fontsize="medium")
+
+
+def most_nonlinear(cell: LFRCell, where: Visited, j: int) -> tuple[Float[Array, " S"], float]:
+    """Where z is along the direction in which output j of the static map changes its slope most.
+
+    It is the leading eigenvector of the mean of g gᵀ, g the slope less its mean, in coordinates in
+    which z has unit covariance.
+
+    Returns:
+        Coordinates of the samples, and the part of the mean of |g|² that lies in that direction: if
+        it is 100 %, the nonlinearity is a function of one variable.
+
+    References:
+        Constantine, "Active Subspaces", SIAM, 2015.
+
+    Example:
+        >>> from lfrtorch.analysis.model_plots import most_nonlinear, visited
+        >>> where = visited(model, model.lfr.cell, record)
+        >>> at, share = most_nonlinear(model.lfr.cell, where, 0)
+        >>> at.shape, round(share, 6)  # of one z
+        ((400,), 1.0)
+    """
+    centred = where.z - where.z.mean(axis=0)
+    powers, axes = np.linalg.eigh(centred.T @ centred / len(centred))
+    scale = np.sqrt(np.maximum(powers, FLAT * powers[-1]))
+    weights = {name: p.detach() for name, p in cell.named_parameters()}
+    z = torch.as_tensor(where.z)[None]
+    J = linearise_static(cell.static, z, of_static(weights)).J[0, :, j].detach().numpy()
+    g = (J - J.mean(axis=0)) @ (axes * scale)
+    shares, directions = np.linalg.eigh(g.T @ g / len(g))
+    total = float(shares.sum())
+    at = (centred @ axes / scale) @ directions[:, -1]
+    return at, float(shares[-1]) / total if total > 0 else 1.0
