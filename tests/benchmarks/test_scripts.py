@@ -8,8 +8,10 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SCRIPTS = [
     "advice",
     "baseline",
+    "boards",
     "cases",
     "engine",
+    "export",
     "first_try",
     "large_linear",
     "linear",
