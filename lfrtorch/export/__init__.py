@@ -1,8 +1,9 @@
-"""A model as a program of other tools, in physical units: C and more to come."""
+"""A model as a program of other tools, in physical units."""
 
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function
+from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.export.targets import TARGETS, write
 
-__all__ = ["TARGETS", "c_source", "casadi_function", "onnx_models", "write"]
+__all__ = ["TARGETS", "c_source", "casadi_function", "matlab_function", "onnx_models", "write"]

@@ -8,6 +8,7 @@ import numpy as np
 
 from lfrtorch._support.types import Array
 from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
+from lfrtorch.export.rendering import rendered
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
@@ -52,8 +53,6 @@ def c_source(model: Model | LinearModel, name: str = "model") -> tuple[str, str]
         >>> [line for line in source.splitlines() if line.startswith("#include")]
         ['#include "actuator.h"', '#include <math.h>']
     """
-    import jinja2
-
     check_name(name)
     e = equations(model)
     known = {"name": name, "NAME": name.upper(), "ts": repr(1.0 / e.fs), **e.sizes}
@@ -68,12 +67,7 @@ def c_source(model: Model | LinearModel, name: str = "model") -> tuple[str, str]
             known["monomials"] = True
             inner |= {"NM": e.static.C.shape[1], "NS": len(e.static.slopes)}
     known["inner"] = inner.items()
-    templates = jinja2.Environment(
-        loader=jinja2.PackageLoader("lfrtorch.export"),
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
-    header, source = (templates.get_template(f"model.{kind}").render(known) for kind in "hc")
-    return header, source
+    return rendered("model.h", **known), rendered("model.c", **known)
 
 
 def _arrays(e: Equations) -> Iterator[str]:
@@ -131,8 +125,7 @@ def comment(lines: Sequence[str]) -> str:
 
 
 def plain(text: str) -> str:
-    """A text in one line that neither ends a comment of C nor begins one."""
-    text = "".join(sign if sign.isprintable() else " " for sign in text)
+    """A text that neither ends a comment of C nor begins one."""
     for pair in ("*/", "/*", "??"):
         text = text.replace(pair, " ".join(pair))
     return text

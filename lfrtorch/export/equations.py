@@ -40,6 +40,10 @@ class Layers:
         return [("Wz", "bz"), *inner, ("Ww", "bw")]
 
 
+MEANT = {"rbf": ", rbf(v) = exp(-v^2)", "softplus": ", softplus(v) = log(1 + exp(v))"}
+"""Activations whose names do not say what they are."""
+
+
 @dataclass(frozen=True, eq=False)
 class Monomials:
     """w = C m(z).
@@ -94,14 +98,20 @@ class Equations:
         (nz, nx), (ny, nw) = self.Cz.shape, self.Dyw.shape
         return {"nx": nx, "nu": len(self.u_offset), "ny": ny, "nz": nz, "nw": nw}
 
-    def about(self, name: str) -> list[str]:
-        """What a reader of the export should know: equations, channels, units, offsets, rate."""
+    def about(self, name: str, place: str = "{0}[{1}]") -> list[str]:
+        """What a reader of the export should know: equations, channels, units, offsets, rate.
+
+        Args:
+            name: of the export.
+            place: how its language writes a channel, with its letter {0} and its number, which
+                counts from 0 as {1} and from 1 as {2}.
+        """
         match self.static:
             case Layers(activation=sigma):
                 h = "z"
                 for W, b in self.static.names[:-1]:
                     h = f"{sigma}({W} {h} + {b})"
-                static = [f"w      = f(z) = Ww {h} + bw"]
+                static = [f"w      = f(z) = Ww {h} + bw{MEANT.get(sigma, '')}"]
             case Monomials():
                 static = ["w      = f(z) = C m, m = 1, z1, z2, .., z1 z1, z1 z2, .."]
             case None:
@@ -117,8 +127,8 @@ class Equations:
             f"    y      = Cy x + Dyu v{w} + y_offset",
             f"    x_next = A x + Bu v{bw}",
             "",
-            *signals("u", self.inputs, self.u_offset),
-            *signals("y", self.outputs, self.y_offset),
+            *signals(place, "u", self.inputs, self.u_offset),
+            *signals(place, "y", self.outputs, self.y_offset),
         ]
 
     def description(self, name: str) -> dict[str, Any]:
@@ -135,12 +145,13 @@ class Equations:
         }
 
 
-def signals(letter: str, channels: Sequence[Channel], offset: Array) -> list[str]:
+def signals(place: str, letter: str, channels: Sequence[Channel], offset: Array) -> list[str]:
     """A line for each channel: its place, name, unit and operating point."""
-    return [
-        f"{letter}[{i}]: {channel}, operating point {number:.6g}"
+    lines = [
+        f"{place.format(letter, i, i + 1)}: {channel}, operating point {number:.6g}"
         for i, (channel, number) in enumerate(zip(channels, offset, strict=True))
     ]
+    return ["".join(sign if sign.isprintable() else " " for sign in line) for line in lines]
 
 
 def equations(model: Model | LinearModel) -> Equations:

@@ -14,6 +14,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function
 from lfrtorch.export.equations import check_name, equations
+from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -48,6 +49,14 @@ def _onnx(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
         path.write_bytes(graph.SerializeToString())
 
 
+def _matlab(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
+    from scipy.io import savemat
+
+    text, variables = matlab_function(model, name)
+    paths[0].write_text(text, encoding="utf-8")
+    savemat(paths[1], variables)
+
+
 TARGETS = {
     "c": Target((".h", ".c"), _c, "{name}_step(x, u, x_next, y);"),
     "casadi": Target(
@@ -58,6 +67,7 @@ TARGETS = {
         _onnx,
         "x_next, y = onnxruntime.InferenceSession('{path}').run(None, {{'x': x, 'u': u}})",
     ),
+    "matlab": Target((".m", ".mat"), _matlab, "[x_next, y] = {name}(x, u)"),
 }
 """All kinds of export."""
 
@@ -76,7 +86,8 @@ def write(
         model: what is exported.
         to: ``"c"``: ``NAME.h`` and ``NAME.c``; ``"casadi"``: ``NAME.casadi``, which
             ``casadi.Function.load`` reads, and ``NAME_channels.json`` with channels and rate;
-            ``"onnx"``: ``NAME.onnx`` for a sample and ``NAME_simulate.onnx``.
+            ``"onnx"``: ``NAME.onnx`` for a sample and ``NAME_simulate.onnx``; ``"matlab"``:
+            ``NAME.m`` with ``NAME.mat``.
         folder: where to; it is made if need be.
         name: of the files, and in them.
         overwrite: whether files that exist may be replaced.

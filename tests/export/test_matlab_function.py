@@ -1,0 +1,66 @@
+"""The MATLAB function of a model, run by Octave beside the model."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from typing import Any
+
+import numpy as np
+import pytest
+from exported import MODELS, check_output, inputs, jacobians
+from scipy.io import loadmat, savemat
+
+from lfrtorch.export import write
+
+needs_octave = pytest.mark.skipif(
+    not shutil.which("octave-cli"), reason="there is no octave-cli (Debian's package octave)"
+)
+
+SCRIPT = """
+names = fieldnames(load('tried.mat'));
+tried = load('tried.mat');
+for i = 1:numel(names)
+    name = names{i}; t = tried.(name);
+    f = str2func(name);
+    [r.x_next, r.y, r.A, r.B, r.C, r.D] = f(t.x, t.u(1, :));
+    x = zeros(numel(t.x), 1); y = [];
+    for k = 1:rows(t.u)
+        [x, y_k] = f(x, t.u(k, :));
+        y(k, :) = y_k;
+    end
+    r.run = y;
+    found.(name) = r;
+end
+save('-v7', 'found.mat', '-struct', 'found');
+"""
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What Octave computes for all models."""
+    folder = tmp_path_factory.mktemp("matlab")
+    tried = {}
+    for name, model in MODELS.items():
+        write(model, "matlab", folder, name=f"f_{name}")
+        x = np.random.default_rng(4).normal(size=(model.lfr.cell.nx, 1))
+        tried[f"f_{name}"] = {"x": x, "u": inputs(model, 1000)}
+    savemat(folder / "tried.mat", tried)
+    (folder / "run_all.m").write_text(SCRIPT)
+    command = ["octave-cli", "--no-init-file", "--no-history", "run_all.m"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    return loadmat(folder / "found.mat", simplify_cells=True)
+
+
+@needs_octave
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", MODELS)
+def test_samples_and_jacobians_are_those_of_the_model(name: str, found: dict[str, Any]):
+    model, one = MODELS[name], found[f"f_{name}"]
+    u = inputs(model, 1000)
+    check_output(np.reshape(one["run"], (1000, -1)), model, u)
+    x = np.random.default_rng(4).normal(size=model.lfr.cell.nx)
+    for letter, expected in zip("ABCD", jacobians(model, x, u[0]), strict=True):
+        error = np.reshape(one[letter], expected.shape) - expected
+        assert np.abs(error).max() <= 1e-12 * np.abs(expected).max()
