@@ -106,6 +106,27 @@ def model_figure(model: Model, records: Record | Sequence[Record] | None = None)
     return figure
 
 
+def static_figure(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
+    """The last part of that figure alone: the nonlinearity of the static map.
+
+    Raises:
+        ValueError: as ``lfrtorch.analysis.plot``, or a model without a static map.
+
+    Example:
+        >>> from lfrtorch.analysis.model_plots import static_figure
+        >>> len(static_figure(model, record).axes)  # a map over its density
+        2
+    """
+    cell = double(model.lfr.cell)
+    if not cell.nw:
+        raise InputError("the model is linear and has no static map to draw.")
+    maps = min(cell.nw, MOST_MAPS)
+    size = (5.0 if maps == 1 else 9.0), max(LEAST_HEIGHT, HEIGHT * -(-maps // 2))
+    figure = Figure(figsize=size, layout="constrained")
+    _maps(figure, cell, visited(model, cell, records), maps)
+    return figure
+
+
 def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | None) -> Visited:
     """Inputs of the static map along simulations, and its nearest affine map there.
 
@@ -179,7 +200,7 @@ def _poles(part: SubFigure, systems: Mapping[str, LinearModel]) -> None:
     ax.set_title("poles in the z plane", fontsize="medium")
 
 
-def _maps(part: SubFigure, cell: LFRCell, where: Visited, count: int) -> None:
+def _maps(part: Figure | SubFigure, cell: LFRCell, where: Visited, count: int) -> None:
     """What the static map is beyond an affine one, a panel for each w."""
     z, nz = where.z, where.z.shape[1]
     low, high = z.min(axis=0), z.max(axis=0)

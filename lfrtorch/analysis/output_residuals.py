@@ -20,6 +20,9 @@ LEVEL = 0.01
 ROUNDING = 1e-12
 """Errors below this part of the output's rms are rounding errors, and so are such means."""
 
+SLIGHT = 0.1
+"""Correlations below this are of 1 % of the power at most: long records show them, and few mind."""
+
 RUNS = 3
 """Most runs of lags that a sentence lists."""
 
@@ -128,7 +131,8 @@ def _where(found: Correlation) -> str:
     """The largest correlation with its lag, and the lags beyond the bounds."""
     value, bound = found.at(found.largest)
     beyond = f"; beyond it at lags {runs(found.outside)}" if len(found.outside) > 1 else ""
-    return f"{value:.2f} at lag {found.largest} (bound {bound:.2f}{beyond})"
+    slight = "slightly, " if abs(value) < SLIGHT else ""
+    return f"{slight}{value:.2f} at lag {found.largest} (bound {bound:.2f}{beyond})"
 
 
 def runs(lags: Integers) -> str:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 from matplotlib.figure import Figure
 
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.analysis.model_plots import static_figure
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.frf import FRF, estimate_frf
@@ -39,9 +42,8 @@ def of_run(
     """
     model = result.model
     drawn, views = of_records(simulated, dataset)
-    signals = model.signals(dataset.train[0])
-    of_best = [s[0, :, : s.shape[2] // result.averaged].numpy() for s in (signals.z, signals.w)]
-    drawn["static_map"] = plots.static_map(*of_best)
+    with suppress(InputError):  # a linear model, or one that diverges
+        drawn["static_map"] = static_figure(model, dataset.train[0])
     units = {channel.unit for channel in model.outputs}
     unit = units.pop() if len(units) == 1 else ""
     drawn["convergence"] = plots.convergence(result.history, result.chosen_iteration, unit)

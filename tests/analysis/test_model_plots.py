@@ -10,7 +10,7 @@ import torch
 from reference import measure, random_cell, random_model
 
 import lfrtorch
-from lfrtorch.analysis.model_plots import most_nonlinear, visited
+from lfrtorch.analysis.model_plots import most_nonlinear, static_figure, visited
 from lfrtorch.engine.nonlinearity import Polynomial
 
 pytestmark = pytest.mark.numeric
@@ -34,6 +34,14 @@ def test_panels(sizes: dict[str, Any], titles: list[str]):
     assert not any(one.startswith(("w5", "y3 / u1")) for one in shown)
     for line in figure.subfigs[0].axes[0].lines:
         assert np.isfinite(np.asarray(line.get_ydata(), dtype=float)).all()
+
+
+def test_the_static_map_alone_is_the_last_part_and_a_linear_model_has_none():
+    model = random_model(random_cell(nz=2, nw=3))
+    titles = [ax.get_title() for ax in static_figure(model).axes]
+    assert [title[:3] for title in titles if title] == ["w1:", "w2:", "w3:"]
+    with pytest.raises(lfrtorch.InputError, match="has no static map"):
+        static_figure(random_model(random_cell(nz=0, nw=0)))
 
 
 def test_the_direction_that_bends_is_found_and_the_linear_part_is_taken_off():
