@@ -56,7 +56,8 @@ class Model:
         fitted_to: the data in words, for ``print(model)``.
 
     ``print(model)`` shows sizes, channels, poles and gains: of the linear part A, Bu, Cy, Dyu, and
-    of the model linearised at rest at the inputs' offsets.
+    of the model linearised at rest at the inputs' offsets. ``lfrtorch.analysis`` has its figure,
+    its residuals on records, and its linearisation about any point.
 
     Example:
         >>> model.sizes, model.parameter_count
