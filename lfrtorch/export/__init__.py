@@ -2,8 +2,18 @@
 
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function
+from lfrtorch.export.control_system import control_system, python_source
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.export.targets import TARGETS, write
 
-__all__ = ["TARGETS", "c_source", "casadi_function", "matlab_function", "onnx_models", "write"]
+__all__ = [
+    "TARGETS",
+    "c_source",
+    "casadi_function",
+    "control_system",
+    "matlab_function",
+    "onnx_models",
+    "python_source",
+    "write",
+]

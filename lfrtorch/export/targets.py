@@ -13,6 +13,7 @@ from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function
+from lfrtorch.export.control_system import python_source
 from lfrtorch.export.equations import check_name, equations
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
@@ -57,6 +58,10 @@ def _matlab(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
     savemat(paths[1], variables)
 
 
+def _control(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
+    paths[0].write_text(python_source(model, name), encoding="utf-8")
+
+
 TARGETS = {
     "c": Target((".h", ".c"), _c, "{name}_step(x, u, x_next, y);"),
     "casadi": Target(
@@ -68,6 +73,7 @@ TARGETS = {
         "x_next, y = onnxruntime.InferenceSession('{path}').run(None, {{'x': x, 'u': u}})",
     ),
     "matlab": Target((".m", ".mat"), _matlab, "[x_next, y] = {name}(x, u)"),
+    "control": Target((".py",), _control, "from {name} import system"),
 }
 """All kinds of export."""
 
@@ -87,7 +93,8 @@ def write(
         to: ``"c"``: ``NAME.h`` and ``NAME.c``; ``"casadi"``: ``NAME.casadi``, which
             ``casadi.Function.load`` reads, and ``NAME_channels.json`` with channels and rate;
             ``"onnx"``: ``NAME.onnx`` for a sample and ``NAME_simulate.onnx``; ``"matlab"``:
-            ``NAME.m`` with ``NAME.mat``.
+            ``NAME.m`` with ``NAME.mat``; ``"control"``: ``NAME.py``, whose ``system()`` is a
+            ``control.NonlinearIOSystem``.
         folder: where to; it is made if need be.
         name: of the files, and in them.
         overwrite: whether files that exist may be replaced.

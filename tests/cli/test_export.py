@@ -46,7 +46,10 @@ def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
     [
         (["to=c"], "checkpoint is not set: add checkpoint=DIR"),
         (["checkpoint=model"], "to is not set: add to=c"),
-        (["checkpoint=model", "to=rust"], "to is 'rust'; give one of c, casadi, onnx, matlab"),
+        (
+            ["checkpoint=model", "to=rust"],
+            "to is 'rust'; give one of c, casadi, onnx, matlab, control",
+        ),
         (["checkpoint=model", "to=c", "name=1"], "name is '1'; give letters"),
         (
             ["checkpoint=model", "to=c", "name=there"],

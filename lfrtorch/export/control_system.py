@@ -1,0 +1,95 @@
+"""A model as a system of python-control, and as the Python code that makes one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
+from lfrtorch.export.optional import imported
+from lfrtorch.export.rendering import rendered
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+
+ACTIVATIONS = {
+    "tanh": "np.tanh(v)",
+    "sigmoid": "0.5 + 0.5 * np.tanh(0.5 * v)",
+    "relu": "np.maximum(v, 0.0)",
+    "rbf": "np.exp(-(v**2))",
+    "softplus": "np.logaddexp(v, 0.0)",
+}
+"""h = σ(v)."""
+
+
+def control_system(model: Model | LinearModel, name: str = "model") -> Any:
+    """A model as a ``control.NonlinearIOSystem`` in discrete time, physical units.
+
+    Dots in channel names, which that package does not allow, become underscores.
+
+    Args:
+        model: what is exported.
+        name: of the system.
+
+    Raises:
+        ValueError: control is not installed, a static map of the user's own class, or a name that
+            is no identifier.
+
+    Example:
+        >>> import control
+        >>> system = lfrtorch.export.control_system(model, "actuator")
+        >>> system.dt, system.input_labels, system.output_labels
+        (0.01, ['u'], ['y'])
+        >>> u = record.u[:50].T
+        >>> y = control.input_output_response(system, np.arange(50) / 100.0, u).outputs
+        >>> np.allclose(y, model.simulate(record.u[:50])[:, 0])
+        True
+    """
+    imported("control", "control")
+    names: dict[str, Any] = {}
+    exec(python_source(model, name), names)
+    return names["system"]()
+
+
+def python_source(model: Model | LinearModel, name: str = "model") -> str:
+    """Code of Python that needs numpy alone: ``step(x, u)``, and ``system()`` for control.
+
+    Args:
+        model: what is exported.
+        name: of the system.
+
+    Raises:
+        ValueError: a static map of the user's own class, or a name that is no identifier.
+
+    Example:
+        >>> made = {}
+        >>> exec(lfrtorch.export.python_source(model), made)
+        >>> x_next, y = made["step"](np.zeros(1), np.ones(1))
+        >>> np.allclose(y, model.simulate([1.0])[0])
+        True
+    """
+    check_name(name)
+    e = equations(model)
+    known = {"name": name, "about": e.about(name), "arrays": _arrays(e), "fs": float(e.fs)}
+    if isinstance(e.static, Layers):
+        known |= {"layers": e.static.names[:-1], "value": ACTIVATIONS[e.static.activation]}
+    sides = {"inputs": e.inputs, "outputs": e.outputs, "static": e.static}
+    return rendered("model_py.txt", **known, **sides, **e.sizes, repr=repr)
+
+
+def _arrays(e: Equations) -> Iterator[tuple[str, str | list[str]]]:
+    """Names and rows of all constants."""
+    named = {
+        name: getattr(e, name)
+        for name in ("u_offset", "y_offset", "A", "Bu", "Cy", "Dyu", "Cz", "Dzu", "Bw", "Dyw")
+    }
+    match e.static:
+        case Layers():
+            for (W, b), weight, bias in zip(e.static.names, e.static.W, e.static.b, strict=True):
+                named |= {W: weight, b: bias}
+        case Monomials():
+            named["C"] = e.static.C
+    for name, value in named.items():
+        if value.size:
+            yield name, str(value.tolist()) if value.ndim == 1 else [*map(str, value.tolist())]
+    if isinstance(e.static, Monomials):
+        yield "growth", [*map(str, e.static.growth)]
