@@ -47,6 +47,19 @@ def test_white_noise_is_called_not_white_as_often_as_it_is_said(kind: str):
     assert 0.014 <= five <= 0.086
 
 
+@pytest.mark.slow
+def test_levels_of_both_tests_over_many_repeats():
+    """Four standard errors of the rates, and 0.2 % of 1 % and 5 % for the length."""
+    rng = np.random.default_rng(0)
+    white = [autocorrelation(rng.standard_normal(2000)).p for _ in range(6000)]
+    crossed = [cross_correlation(*rng.standard_normal((2, 2000))).p for _ in range(2000)]
+    for p in (white, crossed):
+        one, five = rates(p)
+        error = 4 / np.sqrt(len(p))
+        assert one == pytest.approx(0.01, abs=0.002 + 0.1 * error)
+        assert five == pytest.approx(0.05, abs=0.002 + 0.22 * error)
+
+
 SLOW = [1.0], [1.0, -0.98]
 INPUTS: dict[str, Callable[[np.random.Generator, int], Array]] = {
     "slow": lambda rng, T: signal.lfilter(*SLOW, rng.standard_normal(T)),
