@@ -51,6 +51,12 @@ def integer(name: str, value: Any, least: int, *, word: str = "") -> None:
         raise InputError(f"{name} is {value!r}; give a whole number of at least {least}{other}.")
 
 
+def true_or_false(name: str, value: Any) -> None:
+    """Refuse what is neither True nor False with a ValueError."""
+    if not isinstance(value, bool):
+        raise InputError(f"{name} is {value!r}; give True or False.")
+
+
 def band(given: Any) -> None:
     """Refuse what is not a pair of numbers with a ValueError."""
     pair = isinstance(given, Sequence | np.ndarray) and len(given) == 2

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lfrtorch._support.checks import integer
+from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset, Published
@@ -102,8 +102,7 @@ def load(
     """
     chosen = _checked(levels)
     integer("validation", validation, 0)
-    if not isinstance(mean, bool):
-        raise InputError(f"mean is {mean!r}; give True or False.")
+    true_or_false("mean", mean)
     path = official.find(root, _FILE, "FineSteeringMirror", download=download)
     arrays = official.read_npz(path)
 

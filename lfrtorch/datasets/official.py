@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from lfrtorch._support.checks import number
+from lfrtorch._support.checks import number, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.records import Record, Start
@@ -71,8 +71,7 @@ def find(
         FileNotFoundError: it is not there, or it cannot be downloaded without nonlinear_benchmarks.
         OSError: the download fails.
     """
-    if not isinstance(download, bool):
-        raise InputError(f"download is {download!r}; give True or False.")
+    true_or_false("download", download)
     below = folder(root)
     path = _present(below, (file, *others))
     if path is None and download:

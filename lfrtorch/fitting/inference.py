@@ -46,7 +46,11 @@ from lfrtorch._support.types import Array, Complex, Integers
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.chebyshev import chebyshev, chebyshev_slope
 from lfrtorch.fitting.starts import OUTPUT_WEIGHTS, initialise
-from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
+from lfrtorch.least_squares.levenberg_marquardt import (
+    DenseJacobian,
+    LeastSquares,
+    LevenbergMarquardt,
+)
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.least_squares.static_problem import StaticProblem
 from lfrtorch.linear.model import LinearModel
@@ -174,7 +178,7 @@ class Inferred:
     V: Complex | None
 
 
-class InferenceError:
+class InferenceError(LeastSquares):
     """The cost of the module's head as a function of B and N, for ``LevenbergMarquardt``.
 
     θ are the entries of B and then of N, by rows.

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch.nn import Module
 
-from lfrtorch._support.checks import integer, number
+from lfrtorch._support.checks import integer, number, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.trainer import Trainer
@@ -165,8 +165,7 @@ class Settings:
             integer(name, getattr(self, name), 1)
         integer("seed", self.seed, 0)
         for name in ("distil", "refit", "z_feedthrough"):
-            if not isinstance(given := getattr(self, name), bool):
-                raise InputError(f"{name} is {given!r}; give True or False.")
+            true_or_false(name, getattr(self, name))
         known = [*signature(estimate_bla).parameters][2:]
         for name in self.linear:
             if name not in known:

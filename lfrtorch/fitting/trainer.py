@@ -72,6 +72,11 @@ class Trainer(Protocol):
         """Most iterations."""
         ...
 
+    @property
+    def stable(self) -> bool:
+        """Whether A's eigenvalues stay within the unit circle."""
+        ...
+
     def init(self, problem: Any, theta: Tensor) -> Any:
         """State at the start."""
         ...
@@ -256,7 +261,9 @@ class Fit:
         if ranks.world > 1:
             weights = parameters_to_vector(model.lfr.parameters())
             vector_to_parameters(ranks.first(weights), model.lfr.parameters())
-        self.problem = SimulationProblem.of(model, train, ridge=ridge, ranks=ranks)
+        self.problem = SimulationProblem.of(
+            model, train, ridge=ridge, stable=self.trainer.stable, ranks=ranks
+        )
         self.judge = SimulationProblem.judge(model, validation) if validation else None
         self.state: Any = None
         """The trainer's; None before the first call of ``advance``."""

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._support.checks import integer, number, renamed
+from lfrtorch._support.checks import integer, number, renamed, true_or_false
 from lfrtorch._support.reasons import Reason
 
 
@@ -21,6 +21,10 @@ class Differentiable(Protocol):
     ) -> tuple[Float[Tensor, " M"], Float[Tensor, " P"]]:
         """r and the gradient of its mean square at θ."""
         ...
+
+    def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+        """θ, or one near it that the search may go to."""
+        return theta
 
 
 @dataclass
@@ -48,6 +52,9 @@ class Adam:
     Args:
         max_iter: most steps; each sees all the data.
         learning_rate: step size, in normalised units.
+        stable: whether A's eigenvalues stay within the unit circle. Then no bounded input makes a
+            model with a bounded static map run away. If they are not inside at the start, they stay
+            within the circle that they are in.
 
     Example:
         >>> trainer = lfrtorch.Adam(max_iter=20, learning_rate=1e-2)
@@ -58,10 +65,12 @@ class Adam:
 
     max_iter: int = 2000
     learning_rate: float = 1e-3
+    stable: bool = True
 
     def __post_init__(self) -> None:
         number("learning_rate", self.learning_rate, positive=True)
         integer("max_iter", self.max_iter, 0)
+        true_or_false("stable", self.stable)
 
     @property
     def limit(self) -> int:
@@ -80,7 +89,7 @@ class Adam:
             optimiser.state[parameter] = {k: v.clone() for k, v in state.moments.items()}
         parameter.grad = state.gradient
         optimiser.step()
-        theta = parameter.detach()
+        theta = problem.admissible(parameter.detach())
         residual, gradient = problem.gradient(theta)
         iteration = state.iteration + 1
         reason = Reason.ALL_EPOCHS if iteration >= self.max_iter else ""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -54,6 +54,7 @@ class Jacobian:
         penalty: θ - θ_0.
         ranks: the processes that hold the parts.
         fixed: which entries of θ are constants; their columns are zeros. Default: none.
+        bounded: turns a system into one of steps within bounds. Default: there are none.
     """
 
     def __init__(
@@ -64,8 +65,10 @@ class Jacobian:
         penalty: Float[Tensor, " P"],
         ranks: Ranks,
         fixed: Bool[Tensor, " P"] | None = None,
+        bounded: Callable[[System], System] = lambda system: system,
     ) -> None:
         self.parts, self._reduced, self._ranks = parts, reduced, ranks
+        self._bounded = bounded
         self._fixed = torch.zeros_like(ridge, dtype=torch.bool) if fixed is None else fixed
         self._ridge, self._penalty = ridge.masked_fill(self._fixed, 0.0), penalty
         self._penalised = bool(ridge.any())  # its rows are there, whatever is fixed
@@ -104,6 +107,7 @@ class Jacobian:
                 rank = int((~self._fixed[kept]).sum())
                 system = CholeskySystem(G + torch.diag(ridge), rank)
         gradient = gradient + self._ridge.square() * self._penalty
+        system = self._bounded(system)
         if self._ranks.world == 1:
             return system, gradient
         return BroadcastSystem(system, self._ranks), self._ranks.first(gradient)

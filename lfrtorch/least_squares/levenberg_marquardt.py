@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._support.checks import integer, number
+from lfrtorch._support.checks import integer, number, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import Reason
 from lfrtorch.least_squares.linear_systems import SVDSystem, System
@@ -79,6 +79,10 @@ class LeastSquares(Protocol):
         """|r|², summed over the processes that share r."""
         ...
 
+    def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+        """θ, or one near it that the search may go to."""
+        return theta
+
 
 class ManyLeastSquares(Protocol):
     """Several such problems, evaluated together."""
@@ -97,7 +101,7 @@ class ManyLeastSquares(Protocol):
         ...
 
 
-JACOBIAN, RESIDUAL = "jacobian", "residual"
+JACOBIAN, RESIDUAL, ADMISSIBLE = "jacobian", "residual", "admissible"
 
 
 class DenseJacobian:
@@ -193,6 +197,9 @@ class LevenbergMarquardt:
         max_damping: λ relative to the largest squared singular value that ends the search.
         least_damping: to which the first step may lower λ, in trials from the same Jacobian; with
             ``damping`` or more it does not.
+        stable: whether A's eigenvalues stay within the unit circle. Then no bounded input makes a
+            model with a bounded static map run away. If they are not inside at the start, they stay
+            within the circle that they are in.
 
     Example:
         >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=10, acceleration=False)
@@ -212,6 +219,7 @@ class LevenbergMarquardt:
     acceleration_limit: float = 0.75
     max_damping: float = 1e12
     least_damping: float = 1e-8
+    stable: bool = True
 
     def __post_init__(self) -> None:
         for name in ("damping", "truncation", "finite_step", "acceleration_limit", "max_damping"):
@@ -221,6 +229,7 @@ class LevenbergMarquardt:
             number(name, getattr(self, name))
         integer("max_iter", self.max_iter, 0)
         integer("patience", self.patience, 1)
+        true_or_false("stable", self.stable)
 
     @property
     def limit(self) -> int:
@@ -253,7 +262,10 @@ class LevenbergMarquardt:
                 wanted, theta = search.send(answer)
             except StopIteration as end:
                 return end.value
-            answer = problem.linearise(theta) if wanted is JACOBIAN else problem.residual(theta)
+            if wanted is ADMISSIBLE:
+                answer = problem.admissible(theta)
+            else:
+                answer = problem.linearise(theta) if wanted is JACOBIAN else problem.residual(theta)
 
     def refused(self, before: LMState, after: LMState) -> LMState:
         """State to go on from after a step that is undone: it was too long."""
@@ -291,6 +303,8 @@ class LevenbergMarquardt:
             for i, answer in answers.items():
                 try:
                     wanted, theta = searches[i].send(answer)
+                    while wanted is ADMISSIBLE:
+                        wanted, theta = searches[i].send(joint.problems[i].admissible(theta))
                     asked[wanted].append((i, theta))
                 except StopIteration as end:
                     after[i] = end.value
@@ -381,6 +395,7 @@ class LevenbergMarquardt:
             theta = theta + (
                 yield from self._acceleration(cost_of, state, jacobian, system, delta, damping)
             )
+        theta = yield ADMISSIBLE, theta
         residual = yield RESIDUAL, theta
         cost = cost_of(residual)
         gain_ratio = (state.cost - cost) / predicted if predicted > 0 else float("nan")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Self
 
 import torch
@@ -18,17 +19,24 @@ from lfrtorch.engine.initial_state import simulate_estimated
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, is_compiled
-from lfrtorch.least_squares.exact_integrators import fixed_parameters
+from lfrtorch.least_squares.exact_integrators import fixed_parameters, integrating_states
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.jacobian import Jacobian, Memory, Part
+from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
 from lfrtorch.least_squares.record_groups import group_records
+from lfrtorch.least_squares.stable_states import (
+    LIMIT,
+    StableSystem,
+    spectral_radius,
+    stabilised,
+)
 from lfrtorch.model import Model
 from lfrtorch.records import NormalisedRecord, Record, as_records
 
 Ridge = float | Mapping[str, float]
 
 
-class SimulationProblem:
+class SimulationProblem(LeastSquares):
     """Residual, Jacobian and gradient of a model's squared simulation error.
 
     r = weighted y_hat - y in normalised units, over all samples of all records (0 if a sample does
@@ -44,6 +52,8 @@ class SimulationProblem:
             variance over prior variance, both normalised. One number, or one for each group of
             parameters by the beginning of their names: ``{"static": 1e-3, "A": 1e-2, "x0": 0}``;
             other groups get 0.
+        stable: whether a search keeps A's eigenvalues within the unit circle, or, if they are not
+            at θ_0, within the circle that they are in.
         solve_initial_states: estimated initial states are no part of θ, but solved for at every θ.
         ranks: the processes that share the records. All have the same θ, cost and gradient; each
             has the residual of its own records.
@@ -60,6 +70,7 @@ class SimulationProblem:
         y_scale: Array | float = 1.0,
         *,
         ridge: Ridge = 0.0,
+        stable: bool = False,
         solve_initial_states: bool = False,
         ranks: Ranks | None = None,
     ) -> None:
@@ -85,6 +96,12 @@ class SimulationProblem:
         self._ridge = self._ridge_of(ridge)
         self.fixed: Bool[Tensor, " free"] | None = fixed_parameters(lfr.cell)
         """Which entries of the module's free parameters are constants: columns of zeros in J."""
+        self._largest_pole = math.inf
+        if stable and lfr.cell.A.requires_grad:
+            self._integrating = integrating_states(lfr.cell)
+            radius = spectral_radius(lfr.cell.A, self._integrating)
+            largest = torch.tensor(max(LIMIT, radius), dtype=torch.float64)
+            self._largest_pole = float(self.ranks.first(largest))
         self._reduced: Reduction | None = None
         self._memory = Memory()
         self.guesses: list[Tensor | None] = [None] * len(self.groups)
@@ -150,6 +167,15 @@ class SimulationProblem:
             errors.append(self._ridge.sqrt() * (theta - self._theta_0))
         return torch.cat(errors)
 
+    def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+        """θ with A's eigenvalues within the limit, if there is one."""
+        if not math.isfinite(self._largest_pole) or not torch.isfinite(theta).all():
+            return theta
+        nx = self.lfr.cell.nx
+        A = theta[: nx**2].view(nx, nx)
+        found = self.ranks.first(stabilised(A, self._integrating, self._largest_pole))
+        return theta if found is A else torch.cat([found.flatten(), theta[nx**2 :]])
+
     def linearise(self, theta: Float[Tensor, " P"], *, reduce: bool = True) -> Jacobian:
         """dr/dθ at θ.
 
@@ -187,8 +213,16 @@ class SimulationProblem:
             reduced = self._reduced = Reduction(*map(self.ranks.first, reduced))
         else:
             reduced = everything(theta)
-        penalty = theta - self._theta_0
-        return Jacobian(parts, reduced, self._ridge.sqrt(), penalty, self.ranks, fixed)
+        penalty, ridge = theta - self._theta_0, self._ridge.sqrt()
+        if not math.isfinite(self._largest_pole):
+            return Jacobian(parts, reduced, ridge, penalty, self.ranks, fixed)
+        bounded = partial(
+            StableSystem,
+            A=cell.A.detach(),
+            integrating=self._integrating,
+            limit=self._largest_pole,
+        )
+        return Jacobian(parts, reduced, ridge, penalty, self.ranks, fixed, bounded)
 
     def jacobian(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "M P"]:
         """dr/dθ as one matrix, for small problems."""

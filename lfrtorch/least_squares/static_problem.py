@@ -8,10 +8,10 @@ from torch.nn import Module
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from lfrtorch.engine.static_jacobian import linearise_static
-from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian
+from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian, LeastSquares
 
 
-class StaticProblem:
+class StaticProblem(LeastSquares):
     """Residual and Jacobian of static(z) - w, for ``LevenbergMarquardt``.
 
     θ is the vector of all parameters of the map. The map holds the θ that was evaluated last.

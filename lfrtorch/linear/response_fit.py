@@ -20,6 +20,7 @@ from torch import Tensor
 
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.least_squares.gauge import Reduction, reduction
+from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.linear.modal_jacobian import ModalJacobian, Modes, stacked, with_best_inputs
 from lfrtorch.linear.model import linear_cell
@@ -158,7 +159,7 @@ class ResponseFit:
         )
 
 
-class ResponseProblem:
+class ResponseProblem(LeastSquares):
     """Residual and Jacobian of a linear model over spectra; infinite if a pole passes a limit.
 
     θ holds A, B, C and D, row by row, one matrix after another.

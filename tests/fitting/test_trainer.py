@@ -17,7 +17,11 @@ from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import EXPLOSION, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
-from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian, LevenbergMarquardt
+from lfrtorch.least_squares.levenberg_marquardt import (
+    DenseJacobian,
+    LeastSquares,
+    LevenbergMarquardt,
+)
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
@@ -77,6 +81,10 @@ class Walk:
             reason=self.reason if last else "",
         )
 
+    @property
+    def stable(self) -> bool:
+        return True
+
     def prolonged(self, state: State) -> State:
         return state
 
@@ -84,7 +92,7 @@ class Walk:
         return replace(before, iteration=after.iteration, reason=after.reason)
 
 
-class Quadratic:
+class Quadratic(LeastSquares):
     """r = (10 θ1, θ2)."""
 
     def residual(self, theta: Tensor) -> Tensor:

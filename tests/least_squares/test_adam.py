@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.adam import Adam, Differentiable
 
 pytestmark = pytest.mark.numeric
 
 
-class Quadratic:
+class Quadratic(Differentiable):
     """r = (x - 1, 10 (y - 2))."""
 
     def gradient(self, theta: Tensor) -> tuple[Tensor, Tensor]:

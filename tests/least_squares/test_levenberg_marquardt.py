@@ -11,7 +11,12 @@ from reference import normal
 from torch import Tensor
 from torch.func import jacrev
 
-from lfrtorch.least_squares.levenberg_marquardt import DenseJacobian, LevenbergMarquardt, LMState
+from lfrtorch.least_squares.levenberg_marquardt import (
+    DenseJacobian,
+    LeastSquares,
+    LevenbergMarquardt,
+    LMState,
+)
 
 pytestmark = pytest.mark.numeric
 
@@ -23,7 +28,7 @@ def tensor(*values: float) -> Tensor:
 
 
 @dataclass
-class Problem:
+class Problem(LeastSquares):
     """A residual with its Jacobian by autograd; counts what the search asks for."""
 
     f: Callable[[Tensor], Tensor]

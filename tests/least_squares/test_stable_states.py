@@ -1,0 +1,157 @@
+"""Eigenvalues of A that a search keeps within the unit circle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from reference import normal, random_cell, random_model
+from torch import Tensor
+
+from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.linear_systems import CholeskySystem
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.stable_states import LIMIT, StableSystem, spectral_radius, stabilised
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+pytestmark = pytest.mark.numeric
+
+NONE = torch.zeros(4, dtype=torch.bool)
+
+
+def matrix(*poles: complex, seed: int = 0) -> Tensor:
+    """Random A with these eigenvalues, each complex one beside its conjugate."""
+    blocks = [
+        torch.tensor(
+            [[p.real, p.imag], [-p.imag, p.real]] if p.imag else [[p.real]], dtype=torch.float64
+        )
+        for p in map(complex, poles)
+    ]
+    diagonal = torch.block_diag(*blocks)
+    T = normal(*diagonal.shape, seed=seed) + 3.0 * torch.eye(len(diagonal))
+    return T @ diagonal @ torch.linalg.inv(T)
+
+
+def moduli(A: Tensor) -> list[float]:
+    return sorted(np.abs(np.linalg.eigvals(A.numpy())))
+
+
+# --- back into the circle -------------------------------------------------------------------
+
+
+def test_a_stable_matrix_stays_to_the_bit():
+    A = matrix(0.99, 0.3, 0.5 + 0.8j)
+    assert stabilised(A, NONE) is A
+
+
+def test_only_the_poles_outside_move_and_to_the_limit():
+    A = matrix(1.2, 0.3, 0.7 + 0.8j)  # of modulus 1.063
+    found = stabilised(A, NONE)
+    assert moduli(found) == pytest.approx([0.3, LIMIT, LIMIT, LIMIT], rel=1e-9)
+    angles = np.sort(np.angle(np.linalg.eigvals(found.numpy())))
+    assert angles == pytest.approx(np.sort(np.angle(np.linalg.eigvals(A.numpy()))), abs=1e-9)
+
+
+def test_exact_integrators_stay():
+    A = torch.zeros(4, 4, dtype=torch.float64)
+    A[:3, :3] = matrix(1.1, 0.2, 0.3)
+    A[3, :3], A[3, 3] = 1.0, 1.0
+    integrating = torch.tensor([False, False, False, True])
+    assert spectral_radius(A, integrating) == pytest.approx(1.1)
+    found = stabilised(A, integrating)
+    assert torch.equal(found[3], A[3])
+    assert torch.equal(found[:, 3], A[:, 3])
+    assert spectral_radius(found, integrating) == pytest.approx(LIMIT)
+
+
+# --- steps within it ------------------------------------------------------------------------
+
+
+def test_a_step_within_the_limit_is_that_of_the_system():
+    A, J, gradient = matrix(0.5, 0.3, 0.2 + 0.4j), normal(30, 20), 1e-3 * normal(20, seed=1)
+    system = CholeskySystem(J.mT @ J, 20)
+    bounded = StableSystem(system, A, NONE, LIMIT)
+    assert torch.equal(bounded.solve(gradient, 0.1), system.solve(gradient, 0.1))
+
+
+@pytest.mark.parametrize("poles", [(0.999, 0.3, 0.2 + 0.4j), (0.1, 0.3, 0.7 + 0.714j)])
+def test_a_step_beyond_the_limit_is_the_best_one_that_ends_there(poles: tuple[complex, ...]):
+    """To first order; against the minimum in the plane, from its basis."""
+    A, J, damping = matrix(*poles), normal(30, 20), 0.1
+    slope = torch.zeros(20, dtype=A.dtype)
+    leaf = A.clone().requires_grad_()
+    torch.linalg.eigvals(leaf).abs().max().backward()
+    assert leaf.grad is not None
+    slope[:16] = leaf.grad.flatten()
+    G = J.mT @ J
+    H = G + damping * torch.eye(20)
+    gradient = -0.02 / slope.square().sum() * (H @ slope)  # the free step takes the pole to > 1
+    step = StableSystem(CholeskySystem(G, 20), A, NONE, LIMIT).solve(gradient, damping)
+    room = LIMIT - moduli(A)[-1]
+    assert float(slope @ step) == pytest.approx(room, abs=1e-9)
+    first = room * slope / slope.square().sum()
+    plane = torch.linalg.svd(slope.unsqueeze(0)).Vh[1:].mT
+    inside = torch.linalg.solve(plane.mT @ H @ plane, -plane.mT @ (gradient + H @ first))
+    torch.testing.assert_close(step, first + plane @ inside, rtol=1e-6, atol=1e-9)
+
+
+# --- a fit ----------------------------------------------------------------------------------
+
+
+def unstable_data() -> tuple[Model, Record]:
+    """A stable start, and data of a model whose A is outside and whose map holds it back."""
+    truth = random_model(random_cell(1, 1, 2, 1, 1, 3, seed=4))
+    cell = truth.lfr.cell
+    assert isinstance(cell.static, Network)
+    with torch.no_grad():
+        cell.A.copy_(torch.diag(torch.tensor([1.02, 0.5])))
+        cell.Bw.copy_(torch.tensor([[-0.3], [0.0]]))
+        cell.Cz.copy_(torch.tensor([[1.0, 0.0]]))
+        cell.Dzu.zero_()
+        cell.static.Wz.fill_(1.0)
+        cell.static.Ww.fill_(1 / 3)
+        for bias in (cell.static.bz, cell.static.bw):
+            bias.zero_()
+    u = 0.3 * np.random.default_rng(0).normal(size=(400, 1))
+    record = Record(u, truth.simulate(u), fs=truth.fs, inputs=truth.inputs, outputs=truth.outputs)
+    with torch.no_grad():
+        cell.A[0, 0] = 0.9
+        cell.Bw[0, 0] = -0.05
+    return truth, record
+
+
+@pytest.mark.parametrize("trainer", [LevenbergMarquardt(max_iter=12), Adam(150, 2e-2)])
+def test_a_fit_keeps_A_stable_unless_told(trainer):
+    radii = {}
+    for stable in (True, False):
+        model, record = unstable_data()
+        radius = []
+
+        def watch(model: Model, _, radius: list[float] = radius) -> None:
+            radius.append(spectral_radius(model.lfr.cell.A, torch.zeros(2, dtype=torch.bool)))
+
+        result = fit(model, record, trainer=replace(trainer, stable=stable), monitors=[watch])
+        assert result.history[-1].train < result.history[0].train
+        radii[stable] = max(radius)
+    assert radii[True] <= LIMIT * (1 + 1e-9)
+    assert radii[False] > 1.001
+
+
+def test_a_start_that_is_not_stable_stays_within_its_own_circle():
+    model, record = unstable_data()
+    with torch.no_grad():
+        model.lfr.cell.A[0, 0] = 1.01
+    problem = SimulationProblem.of(model, record, stable=True)
+    theta = problem.theta.clone()
+    assert problem.admissible(theta) is theta
+    theta[0] = 1.3
+    assert float(problem.admissible(theta)[0]) == pytest.approx(1.01)
+
+
+def test_stable_is_true_or_false():
+    with pytest.raises(ValueError, match="stable is 'yes'; give True or False"):
+        LevenbergMarquardt(stable="yes")  # pyright: ignore[reportArgumentType]
