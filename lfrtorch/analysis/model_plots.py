@@ -121,7 +121,7 @@ def static_figure(model: Model, records: Record | Sequence[Record] | None = None
     if not cell.nw:
         raise InputError("the model is linear and has no static map to draw.")
     maps = min(cell.nw, MOST_MAPS)
-    size = (5.0 if maps == 1 else 9.0), max(LEAST_HEIGHT, HEIGHT * -(-maps // 2))
+    size = (5.0 if maps == 1 else 7.5), max(LEAST_HEIGHT, HEIGHT * -(-maps // 2))
     figure = Figure(figsize=size, layout="constrained")
     _maps(figure, cell, visited(model, cell, records), maps)
     return figure

@@ -16,7 +16,7 @@ from lfrtorch.analysis.output_residuals import OutputResiduals
 MOST_OUTPUTS = 4
 """Outputs in one figure."""
 
-WIDTH, HEIGHT = 13.0, 2.9
+WIDTH, HEIGHT = 11.0, 2.8
 """Width of the figure, and height of an output, in inches."""
 
 NOISE = "#cc79a7"
