@@ -44,9 +44,9 @@ MOST_ROWS = 24
 """Most rows of a printed table, those of the least fit."""
 
 LEGEND = (
-    "fit: 100 (1 - |y - y_hat| / |y - mean y|), scored samples. white, inputs, even, odd: "
-    "probability of such correlations by chance, of the errors with themselves, the inputs and "
-    "their squares, and of errors times outputs with the squares."
+    "fit: 100 (1 - |y - y_hat| / |y - mean y|), of the scored samples.\n"
+    "white, inputs, even, odd: probability of such correlations by chance, of the errors with "
+    "themselves,\nthe inputs and their squares, and of errors times outputs with the squares."
 )
 
 
