@@ -139,7 +139,7 @@ class Residuals:
         return "\n".join([table(head, rows), "", *said])
 
     def __repr__(self) -> str:
-        return f"Residuals({len(self.parts)} outputs of records, the worst in '{self.worst}')"
+        return f"Residuals(parts: {len(self.parts)}, worst record: '{self.worst}')"
 
     def plot(self, record: str | None = None) -> Figure:
         """Figure of a record: correlations with their bounds, and spectra, a row an output.
