@@ -173,9 +173,8 @@ def _line(name: str, unit: str, errors: Errors) -> str:
 def _sizes(metrics: Mapping[str, Any]) -> str:
     """The sizes of the model in words."""
     sizes = dict(metrics["sizes"])
-    static = (
-        f"polynomial of degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])
-    )
+    degree = sizes.get("degree")
+    static = neurons(sizes) if degree is None else f"polynomial of degree {degree}"
     return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
 
 

@@ -293,7 +293,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
         for line, s, of in shown
     ]
     title = f"Simulation RMSE{f' ({unit})' if unit else ''}"
-    static = f"degree {sizes['degree']}" if "degree" in sizes else neurons(sizes["nn"])
+    static = f"degree {sizes['degree']}" if "degree" in sizes else neurons(sizes)
     title += f", nx {sizes['nx']}, "
     title += f"nz {sizes['nz']}, nw {sizes['nw']}, {static}" if sizes["nz"] else "a linear model"
     if not rows:
@@ -350,9 +350,10 @@ def of_samples(scored: int, samples: int) -> str:
     return f"{scored} of {samples}" if scored else NOT_SCORED
 
 
-def neurons(count: int) -> str:
-    """The number of neurons in words; maps that are not networks have none."""
-    return f"{count} neurons" if count else "a map of one's own"
+def neurons(sizes: Mapping[str, int]) -> str:
+    """The neurons in words; maps that are not networks have none."""
+    layers = f" in each of {sizes['layers']} layers" if "layers" in sizes else ""
+    return f"{sizes['nn']} neurons{layers}" if sizes["nn"] else "a map of one's own"
 
 
 def starts_table(result: Mapping[str, Any]) -> str:
