@@ -16,7 +16,7 @@ COMMANDS = {
     "fit": "identify a nonlinear LFR model, from records to report",
     "evaluate": "score a saved model on a dataset",
     "simulate": "run a saved model on the inputs of files",
-    "export": "write a saved model as C, CasADi, ONNX, MATLAB or Python",
+    "export": "write a saved model as C, CasADi, ONNX, MATLAB, Python or FMU",
 }
 """Modules of this room, in the order in which a user meets them, and what they do."""
 

@@ -3,6 +3,7 @@
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function
 from lfrtorch.export.control_system import control_system, python_source
+from lfrtorch.export.fmu import write_fmu
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.export.targets import TARGETS, write
@@ -16,4 +17,5 @@ __all__ = [
     "onnx_models",
     "python_source",
     "write",
+    "write_fmu",
 ]

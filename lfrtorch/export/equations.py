@@ -151,7 +151,12 @@ def signals(place: str, letter: str, channels: Sequence[Channel], offset: Array)
         f"{place.format(letter, i, i + 1)}: {channel}, operating point {number:.6g}"
         for i, (channel, number) in enumerate(zip(channels, offset, strict=True))
     ]
-    return ["".join(sign if sign.isprintable() else " " for sign in line) for line in lines]
+    return [printable(line) for line in lines]
+
+
+def printable(text: str) -> str:
+    """A text in one line: names of channels come from files."""
+    return "".join(sign if sign.isprintable() else " " for sign in text)
 
 
 def equations(model: Model | LinearModel) -> Equations:

@@ -15,6 +15,7 @@ from lfrtorch.export.c_source import c_source
 from lfrtorch.export.casadi_function import casadi_function
 from lfrtorch.export.control_system import python_source
 from lfrtorch.export.equations import check_name, equations
+from lfrtorch.export.fmu import write_fmu
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.linear.model import LinearModel
@@ -62,6 +63,10 @@ def _control(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
     paths[0].write_text(python_source(model, name), encoding="utf-8")
 
 
+def _fmu(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
+    write_fmu(model, paths[0], name)
+
+
 TARGETS = {
     "c": Target((".h", ".c"), _c, "{name}_step(x, u, x_next, y);"),
     "casadi": Target(
@@ -74,6 +79,7 @@ TARGETS = {
     ),
     "matlab": Target((".m", ".mat"), _matlab, "[x_next, y] = {name}(x, u)"),
     "control": Target((".py",), _control, "from {name} import system"),
+    "fmu": Target((".fmu",), _fmu, "fmpy.simulate_fmu('{path}', step_size=sampling_time)"),
 }
 """All kinds of export."""
 
@@ -94,7 +100,7 @@ def write(
             ``casadi.Function.load`` reads, and ``NAME_channels.json`` with channels and rate;
             ``"onnx"``: ``NAME.onnx`` for a sample and ``NAME_simulate.onnx``; ``"matlab"``:
             ``NAME.m`` with ``NAME.mat``; ``"control"``: ``NAME.py``, whose ``system()`` is a
-            ``control.NonlinearIOSystem``.
+            ``control.NonlinearIOSystem``; ``"fmu"``: ``NAME.fmu``.
         folder: where to; it is made if need be.
         name: of the files, and in them.
         overwrite: whether files that exist may be replaced.

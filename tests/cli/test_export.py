@@ -48,7 +48,7 @@ def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
         (["checkpoint=model"], "to is not set: add to=c"),
         (
             ["checkpoint=model", "to=rust"],
-            "to is 'rust'; give one of c, casadi, onnx, matlab, control",
+            "to is 'rust'; give one of c, casadi, onnx, matlab, control, fmu",
         ),
         (["checkpoint=model", "to=c", "name=1"], "name is '1'; give letters"),
         (
