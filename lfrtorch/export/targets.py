@@ -79,7 +79,7 @@ TARGETS = {
     ),
     "matlab": Target((".m", ".mat"), _matlab, "[x_next, y] = {name}(x, u)"),
     "control": Target((".py",), _control, "from {name} import system"),
-    "fmu": Target((".fmu",), _fmu, "fmpy.simulate_fmu('{path}', step_size=sampling_time)"),
+    "fmu": Target((".fmu",), _fmu, "found = fmpy.simulate_fmu('{path}')"),
 }
 """All kinds of export."""
 
