@@ -65,7 +65,7 @@ class Adam:
 
     max_iter: int = 2000
     learning_rate: float = 1e-3
-    stable: bool = True
+    stable: bool = False
 
     def __post_init__(self) -> None:
         number("learning_rate", self.learning_rate, positive=True)

@@ -219,7 +219,7 @@ class LevenbergMarquardt:
     acceleration_limit: float = 0.75
     max_damping: float = 1e12
     least_damping: float = 1e-8
-    stable: bool = True
+    stable: bool = False
 
     def __post_init__(self) -> None:
         for name in ("damping", "truncation", "finite_step", "acceleration_limit", "max_damping"):
