@@ -2,7 +2,7 @@
 
     python benchmarks/boards.py --root DIR [--only mirror f16 emps]
 
-Official test records are not looked at; ``boards.md`` has what this prints. Of the mirror two
+Official test records are not looked at; ``boards.md`` has what it printed. Of the mirror two
 realisations of each level are fitted and the other four are simulated: µm, mean over realisations,
 periods and outputs. Of the F-16 the levels 1, 3 and 7 are fitted and level 5 is simulated: first
 acceleration, m/s². Of EMPS three quarters are fitted, and the whole record is simulated from its

@@ -17,6 +17,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.initial_state import simulate_estimated
 from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, is_compiled
 from lfrtorch.least_squares.exact_integrators import fixed_parameters, integrating_states
@@ -24,12 +25,7 @@ from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.jacobian import Jacobian, Memory, Part
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
 from lfrtorch.least_squares.record_groups import group_records
-from lfrtorch.least_squares.stable_states import (
-    LIMIT,
-    StableSystem,
-    spectral_radius,
-    stabilised,
-)
+from lfrtorch.least_squares.stable_states import LIMIT, StableSystem, fading, stabilised
 from lfrtorch.model import Model
 from lfrtorch.records import NormalisedRecord, Record, as_records
 
@@ -97,11 +93,10 @@ class SimulationProblem(LeastSquares):
         self.fixed: Bool[Tensor, " free"] | None = fixed_parameters(lfr.cell)
         """Which entries of the module's free parameters are constants: columns of zeros in J."""
         self._largest_pole = math.inf
-        if stable and lfr.cell.A.requires_grad:
-            self._integrating = integrating_states(lfr.cell)
-            radius = spectral_radius(lfr.cell.A, self._integrating)
-            largest = torch.tensor(max(LIMIT, radius), dtype=torch.float64)
-            self._largest_pole = float(self.ranks.first(largest))
+        self._integrating = integrating_states(lfr.cell)
+        if stable and lfr.cell.A.requires_grad and not self._integrating.all():
+            radius = spectral_radius(fading(lfr.cell.A, self._integrating)).double()
+            self._largest_pole = max(LIMIT, float(self.ranks.first(radius)))
         self._reduced: Reduction | None = None
         self._memory = Memory()
         self.guesses: list[Tensor | None] = [None] * len(self.groups)

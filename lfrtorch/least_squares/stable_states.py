@@ -14,23 +14,24 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lfrtorch._support.types import Array
+from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.least_squares.linear_systems import System
 
 LIMIT = 1.0 - 1e-6
 """Largest modulus of an eigenvalue: a million samples to fade to 1/e."""
 
 
-def spectral_radius(A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"]) -> float:
-    """Largest modulus of an eigenvalue; exact integrators do not count.
+NEAR = 0.9
+"""Moduli below this part of the limit are left out of a step's bounds: no step goes so far, and
+eigenvalues at 0, those of delays, have no derivative."""
 
-    Example:
-        >>> from lfrtorch.least_squares.stable_states import spectral_radius
-        >>> spectral_radius(torch.diag(torch.tensor([0.5, 1.0])), torch.tensor([False, True]))
-        0.5
-    """
-    own = _own(A, integrating)
-    return float(np.abs(np.linalg.eigvals(own)).max(initial=0.0))
+ROUNDING = 1e-12
+"""A modulus at the limit is not beyond it."""
+
+
+def fading(A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"]) -> Float[Tensor, "n n"]:
+    """A without the rows and columns of exact integrators, which do not act on the others."""
+    return A.detach()[~integrating][:, ~integrating]
 
 
 def stabilised(
@@ -53,10 +54,10 @@ def stabilised(
         tensor([[0.5000, 7.0000],
                 [0.0000, 0.7500]])
     """
-    own = _own(A, integrating)
-    if np.abs(np.linalg.eigvals(own)).max(initial=0.0) <= limit:
+    own = fading(A, integrating)
+    if spectral_radius(own) <= limit:
         return A
-    T, Q = scipy.linalg.schur(own, output="real")
+    T, Q = scipy.linalg.schur(own.double().cpu().numpy(), output="real")
     i = 0
     while i < len(T):
         block = slice(i, i + 1 + (i + 1 < len(T) and T[i + 1, i] != 0))
@@ -90,17 +91,18 @@ class StableSystem:
         limit: float,
     ) -> None:
         self._system, self.scale, self.rank = system, system.scale, system.rank
-        nx, own = len(A), torch.nonzero(~integrating).flatten().cpu().numpy()
-        values, right = np.linalg.eig(_own(A, integrating))
-        left = np.linalg.inv(right)
-        slopes = np.zeros((len(values), nx, nx))
-        # dλ = left dA right; d|λ| is its part along λ.
-        for i, value in enumerate(values):
-            along = np.conj(value) / abs(value) if value else 1.0
-            slopes[i][np.ix_(own, own)] = (along * np.outer(left[i], right[:, i])).real
-        once = np.imag(values) >= 0
-        self._slopes = torch.as_tensor(slopes[once]).flatten(1).to(A)
-        self._room = torch.as_tensor(limit - np.abs(values[once])).to(A)
+        own = torch.nonzero(~integrating).flatten().cpu().numpy()
+        matrix = fading(A, integrating).double().cpu().numpy()
+        values, left, right = scipy.linalg.eig(matrix, left=True, right=True)
+        near = np.flatnonzero((np.imag(values) >= 0) & (np.abs(values) > NEAR * limit))
+        slopes = np.zeros((len(near), len(A), len(A)))
+        # dλ = leftᴴ dA right / leftᴴ right; d|λ| is its part along λ.
+        for slope, i in zip(slopes, near, strict=True):
+            y, x = np.conj(left[:, i]), right[:, i]
+            along = np.conj(values[i]) / abs(values[i])
+            slope[np.ix_(own, own)] = (along * np.outer(y, x) / (y @ x)).real
+        self._slopes = torch.as_tensor(slopes).flatten(1).to(A)
+        self._room = torch.as_tensor(limit - np.abs(values[near])).to(A)
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient, within the limit."""
@@ -117,13 +119,3 @@ class StableSystem:
             across = torch.stack([-self._system.solve(c, damping) for c in C])
             excess = C @ free - self._room[held]
             step = free - across.mT @ torch.linalg.lstsq(across @ C.mT, excess).solution
-
-
-ROUNDING = 1e-12
-"""A modulus at the limit is not beyond it."""
-
-
-def _own(A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"]) -> Array:
-    """The rows and columns of the other states; those of integrators do not act on them."""
-    other = ~integrating.cpu().numpy()
-    return A.detach().double().cpu().numpy()[np.ix_(other, other)]
