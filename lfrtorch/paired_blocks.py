@@ -11,7 +11,10 @@ is half of one of its own. Of two models that are equally good the smaller is ta
 cases.
 
 Long records tell apart what is not worth a parameter (on the Silverbox 25 neurons are better than 5
-by 0.6 % and two standard errors), so a model within 1 % of the best does as well.
+by 0.6 % and two standard errors), so a model within 1 % of the best does as well. Where a few
+resonances or impacts make up most of the error, one standard error can be a fifth of it, and the
+smallest model that is so near leaves out just these; so no model more than 5 % above the best does
+as well.
 
 References:
     Hastie, Tibshirani and Friedman, "The Elements of Statistical Learning", 2nd ed., 2009, section
@@ -34,12 +37,15 @@ from lfrtorch._support.types import Array, Integers
 MARGIN = 0.01
 """A model does as well as the best if its rms error exceeds that one's by at most this part."""
 
+CEILING = 0.05
+"""And does not if it exceeds it by more than this part."""
+
 BLOCKS = 10
 """Least number of blocks of time, over all records."""
 
 
 def as_good(squares: Sequence[Array] | Array, counts: Integers) -> NDArray[np.bool_]:
-    """Which models are within one standard error, or ``MARGIN``, of the best.
+    """Which models are within one standard error of the best, or ``MARGIN``; at most ``CEILING``.
 
     Args:
         squares, counts: see ``standard_errors_above``.
@@ -48,8 +54,9 @@ def as_good(squares: Sequence[Array] | Array, counts: Integers) -> NDArray[np.bo
         squares: (C, B), counts: (B,) -> (C,).
     """
     means = np.asarray(squares).sum(axis=1)
-    close = means <= (1.0 + MARGIN) ** 2 * means.min()
-    return close | (standard_errors_above(squares, counts) <= 1.0)
+    near = standard_errors_above(squares, counts) <= 1.0
+    near &= means <= (1.0 + CEILING) ** 2 * means.min()
+    return near | (means <= (1.0 + MARGIN) ** 2 * means.min())
 
 
 def no_progress(errors: Sequence[float], last: int) -> bool:

@@ -78,8 +78,8 @@ ITERATIONS = 75
 
 LEGEND = """\
 validation: rms error over that of the output. above best: in standard errors of the difference.
-chosen: the fewest net parameters with 1 at most, or an error up to 1 % above the best; or fewer
-with a smaller error."""
+chosen: the fewest net parameters with 1 at most and an error up to 5 % above the best, or with an
+error up to 1 % above it; or fewer with a smaller error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +175,10 @@ class SizeSearch:
 
     @property
     def chosen(self) -> Candidate:
-        """The one with the fewest net parameters within one standard error, or 1 %, of the best.
+        """The one with the fewest net parameters whose error is near the best.
 
-        Or one that has fewer parameters than that one, and a smaller error.
+        That is within one standard error of the difference, 5 % at most, or within 1 %. Or one that
+        has fewer parameters than that one, and a smaller error.
         """
         good = as_good([c.squares for c in self.candidates], self.counts)
         near = [c for c, enough in zip(self.candidates, good, strict=True) if enough]

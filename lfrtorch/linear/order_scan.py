@@ -69,8 +69,8 @@ class OrderScan:
             records. Without them the error over the fitted data, times √(1 + p ln M / M) for p
             parameters and M equations (minimum description length).
         validated: whether validation records give the scores.
-        chosen: the lowest order whose score is within one standard error, or 1 %, of the best;
-            without validation records the order of the best score.
+        chosen: the lowest order whose score is within one standard error of the best, 5 % at most,
+            or within 1 %; without validation records the order of the best score.
         lengths: the error over the fitted data with that factor, whatever the scores are.
         notes: why the scores are those of a cross-validation, and what orders were left out.
 
