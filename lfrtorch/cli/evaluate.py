@@ -15,8 +15,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
+from lfrtorch import analysis
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
+from lfrtorch.analysis.residual_analysis import SHORTEST
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import loaded, require_data
@@ -61,6 +63,11 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
     dataset = windowed(dataset, model if bla is None else bla.to_model(), Terminal(cfg))
     scores = report.evaluation(model, bla, dataset, command=command)
     print(f"\n{report.table(scores, dataset.published)}")
+    scored = [r for r in dataset.tests or dataset.validation if r.samples - r.skip >= SHORTEST]
+    if scored:
+        residuals = analysis.residuals(model, scored)
+        scores["residuals"] = residuals.entries()
+        print(f"\nResiduals\n\n{residuals}")
     if cfg.out is not None:
         found = {"checkpoint": folder, **scores}
         with whole_file(cfg.out) as file:

@@ -72,7 +72,10 @@ def test_scores_are_those_of_the_model_from_the_start_of_each_record(
     assert found["validation"]["rmse"] == pytest.approx(0.25, rel=1e-8)
     assert found["sizes"]["nx"] == 2
     assert "scripts/evaluate.py" in found["command"]
+    part = found["residuals"]["rest"]["y1"]
+    assert part["bias"] == pytest.approx(0.25, rel=1e-8)
     printed = capsys.readouterr()
+    assert part["verdict"] in printed.out
     assert printed.err == ""
     for words in ("note: a note", "Simulation RMSE (mm), nx 2, nz 1", "steady ", "paper: A (2001)"):
         assert words in printed.out
@@ -130,7 +133,7 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
     for part in ("scores", "validation", "sizes", "parameters_net"):
         assert found[part] == metrics[part]
     table = capsys.readouterr().out.split("Simulation RMSE")
-    assert table[1].split("\nnext: ")[0].strip() == table[2].split("\n\nScores in")[0].strip()
+    assert table[1].split("\nnext: ")[0].strip() == table[2].split("\n\nResiduals\n")[0].strip()
 
     new = tmp_path / "new.csv"
     new.write_text(csv.read_text())
