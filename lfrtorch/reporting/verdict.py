@@ -1,10 +1,11 @@
 """The verdict on a fit: is the NL-LFR better than the linear model on what was not fitted?
 
-The models share a record's noise, so what tells them apart is the difference of their squared
-errors, and the standard error of its mean over blocks of time, as in the search for sizes
-(:func:`lfrtorch.search_sizes`). A difference is clear if it is beyond Student's quantile, or
-if one error is twice the other: one burst of a model that runs away has a large standard error,
-and is no chance. A difference below 5 % of the error is none.
+The models share a record's noise, so what tells them apart is the ratio of their errors over the
+same blocks of time, and the standard error of its logarithm. (That of the difference is large if a
+few resonances have most of the error, even where one model is better in every block.) A ratio is
+clear if it is beyond Student's quantile, or if one error is twice the other: one burst of a model
+that runs away has a large standard error, and is no chance. A difference below 5 % of the error is
+none.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ class Compared(NamedTuple):
     Args:
         name: in a sentence, such as ``"test 'sweep'"``.
         ratio, ratio_std: of their errors, and its standard error.
-        deviations: of the mean difference of the squared errors from 0, in standard errors.
+        deviations: of the logarithm of the ratio from 0, in standard errors.
         clear: how many are needed.
         nrmse, linear_nrmse: errors over the output's standard deviation.
     """
@@ -281,18 +282,18 @@ def _compared(errors: Sequence[_Errors], among: int = 1) -> Compared:
         for each in ([e.squares for e in errors], [e.linear for e in errors])
     )
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        difference, error = blocked_mean(squares - linear, counts)
         ratio = math.sqrt(squares.sum() / linear.sum()) if linear.any() else 1.0
         # The linear model's mean square is 1: d ratio = d (squares - ratio² linear) / (2 ratio).
         _, spread = blocked_mean(squares - ratio**2 * linear, counts)
+    ratio_std = float(spread) / (2.0 * ratio) if ratio > 0 else 0.0
     power = float(np.dot([e.power for e in errors], samples)) or math.nan
     first = errors[0].response
     several = f"{len(errors)} {_use(first)} records"
     return Compared(
         name=_name(first) if len(errors) == 1 else several,
         ratio=ratio,
-        ratio_std=float(spread) / (2.0 * ratio) if ratio > 0 else 0.0,
-        deviations=float(difference / error) if error > 0 else 0.0,
+        ratio_std=ratio_std,
+        deviations=math.log(ratio) * ratio / ratio_std if ratio_std > 0 else 0.0,
         clear=float(t.ppf(1.0 - (1.0 - CONFIDENCE) / max(1, among), len(counts) - 1)),
         nrmse=math.sqrt(sum(e.squares.sum() for e in errors) / power),
         linear_nrmse=math.sqrt(sum(e.linear.sum() for e in errors) / power),

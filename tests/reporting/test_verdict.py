@@ -80,6 +80,17 @@ def test_a_difference_is_judged_by_its_standard_error():
     assert judge(result(), [TRAIN, many, *more]).kind == Kind.BETTER
 
 
+def test_better_in_every_block_is_better_where_one_resonance_has_the_error():
+    rng = np.random.default_rng(1)
+    linear = rng.normal(size=(1000, 1))
+    linear[400:500] *= 30.0
+    y = rng.normal(size=(1000, 1))
+    own = (0.5 + 0.2 * rng.random((1000, 1))) * linear
+    record = Record(np.zeros((1000, 1)), y)
+    found = judge(result(), [Response(record, "test", y - linear, y - own)])
+    assert found.kind == Kind.BETTER, found.text
+
+
 @pytest.mark.parametrize("part", [0.1, 0.8, 3.0])
 def test_the_standard_error_is_how_far_the_ratio_varies(part: float):
     rng = np.random.default_rng(5)
