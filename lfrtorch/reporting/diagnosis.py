@@ -102,7 +102,8 @@ class Evidence:
         starts: errors of all starts that went to the end, the best first.
         started: number of starts.
         continued: whether the fit went on from a model, so that there are no other starts.
-        sizes: nx, nz, nw, and nn or degree.
+        sizes: nx of the linear model, which relaxations and modes are added to, nz, nw, and nn or
+            degree.
         searched: whether validation chose them.
         largest: those that are the largest of a search.
         trainer: the search.
@@ -294,7 +295,7 @@ def evidence(
         starts=_finished(result),
         started=max(1, len(result.starts)),
         continued=continued,
-        sizes=result.model.sizes,
+        sizes=result.model.sizes if bla is None else {**result.model.sizes, "nx": bla.nx},
         searched=search is not None,
         largest=[] if search is None else search.largest,
         trainer=LevenbergMarquardt() if trainer is None else trainer,

@@ -86,6 +86,10 @@ def test_evidence_is_measured_on_the_records(fitted):
     assert found.falling == 1.0 - 0.25**0.1  # of two iterations: a tenth of them, at their pace
     assert list(found.starts) == [1.0, 1.5]
     assert found.started == 3
+    larger = replace(
+        result, model=lfrtorch.initialise(bla, responses[0].record, nz=1, nw=1, nn=2, relaxations=2)
+    )
+    assert evidence(larger, responses, bla=bla).sizes["nx"] == 1  # what a user gives
     assert set(found.outputs) == {"a", "b"}
     offset = result.model.scaler.u_offset
     test, train = (np.abs(r.record.u - offset).max() for r in responses[::-1])
