@@ -1,10 +1,11 @@
-"""What a fitted model is, and how far it may be trusted: figure, residuals, poles."""
+"""What a fitted model is, and how far it may be trusted: figure, residuals, poles, bounds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from lfrtorch.analysis.bounds import Bound, bound
 from lfrtorch.analysis.linearisation import linearise
 from lfrtorch.analysis.residual_analysis import Residuals, residuals
 from lfrtorch.model import Model
@@ -13,7 +14,7 @@ from lfrtorch.records import Record
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Residuals", "linearise", "plot", "residuals"]
+__all__ = ["Bound", "Residuals", "bound", "linearise", "plot", "residuals"]
 
 
 def plot(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:

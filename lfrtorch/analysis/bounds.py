@@ -1,0 +1,120 @@
+"""Proven bounds of states and outputs for all inputs of an amplitude."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import engineering, number, quantity, table
+from lfrtorch._support.types import Array
+from lfrtorch.engine.operating_point import double
+from lfrtorch.engine.reach import reach
+from lfrtorch.model import Model
+from lfrtorch.records import Channel
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """Proven bounds, up to rounding errors; ``print(bound)`` shows those of the outputs.
+
+    Args:
+        amplitude: of the inputs, (nu,), physical units: |u - offset| is at most so.
+        y: lowest and highest value of each output, (ny, 2), physical units.
+        x, z, w: the same of states and of the static map's signals, in the model's coordinates,
+            as in ``model.signals(record)``.
+        inputs, outputs: channel names and units.
+
+    Example:
+        >>> bound = lfrtorch.analysis.bound(model, 2.0)
+        >>> low, high = bound.y[0]
+        >>> u = np.random.default_rng(1).uniform(-2.0, 2.0, 1000)
+        >>> bool(low <= model.simulate(u).min() and model.simulate(u).max() <= high)
+        True
+    """
+
+    amplitude: Array
+    y: Float[Array, "ny 2"]
+    x: Float[Array, "nx 2"]
+    z: Float[Array, "nz 2"]
+    w: Float[Array, "nw 2"]
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+
+    def __str__(self) -> str:
+        rows = []
+        for channel, sides in zip(self.outputs, self.y, strict=True):
+            factor, unit = engineering(sides.tolist(), channel.unit)
+            rows.append([channel.name, *(number(factor * side) for side in sides), unit])
+        return (
+            f"Inputs within {levels_of(self.inputs, self.amplitude)} of their offsets\n\n"
+            + table(["output", "at least", "at most", "unit"], rows)
+        )
+
+
+def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) -> Bound:
+    """What the states and outputs of a model stay within, whatever the input of an amplitude.
+
+    It is reached by the worst input of a linear model, and may be far from that of a nonlinear one.
+    The mathematics are in ``lfrtorch/engine/reach.py``.
+
+    Args:
+        model: with a stable A, and a network of tanh, sigmoid or rbf; or linear.
+        amplitude: largest |u - offset|, physical units; the offsets are those of the model.
+        x0: initial state in the model's coordinates. Default: 0.
+
+    Shape:
+        amplitude: (nu,) or a number for all inputs, x0: (nx,).
+
+    Raises:
+        ValueError: A is not stable, or the static map not bounded: the bound would be infinite.
+
+    Example:
+        >>> bound = lfrtorch.analysis.bound(model, amplitude=0.5)
+        >>> bound.y.shape, bound.x.shape
+        ((1, 2), (1, 2))
+        >>> louder = lfrtorch.analysis.bound(model, amplitude=1.0)
+        >>> bool((louder.y[:, 1] > bound.y[:, 1]).all())
+        True
+    """
+    cell, scaler = double(model.lfr.cell), model.scaler
+    size = amplitudes(amplitude, len(model.inputs))
+    start = np.zeros(cell.nx) if x0 is None else np.asarray(x0, dtype=np.float64).ravel()
+    if len(start) != cell.nx or not np.isfinite(start).all():
+        raise InputError(f"x0 is {x0!r}; the model has {cell.nx} states: give as many numbers.")
+    reached = reach(cell, size / scaler.u_scale, start)
+    y = np.stack([scaler.restore_y(side) for side in reached.y], axis=-1)
+    x, z, w = (np.stack(signal, axis=-1) for signal in (reached.x, reached.z, reached.w))
+    return Bound(size, y, x, z, w, model.inputs, model.outputs)
+
+
+def amplitudes(given: ArrayLike, nu: int) -> Array:
+    """An amplitude for each input.
+
+    Example:
+        >>> from lfrtorch.analysis.bounds import amplitudes
+        >>> amplitudes(0.5, nu=2)
+        array([0.5, 0.5])
+    """
+    found = np.atleast_1d(np.asarray(given, dtype=np.float64))
+    if found.shape not in ((1,), (nu,)) or not (np.isfinite(found) & (found >= 0)).all():
+        raise InputError(
+            f"amplitude is {given!r}; the model has {nu} input(s): give one finite number for all, "
+            "or one for each, in physical units and not negative."
+        )
+    return np.broadcast_to(found, nu).copy()
+
+
+def levels_of(channels: tuple[Channel, ...], amplitude: Array) -> str:
+    """Amplitudes with the names and units of their channels.
+
+    Example:
+        >>> from lfrtorch.analysis.bounds import levels_of
+        >>> levels_of((lfrtorch.Channel("force", "N"),), np.array([2.0]))
+        'force 2.00 N'
+    """
+    pairs = zip(channels, amplitude, strict=True)
+    return ", ".join(f"{c.name} {quantity(float(a), c.unit)}" for c, a in pairs)

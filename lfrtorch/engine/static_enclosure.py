@@ -1,0 +1,207 @@
+"""Values and slopes that a network cannot leave while its inputs stay in a box.
+
+Intervals go through the layers: σ of an interval lies between its values at the ends and at the
+extremes inside, and so does σ'. This counts each neuron as if the others did not matter, and is too
+wide where large ones cancel. So the box is cut into cells: what holds in all of them holds in the
+box. In a cell about c the mean value theorem, w ∈ f(c) + J (z - c) with any J within the slopes, is
+the narrower, the smaller the cell.
+
+References:
+    Moore, Kearfott and Cloud, "Introduction to Interval Analysis", SIAM 2009, chapters 5 and 6.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from lfrtorch._support.types import Array
+from lfrtorch.engine.nonlinearity import Network
+
+CELLS, CELLS_OF_SEVERAL_LAYERS = 2**12, 2**9
+"""Most cells of a box."""
+
+FAR = 1e100
+"""Stands for infinity: its products are finite, and every bounded σ is at its limit."""
+
+ACTIVE = np.linspace(-4.0, 4.0, 17)
+"""Where σ bends."""
+
+BOUNDED = ("tanh", "sigmoid", "rbf")
+"""Activations that are bounded."""
+
+ROUNDING = 1e-12
+"""What is added to intervals, relative to their width and their distance from 0."""
+
+
+class _Activation(NamedTuple):
+    """σ and σ', and the places where each of them has an extreme."""
+
+    value: Callable[[Array], Array]
+    slope: Callable[[Array], Array]
+    extremes: tuple[float, ...]
+    extremes_of_slope: tuple[float, ...]
+
+
+def _rbf(v: Array) -> Array:
+    return np.exp(-np.square(v))
+
+
+def _logistic(v: Array) -> Array:
+    return scipy.special.expit(v)
+
+
+_FLAT = math.sqrt(0.5)
+_ACTIVATIONS = {
+    "tanh": _Activation(np.tanh, lambda v: 1.0 - np.square(np.tanh(v)), (), (0.0,)),
+    "sigmoid": _Activation(_logistic, lambda v: _logistic(v) * _logistic(-v), (), (0.0,)),
+    "relu": _Activation(lambda v: np.maximum(v, 0.0), lambda v: np.heaviside(v, 0.0), (), ()),
+    "rbf": _Activation(_rbf, lambda v: -2.0 * v * _rbf(v), (0.0,), (-_FLAT, _FLAT)),
+    "softplus": _Activation(lambda v: np.logaddexp(v, 0.0), _logistic, (), ()),
+}
+
+
+class Interval(NamedTuple):
+    """Numbers between low and high, entry by entry."""
+
+    low: Array
+    high: Array
+
+    @property
+    def middle(self) -> Array:
+        """(low + high) / 2."""
+        return (self.low + self.high) / 2
+
+    @property
+    def radius(self) -> Array:
+        """(high - low) / 2."""
+        return (self.high - self.low) / 2
+
+    def within(self, other: Interval) -> Interval:
+        """What both have in common."""
+        return Interval(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
+
+    def wider(self) -> Interval:
+        """The same, less than rounding errors wider."""
+        more = ROUNDING * (np.abs(self.low) + np.abs(self.high))
+        return Interval(self.low - more, self.high + more)
+
+
+class Enclosure(NamedTuple):
+    """What a map cannot leave in a box: w (nw,), or w - K z, and J = ∂w/∂z (nw, nz).
+
+    ``centres`` (C, nz) are the middles of its cells.
+    """
+
+    w: Interval
+    J: Interval
+    centres: Array
+
+
+def everywhere(size: int) -> Interval:
+    """All numbers."""
+    return Interval(np.full(size, -FAR), np.full(size, FAR))
+
+
+def enclosure(
+    static: Network,
+    z: Interval,
+    a: Interval | None = None,
+    K: Float[Array, "nw nz"] | None = None,
+) -> Enclosure:
+    """Bounds of a network's outputs and of its slopes.
+
+    Args:
+        static: the network.
+        z: box (nz,) of its inputs; ``everywhere`` for any.
+        a: what Wz z (nn,) cannot leave besides. Default: nothing more is known.
+        K: a matrix; then w - K z is bounded instead of w.
+    """
+    sigma = _ACTIVATIONS[static.activation]
+    W = [_array(M) for M in (static.Wz, *(M for M, _ in static.inner), static.Ww)]
+    b = [_array(v) for v in (static.bz, *(v for _, v in static.inner), static.bw)]
+    K = np.zeros((len(W[-1]), W[0].shape[1])) if K is None else K
+    cells = _cells(z, W[0], b[0], CELLS if len(W) == 2 else CELLS_OF_SEVERAL_LAYERS)
+    first = _product(W[0], cells)
+    if a is not None:
+        first = first.within(a)
+        reached = (first.low <= first.high).all(axis=-1)
+        cells, first = (Interval(i.low[reached], i.high[reached]) for i in (cells, first))
+    centres = cells.middle
+
+    # h and ∂h/∂z after each layer, as intervals, and h at the centres.
+    v, at = first, centres @ W[0].T
+    J = Interval(*np.broadcast_arrays(W[0], W[0]))
+    for M, bias in zip(W[1:], b[:-1], strict=True):
+        v, at = Interval(v.low + bias, v.high + bias), at + bias
+        J = _scaled(J, _range(sigma.slope, sigma.extremes_of_slope, v))
+        J = _product(M, Interval(J.low.swapaxes(-1, -2), J.high.swapaxes(-1, -2)))
+        J = Interval(J.low.swapaxes(-1, -2), J.high.swapaxes(-1, -2))
+        v = _product(M, _range(sigma.value, sigma.extremes, v))
+        at = sigma.value(at) @ M.T
+    linear = _product(K, cells)
+    w = Interval(v.low + b[-1] - linear.high, v.high + b[-1] - linear.low)
+    steepest = np.maximum(np.abs(J.low - K), np.abs(J.high - K))
+    reach = (steepest @ cells.radius[..., None])[..., 0]
+    at = at + b[-1] - centres @ K.T
+    w = w.within(Interval(at - reach, at + reach))
+    return Enclosure(_hull(w).wider(), _hull(J).wider(), centres)
+
+
+def _array(parameter) -> Array:
+    return parameter.detach().double().cpu().numpy()
+
+
+def _product(M: Float[Array, "m k"], x: Interval) -> Interval:
+    """M x for x (.., k)."""
+    up, down = np.maximum(M, 0.0).T, np.minimum(M, 0.0).T
+    return Interval(x.low @ up + x.high @ down, x.high @ up + x.low @ down)
+
+
+def _scaled(J: Interval, slope: Interval) -> Interval:
+    """Rows of J times the slopes (C, nn)."""
+    ends = [s[..., None] * side for s in slope for side in J]
+    return Interval(np.minimum.reduce(ends), np.maximum.reduce(ends))
+
+
+def _range(
+    function: Callable[[Array], Array], extremes: tuple[float, ...], v: Interval
+) -> Interval:
+    """Values of a function in intervals: at the ends, and at the extremes inside."""
+    ends = [function(v.low), function(v.high)]
+    low, high = np.minimum(*ends), np.maximum(*ends)
+    for place in extremes:
+        inside = (v.low < place) & (place < v.high)
+        value = function(np.asarray(place))
+        low = np.where(inside, np.minimum(low, value), low)
+        high = np.where(inside, np.maximum(high, value), high)
+    return Interval(low, high)
+
+
+def _hull(each: Interval) -> Interval:
+    """The interval that holds those of all cells."""
+    return Interval(each.low.min(axis=0), each.high.max(axis=0))
+
+
+def _cells(z: Interval, Wz: Float[Array, "nn nz"], bz: Float[Array, " nn"], most: int) -> Interval:
+    """Cells (C, nz) that cover a box: half of them alike, half where the neurons bend."""
+    nz = len(z.low)
+    each = math.floor(most ** (1.0 / nz) + 1e-9)
+    edges = []
+    for j, (low, high) in enumerate(zip(*z, strict=True)):
+        steep = np.abs(Wz[:, j]) > 1.0 / FAR
+        bends = (np.subtract.outer(ACTIVE, bz[steep]) / Wz[steep, j]).ravel()
+        bends = bends[(bends > low) & (bends < high)]
+        inner = [np.empty(0)]
+        if each > 1 and len(bends):
+            inner.append(np.quantile(bends, np.linspace(0.0, 1.0, each // 2)))
+        if high - low < FAR:
+            inner.append(np.linspace(low, high, each - each // 2 + 1)[1:-1])
+        edges.append(np.concatenate([[low], np.unique(np.concatenate(inner)), [high]]))
+    low, high = (np.meshgrid(*(e[part] for e in edges)) for part in (slice(-1), slice(1, None)))
+    return Interval(*(np.stack([g.ravel() for g in side], axis=-1) for side in (low, high)))
