@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from lfrtorch.analysis.bounds import Bound, bound
 from lfrtorch.analysis.linearisation import linearise
+from lfrtorch.analysis.lpv_form import LPV, lpv
 from lfrtorch.analysis.residual_analysis import Residuals, residuals
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -14,7 +15,7 @@ from lfrtorch.records import Record
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Bound", "Residuals", "bound", "linearise", "plot", "residuals"]
+__all__ = ["LPV", "Bound", "Residuals", "bound", "linearise", "lpv", "plot", "residuals"]
 
 
 def plot(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:

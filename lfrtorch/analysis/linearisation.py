@@ -51,7 +51,7 @@ def linearise(
         >>> system = local.to_scipy()
     """
     cell, scaler = double(model.lfr.cell), model.scaler
-    u0 = scaler.u_offset if u is None else _vector("u", u, cell.nu, "the model has {} input(s)")
+    u0 = scaler.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
     v: Tensor = torch.as_tensor((u0 - scaler.u_offset) / scaler.u_scale)
     if x is None:
         found = equilibrium(cell, v)
@@ -62,7 +62,7 @@ def linearise(
                 "state: linearise(model, u, x=...)."
             )
     else:
-        found = torch.as_tensor(_vector("x", x, cell.nx, "the model has {} states"))
+        found = torch.as_tensor(vector("x", x, cell.nx, "the model has {} states"))
     with torch.no_grad():
         y0 = scaler.restore_y(cell(v, found)[0].numpy())
     return _linear_model(model, linearised_at(cell, v, found), np.array(u0), y0)
@@ -86,8 +86,14 @@ def _linear_model(model: Model, system: StateSpace, u0: Array, y0: Array) -> Lin
     )
 
 
-def _vector(name: str, given: ArrayLike, size: int, expected: str) -> Array:
-    """The numbers of an argument; refuse another shape and numbers that are not finite."""
+def vector(name: str, given: ArrayLike, size: int, expected: str) -> Array:
+    """The numbers of an argument; refuse another shape and numbers that are not finite.
+
+    Example:
+        >>> from lfrtorch.analysis.linearisation import vector
+        >>> vector("u", 0.5, 1, "the model has {} input(s)").tolist()
+        [0.5]
+    """
     if isinstance(given, Tensor):
         given = given.detach().cpu().numpy()
     try:

@@ -1,4 +1,4 @@
-"""A model as a function of MATLAB and Octave with its matrices in a file."""
+"""A model as functions of MATLAB and Octave with its matrices in a file."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lfrtorch.analysis.lpv_form import gauss_legendre, lpv
 from lfrtorch.export.equations import Layers, Monomials, check_name, equations
 from lfrtorch.export.rendering import rendered
 from lfrtorch.linear.model import LinearModel
@@ -20,33 +21,63 @@ ACTIVATIONS = {
 }
 """h = σ(v) and σ'(v); # stands for the number of the layer."""
 
+MEAN_SLOPES = {
+    "tanh": ["s = (1 - tanh(a) .* tanh(v)) .* over(tanh(d), d);"],
+    "sigmoid": ["s = (1 - tanh(a / 2) .* tanh(v / 2)) .* over(tanh(d / 2), d / 2) / 4;"],
+    "relu": [
+        "s = over(max(a, 0) - max(v, 0), d);",
+        "s(a > 0 & v > 0) = 1;",
+        "s(a <= 0 & v <= 0) = 0;",
+    ],
+    "rbf": [
+        "q = abs(d .* (v + a));",
+        "s = -(v + a) .* exp(-min(a .^ 2, v .^ 2)) .* over(-expm1(-q), q);",
+    ],
+    "softplus": [
+        "s = 1 ./ (1 + exp(-v));",
+        "near = abs(d) < 1 & d ~= 0;",
+        "s(near) = log1p(s(near) .* expm1(d(near))) ./ d(near);",
+        "far = abs(d) >= 1;",
+        "value = @(v) max(v, 0) + log1p(exp(-abs(v)));",
+        "s(far) = (value(a(far)) - value(v(far))) ./ d(far);",
+    ],
+}
+"""s = (σ(a) - σ(v)) / d with a = v + d, as ``lfrtorch.analysis.lpv_form.mean_slope``."""
 
-def matlab_function(model: Model | LinearModel, name: str = "model") -> tuple[str, dict[str, Any]]:
-    """A model as a function of MATLAB and Octave, ``[x_next, y, A, B, C, D] = NAME(x, u)``.
 
-    It is one sample in physical units; A, B, C and D are the matrices of the model linearised
-    there. The function loads what ``scipy.io.savemat`` writes to ``NAME.mat`` beside it: all
-    matrices of the model, offsets, names and units of the channels, and fs.
+def matlab_function(
+    model: Model | LinearModel, name: str = "model"
+) -> tuple[str, str, dict[str, Any]]:
+    """A model as functions of MATLAB and Octave.
+
+    ``[x_next, y, A, B, C, D] = NAME(x, u)`` is one sample in physical units; A, B, C and D are the
+    matrices of the model linearised there. ``[A, B, C, D, p] = NAME_lpv(x, u)`` has those of the
+    exact LPV form, ``lfrtorch.analysis.lpv(model)``. Both load what ``scipy.io.savemat`` writes to
+    ``NAME.mat`` beside them: all matrices of the model, offsets, names and units of the channels,
+    fs, and in ``lpv`` the matrices of the LPV form (the third index counts them) and its bounds.
 
     Args:
         model: what is exported.
         name: of the function.
 
     Returns:
-        The text of ``NAME.m``, and the variables of ``NAME.mat``.
+        The texts of ``NAME.m`` and ``NAME_lpv.m``, and the variables of ``NAME.mat``.
 
     Raises:
         ValueError: a static map of the user's own class, or a name that is no identifier.
 
     Example:
-        >>> text, variables = lfrtorch.export.matlab_function(model, "actuator")
+        >>> text, lpv_text, variables = lfrtorch.export.matlab_function(model, "actuator")
         >>> text.splitlines()[0]
         'function [x_next, y, A, B, C, D] = actuator(x, u)'
+        >>> lpv_text.splitlines()[0]
+        'function [A, B, C, D, p] = actuator_lpv(x, u)'
         >>> variables["fs"], variables["A"].shape
         (100.0, (1, 1))
     """
     check_name(name)
-    e = equations(model)
+    model = model.to_model() if isinstance(model, LinearModel) else model
+    e, form = equations(model), lpv(model)
     found: dict[str, Any] = {letters: getattr(e, letters) for letters in MATRICES}
     found |= {"u_offset": e.u_offset[:, None], "y_offset": e.y_offset[:, None], "fs": e.fs}
     for side, channels in (("input", e.inputs), ("output", e.outputs)):
@@ -61,6 +92,7 @@ def matlab_function(model: Model | LinearModel, name: str = "model") -> tuple[st
     match e.static:
         case Layers():
             known["value"], known["slope"] = ACTIVATIONS[e.static.activation]
+            known["mean_slope"] = MEAN_SLOPES[e.static.activation]
             known["layers"] = e.static.names[:-1]
             for (W, b), weight, bias in zip(e.static.names, e.static.W, e.static.b, strict=True):
                 found |= {W: weight, b: bias[:, None]}
@@ -72,7 +104,16 @@ def matlab_function(model: Model | LinearModel, name: str = "model") -> tuple[st
                 (n + 1.0, j + 1.0, float(times), m + 1.0) for n, j, times, m in e.static.slopes
             ]
             found |= {"C": e.static.C, "growth": np.array(growth), "slopes": np.array(slopes)}
-    return rendered("model.m", **known, **e.sizes), found
+    found["lpv"] = {letter: np.moveaxis(getattr(form, letter), 0, -1) for letter in "ABCD"}
+    points = {"x0": form.x0, "u0": form.u0, "x_next0": form.x_next0, "y0": form.y0}
+    found["lpv"] |= {letters: value[:, None] for letters, value in points.items()}
+    found["lpv"] |= {"Cz": form.Cz, "Dzu": form.Dzu, "bounds": form.bounds}
+    if isinstance(e.static, Monomials):
+        nodes = gauss_legendre(model.lfr.cell.static)
+        found["lpv"] |= dict(zip(("nodes", "weights"), nodes, strict=True))
+    known["schedule"] = form.schedule
+    known |= e.sizes
+    return rendered("model.m", **known), rendered("model_lpv.m", **known), found
 
 
 MATRICES = ("A", "Bu", "Bw", "Cz", "Dzu", "Cy", "Dyu", "Dyw")

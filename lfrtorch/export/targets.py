@@ -54,9 +54,10 @@ def _onnx(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
 def _matlab(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
     from scipy.io import savemat
 
-    text, variables = matlab_function(model, name)
-    paths[0].write_text(text, encoding="utf-8")
+    *texts, variables = matlab_function(model, name)
     savemat(paths[1], variables)
+    for path, text in zip([paths[0], paths[2]], texts, strict=True):
+        path.write_text(text, encoding="utf-8")
 
 
 def _control(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
@@ -77,7 +78,7 @@ TARGETS = {
         _onnx,
         "x_next, y = onnxruntime.InferenceSession('{path}').run(None, {{'x': x, 'u': u}})",
     ),
-    "matlab": Target((".m", ".mat"), _matlab, "[x_next, y] = {name}(x, u)"),
+    "matlab": Target((".m", ".mat", "_lpv.m"), _matlab, "[x_next, y] = {name}(x, u)"),
     "control": Target((".py",), _control, "from {name} import system"),
     "fmu": Target((".fmu",), _fmu, "found = fmpy.simulate_fmu('{path}')"),
 }
@@ -99,8 +100,8 @@ def write(
         to: ``"c"``: ``NAME.h`` and ``NAME.c``; ``"casadi"``: ``NAME.casadi``, which
             ``casadi.Function.load`` reads, and ``NAME_channels.json`` with channels and rate;
             ``"onnx"``: ``NAME.onnx`` for a sample and ``NAME_simulate.onnx``; ``"matlab"``:
-            ``NAME.m`` with ``NAME.mat``; ``"control"``: ``NAME.py``, whose ``system()`` is a
-            ``control.NonlinearIOSystem``; ``"fmu"``: ``NAME.fmu``.
+            ``NAME.m`` and ``NAME_lpv.m`` with ``NAME.mat``; ``"control"``: ``NAME.py``, whose
+            ``system()`` is a ``control.NonlinearIOSystem``; ``"fmu"``: ``NAME.fmu``.
         folder: where to; it is made if need be.
         name: of the files, and in them.
         overwrite: whether files that exist may be replaced.

@@ -11,6 +11,7 @@ import pytest
 from exported import MODELS, check_output, inputs, jacobians
 from scipy.io import loadmat, savemat
 
+from lfrtorch.analysis import lpv
 from lfrtorch.export import write
 
 needs_octave = pytest.mark.skipif(
@@ -30,6 +31,17 @@ for i = 1:numel(names)
         y(k, :) = y_k;
     end
     r.run = y;
+    m = load([name '.mat']);
+    f = m.lpv;
+    lpv = str2func([name '_lpv']);
+    x = zeros(numel(t.x), 1); y = []; ps = [];
+    for k = 1:200
+        [A, B, C, D, p] = lpv(x, t.u(k, :));
+        y(k, :) = f.y0 + C * (x - f.x0) + D * (t.u(k, :).' - f.u0);
+        x = f.x_next0 + A * (x - f.x0) + B * (t.u(k, :).' - f.u0);
+        ps(k, :) = p;
+    end
+    r.lpv_run = y; r.p = ps;
     found.(name) = r;
 end
 save('-v7', 'found.mat', '-struct', 'found');
@@ -64,3 +76,14 @@ def test_samples_and_jacobians_are_those_of_the_model(name: str, found: dict[str
     for letter, expected in zip("ABCD", jacobians(model, x, u[0]), strict=True):
         error = np.reshape(one[letter], expected.shape) - expected
         assert np.abs(error).max() <= 1e-12 * np.abs(expected).max()
+
+
+@needs_octave
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", MODELS)
+def test_the_lpv_form_runs_as_the_model(name: str, found: dict[str, Any]):
+    model, one = MODELS[name], found[f"f_{name}"]
+    u, form = inputs(model, 1000)[:200], lpv(model)
+    check_output(np.reshape(one["lpv_run"], (200, -1)), model, u)
+    p = form.scheduling(model.signals(u).x[0, :-1].numpy(), u)
+    np.testing.assert_allclose(np.reshape(one["p"], p.shape), p, rtol=0, atol=1e-9)

@@ -1,0 +1,390 @@
+"""The model as one that is linear in x and u and varies with parameters: the exact LPV form.
+
+With z - z0 = ζ the static map is f(z) = f(z0) + Δ(ζ) ζ, Δ = ∫ f'(z0 + t ζ) dt over t from 0 to 1.
+In each layer of a network the integral is a quotient s = (σ(v0 + d) - σ(v0)) / d, the mean slope of
+a neuron between v0 and v0 + d: with the layers' d1 = Wz ζ, d2 = W2 (s1 d1), .., it is
+Δ = Ww diag(s_last) .. W2 diag(s1) Wz. A mean slope lies between the least and the largest slope, so
+the parameters of the form are bounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from torch.nn import Module
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
+from lfrtorch.analysis.linearisation import vector
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linearised import of_static
+from lfrtorch.engine.nonlinearity import (
+    ACTIVATIONS,
+    Network,
+    has_one_layer,
+    is_network,
+    is_polynomial,
+)
+from lfrtorch.engine.operating_point import double, equilibrium
+from lfrtorch.engine.static_jacobian import linearise_static
+from lfrtorch.model import Model
+
+NODES = 32
+"""Of the Gauss-Legendre rule for a static map whose integral is not known."""
+
+ROUNDING = 1e-14
+"""Error of f(z) - f(z0), relative to both, that is left alone: over a small ζ it would be large."""
+
+STEEPEST = float(np.sqrt(2.0 / np.e))
+"""Largest slope of exp(-v²), at v = -1/√2."""
+
+SLOPES = {
+    "tanh": (0.0, 1.0),
+    "sigmoid": (0.0, 0.25),
+    "relu": (0.0, 1.0),
+    "rbf": (-STEEPEST, STEEPEST),
+    "softplus": (0.0, 1.0),
+}
+"""Least and largest slope of each activation, and so of its mean slopes."""
+
+Slopes = Callable[[Float[Array, "S nz"]], Float[Array, "S P"]]
+
+
+@dataclass(frozen=True, eq=False)
+class LPV:
+    """A model in LPV form, physical units::
+
+        x+ = x_next0 + A(p) (x - x0) + B(p) (u - u0)
+        y  = y0      + C(p) (x - x0) + D(p) (u - u0)
+
+    A(p) = A[0] + p_1 A[1] + p_2 A[2] + .., and so B, C and D. It is the model itself, not an
+    approximation, if p = scheduling(x, u). At rest x_next0 = x0.
+
+    Args:
+        A, B, C, D: matrices; the first axis counts the parameters from 1.
+        bounds: least and largest value of each p, whatever x and u; infinite if none is known.
+        schedule: what p are: ``"neurons"`` or ``"map"``.
+        x0, u0, x_next0, y0: the point that deviations are counted from, with the next state and the
+            output there.
+        Cz, Dzu: z - z0 = Cz (x - x0) + Dzu (u - u0).
+        slopes: z - z0 -> p.
+
+    Shape:
+        A: (1 + P, nx, nx), B: (1 + P, nx, nu), C: (1 + P, ny, nx), D: (1 + P, ny, nu),
+        bounds: (P, 2), Cz: (nz, nx), Dzu: (nz, nu).
+
+    Example:
+        >>> form = lfrtorch.analysis.lpv(model)
+        >>> form.A.shape, form.bounds.tolist()[0]
+        ((5, 1, 1), [0.0, 1.0])
+    """
+
+    A: Float[Array, "Q nx nx"]
+    B: Float[Array, "Q nx nu"]
+    C: Float[Array, "Q ny nx"]
+    D: Float[Array, "Q ny nu"]
+    bounds: Float[Array, "P 2"]
+    schedule: str
+    x0: Float[Array, " nx"]
+    u0: Float[Array, " nu"]
+    x_next0: Float[Array, " nx"]
+    y0: Float[Array, " ny"]
+    Cz: Float[Array, "nz nx"]
+    Dzu: Float[Array, "nz nu"]
+    slopes: Slopes
+
+    def scheduling(
+        self, x: Float[Array, "*axes nx"], u: Float[Array, "*axes nu"]
+    ) -> Float[Array, "*axes P"]:
+        """p of states and inputs.
+
+        Example:
+            >>> form = lfrtorch.analysis.lpv(model)
+            >>> form.scheduling(np.zeros(1), np.zeros(1)).shape
+            (4,)
+        """
+        zeta = (x - self.x0) @ self.Cz.T + (u - self.u0) @ self.Dzu.T
+        points = zeta.reshape(int(np.prod(zeta.shape[:-1])), len(self.Cz))
+        return self.slopes(points).reshape(*zeta.shape[:-1], len(self.bounds))
+
+    def at(self, p: Float[Array, " P"]) -> tuple[Array, Array, Array, Array]:
+        """A(p), B(p), C(p) and D(p).
+
+        Example:
+            >>> form = lfrtorch.analysis.lpv(model)
+            >>> A, B, C, D = form.at(form.bounds.mean(axis=1))
+        """
+        A, B, C, D = (M[0] + np.tensordot(p, M[1:], 1) for M in (self.A, self.B, self.C, self.D))
+        return A, B, C, D
+
+    def step(
+        self, x: Float[Array, " nx"], u: Float[Array, " nu"]
+    ) -> tuple[Float[Array, " nx"], Float[Array, " ny"]]:
+        """Next state and output.
+
+        Example:
+            >>> x_next, y = lfrtorch.analysis.lpv(model).step(np.zeros(1), np.ones(1))
+            >>> np.allclose(y, model.simulate([1.0])[0])
+            True
+        """
+        A, B, C, D = self.at(self.scheduling(x, u))
+        dx, du = x - self.x0, u - self.u0
+        return self.x_next0 + A @ dx + B @ du, self.y0 + C @ dx + D @ du
+
+    def simulate(self, u: ArrayLike, x0: Float[Array, " nx"] | None = None) -> Float[Array, "T ny"]:
+        """Output of an input.
+
+        Args:
+            u: the input, physical units.
+            x0: initial state in the model's coordinates. Default: 0, as ``model.simulate``.
+
+        Shape:
+            u: (T, nu), or (T,) of one input.
+
+        Raises:
+            ValueError: an input of another shape.
+
+        Example:
+            >>> form = lfrtorch.analysis.lpv(model)
+            >>> np.allclose(form.simulate(record.u), model.simulate(record.u))
+            True
+        """
+        signal = np.asarray(u, dtype=np.float64)
+        signal = signal[:, None] if signal.ndim == 1 else signal
+        if signal.ndim != 2 or signal.shape[1] != len(self.u0):
+            raise InputError(
+                f"the input has the shape {np.shape(u)}; give (samples, {len(self.u0)})."
+            )
+        x = np.zeros_like(self.x0) if x0 is None else x0
+        y = np.empty((len(signal), len(self.y0)))
+        for k, u_k in enumerate(signal):
+            x, y[k] = self.step(x, u_k)
+        return y
+
+
+def lpv(
+    model: Model,
+    u: ArrayLike | None = None,
+    *,
+    x: ArrayLike | None = None,
+    schedule: str | None = None,
+) -> LPV:
+    """The exact LPV form of a model about an operating point, in physical units.
+
+    Args:
+        model: nonlinear or linear (then there is no p).
+        u: constant input u0. Default: the inputs' offsets in the data.
+        x: state x0 in the model's coordinates. Default: the one at rest under u0, so that the form
+            has no constant terms; 0 if there is none.
+        schedule: what p are. ``"neurons"``: the mean slope of each neuron of a network with one
+            hidden layer. ``"map"``: the entries of Δ, by rows (w1 z1, w1 z2, .., w2 z1, ..), of
+            any static map; a network with fewer of them than neurons is better off with them.
+            Default: the neurons if there is one hidden layer.
+
+    A map of the user's own class is integrated by a Gauss-Legendre rule with 32 nodes; what the
+    rule leaves goes along ζ, so that f(z0) + Δ ζ is exact.
+
+    Shape:
+        u: (nu,) or a number for one input, x: (nx,).
+
+    Raises:
+        ValueError: an unknown schedule, the neurons of another map, or wrong shapes.
+
+    References:
+        Tóth, "Modeling and Identification of Linear Parameter-Varying Systems", Springer, 2010.
+
+    Example:
+        >>> form = lfrtorch.analysis.lpv(model, schedule="map")
+        >>> form.A.shape, bool(np.isfinite(form.bounds).all())
+        ((2, 1, 1), True)
+    """
+    cell, s = double(model.lfr.cell), model.scaler
+    one_layer = has_one_layer(cell.static)
+    if schedule not in (None, "neurons", "map"):
+        raise InputError(f"schedule is {schedule!r}; give 'neurons' or 'map'.")
+    if schedule == "neurons" and not one_layer:
+        raise InputError(
+            "schedule is 'neurons', and the static map is no network with one hidden layer; "
+            "give schedule='map'."
+        )
+    schedule = schedule or ("neurons" if one_layer else "map")
+    u0 = s.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
+    v0 = torch.as_tensor((u0 - s.u_offset) / s.u_scale)
+    if x is not None:
+        x0 = torch.as_tensor(vector("x", x, cell.nx, "the model has {} states"))
+    elif (x0 := equilibrium(cell, v0)) is None:
+        x0 = v0.new_zeros(cell.nx)
+    with torch.no_grad():
+        y0, x_next0 = (each.numpy() for each in cell(v0, x0))
+        z0 = cell.internal(v0, x0)[0].numpy()
+    left, right, bounds, slopes = _slopes(cell, z0, schedule)
+    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = (
+        np.asarray(p.detach().numpy())
+        for p in (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
+    )
+
+    def affine(M: Array, into: Array, of: Array) -> Array:
+        """M, and what each p multiplies: a column of ``left`` times a row of ``right``."""
+        return np.concatenate([M[None], np.einsum("ip,pj->pij", into @ left, right @ of)])
+
+    scale = s.y_scale[:, None]
+    Dzu = Dzu / s.u_scale
+    return LPV(
+        affine(A, Bw, Cz),
+        affine(Bu / s.u_scale, Bw, Dzu),
+        affine(scale * Cy, scale * Dyw, Cz),
+        affine(scale * Dyu / s.u_scale, scale * Dyw, Dzu),
+        bounds, schedule, x0.numpy(), np.array(u0), x_next0, s.restore_y(y0), Cz, Dzu, slopes,
+    )  # fmt: skip
+
+
+def _slopes(
+    cell: LFRCell, z0: Float[Array, " nz"], schedule: str
+) -> tuple[Array, Array, Float[Array, "P 2"], Slopes]:
+    """L (nw, P), R (P, nz), bounds and p(ζ) of Δ = L diag(p) R."""
+    nw, nz, static = cell.nw, cell.nz, cell.static
+    if static is None:
+        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 2)), lambda zeta: zeta
+    if is_network(static) and schedule == "neurons":
+        W, _ = _layers(static)
+        bounds = np.tile(SLOPES[static.activation], (len(W[0]), 1))
+        return W[1], W[0], bounds, lambda zeta: _mean_slopes(static, z0, zeta)[0]
+    left, right = np.repeat(np.eye(nw), nz, axis=1), np.tile(np.eye(nz), (nw, 1))
+    known = _bounds(static) if is_network(static) else np.array([-np.inf, np.inf])
+    bounds = np.broadcast_to(known, (nw, nz, 2)).reshape(-1, 2)
+    return left, right, bounds, lambda zeta: _delta(cell, z0, zeta).reshape(len(zeta), -1)
+
+
+def _delta(
+    cell: LFRCell, z0: Float[Array, " nz"], zeta: Float[Array, "S nz"]
+) -> Float[Array, "S nw nz"]:
+    """Δ(ζ)."""
+    static = cell.static
+    if is_network(static):
+        W, _ = _layers(static)
+        product = np.broadcast_to(W[0], (len(zeta), *W[0].shape))
+        for s, after in zip(_mean_slopes(static, z0, zeta), W[1:], strict=True):
+            product = after @ (s[..., None] * product)
+        return product
+    t, weight = gauss_legendre(static)
+    points = z0 + t[:, None, None] * zeta
+    theta = {name: p.detach() for name, p in cell.named_parameters()}
+    with torch.no_grad():
+        J = linearise_static(static, torch.as_tensor(points), of_static(theta)).J.numpy()
+    delta = np.tensordot(weight, J, 1)
+    return delta if is_polynomial(static) else delta + _left_over(cell, z0, zeta, delta)
+
+
+def gauss_legendre(static: Module | None) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Nodes and weights of a rule for integrals of a map's slope from 0 to 1.
+
+    The slope of a polynomial is one in t, for which few nodes are exact.
+
+    Example:
+        >>> from lfrtorch.analysis.lpv_form import gauss_legendre
+        >>> [part.tolist() for part in gauss_legendre(lfrtorch.Polynomial(1, 1, degree=1))]
+        [[0.5], [1.0]]
+    """
+    nodes = (static.degree + 1) // 2 if is_polynomial(static) else NODES
+    t, weight = np.polynomial.legendre.leggauss(nodes)
+    return (t + 1.0) / 2, weight / 2
+
+
+@torch.no_grad()
+def _left_over(
+    cell: LFRCell,
+    z0: Float[Array, " nz"],
+    zeta: Float[Array, "S nz"],
+    delta: Float[Array, "S nw nz"],
+) -> Float[Array, "S nw nz"]:
+    """The least change of Δ that makes f(z0) + Δ ζ exact."""
+    assert cell.static is not None
+    f = cell.static(torch.as_tensor(np.concatenate([z0[None], z0 + zeta]))).numpy()
+    error = f[1:] - f[0] - np.einsum("swz,sz->sw", delta, zeta)
+    error[np.abs(error) <= ROUNDING * (np.abs(f[1:]) + np.abs(f[0]))] = 0.0
+    power = np.sum(zeta**2, axis=1, keepdims=True)
+    along = np.divide(zeta, power, out=np.zeros_like(zeta), where=power > 0)
+    return error[:, :, None] * along[:, None, :]
+
+
+def _layers(static: Network) -> tuple[list[Array], list[Array]]:
+    """All matrices of a network, and the constants of its hidden layers."""
+    W = [static.Wz, *(W for W, _ in static.inner), static.Ww]
+    b = [static.bz, *(b for _, b in static.inner)]
+    return [m.detach().numpy() for m in W], [c.detach().numpy() for c in b]
+
+
+def _mean_slopes(
+    static: Network, z0: Float[Array, " nz"], zeta: Float[Array, "S nz"]
+) -> list[Float[Array, "S nn"]]:
+    """The mean slopes of each layer's neurons between z0 and z0 + ζ."""
+    h, d, found = z0, zeta, []
+    W, b = _layers(static)
+    for W_h, b_h in zip(W, b, strict=False):
+        v, d = W_h @ h + b_h, d @ W_h.T
+        found.append(mean_slope(static.activation, v, d))
+        h = ACTIVATIONS[static.activation](torch.as_tensor(v)).numpy()
+        d = found[-1] * d
+    return found
+
+
+def mean_slope(activation: str, v: ArrayLike, d: ArrayLike) -> Array:
+    """(σ(v + d) - σ(v)) / d without cancellation, σ'(v) for d = 0.
+
+    Args:
+        activation: σ, a name of ``Network``.
+        v, d: arrays of shapes that broadcast.
+
+    Example:
+        >>> from lfrtorch.analysis.lpv_form import mean_slope
+        >>> mean_slope("tanh", 0.0, np.array([0.0, 1e-9, 2.0])).round(6).tolist()
+        [1.0, 1.0, 0.482014]
+    """
+    v, d = np.broadcast_arrays(np.asarray(v, dtype=np.float64), np.asarray(d, dtype=np.float64))
+    a = v + d
+    match activation:
+        case "tanh":  # tanh a - tanh v = tanh(a - v) (1 - tanh a tanh v)
+            return _quotient(np.tanh(d), d) * (1.0 - np.tanh(a) * np.tanh(v))
+        case "sigmoid":  # (1 + tanh(v / 2)) / 2
+            return mean_slope("tanh", v / 2, d / 2) / 4
+        case "relu":
+            part = _quotient(np.maximum(a, 0.0) - np.maximum(v, 0.0), d)
+            return np.where((a > 0) & (v > 0), 1.0, np.where((a > 0) | (v > 0), part, 0.0))
+        case "rbf":  # e^-a² - e^-v² = e^-min (e^-|q| - 1) with the sign of q = a² - v² = d (v + a)
+            q = np.abs(d * (v + a))
+            return -(v + a) * np.exp(-np.minimum(a**2, v**2)) * _quotient(-np.expm1(-q), q)
+        case _:  # softplus: ln(1 + s (e^d - 1)), s = sigmoid(v); a plain difference if d is large
+            near = np.clip(d, -1.0, 1.0)
+            s = 0.5 + 0.5 * np.tanh(v / 2)
+            part = np.where(
+                np.abs(d) < 1.0,
+                np.log1p(s * np.expm1(near)),
+                np.logaddexp(a, 0.0) - np.logaddexp(v, 0.0),
+            )
+            return np.where(d == 0, s, _quotient(part, d))
+
+
+def _quotient(a: Array, d: Array) -> Array:
+    """a / d, and 1 for d = 0."""
+    return np.divide(a, d, out=np.ones_like(d), where=d != 0)
+
+
+def _bounds(static: Network) -> Float[Array, "nw nz 2"]:
+    """Bounds of the entries of Δ, by interval arithmetic from layer to layer."""
+    W, _ = _layers(static)
+    slopes = SLOPES[static.activation]
+    low = high = W[0]
+    for after in W[1:]:
+        corners = [s * M for s in slopes for M in (low, high)]
+        low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
+        plus, minus = np.maximum(after, 0.0), np.minimum(after, 0.0)
+        low, high = plus @ low + minus @ high, plus @ high + minus @ low
+    return np.stack([low, high], axis=-1)
+
+
+__all__ = ["LPV", "gauss_legendre", "lpv", "mean_slope"]

@@ -1,0 +1,93 @@
+function [A, B, C, D, p] = {{ name }}_lpv(x, u)
+% {{ NAME }}_LPV  The exact LPV form of {{ name }}, in physical units.
+%
+%   [A, B, C, D, p] = {{ name }}_lpv(x, u) gives the matrices with which, not approximately,
+%
+%       x_next = x_next0 + A (x - x0) + B (u - u0)
+%       y      = y0      + C (x - x0) + D (u - u0)
+%
+%   They are A(:,:,1) + p(1) A(:,:,2) + p(2) A(:,:,3) + .., with the arrays and points of the struct
+%   lpv in {{ name }}.mat; a row of lpv.bounds has the least and the largest value of one p.
+{% if static and schedule == "neurons" %}
+%   p(i) is the mean slope of neuron i between its values at x0, u0 and at x, u.
+{% elif static %}
+%   p are the entries of Delta, by rows: w - w0 = Delta (z - z0).
+{% else %}
+%   There is no p: the model is linear.
+{% endif %}
+
+persistent m
+if isempty(m)
+    m = load(fullfile(fileparts(mfilename('fullpath')), '{{ name }}.mat'));
+end
+f = m.lpv;
+{% if static %}
+d = f.Cz * (x(:) - f.x0) + f.Dzu * (u(:) - f.u0); % z - z0
+z = m.Cz * f.x0 + m.Dzu * (f.u0 - m.u_offset); % z0
+{% if layers %}
+h0 = z;
+Delta = eye({{ nz }});
+{% for W, b in layers %}
+v{{ loop.index }} = m.{{ W }} * h{{ loop.index0 }} + m.{{ b }};
+h{{ loop.index }} = {{ value.replace("#", loop.index | string) }};
+d = m.{{ W }} * d;
+s = mean_slope(v{{ loop.index }}, d);
+d = s .* d;
+Delta = bsxfun(@times, s, m.{{ W }} * Delta);
+{% endfor %}
+{% if schedule == "neurons" %}
+p = s;
+{% else %}
+p = reshape((m.Ww * Delta).', [], 1);
+{% endif %}
+{% else %}
+% The mean of the slope between z0 and z, by a Gauss-Legendre rule that is exact.
+Delta = zeros({{ nw }}, {{ nz }});
+for n = 1:numel(f.nodes)
+    z_n = z + f.nodes(n) * d;
+    q = ones({{ monomials }}, 1); % 1, z1, z2, .., z1 z1, z1 z2, ..
+    for i = 1:{{ monomials - 1 }}
+        q(i + 1) = q(m.growth(i, 1)) * z_n(m.growth(i, 2));
+    end
+    for i = 1:size(m.slopes, 1)
+        s = m.slopes(i, :);
+        Delta(:, s(2)) = Delta(:, s(2)) + f.weights(n) * s(3) * q(s(4)) * m.C(:, s(1));
+    end
+end
+p = reshape(Delta.', [], 1);
+{% endif %}
+A = at(f.A, p);
+B = at(f.B, p);
+C = at(f.C, p);
+D = at(f.D, p);
+end
+
+function M = at(Ms, p)
+M = reshape(reshape(Ms, [], numel(p) + 1) * [1; p], size(Ms, 1), size(Ms, 2));
+end
+{% if layers %}
+
+function s = mean_slope(v, d)
+% (sigma(v + d) - sigma(v)) / d without cancellation.
+a = v + d;
+{% for line in mean_slope %}
+{{ line }}
+{% endfor %}
+{% if activation != "softplus" %}
+end
+
+function q = over(a, d)
+% a / d, and 1 for d = 0.
+q = ones(size(d));
+q(d ~= 0) = a(d ~= 0) ./ d(d ~= 0);
+{% endif %}
+end
+{% endif %}
+{% else %}
+p = zeros(0, 1);
+A = f.A;
+B = f.B;
+C = f.C;
+D = f.D;
+end
+{% endif %}

@@ -1,0 +1,107 @@
+"""The LPV form of a model is the model itself, and its parameters stay within their bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from exported import MODELS, check_run, check_step, inputs
+from reference import SIGMA, random_cell, random_model
+from torch import Tensor
+
+import lfrtorch
+from lfrtorch.analysis import lpv
+from lfrtorch.analysis.lpv_form import SLOPES, mean_slope
+
+pytestmark = pytest.mark.numeric
+
+ONE_LAYER = [name for name in MODELS if name in SIGMA]
+
+
+class Hinges(torch.nn.Module):
+    """A map of a class of its own with corners, on which no rule for integrals is exact."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gain = torch.nn.Parameter(torch.tensor(0.2, dtype=torch.float64))
+
+    def forward(self, z: Tensor) -> Tensor:
+        return self.gain * torch.cat([z.abs(), z.roll(1, -1).clamp(-0.3, 0.1)], dim=-1)
+
+
+OWN = random_model(random_cell(1, 1, 2, 2, 4, static=Hinges(), radius=0.5))
+
+
+@pytest.mark.parametrize("name", [*MODELS, "own"])
+def test_it_is_the_model(name: str):
+    model = OWN if name == "own" else MODELS[name]
+    for form in (lpv(model), lpv(model, schedule="map")):
+        check_step(form.step, model)
+    u = inputs(model, 30)
+    np.testing.assert_allclose(form.simulate(u), model.simulate(u), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["tanh", "layers"])
+def test_long_simulations_are_those_of_the_model(name: str):
+    check_run(lpv(MODELS[name]).step, MODELS[name])
+
+
+@pytest.mark.parametrize("name", [*ONE_LAYER, "layers", "polynomial"])
+def test_it_is_the_model_about_any_point(name: str):
+    model = MODELS[name]
+    x = np.random.default_rng(0).standard_normal(model.lfr.cell.nx)
+    form = lpv(model, inputs(model, 1)[0], x=x)
+    check_step(form.step, model)
+
+
+@pytest.mark.parametrize("name", ONE_LAYER)
+def test_about_its_rest_the_form_has_no_constant_terms(name: str):
+    form = lpv(MODELS[name])
+    np.testing.assert_allclose(form.x_next0, form.x0, atol=1e-9)
+    local = lfrtorch.analysis.linearise(MODELS[name])
+    here = form.at(form.scheduling(form.x0, form.u0))
+    expected = (local.A, local.B, local.C, local.D)
+    for found, matrix in zip(here, expected, strict=True):
+        np.testing.assert_allclose(found, matrix, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [*ONE_LAYER, "layers"])
+def test_parameters_stay_within_their_bounds_however_loud_the_input(name: str):
+    model = MODELS[name]
+    u0 = model.scaler.u_offset
+    for schedule in (None, "map"):
+        form = lpv(model, schedule=schedule)
+        for amplitude in (0.1, 1.0, 30.0):
+            u = u0 + amplitude * (inputs(model, 300) - u0)
+            p = form.scheduling(model.signals(u).x[0, :-1].numpy(), u)
+            assert (p >= form.bounds[:, 0] - 1e-12).all()
+            assert (p <= form.bounds[:, 1] + 1e-12).all()
+
+
+@pytest.mark.parametrize("activation", SIGMA)
+def test_mean_slopes_are_exact_and_become_the_slope(activation: str):
+    v = np.linspace(-6.0, 6.0, 41)[:, None]
+    far = np.array([-40.0, -3.0, -1.0, -0.4, 0.5, 1.0, 2.0, 40.0])
+    sigma = SIGMA[activation]
+    value = sigma(torch.as_tensor(v + far)) - sigma(torch.as_tensor(v))
+    np.testing.assert_allclose(mean_slope(activation, v, far) * far, value, rtol=1e-12, atol=1e-13)
+    at = torch.as_tensor(v, dtype=torch.float64).requires_grad_()
+    sigma(at).sum().backward()
+    assert at.grad is not None
+    smooth = np.abs(v) > 1e-3 if activation == "relu" else np.full(v.shape, True)
+    for near in (0.0, 1e-15, -1e-9):
+        found = mean_slope(activation, v, near)
+        np.testing.assert_allclose(found[smooth], at.grad.numpy()[smooth], atol=3e-9)
+    low, high = SLOPES[activation]
+    slopes = mean_slope(activation, v, np.linspace(-50.0, 50.0, 301))
+    assert low - 1e-12 <= slopes.min()
+    assert slopes.max() <= high + 1e-12
+
+
+def test_what_cannot_be_scheduled_is_refused():
+    with pytest.raises(lfrtorch.InputError, match="give schedule='map'"):
+        lpv(MODELS["layers"], schedule="neurons")
+    with pytest.raises(lfrtorch.InputError, match="give 'neurons' or 'map'"):
+        lpv(MODELS["layers"], schedule="state")
+    with pytest.raises(lfrtorch.InputError, match="give \\(samples, 2\\)"):
+        lpv(MODELS["tanh"]).simulate(np.zeros((5, 3)))
