@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import ArrayLike
+from torch import Tensor
 from torch.nn import Module
 
 from lfrtorch._support import checkpoint
+from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
 from lfrtorch.engine.initial_state import simulate_estimated
+from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network
 from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
@@ -31,6 +35,7 @@ from lfrtorch.records import (
     Start,
     as_signal,
     check_start,
+    with_past_outputs,
 )
 
 
@@ -54,6 +59,12 @@ class Model:
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
         fitted_to: the data in words, for ``print(model)``.
+        K: gain of the innovations e in x+ = A x + Bu u + Bw w + K e, y = ... + e, with x and y
+            normalised. Default: no noise model; ``lfrtorch.fit`` finds one with
+            ``noise="innovation"``.
+
+    Shape:
+        K: (nx, ny).
 
     ``print(model)`` shows sizes, channels, poles and gains: of the linear part A, Bu, Cy, Dyu, and
     of the model linearised at rest at the inputs' offsets. ``lfrtorch.analysis`` has its figure,
@@ -74,6 +85,7 @@ class Model:
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     fitted_to: str = ""
+    K: Float[Tensor, "nx ny"] | None = None
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.sizes.items())
@@ -99,6 +111,7 @@ class Model:
             ("sizes", f"{sizes}; {counts}"),
             ("static map", "" if cell.static is None else str(cell.static).split("\n")[0]),
             ("fitted to", self.fitted_to),
+            ("noise", "" if self.K is None else "innovation form: model.predict, model.observer"),
             ("rest", rest),
         ]
         lines = [
@@ -151,7 +164,7 @@ class Model:
         nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu hold as well.
         """
         cell = self.lfr.cell
-        gauge = cell.nx**2
+        gauge = cell.nx**2 + cell.past_outputs * (cell.nz + cell.ny)  # zeros of a predictor
         if isinstance(cell.static, Network | Polynomial):
             gauge += cell.nz**2 + cell.nw**2 + max(0, cell.nw - cell.ny)
         if isinstance(cell.static, Polynomial):
@@ -220,6 +233,83 @@ class Model:
             trajectory = self.lfr.trajectory(v, state, start)
         return Trajectory(*(signal.cpu() for signal in trajectory))
 
+    def predict(self, record: Record, *, horizon: int = 1) -> Array:
+        """Output (T, ny) predicted so many samples ahead, in physical units.
+
+        The prediction of a sample knows the inputs up to it, and the outputs up to ``horizon``
+        samples before it. In the first samples, before which there are none, it is a simulation.
+
+        Args:
+            record: inputs and measured outputs.
+            horizon: 1 is the next sample.
+
+        Raises:
+            ValueError: a model without K, a record of other channels or another rate, or a horizon
+                below 1.
+
+        Example:
+            >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
+            >>> started = lfrtorch.initialise(linear, record, nz=1, nw=1, nn=4)
+            >>> started.predict(record, horizon=5).shape
+            (400, 1)
+            >>> np.allclose(started.predict(record), linear.predict(record))  # without a fit
+            True
+        """
+        integer("horizon", horizon, 1)
+        self.check(record)
+        states = self.predictor().signals(with_past_outputs(record)).x[0, :-1]
+        cell, T = self.lfr.cell, record.samples
+        u = torch.as_tensor(self.scaler.normalise_u(record.u)).to(cell.A)
+        x, y = states.to(cell.A), cell.A.new_empty(T, cell.ny)
+        with torch.no_grad():
+            for ahead in range(min(horizon, T)):  # x: the states so far after what is known
+                y[ahead:], after = cell(u[ahead:], x)
+                x = after[:-1]
+        return record.shown(self.scaler.restore_y(y.double().cpu().numpy()))
+
+    def predictor(self) -> Model:
+        """The model of the output one sample ahead; its inputs are u, then y.
+
+        Raises:
+            ValueError: a model without K.
+
+        Example:
+            >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
+            >>> started = lfrtorch.initialise(linear, record, nz=1, nw=1, nn=4)
+            >>> started.predictor()
+            Model(u, y -> y, 100 Hz, nx=1, nz=1, nw=1, nn=4)
+        """
+        if self.K is None:
+            raise InputError(
+                "this model has no innovation gain K: fit it with noise='innovation', from a start "
+                "with the linear model of estimate_bla(..., refine='prediction')."
+            )
+        s = self.scaler
+        scaler = Scaler(
+            np.concatenate([s.u_offset, s.y_offset]),
+            np.concatenate([s.u_scale, s.y_scale]),
+            s.y_offset,
+            s.y_scale,
+        )
+        cell = predictor_cell(self.lfr.cell, self.K)
+        inputs = (*self.inputs, *self.outputs)
+        return replace(self, lfr=LFR(cell), scaler=scaler, inputs=inputs, K=None)
+
+    def innovation_form(self) -> Model:
+        """The system's own model, with K, of its predictor: the inverse of ``predictor``.
+
+        Example:
+            >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
+            >>> started = lfrtorch.initialise(linear, record, nz=1, nw=1, nn=4)
+            >>> again = started.predictor().innovation_form()
+            >>> np.allclose(again.simulate(record), started.simulate(record))
+            True
+        """
+        cell, K = split_predictor(self.lfr.cell)
+        nu, s = cell.nu, self.scaler
+        scaler = Scaler(s.u_offset[:nu], s.u_scale[:nu], s.y_offset, s.y_scale)
+        return replace(self, lfr=LFR(cell), scaler=scaler, inputs=self.inputs[:nu], K=K)
+
     def check(self, record: Record) -> None:
         """Refuse a record of other channels or another sampling frequency with a ValueError.
 
@@ -286,6 +376,8 @@ class Model:
         weights = dict(self.lfr.cell.state_dict())
         scaling = ("u_offset", "u_scale", "y_offset", "y_scale")
         weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in scaling}
+        if self.K is not None:
+            weights["K"] = self.K
         return checkpoint.write(folder, description, weights)
 
 
@@ -382,6 +474,9 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             case {"type": "Polynomial", "degree": degree}:
                 static = Polynomial(sizes["nz"], sizes["nw"], degree, dtype=dtype)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
+        K = weights.pop("K", None)
+        if K is not None and K.shape != (cell.nx, cell.ny):
+            raise InputError(f"K has the shape {tuple(K.shape)}")
         cell.load_state_dict(weights)
         cell.Dzu.requires_grad_(description.get("z_feedthrough", True))
         channels = [
@@ -395,7 +490,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             raise InputError(f"fs is {fs}")
         inputs, outputs = channels
         fitted_to = str(description.get("fitted_to", ""))
-        return Model(LFR(cell), scaler, fs, inputs, outputs, fitted_to)
+        return Model(LFR(cell), scaler, fs, inputs, outputs, fitted_to, K)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise InputError(
             f"'{folder}' is damaged: its description and weights do not fit ({error})."

@@ -309,6 +309,26 @@ def signals(record: Record) -> str:
     return f"{listed(record.inputs)} -> {listed(record.outputs)}"
 
 
+def with_past_outputs(record: Record) -> Record:
+    """The record of a one-step predictor: its inputs are u, then y, and its output is y.
+
+    A record in steady state has an estimated start: its noise does not repeat.
+
+    Example:
+        >>> from lfrtorch.records import with_past_outputs
+        >>> with_past_outputs(record)
+        Record('record': u, y -> y, 400 samples at 100 Hz, start estimated)
+    """
+    return replace(
+        record,
+        u=np.hstack([record.u, record.y]),
+        inputs=(*record.inputs, *record.outputs),
+        start="estimated" if record.start == "periodic" else record.start,
+        period=None,
+        line_weight=None,
+    )
+
+
 def as_records(records: Record | Sequence[Record]) -> list[Record]:
     """One record or several as a list, checked to share channels and sampling frequency.
 

@@ -57,6 +57,7 @@ def begun_on_part(
         dataset.selection,
         trainer=replace(trainer, max_iter=settings.first_iterations),
         ridge=settings.ridge,
+        noise=settings.noise,
         monitors=None if monitor is None else [[monitor]] * len(models),
         ranks=ranks,
         stop=stop,

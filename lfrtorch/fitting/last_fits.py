@@ -105,6 +105,7 @@ def refitted(
             held_out,
             trainer=settings.trainer,
             ridge=settings.ridge,
+            noise=settings.noise,
             iterations=iterations,
             monitor=observer.searching(),
             ranks=ranks,

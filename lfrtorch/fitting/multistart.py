@@ -37,6 +37,7 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
+from lfrtorch.fitting.prediction import Noise, predicting, shown_innovation_form
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import (
     Fit,
@@ -79,6 +80,7 @@ def fit(
     *,
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
+    noise: Noise = "output",
     average: int = 1,
     monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None = None,
     watch: Callable[[Round], None] = lambda _: None,
@@ -111,6 +113,11 @@ def fit(
             Starts are judged on validation and selection, and without both on training.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge: weight of |θ - θ_start|², see ``SimulationProblem``.
+        noise: where it acts. ``"output"``: on the outputs, and the simulation error is minimised.
+            ``"innovation"``: inside the system, too, and the error of the prediction one sample
+            ahead is minimised; all errors are those of predictions, and the model of the result
+            has K. The models need one, as ``initialise`` writes it from a linear model of
+            ``estimate_bla(..., refine="prediction")``; records in steady state are taken as others.
         average: most starts that the model of the result is the mean of
             (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
             averaged as bring the mean within 1 % of the least error on validation and selection,
@@ -153,6 +160,15 @@ def fit(
         >>> sorted(start.number for start in result.starts)
         [0, 1, 2]
     """
+    if noise != "output":
+        starts, *data = predicting(noise, models, train, validation, selection)
+        result = fit(
+            starts, *data,
+            trainer=trainer, ridge=ridge, average=average, monitors=shown_innovation_form(monitors),
+            watch=watch, ranks=ranks, snapshots=snapshots, stop=stop,
+        )  # fmt: skip
+        members = tuple(model.innovation_form() for model in result.members)
+        return replace(result, model=result.model.innovation_form(), members=members)
     alone = isinstance(models, Model)
     starts = [models] if alone else list(models)
     given = [monitors] if alone and monitors is not None else monitors
@@ -207,9 +223,9 @@ def fit(
             watch(Round(number, len(planned), judge.summaries(field), time.perf_counter() - clock))
             cut = next((fit for fit in field if fit.reason in CUT_SHORT), None)
             if cut is not None:
-                for fit in field:
-                    if not fit.reason:  # it reached the end of the round
-                        fit.note_end(cut.reason, cut.detail)
+                for one in field:
+                    if not one.reason:  # it reached the end of the round
+                        one.note_end(cut.reason, cut.detail)
                 break
             if number < len(planned):
                 kept, _ = planned[number]

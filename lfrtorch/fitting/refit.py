@@ -19,6 +19,7 @@ import numpy as np
 
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.prediction import Noise
 from lfrtorch.fitting.trainer import FitResult, Monitor, Stop, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
@@ -32,6 +33,7 @@ def refit(
     *,
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
+    noise: Noise = "output",
     iterations: int | None = None,
     monitor: Monitor | None = None,
     ranks: Ranks | None = None,
@@ -47,7 +49,7 @@ def refit(
         train: records that it was fitted to.
         held_out: records that chose its iterate. One that begins in a training record, as the
             parts of a measurement do, continues that record.
-        trainer, ridge: of the fit; ridge pulls towards the model that was chosen.
+        trainer, ridge, noise: of the fit; ridge pulls towards the model that was chosen.
         iterations: that were chosen. Default: those of the fit, without what came before it.
         monitor: called after every iteration. Default: a line on a terminal or in a notebook.
         ranks, stop: see :func:`lfrtorch.fit`.
@@ -81,6 +83,7 @@ def refit(
         all_records(train, held_out),
         trainer=replace(base, max_iter=limit),
         ridge=ridge,
+        noise=noise,
         average=len(models),
         monitors=None if monitor is None else [[monitor]] * len(models),
         ranks=ranks,

@@ -13,6 +13,7 @@ from torch.nn import Module
 from lfrtorch._support.checks import integer, number, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.nonlinearity import Polynomial
+from lfrtorch.fitting.prediction import Noise, check_noise
 from lfrtorch.fitting.trainer import Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
@@ -92,6 +93,9 @@ class Settings:
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
+        noise: where it acts, ``"output"`` or ``"innovation"``, see :func:`lfrtorch.fit`. In the
+            latter case the linear model has ``refine="prediction"``, too, and validation errors
+            are those of predictions one sample ahead.
         distil: whether one model takes the place of a mean of several if it does as well, see
             :func:`lfrtorch.distil`.
         refit: whether the model that validation chose is fitted to all estimation records at last,
@@ -134,6 +138,7 @@ class Settings:
     linear: Mapping[str, Any] = field(default_factory=dict)
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
     ridge: Ridge = 0.0
+    noise: Noise = "output"
     average: int = 1
     distil: bool = False
     refit: bool = False
@@ -163,6 +168,13 @@ class Settings:
                 object.__setattr__(self, name, size)
         for name in ("layers", "nx_max", "starts", "average"):
             integer(name, getattr(self, name), 1)
+        check_noise(self.noise)
+        if self.noise != "output":
+            object.__setattr__(self, "linear", {"refine": "prediction", **self.linear})
+            if self.distil:
+                raise InputError(
+                    f"distil is for noise='output', and noise is {self.noise!r}; give one of them."
+                )
         integer("seed", self.seed, 0)
         for name in ("distil", "refit", "z_feedthrough"):
             true_or_false(name, getattr(self, name))

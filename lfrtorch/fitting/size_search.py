@@ -43,6 +43,7 @@ from lfrtorch.fitting.folds import Fold
 from lfrtorch.fitting.folds import folds as folds_of
 from lfrtorch.fitting.live_line import StartsLine
 from lfrtorch.fitting.multistart import Together, any_of, iterations_of
+from lfrtorch.fitting.prediction import Noise, predicting
 from lfrtorch.fitting.refit import all_records
 from lfrtorch.fitting.trainer import Fit, Monitor, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -267,6 +268,7 @@ def search_sizes(
     folds: int = 0,
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
+    noise: Noise = "output",
     monitor: Monitor | None = None,
     watch: Callable[[SizeRound], None] = lambda _: None,
     ranks: Ranks | None = None,
@@ -293,7 +295,7 @@ def search_sizes(
             training and validation records in turn (:func:`lfrtorch.fitting.folds.folds`), and the
             errors in the stretches that were left out choose, those of finalists alone.
         trainer: the search. Default: Levenberg-Marquardt with 75 iterations.
-        ridge, ranks, stop: see :func:`lfrtorch.fit`.
+        ridge, noise, ranks, stop: see :func:`lfrtorch.fit`.
         monitor: called after every iteration of any model. Default: a line on a terminal or in a
             notebook, and nothing elsewhere.
         watch: called after each round.
@@ -326,6 +328,10 @@ def search_sizes(
             "there are no validation records, on which sizes are chosen; give some, or set "
             f"{', '.join(tried)} to numbers."
         )
+    if noise != "output":
+        begin, linear = start, None if linear is None else linear.predictor()
+        start = lambda sizes, seed: begin(sizes, seed).predictor()  # noqa: E731
+        _, train, validation = predicting(noise, [], train, validation)
     given_records = all_records(as_records(train), as_records(validation)) if folds else []
     ranks = Ranks() if ranks is None else ranks
     trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer

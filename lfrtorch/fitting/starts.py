@@ -161,6 +161,9 @@ def initialise(
         cell.A.copy_(cell.A * std / std[:, None])
         cell.Bu.div_(std[:, None])
         cell.Cy.mul_(std)
+        K = None
+        if bla.K is not None:
+            K = torch.as_tensor(bla.K * scaler.y_scale).to(std) / std[:, None]
         integrating = integrating_states(cell)
         uniform(cell.Cz)
         uniform(cell.Dzu)
@@ -196,6 +199,9 @@ def initialise(
             natural = distortion_frequencies(inputs, errors, modes)
         cell = with_driven_states(cell, corners, natural, generator)
         model = replace(model, lfr=LFR(cell))
+        if K is not None:
+            K = torch.cat([K, K.new_zeros(cell.nx - len(K), cell.ny)])
+    model = replace(model, K=K)
     model.lfr.cell.Dzu.requires_grad_(z_feedthrough)
     return model
 

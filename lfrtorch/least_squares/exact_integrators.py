@@ -35,12 +35,18 @@ def integrating_states(cell: LFRCell) -> Bool[Tensor, " nx"]:
 
 
 def fixed_parameters(cell: LFRCell) -> Bool[Tensor, " free"] | None:
-    """Which entries of the free parameters a fit must not change; None if there are none."""
+    """Which entries of the free parameters a fit must not change; None if there are none.
+
+    Columns of exact integrators, and of past outputs in a predictor
+    (``lfrtorch.engine.innovation``).
+    """
     states = integrating_states(cell)
-    if not states.any():
+    if not (states.any() or cell.past_outputs):
         return None
+    inputs = torch.arange(cell.nu, device=states.device) >= cell.nu - cell.past_outputs
+    columns = {"A": states, "Cz": states, "Dzu": inputs, "Dyu": inputs}
     masks = [
-        (states if name in ("A", "Cz") else torch.zeros_like(p, dtype=torch.bool)).expand(p.shape)
+        columns.get(name, torch.zeros_like(p, dtype=torch.bool)).expand(p.shape)
         for name, p in cell.named_parameters()
         if p.requires_grad
     ]

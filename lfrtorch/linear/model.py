@@ -22,7 +22,7 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.operating_point import StateSpace
 from lfrtorch.linear.resolvent import frequency_response, response_jacobian, solve_resolvents
 from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, Scaler, without_coordinates
+from lfrtorch.records import Channel, Record, Scaler, with_past_outputs, without_coordinates
 
 SINGULAR = 1e-12
 """Singular values below this, relative to the size of the system, count as zero when zeros at
@@ -225,26 +225,35 @@ class LinearModel:
             >>> predictor.predict(record).shape
             (400, 1)
         """
+        self.to_model().check(without_coordinates(record))
+        return self.predictor().simulate(with_past_outputs(record))
+
+    def predictor(self) -> LinearModel:
+        """The linear model of the output one sample ahead; its inputs are u, then y.
+
+        Raises:
+            ValueError: a model without K.
+
+        Example:
+            >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
+            >>> linear.predictor().inputs
+            (Channel(name='u', unit=''), Channel(name='y', unit=''))
+        """
         if self.K is None:
             raise InputError(
                 "this model has no innovation gain K: estimate it with refine='prediction'."
             )
-        self.to_model().check(without_coordinates(record))
         ny = len(self.outputs)
-        predictor = replace(
+        return replace(
             self,
             A=self.A - self.K @ self.C,
             B=np.hstack([self.B - self.K @ self.D, self.K]),
             D=np.hstack([self.D, np.zeros((ny, ny))]),
+            K=None,
+            covariance=None,
             u_offset=np.concatenate([self.u_offset, self.y_offset]),
             inputs=(*self.inputs, *self.outputs),
         )
-        u = np.hstack([record.u, record.y])
-        start = "estimated" if record.start == "periodic" else record.start
-        driven = replace(
-            record, u=u, inputs=predictor.inputs, start=start, period=None, line_weight=None
-        )
-        return predictor.simulate(driven)
 
     def transformed(self, T: Array, inverse: Array | None = None) -> LinearModel:
         """The same system in the coordinates T x.
@@ -302,7 +311,8 @@ class LinearModel:
         nu, ny = len(self.inputs), len(self.outputs)
         unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
         cell = linear_cell(self.A, self.B, self.C, self.D)
-        return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs)
+        K = None if self.K is None else torch.as_tensor(self.K)
+        return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs, K=K)
 
     def to_scipy(self) -> scipy.signal.StateSpace:
         """The deviations from the operating point as a ``scipy.signal.StateSpace``.

@@ -15,6 +15,7 @@ SCRIPTS = [
     "first_try",
     "large_linear",
     "linear",
+    "noise",
     "nonlinear",
     "parts",
     "refit",

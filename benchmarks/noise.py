@@ -1,0 +1,170 @@
+"""Noise inside the system: the fit of predictions against that of the simulation error.
+
+    python benchmarks/noise.py [--runs 50] [--samples 500 2000 8000] [--only innovations states]
+
+An oscillator with a softening spring (two states, one neuron) is driven by white noise of unit
+variance. A force that nobody measures acts on it, and its sensor has noise: as innovations with the
+gain of the Kalman filter about rest, or on the states and the output. ``SNR`` is the power of the
+output without noise over that of what noise adds. Models of nx = 2, nz = nw = 1 and four neurons
+start from linear models and are fitted 40 iterations at most.
+
+Printed: the median over the runs of the error against the true output without noise on another
+input, over its rms, of both fits, its bias (the mean over the runs), and the error of the
+prediction one sample ahead on another record, over the rms of the true innovations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+import torch
+
+import lfrtorch
+from lfrtorch.fitting.prediction import Noise
+from lfrtorch.linear.bla import Criterion
+from lfrtorch.metrics import rms
+from lfrtorch.records import Scaler
+
+FORCE = 10.0
+"""Deviation of the force that nobody measures over that of the sensor's noise, per sample, as
+deviations of the states."""
+
+SETTLING = 200
+"""Samples that are not scored."""
+
+
+class Noisy(NamedTuple):
+    """What a record was made of.
+
+    Args:
+        record: as it is measured.
+        clean: the output without any noise, (T, 1).
+        innovations: e, (T, 1); of noise on the states those of the Kalman filter are not known.
+    """
+
+    record: lfrtorch.Record
+    clean: np.ndarray
+    innovations: np.ndarray | None
+
+
+def oscillator() -> lfrtorch.Model:
+    """Two states, resonance at a twentieth of the rate, damping 0.1, a spring that softens."""
+    angle, radius = 0.3, 0.97
+    static = lfrtorch.Network(1, 1, 1, dtype=torch.float64)
+    cell = lfrtorch.LFRCell(1, 1, 2, 1, 1, static, dtype=torch.float64)
+    turn = radius * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    with torch.no_grad():
+        cell.A.copy_(torch.as_tensor(turn))
+        cell.Bu.copy_(torch.tensor([[0.0], [0.3]]))
+        cell.Bw.copy_(torch.tensor([[0.0], [0.3]]))
+        cell.Cz.copy_(torch.tensor([[1.0, 0.0]]))
+        cell.Cy.copy_(torch.tensor([[1.0, 0.0]]))
+        for name, value in (("Wz", 1.0), ("bz", 0.3), ("Ww", -1.0), ("bw", np.tanh(0.3))):
+            static.get_parameter(name).fill_(value)
+    zero, one = np.zeros(1), np.ones(1)
+    channels = (lfrtorch.Channel("u"),), (lfrtorch.Channel("y"),)
+    return lfrtorch.Model(lfrtorch.LFR(cell), Scaler(zero, one, zero, one), 1.0, *channels)
+
+
+def kalman_gain(model: lfrtorch.Model) -> np.ndarray:
+    """Of the linearisation at rest, (2, 1)."""
+    linear = lfrtorch.analysis.linearise(model)
+    A, C = np.asarray(linear.A), np.asarray(linear.C)
+    force = FORCE**2 * np.outer([0.0, 0.3], [0.0, 0.3])
+    P = scipy.linalg.solve_discrete_are(A.T, C.T, force, np.eye(1))
+    return A @ P @ C.T / (C @ P @ C.T + 1.0)
+
+
+def measured(
+    model: lfrtorch.Model, kind: str, level: float, T: int, rng: np.random.Generator
+) -> Noisy:
+    """A record of the oscillator with noise of a level."""
+    cell, u = model.lfr.cell, rng.standard_normal((T, 1))
+    K = kalman_gain(model)
+    e = level * rng.standard_normal((T, 1))
+    force = level * FORCE * rng.standard_normal((T, 1)) * np.array([0.0, 0.3])
+    moved = e @ K.T if kind == "innovations" else force
+    x, y = torch.zeros(1, 2), np.zeros((T, 1))
+    with torch.no_grad():
+        for k in range(T):
+            found, x = cell(torch.as_tensor(u[k : k + 1]), x.double())
+            y[k] = found.numpy()[0] + e[k]
+            x = x + torch.as_tensor(moved[k])
+    record = lfrtorch.Record(u, y, fs=model.fs, skip=SETTLING, inputs=model.inputs)
+    return Noisy(record, model.simulate(u), e if kind == "innovations" else None)
+
+
+def level_of(model: lfrtorch.Model, kind: str, decibels: float) -> float:
+    """The level of noise that gives a signal-to-noise ratio, by bisection on one long record."""
+    low, high, level = 1e-5, 10.0, 1e-2
+    for _ in range(25):
+        made = measured(model, kind, level, 4000, np.random.default_rng(99))
+        ratio = rms(made.clean) / rms(made.record.y - made.clean)
+        low, high = (level, high) if 20 * np.log10(ratio) > decibels else (low, level)
+        level = float(np.sqrt(low * high))
+    return level
+
+
+def fits(record: lfrtorch.Record) -> Iterator[tuple[str, lfrtorch.Model]]:
+    """The fits of the simulation error and of predictions."""
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=40)
+    kinds: tuple[tuple[Noise, Criterion], ...]
+    kinds = (("output", "simulation"), ("innovation", "prediction"))
+    for noise, refine in kinds:
+        linear = lfrtorch.estimate_bla(record, nx=2, refine=refine)
+        start = lfrtorch.initialise(linear, record, nz=1, nw=1, nn=4)
+        result = lfrtorch.fit(start, record, noise=noise, trainer=trainer, monitors=[])
+        yield noise, result.model
+
+
+def main() -> int:
+    """The table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=50)
+    parser.add_argument("--samples", type=int, nargs="*", default=[500, 2000, 8000])
+    parser.add_argument("--decibels", type=float, nargs="*", default=[30, 20, 10])
+    parser.add_argument("--only", nargs="*", default=["innovations", "states"])
+    options = parser.parse_args()
+    truth = oscillator()
+    print(
+        "| noise | SNR (dB) | samples | simulation fit | bias | prediction fit | bias | one step |"
+    )
+    print("|---" * 8 + "|")
+    for kind in options.only:
+        for decibels in options.decibels:
+            level = level_of(truth, kind, decibels)
+            other = measured(truth, kind, level, 4000, np.random.default_rng(12345))
+            clean = other.clean[SETTLING:]
+            for samples in options.samples:
+                errors: dict[str, list[np.ndarray]] = {"output": [], "innovation": []}
+                ahead = []
+                for run in range(options.runs):
+                    rng = np.random.default_rng(run)
+                    made = measured(truth, kind, level, samples + SETTLING, rng)
+                    for noise, model in fits(made.record):
+                        y_hat = model.simulate(other.record.u)[SETTLING:]
+                        errors[noise].append(y_hat - clean)
+                        if noise == "innovation":
+                            ahead.append(lfrtorch.rmse(other.record, model.predict(other.record)))
+                cells = [kind, f"{decibels:g}", str(samples)]
+                scale = rms(clean)
+                for found in errors.values():
+                    each = [rms(error) for error in found]
+                    bias = rms(np.mean(found, axis=0))
+                    cells += [f"{np.median(each) / scale:.4f}", f"{bias / scale:.4f}"]
+                true = other.innovations
+                least = "-"
+                if true is not None:
+                    least = f"{np.median(ahead) / rms(true[SETTLING:]):.4f}"
+                print("|", " | ".join([*cells, least]), "|")
+                sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

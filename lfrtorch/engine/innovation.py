@@ -1,0 +1,79 @@
+"""The innovation form of an NL-LFR, and its one-step predictor, which is an NL-LFR again.
+
+A disturbance inside the system moves the states, and the outputs tell of it::
+
+    x+ = A x + Bu u + Bw w + K e
+    y  = Cy x + Dyu u + Dyw w + e
+
+with innovations e that nobody can predict. Put e = y - ŷ into the first equation: the best
+prediction ŷ of the next output is the output of an NL-LFR whose inputs are u and the measured y::
+
+    x+ = (A - K Cy) x + (Bu - K Dyu) u + K y + (Bw - K Dyw) w
+    ŷ  = Cy x + Dyu u + Dyw w
+
+Neither ŷ nor z has y at once: those columns are zeros, which a fit must leave alone. The two forms
+have the same number of parameters, and each follows from the other.
+
+References:
+    Ljung, "System Identification: Theory for the User", 2nd ed., 1999, section 4.3.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lfrtorch.engine.cell import LFRCell
+
+
+def predictor_cell(cell: LFRCell, K: Float[Tensor, "nx ny"]) -> LFRCell:
+    """The one-step predictor of a cell with the innovation gain K: its inputs are u, then y.
+
+    Example:
+        >>> from lfrtorch.engine.innovation import predictor_cell, split_predictor
+        >>> cell = lfrtorch.LFRCell(nu=1, ny=1, nx=2)
+        >>> predictor = predictor_cell(cell, torch.ones(2, 1))
+        >>> predictor.nu, predictor.past_outputs
+        (2, 1)
+        >>> again, K = split_predictor(predictor)
+        >>> torch.equal(again.A, cell.A), K.shape
+        (True, torch.Size([2, 1]))
+    """
+    with torch.no_grad():
+        K = K.to(cell.A)
+        found = _like(cell, cell.nu + cell.ny)
+        found.past_outputs = cell.ny
+        found.A.copy_(cell.A - K @ cell.Cy)
+        found.Bu.copy_(torch.cat([cell.Bu - K @ cell.Dyu, K], dim=1))
+        found.Bw.copy_(cell.Bw - K @ cell.Dyw)
+        for name in ("Dzu", "Dyu"):
+            getattr(found, name)[:, : cell.nu] = getattr(cell, name)
+    found.Dzu.requires_grad_(cell.Dzu.requires_grad)
+    return found
+
+
+def split_predictor(cell: LFRCell) -> tuple[LFRCell, Float[Tensor, "nx ny"]]:
+    """The cell of the system itself, and its innovation gain K, of a predictor."""
+    nu = cell.nu - cell.ny
+    with torch.no_grad():
+        found, K = _like(cell, nu), cell.Bu[:, nu:].clone()
+        found.A.copy_(cell.A + K @ cell.Cy)
+        found.Bu.copy_(cell.Bu[:, :nu] + K @ cell.Dyu[:, :nu])
+        found.Bw.copy_(cell.Bw + K @ cell.Dyw)
+        for name in ("Dzu", "Dyu"):
+            getattr(found, name).copy_(getattr(cell, name)[:, :nu])
+    found.Dzu.requires_grad_(cell.Dzu.requires_grad)
+    return found, K
+
+
+def _like(cell: LFRCell, nu: int) -> LFRCell:
+    """A cell of other inputs, with what both forms share; the static map is a copy."""
+    A = cell.A
+    sizes = nu, cell.ny, cell.nx, cell.nz, cell.nw
+    found = LFRCell(*sizes, deepcopy(cell.static), device=A.device, dtype=A.dtype)
+    for name in ("Cz", "Cy", "Dyw"):
+        getattr(found, name).copy_(getattr(cell, name))
+    return found

@@ -1,0 +1,60 @@
+"""Fits of the prediction one sample ahead: models and records of predictors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+from lfrtorch._support.errors import InputError
+from lfrtorch.fitting.trainer import Monitor
+from lfrtorch.least_squares.exact_integrators import integrating_states
+from lfrtorch.model import Model
+from lfrtorch.records import Record, as_records, with_past_outputs
+
+Noise = Literal["output", "innovation"]
+"""Where noise acts: on the outputs alone, or inside the system, too."""
+
+
+def check_noise(noise: str) -> None:
+    """Refuse an unknown kind of noise with a ValueError."""
+    if noise not in get_args(Noise):
+        raise InputError(f"noise is {noise!r}; use 'output' or 'innovation'.")
+
+
+def predicting(
+    noise: str,
+    models: Model | Sequence[Model],
+    *records: Record | Sequence[Record],
+) -> tuple[Model | list[Model], *tuple[list[Record], ...]]:
+    """The predictors of models, and the records that drive them.
+
+    Raises:
+        ValueError: an unknown kind of noise, a model without K, or one with exact integrators.
+    """
+    check_noise(noise)
+    given = [models] if isinstance(models, Model) else list(models)
+    for model in given:
+        if integrating_states(model.lfr.cell).any():
+            raise InputError(
+                "noise='innovation' is for models without exact integrators, which a predictor "
+                "has not; give integrators=0, or noise='output'."
+            )
+    found = [model.predictor() for model in given]
+    driven = [[with_past_outputs(r) for r in as_records(part)] if part else [] for part in records]
+    return (found[0] if isinstance(models, Model) else found, *driven)
+
+
+def shown_innovation_form(
+    monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None,
+) -> list[Any] | None:
+    """Monitors of a fit of predictors, which see the models of the systems themselves."""
+    if monitors is None:
+        return None
+
+    def wrapped(monitor: Monitor) -> Monitor:
+        return lambda model, progress: monitor(model.innovation_form(), progress)
+
+    return [
+        wrapped(each) if callable(each) else [wrapped(monitor) for monitor in each]
+        for each in monitors
+    ]
