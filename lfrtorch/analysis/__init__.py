@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from lfrtorch.analysis.bounds import Bound, bound
+from lfrtorch.analysis.contraction import Contraction, contraction
 from lfrtorch.analysis.linearisation import linearise
 from lfrtorch.analysis.lpv_form import LPV, lpv
 from lfrtorch.analysis.residual_analysis import Residuals, residuals
@@ -15,7 +16,18 @@ from lfrtorch.records import Record
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["LPV", "Bound", "Residuals", "bound", "linearise", "lpv", "plot", "residuals"]
+__all__ = [
+    "LPV",
+    "Bound",
+    "Contraction",
+    "Residuals",
+    "bound",
+    "contraction",
+    "linearise",
+    "lpv",
+    "plot",
+    "residuals",
+]
 
 
 def plot(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:

@@ -93,13 +93,15 @@ class Interval(NamedTuple):
 
 
 class Enclosure(NamedTuple):
-    """What a map cannot leave in a box: w (nw,), or w - K z, and J = ∂w/∂z (nw, nz).
+    """What a map cannot leave in a box: w (nw,), or w - K z, J = ∂w/∂z (nw, nz), and the slopes σ'
+    (nn,) of its first layer.
 
     ``centres`` (C, nz) are the middles of its cells.
     """
 
     w: Interval
     J: Interval
+    slopes: Interval
     centres: Array
 
 
@@ -136,6 +138,7 @@ def enclosure(
 
     # h and ∂h/∂z after each layer, as intervals, and h at the centres.
     v, at = first, centres @ W[0].T
+    slopes = _range(sigma.slope, sigma.extremes_of_slope, Interval(v.low + b[0], v.high + b[0]))
     J = Interval(*np.broadcast_arrays(W[0], W[0]))
     for M, bias in zip(W[1:], b[:-1], strict=True):
         v, at = Interval(v.low + bias, v.high + bias), at + bias
@@ -150,7 +153,7 @@ def enclosure(
     reach = (steepest @ cells.radius[..., None])[..., 0]
     at = at + b[-1] - centres @ K.T
     w = w.within(Interval(at - reach, at + reach))
-    return Enclosure(_hull(w).wider(), _hull(J).wider(), centres)
+    return Enclosure(_hull(w).wider(), _hull(J).wider(), _hull(slopes).wider(), centres)
 
 
 def _array(parameter) -> Array:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from lfrtorch._support.optional import imported
 from lfrtorch.export.equations import Layers, Monomials, check_name, equations
-from lfrtorch.export.optional import imported
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 

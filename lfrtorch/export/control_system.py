@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from lfrtorch._support.optional import imported
 from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
-from lfrtorch.export.optional import imported
 from lfrtorch.export.rendering import rendered
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model

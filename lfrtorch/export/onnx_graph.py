@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
 from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
-from lfrtorch.export.optional import imported
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 

@@ -1,4 +1,4 @@
-"""Packages that some exports need and that lfrtorch does without."""
+"""Packages that extras install and that lfrtorch does without."""
 
 from __future__ import annotations
 

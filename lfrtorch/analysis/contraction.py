@@ -1,0 +1,256 @@
+"""Whether a model forgets: a proof that all its trajectories under the same input come together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import number
+from lfrtorch._support.types import Array
+from lfrtorch.analysis.bounds import amplitudes, levels_of
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.linearised import linearise, spectral_radius
+from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.engine.operating_point import double
+from lfrtorch.engine.reach import reach
+from lfrtorch.engine.static_enclosure import FAR, Enclosure, Interval, enclosure, everywhere
+from lfrtorch.least_squares.certificate import LARGEST, Certificate, Differences, certificate, gain
+from lfrtorch.model import Model
+from lfrtorch.records import Channel
+
+LOCAL = 500
+"""Most points at which the model is linearised to find out why there is no certificate."""
+
+CLOSE, FARTHEST = 1.02, 2.0**20
+"""Factors: to within the first the largest amplitude is found, to within the second of the data's
+rms it is looked for."""
+
+SLOWEST, HALVINGS = 1e-3, 9
+"""The rate is looked for between this part of the best possible 1 - ρ and all of it, by so many
+halvings of the logarithm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contraction:
+    """What was proven; ``print(contraction)`` says it in words.
+
+    Args:
+        amplitude: of the inputs about their offsets, (nu,), physical units, for which it holds:
+            infinite if for all; 0 if nothing was found.
+        rate: ρ, by which the norm of the difference shrinks in every sample; NaN if nothing was
+            found.
+        gain: γ, the largest root sum of squares of the outputs' difference over that of the
+            inputs', in physical units (of one input and output; otherwise of all together); NaN if
+            none was found.
+        P: of the norm √(ΔxᵀPΔx), (nx, nx), in the model's coordinates; ``None`` if nothing was
+            found.
+        reason: why nothing was found.
+        inputs, outputs: channel names and units.
+
+    Example:
+        >>> contraction = lfrtorch.analysis.contraction(model)
+        >>> contraction.found, contraction.rate < 1
+        (True, True)
+    """
+
+    amplitude: Array
+    rate: float
+    gain: float
+    P: Float[Array, "nx nx"] | None
+    reason: str
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+
+    @property
+    def found(self) -> bool:
+        """Whether the model was proven to contract."""
+        return self.P is not None
+
+    def __str__(self) -> str:
+        if not self.found:
+            return f"no proof that the model contracts was found: {self.reason}"
+        for_which = "all inputs"
+        if np.isfinite(self.amplitude).all():
+            for_which = f"inputs within {levels_of(self.inputs, self.amplitude)} of their offsets"
+        samples = number(-1.0 / math.log(self.rate)) if self.rate > 0 else "0"
+        lines = [
+            f"The model contracts, for {for_which}: differences of states under the same input",
+            f"shrink by {self.rate:.6g} or more in every sample, to 1/e in {samples} samples.",
+        ]
+        if math.isfinite(self.gain):
+            one = len(self.inputs) == len(self.outputs) == 1
+            unit = f"{self.outputs[0].unit}/{self.inputs[0].unit}" if one else ""
+            lines.append(f"Incremental gain: {number(self.gain)} {unit.strip('/')}".rstrip())
+        return "\n".join(lines)
+
+
+def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction:
+    """A proof that a model contracts, with its rate and gain, or why there is none.
+
+    Under the same input, the difference of any two states shrinks by ``rate`` or more in each
+    sample, in a norm that is the same everywhere. So the model forgets its start, answers a
+    periodic input with that period, and a change of the input changes the output by ``gain`` times
+    as much at most.
+
+    For inputs of an amplitude the slopes of the static map are those between the bounds of z that
+    ``bound`` proves, and the states those that such inputs reach from x = 0.
+
+    Args:
+        model: with a network of any activation, or linear. With an amplitude, A must be stable, and
+            the network of tanh, sigmoid or rbf.
+        amplitude: of the inputs, largest |u - offset|, physical units. Default: all inputs, or, if
+            nothing is found for them, the largest amplitude for which something is.
+
+    Shape:
+        amplitude: (nu,) or a number for all inputs.
+
+    Raises:
+        ValueError: a map whose slopes are not known to be bounded, an amplitude for a model that
+            ``bound`` refuses, or the package clarabel is missing: ``lfrtorch[certificate]``.
+
+    Example:
+        >>> contraction = lfrtorch.analysis.contraction(model)
+        >>> bool(np.isinf(contraction.amplitude).all())
+        True
+        >>> nearby = lfrtorch.analysis.contraction(model, amplitude=0.1)
+        >>> nearby.found
+        True
+    """
+    cell = double(model.lfr.cell)
+    if cell.static is not None and not is_network(cell.static):
+        raise InputError(
+            f"the static map is a {type(cell.static).__name__}, whose slopes are not known to be "
+            "bounded; a certificate needs a network, or no map."
+        )
+    scale = model.scaler.u_scale
+    if amplitude is not None:
+        size = amplitudes(amplitude, cell.nu)
+        proof = _proof(cell, _slopes_of(cell, size / scale))
+    else:
+        size = np.full(cell.nu, np.inf)
+        proof = _proof(cell, _slopes_of(cell, None))
+        if isinstance(proof, str):
+            size, proof = _largest(cell, proof)
+            size = size * scale
+    if isinstance(proof, str):
+        nothing = 0.0 * scale
+        return Contraction(nothing, math.nan, math.nan, None, proof, model.inputs, model.outputs)
+    system, found = proof
+    rate, found = _fastest(system, found)
+    y = model.scaler.y_scale[:, None]
+    physical = replace(
+        system,
+        Bu=system.Bu / scale, D=system.D / scale,
+        Cy=y * system.Cy, Dy=y * system.Dy, Dyu=y * system.Dyu / scale,
+    )  # fmt: skip
+    proven = gain(physical)
+    proven = math.nan if proven is None else proven
+    return Contraction(size, rate, proven, found.P, "", model.inputs, model.outputs)
+
+
+_Proof = tuple[Differences, Certificate]
+
+
+def _slopes_of(cell: LFRCell, amplitude: Array | None) -> Enclosure | None:
+    """What the static map does for inputs of an amplitude, or for all; None without a map."""
+    if amplitude is None:
+        return enclosure(cell.static, everywhere(cell.nz)) if is_network(cell.static) else None
+    return reach(cell, amplitude, np.zeros(cell.nx)).map
+
+
+def _proof(cell: LFRCell, slopes: Enclosure | None) -> _Proof | str:
+    """A system with its certificate, or why there is none."""
+    if slopes is not None:
+        radius, place = _steepest(cell, slopes)
+        if radius >= 1.0:
+            return (
+                f"linearised {place} it has an eigenvalue of modulus {radius:.4g}, so that no norm "
+                "shrinks there."
+            )
+    for system in _systems(cell, slopes):
+        found = certificate(system, _slow(system))
+        if found is not None:
+            return system, found
+    return "no norm was found that shrinks for all slopes within the bounds of the static map's."
+
+
+def _systems(cell: LFRCell, slopes: Enclosure | None) -> Iterator[Differences]:
+    """Systems of differences: by the entries of ∂w/∂z and by neurons, the smaller one first."""
+    if slopes is None:
+        yield Differences.by_entry(cell, Interval(np.zeros((0, 0)), np.zeros((0, 0))))
+        return
+    systems = [Differences.by_entry(cell, slopes.J)]
+    if is_network(cell.static) and cell.static.layers == 1:
+        systems.append(Differences.by_neuron(cell, cell.static, slopes.slopes))
+    systems.sort(key=lambda system: system.size)
+    yield systems[0]
+    yield from (system for system in systems[1:] if system.size <= LARGEST)
+
+
+def _steepest(cell: LFRCell, slopes: Enclosure) -> tuple[float, str]:
+    """Largest spectral radius among linearisations within the box, and where that is.
+
+    Only z that some state and input bring about are tried.
+    """
+    every = max(1, len(slopes.centres) // LOCAL)
+    z = torch.as_tensor(slopes.centres[::every])
+    onto = torch.cat([cell.Cz, cell.Dzu], dim=1).detach()
+    z = z @ (onto @ torch.linalg.pinv(onto)).mT
+    radii = spectral_radius(linearise(cell, z.unsqueeze(0)).F[0])
+    worst = int(radii.argmax())
+    place = f"at z = ({', '.join(f'{v:.3g}' for v in z[worst].tolist())})"
+    far = bool(z[worst].abs().max() >= math.sqrt(FAR))
+    return float(radii[worst]), "far from its data" if far else place
+
+
+def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
+    """The largest amplitude, relative to the data's rms, with a proof; or none, and why."""
+    nothing = np.zeros(cell.nu)
+
+    def attempt(factor: float) -> _Proof | str:
+        return _proof(cell, _slopes_of(cell, np.full(cell.nu, factor)))
+
+    try:
+        at_rest = attempt(1.0 / FARTHEST)
+    except InputError as error:  # z has no bounds
+        text = str(error).split("\n", 1)[0]
+        return nothing, f"{reason}\nNor is there one for an amplitude: {text}"
+    if isinstance(at_rest, str):
+        return nothing, f"{at_rest}\nThis is so for the smallest inputs."
+    low, high, best = 1.0 / FARTHEST, FARTHEST, at_rest
+    while high > CLOSE * low:
+        factor = math.sqrt(low * high)
+        proof = attempt(factor)
+        if isinstance(proof, str):
+            high = factor
+        else:
+            low, best = factor, proof
+    return np.full(cell.nu, low), best
+
+
+def _slow(system: Differences) -> float:
+    """The largest rate that counts."""
+    best = float(np.abs(np.linalg.eigvals(system.A)).max())
+    return 1.0 - SLOWEST * (1.0 - best)
+
+
+def _fastest(system: Differences, slow: Certificate) -> tuple[float, Certificate]:
+    """The smallest rate that is proven, with its certificate."""
+    rate, found = _slow(system), slow
+    low, high = SLOWEST, 1.0
+    for _ in range(HALVINGS):
+        part = math.sqrt(low * high)
+        tried = 1.0 - part / SLOWEST * (1.0 - _slow(system))
+        closer = certificate(system, tried)
+        if closer is None:
+            high = part
+        else:
+            low, rate, found = part, tried, closer
+    return rate, found

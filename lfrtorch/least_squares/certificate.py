@@ -1,0 +1,302 @@
+"""Whether all trajectories of a model come together: one linear matrix inequality.
+
+The difference of two trajectories obeys a linear system with a few uncertain slopes::
+
+    x+ = A x + B p + Bu u
+    v  = C x + D u            |p_i| <= |v_i|, i = 1 .. q
+    y  = Cy x + Dy p + Dyu u
+
+Let P > 0 and a diagonal T >= 0 have, for u = 0 and all other x and p::
+
+    |x+|²_P - ρ²|x|²_P + |v|²_T - |p|²_T < 0.
+
+The last two terms are not negative, so |x|_P shrinks by ρ in every sample. Likewise with::
+
+    |x+|²_P - |x|²_P + |v|²_T - |p|²_T + |y|² - γ²|u|² < 0
+
+for all x, p and u, the sum of |y|² is at most γ² times that of |u|². Both are linear in P, T and
+γ². An interior-point method finds them. Whether they do what they should is checked afterwards with
+the eigenvalues of the matrices, so the method need not be trusted.
+
+References:
+    Boyd, El Ghaoui, Feron and Balakrishnan, "Linear Matrix Inequalities in System and Control
+    Theory", SIAM 1994, chapters 5 and 8.
+    Lohmiller and Slotine, "On contraction analysis for non-linear systems", Automatica 34, 1998.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from lfrtorch._support.optional import imported
+from lfrtorch._support.types import Array
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.engine.static_enclosure import Interval
+
+ACCURACY = 1e-9
+"""Of the solver, relative."""
+
+ROUNDING = 10 * np.finfo(np.float64).eps
+"""Of a sum, relative to the sum of its moduli, times the length: what an eigenvalue must exceed."""
+
+SHORTEST = 1e-9
+"""Shorter rows of C and columns of B, relative to the longest, are scaled like this one."""
+
+LARGEST = 64
+"""Most rows of the inequality: the time of a solution grows with their sixth power."""
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """The system above.
+
+    Args:
+        A, B, C, Bu, D, Cy, Dy, Dyu: its matrices.
+    """
+
+    A: Float[Array, "nx nx"]
+    B: Float[Array, "nx q"]
+    C: Float[Array, "q nx"]
+    Bu: Float[Array, "nx nu"]
+    D: Float[Array, "q nu"]
+    Cy: Float[Array, "ny nx"]
+    Dy: Float[Array, "ny q"]
+    Dyu: Float[Array, "ny nu"]
+
+    @classmethod
+    def by_entry(cls, cell: LFRCell, J: Interval) -> Differences:
+        """Each entry of J = ∂w/∂z is anywhere in its interval."""
+        i, j = np.nonzero(J.radius)
+        radius = J.radius[i, j]
+        return cls._about(
+            cell, J.middle, np.eye(cell.nw)[:, i], radius[:, None] * np.eye(cell.nz)[j]
+        )
+
+    @classmethod
+    def by_neuron(cls, cell: LFRCell, static: Network, slopes: Interval) -> Differences:
+        """The slope of each neuron of one layer is anywhere in its interval."""
+        Wz, Ww = _array(static.Wz), _array(static.Ww)
+        return cls._about(cell, Ww * slopes.middle @ Wz, Ww, slopes.radius[:, None] * Wz)
+
+    @classmethod
+    def _about(cls, cell: LFRCell, J: Array, left: Array, right: Array) -> Differences:
+        """∂w/∂z = J + left diag(δ) right, |δ| <= 1."""
+        A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = (
+            _array(p)
+            for p in (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
+        )
+        return cls(
+            A=A + Bw @ J @ Cz,
+            B=Bw @ left,
+            C=right @ Cz,
+            Bu=Bu + Bw @ J @ Dzu,
+            D=right @ Dzu,
+            Cy=Cy + Dyw @ J @ Cz,
+            Dy=Dyw @ left,
+            Dyu=Dyu + Dyw @ J @ Dzu,
+        )
+
+    @property
+    def size(self) -> int:
+        """Rows of the inequality."""
+        return sum(self.B.shape)
+
+    def moved(self, L: Float[Array, "nx nx"]) -> tuple[Differences, Float[Array, " q"]]:
+        """The same for L x and s v, s p, with s so that columns of B are as long as rows of C."""
+        back = np.linalg.inv(L)
+        B, C = L @ self.B, self.C @ back
+        lengths = np.array([np.linalg.norm(B, axis=0), np.linalg.norm(C, axis=1)])
+        s = np.sqrt(np.divide(*np.maximum(lengths, SHORTEST * lengths.max(initial=SHORTEST))))
+        moved = Differences(
+            A=L @ self.A @ back,
+            B=B / s,
+            C=s[:, None] * C,
+            Bu=L @ self.Bu,
+            D=s[:, None] * self.D,
+            Cy=self.Cy @ back,
+            Dy=self.Dy / s,
+            Dyu=self.Dyu,
+        )
+        return moved, s
+
+
+class Certificate(NamedTuple):
+    """P and T that do what they should, as the eigenvalues of the inequality show."""
+
+    P: Float[Array, "nx nx"]
+    T: Float[Array, " q"]
+
+
+def certificate(system: Differences, rate: float) -> Certificate | None:
+    """P and T by which all differences shrink by the rate in every sample; None if none is found.
+
+    They are those of the largest margin t, M(P, T) <= -t I, about the coordinates in which the
+    system with p = 0 shrinks.
+
+    Raises:
+        ValueError: the solver is not installed.
+    """
+    moved = _prepared(system, rate)
+    if moved is None:
+        return None
+    x, L, s = moved
+    nx, q = x.B.shape
+    basis = _symmetric(nx)
+    F = [inequality(x, E, np.zeros(q), rate) for E in basis]
+    F += [inequality(x, np.zeros((nx, nx)), e, rate) for e in np.eye(q)]
+    margin = np.eye(nx + q)
+    trace = np.array([*(np.trace(E) for E in basis), *np.zeros(q + 1)]) / nx
+    found = _solved(np.array([*F, margin]), np.zeros_like(margin), len(F), -1.0, trace)
+    if found is None or not found[-1] > 0:
+        return None
+    return _checked(system, L, s, found, rate, None)
+
+
+def gain(system: Differences) -> float | None:
+    """Smallest γ for which |Δy| <= γ |Δu| is proven, as root sums of squares over all time."""
+    sizes = [np.abs(M).max(initial=0.0) for M in (system.Cy, system.Dy, system.Bu, system.D)]
+    y, u = max(sizes[:2]) or 1.0, max(sizes[2:]) or 1.0
+    unit = replace(
+        system,
+        Cy=system.Cy / y, Dy=system.Dy / y, Dyu=system.Dyu / (y * u),
+        Bu=system.Bu / u, D=system.D / u,
+    )  # fmt: skip
+    moved = _prepared(unit, 1.0)
+    if moved is None:
+        return None
+    x, L, s = moved
+    nx, q = x.B.shape
+    zero, none = np.zeros((nx, nx)), np.zeros(q)
+    constant = inequality(x, zero, none, gain=0.0)
+    basis = _symmetric(nx)
+    F = [inequality(x, E, none, gain=0.0) - constant for E in basis]
+    F += [inequality(x, zero, e, gain=0.0) - constant for e in np.eye(q)]
+    F.append(inequality(x, zero, none, gain=1.0) - constant)
+    for margin in (1e-6, 1e-4, 1e-2):
+        found = _solved(np.array(F), constant + margin * np.eye(len(constant)), len(F) - 1, 1.0)
+        if found is not None and found[-1] > 0:
+            value = float(np.sqrt(found[-1]))
+            if _checked(unit, L, s, found, 1.0, value) is not None:
+                return value * y * u
+    return None
+
+
+def inequality(
+    system: Differences,
+    P: Float[Array, "nx nx"],
+    T: Float[Array, " q"],
+    rate: float = 1.0,
+    gain: float | None = None,
+) -> Array:
+    """The matrix that shall be negative definite: for x and p, or with a gain for x, p and u."""
+    return sum(S.T @ Q @ S for S, Q in _terms(system, P, T, rate, gain))  # pyright: ignore[reportReturnType]
+
+
+def _terms(
+    system: Differences, P: Array, T: Array, rate: float, gain: float | None
+) -> list[tuple[Array, Array]]:
+    """Pairs S, Q of the inequality's parts Sᵀ Q S."""
+    (nx, q), nu = system.B.shape, system.Bu.shape[1] if gain is not None else 0
+    one = np.eye(nx + q + nu)
+    V = np.hstack([system.C, np.zeros((q, q)), system.D[:, :nu]])
+    terms = [
+        (np.hstack([system.A, system.B, system.Bu[:, :nu]]), P),
+        (one[:nx], -(rate**2) * P),
+        (V, np.diag(T)),
+        (one[nx : nx + q], -np.diag(T)),
+    ]
+    if gain is not None:
+        Y = np.hstack([system.Cy, system.Dy, system.Dyu])
+        terms += [(Y, np.eye(len(Y))), (one[nx + q :], -(gain**2) * np.eye(nu))]
+    return terms
+
+
+def _prepared(system: Differences, rate: float) -> tuple[Differences, Array, Array] | None:
+    """The system for L x and s v, in which A nearly shrinks x, L and s; None if A is not stable."""
+    A = system.A / rate
+    if np.abs(np.linalg.eigvals(A)).max() >= 1.0 - ROUNDING:
+        return None
+    P, power = np.eye(len(A)), A
+    for _ in range(60):  # Σ (Aᵏ)ᵀ Aᵏ, by doubling
+        P, power = P + power.T @ P @ power, power @ power
+        if np.abs(power).max() < ACCURACY:
+            break
+    try:
+        L = np.linalg.cholesky(P / np.trace(P) * len(A)).T
+    except np.linalg.LinAlgError:
+        return None
+    moved, s = system.moved(L)
+    return moved, L, s
+
+
+def _checked(
+    system: Differences, L: Array, s: Array, found: Array, rate: float, gain: float | None
+) -> Certificate | None:
+    """P and T of what the solver found for L x and s v, if they do what they should."""
+    nx, q = system.B.shape
+    P = L.T @ np.einsum("k,kij->ij", found[: -q - 1], _symmetric(nx)) @ L
+    P, T = (P + P.T) / 2, found[-q - 1 : -1] * s**2
+    terms = _terms(system, P, T, rate, gain)
+    negative = _is_negative(terms) and (T >= 0).all() and _is_negative([(np.eye(nx), -P)])
+    return Certificate(P, T) if negative else None
+
+
+def _is_negative(terms: Sequence[tuple[Array, Array]]) -> bool:
+    """Whether Σ Sᵀ Q S is negative definite beyond rounding errors."""
+    M = sum(S.T @ Q @ S for S, Q in terms)
+    size = sum(np.abs(S).T @ np.abs(Q) @ np.abs(S) for S, Q in terms)
+    assert isinstance(M, np.ndarray)
+    assert isinstance(size, np.ndarray)
+    scale = 1.0 / np.sqrt(np.maximum(size.diagonal(), 1e-300))
+    M, size = (scale[:, None] * N * scale for N in (M, size))
+    if not np.isfinite(M).all():
+        return False
+    error = ROUNDING * len(M) * np.linalg.norm(size, np.inf)
+    return bool(np.linalg.eigvalsh((M + M.T) / 2)[-1] < -error)
+
+
+def _symmetric(n: int) -> Float[Array, "k n n"]:
+    """A basis of symmetric matrices."""
+    i, j = np.triu_indices(n)
+    basis = np.zeros((len(i), n, n))
+    basis[range(len(i)), i, j] = basis[range(len(i)), j, i] = 1.0
+    return basis
+
+
+def _solved(
+    F: Float[Array, "k n n"],
+    constant: Float[Array, "n n"],
+    objective: int,
+    weight: float,
+    trace: Array | None = None,
+) -> Array | None:
+    """min weight ξ_objective with constant + Σ ξ_k F_k <= 0, and trace · ξ = 1 if it is given."""
+    clarabel: Any = imported("clarabel", "certificate")
+    n, count = F.shape[-1], len(F)
+    j, i = np.tril_indices(n)  # the upper triangle, column by column
+    weights = np.where(i == j, 1.0, np.sqrt(2.0))
+    rows, right = (F[:, i, j] * weights).T, -constant[i, j] * weights
+    cones = [clarabel.PSDTriangleConeT(n)]
+    if trace is not None:
+        rows, right = np.vstack([trace, rows]), np.concatenate([[1.0], right])
+        cones.insert(0, clarabel.ZeroConeT(1))
+    cost = np.zeros(count)
+    cost[objective] = weight
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    nothing = scipy.sparse.csc_matrix((count, count))
+    sparse = scipy.sparse.csc_matrix(rows)
+    answer = clarabel.DefaultSolver(nothing, cost, sparse, right, cones, settings).solve()
+    found = np.array(answer.x)
+    return found if len(found) == count and np.isfinite(found).all() else None
+
+
+def _array(parameter: Any) -> Array:
+    return parameter.detach().double().cpu().numpy()
