@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from lfrtorch.analysis.bounds import Bound, bound
+from lfrtorch.analysis.canonical_form import Canonical, canonical
 from lfrtorch.analysis.contraction import Contraction, contraction
 from lfrtorch.analysis.linearisation import linearise
 from lfrtorch.analysis.lpv_form import LPV, lpv
@@ -19,9 +20,11 @@ if TYPE_CHECKING:
 __all__ = [
     "LPV",
     "Bound",
+    "Canonical",
     "Contraction",
     "Residuals",
     "bound",
+    "canonical",
     "contraction",
     "linearise",
     "lpv",

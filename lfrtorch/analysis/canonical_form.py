@@ -1,0 +1,264 @@
+"""A model in coordinates that two fits of one system share, its static map without a linear part.
+
+The linear part of the static map may as well be in the linear block, and z, w and x may be scaled
+and mixed: many sets of weights are one model. The canonical form is the one of them in which
+
+- the affine map nearest to w(z) over the data has the slope 0: that is in A, Bu, Cy and Dyu;
+- z, w and x have unit covariance over the data (w about that constant);
+- the first w adds the most to the output, the first z bends the map the most, the first x is seen
+  the most in y and z;
+- the largest entry of the impulse response from u to each z and from each w to y is positive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Complex128, Float
+from torch import Tensor
+from torch.nn import Module
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Complex
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.lfr import LFR
+from lfrtorch.engine.linearised import of_static
+from lfrtorch.engine.operating_point import double
+from lfrtorch.engine.static_jacobian import linearise_static
+from lfrtorch.model import Model
+from lfrtorch.records import Record, as_records
+
+MOST_SAMPLES = 16_384
+"""Of each record that the covariances and the response to w are taken over, its last ones."""
+
+ANGLES = 1024
+"""Frequencies of impulse responses and of the observability Gramian."""
+
+FLAT = 1e-12
+"""Least variance in a direction that is scaled to 1, relative to the largest."""
+
+
+class Beyond(Module):
+    """What a map is beyond a linear one, in other coordinates: w = W (f(Z z) - L Z z).
+
+    Args:
+        base: f.
+        slope: L.
+        into: Z, from the coordinates of this map to those of f.
+        out: W.
+
+    Example:
+        >>> from lfrtorch.analysis.canonical_form import Beyond
+        >>> one = torch.eye(1)
+        >>> Beyond(torch.nn.Tanh(), one, one, 2 * one)(torch.tensor([0.5])).round(decimals=3)
+        tensor([-0.0760])
+    """
+
+    slope: Tensor
+    into: Tensor
+    out: Tensor
+
+    def __init__(
+        self,
+        base: Module,
+        slope: Float[Tensor, "nw nz"],
+        into: Float[Tensor, "nz nz"],
+        out: Float[Tensor, "nw nw"],
+    ) -> None:
+        super().__init__()
+        self.base = base
+        self.register_buffer("slope", slope)
+        self.register_buffer("into", into)
+        self.register_buffer("out", out)
+
+    def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
+        """w of z."""
+        z = z @ self.into.mT
+        return (self.base(z) - z @ self.slope.mT) @ self.out.mT
+
+
+@dataclass(frozen=True, eq=False)
+class Canonical:
+    """A model in its canonical form, and what its coordinates mean.
+
+    Args:
+        model: the same model; x = X x_before, z = Z z_before.
+        shares: part of the power that the nonlinearity adds to the normalised output, by w, if all
+            w had the mean of their spectra.
+        bends: part of the mean squared change of the map's slope, by z; w counts by its share.
+        X, Z: from the coordinates before to these.
+
+    Shape:
+        shares: (nw,), bends: (nz,), X: (nx, nx), Z: (nz, nz).
+
+    Example:
+        >>> _ = model.lfr.cell.static.Ww.data.normal_()
+        >>> found = lfrtorch.analysis.canonical(model, record)
+        >>> found.shares.tolist(), found.bends.tolist()
+        ([1.0], [1.0])
+    """
+
+    model: Model
+    shares: Float[Array, " nw"]
+    bends: Float[Array, " nz"]
+    X: Float[Array, "nx nx"]
+    Z: Float[Array, "nz nz"]
+
+
+def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
+    """A model in its canonical form: the same for all weights that are the same model.
+
+    Its static map is what is left of the model's beyond the nearest affine map over the records,
+    a module of class ``Beyond`` that holds the map itself. So it simulates to rounding as the
+    model does, but without its compiled code, and ``lfrtorch.export`` refuses it: export the model.
+
+    Args:
+        model: nonlinear.
+        records: data that say where x and z are. Two models compare on the same data.
+
+    A direction of z or x that the data do not visit stays small, and is not unique. Neither are
+    directions that add the same power.
+
+    Raises:
+        ValueError: a linear model, a map that is affine over the records, or a model that diverges
+            on them.
+
+    Example:
+        >>> _ = model.lfr.cell.static.Ww.data.normal_()
+        >>> same = lfrtorch.analysis.canonical(model, record).model
+        >>> np.allclose(same.simulate(record), model.simulate(record))
+        True
+        >>> round(float(same.signals(record).z.var(correction=0)), 6)
+        1.0
+    """
+    cell = double(model.lfr.cell)
+    if cell.static is None:
+        raise InputError("the model is linear: it has no static map to take apart.")
+    found = [model.signals(record) for record in as_records(records)]
+    x, z, w = (
+        [getattr(one, name)[0, -MOST_SAMPLES:].double().numpy() for one in found] for name in "xzw"
+    )
+    x_all, z_all, w_all = (np.concatenate(parts) for parts in (x, z, w))
+    if not all(np.isfinite(part).all() for part in (x_all, w_all)):
+        raise InputError("the model diverges on the records; give others.")
+    slope, constant = _nearest(z_all, w_all)
+    beyond = [w_r - z_r @ slope.T - constant for w_r, z_r in zip(w, z, strict=True)]
+    left = np.concatenate(beyond)
+    if not np.sum(left**2) > FLAT * np.sum(w_all**2):
+        raise InputError(
+            "the static map is affine over the records: nothing of it is nonlinear. "
+            "Give a model that was fitted, or records of larger inputs."
+        )
+    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = (
+        np.asarray(p.detach().numpy())
+        for p in (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
+    )
+    A, Bu = A + Bw @ slope @ Cz, Bu + Bw @ slope @ Dzu
+    Cy, Dyu = Cy + Dyw @ slope @ Cz, Dyu + Dyw @ slope @ Dzu
+    # w in coordinates of unit covariance, turned to the directions of its response in y.
+    W = _whitening(left)
+    responses = [_response(A, Bw, Cy, Dyw, one, W) for one in beyond]
+    power, turn = _ordered(sum(responses, np.zeros((len(W), len(W)))))
+    W = turn.T @ W
+    # z, turned to the directions in which the slope of w changes the most.
+    Z = _whitening(z_all)
+    theta = of_static({name: p.detach() for name, p in cell.named_parameters()})
+    J = linearise_static(cell.static, torch.as_tensor(z_all)[None], theta).J[0].detach().numpy()
+    bent = np.sqrt(power)[:, None] * (W @ (J - slope) @ _inverse(Z))
+    bends, turn = _ordered(np.einsum("swi,swj->ij", bent, bent) / len(bent))
+    Z = turn.T @ Z
+    angles: Array = np.asarray(2 * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)
+    Z = _signs(_frf(A, Bu, Z @ Cz, Z @ Dzu, angles), 1)[:, None] * Z
+    into_y = _frf(A, Bw @ _inverse(W), Cy, Dyw @ _inverse(W), angles)
+    W = _signs(into_y, 2)[:, None] * W
+    # x, turned to the axes of the observability Gramian.
+    X = _whitening(x_all)
+    seen = np.vstack([Cy, Z @ Cz]) @ _inverse(X)
+    G = _frf(X @ A @ _inverse(X), np.eye(len(A)), seen, np.zeros_like(seen), angles)
+    _, turn = _ordered(np.einsum("fsi,fsj->ij", G.conj(), G).real)
+    X = turn.T @ X
+    seen = seen @ turn
+    X = np.sign(np.take_along_axis(seen, np.abs(seen).argmax(axis=0)[None], 0)).T * X
+    back, out = _inverse(X), _inverse(W)
+    made = {
+        "A": X @ A @ back, "Bu": X @ Bu, "Bw": X @ Bw @ out, "Cz": Z @ Cz @ back, "Dzu": Z @ Dzu,
+        "Cy": Cy @ back, "Dyu": Dyu, "Dyw": Dyw @ out,
+    }  # fmt: skip
+    same = replace(model, lfr=LFR(_cell(cell, made, slope, _inverse(Z), W)))
+    return Canonical(same, power / power.sum(), bends / max(bends.sum(), 1e-300), X, Z)
+
+
+def _cell(cell: LFRCell, made: dict[str, Array], slope: Array, into: Array, out: Array) -> LFRCell:
+    """The cell with these matrices and the map beyond its linear part."""
+    parts = (torch.as_tensor(np.ascontiguousarray(part)) for part in (slope, into, out))
+    assert cell.static is not None
+    static = Beyond(deepcopy(cell.static), *parts)
+    found = LFRCell(cell.nu, cell.ny, cell.nx, cell.nz, cell.nw, static, dtype=torch.float64)
+    with torch.no_grad():
+        for name, value in made.items():
+            found.get_parameter(name).copy_(torch.as_tensor(np.ascontiguousarray(value)))
+    return found
+
+
+def _nearest(
+    z: Float[Array, "S nz"], w: Float[Array, "S nw"]
+) -> tuple[Float[Array, "nw nz"], Float[Array, " nw"]]:
+    """Slope and constant of the affine map nearest to w(z)."""
+    affine = np.hstack([z, np.ones((len(z), 1))])
+    solution: Array = np.asarray(np.linalg.lstsq(affine, w, rcond=None)[0], dtype=np.float64)
+    return solution[:-1].T, solution[-1]
+
+
+def _whitening(signal: Float[Array, "S n"]) -> Float[Array, "n n"]:
+    """T such that T s has unit covariance."""
+    centred = signal - signal.mean(axis=0)
+    power, axes = np.linalg.eigh(centred.T @ centred / len(centred))
+    return (axes / np.sqrt(np.maximum(power, FLAT * max(power[-1], 1e-300)))).T
+
+
+def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def _ordered(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Eigenvalues of a symmetric matrix, the largest first, and its eigenvectors."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+
+
+def _frf(A: Array, B: Array, C: Array, D: Array, angles: Float[Array, " F"]) -> Complex:
+    """C (zI - A)⁻¹ B + D at z = exp(j angle): (F, outputs, inputs)."""
+    resolvent = np.exp(1j * angles)[:, None, None] * np.eye(len(A)) - A
+    columns = np.broadcast_to(B.astype(np.complex128), (len(angles), *B.shape))
+    return C @ np.linalg.solve(resolvent, columns) + D
+
+
+def _response(
+    A: Array, Bw: Array, Cy: Array, Dyw: Array, w: Float[Array, "T nw"], W: Float[Array, "nw nw"]
+) -> Float[Array, "nw nw"]:
+    """Products of the responses in y from the entries of W w, by the power that w has there.
+
+    It is computed from frequency responses, which an unstable linear block has, too.
+    """
+    lines = np.asarray(np.fft.rfftfreq(len(w)), dtype=np.float64)
+    angles = 2 * np.pi * (lines + 0.5 / len(w))
+    out = _inverse(W)
+    G = _frf(A, Bw @ out, Cy, Dyw @ out, angles)  # between the lines, so that no pole at 1 is hit
+    power = np.sum(np.abs(np.fft.rfft(w @ W.T, axis=0)) ** 2, axis=1)
+    return np.einsum("fyi,fyj,f->ij", G.conj(), G, power).real
+
+
+def _signs(G: Complex128[Complex, "F n m"], axis: int) -> Float[Array, " K"]:
+    """The sign of the largest sample of the impulse responses of each row (1) or column (2)."""
+    turned = np.exp(-1j * np.pi * (np.arange(len(G)) / len(G)))  # frequencies lie between lines
+    impulse = (np.fft.ifft(G, axis=0) / turned[:, None, None]).real
+    each = np.moveaxis(impulse, axis, 0).reshape(G.shape[axis], -1)
+    largest = each[np.arange(len(each)), np.abs(each).argmax(axis=1)]
+    return np.where(largest < 0, -1.0, 1.0)
+
+
+__all__ = ["Beyond", "Canonical", "canonical"]
