@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from lfrtorch.analysis.block_structure import Structure, structure
 from lfrtorch.analysis.bounds import Bound, bound
 from lfrtorch.analysis.canonical_form import Canonical, canonical
 from lfrtorch.analysis.contraction import Contraction, contraction
@@ -23,6 +24,7 @@ __all__ = [
     "Canonical",
     "Contraction",
     "Residuals",
+    "Structure",
     "bound",
     "canonical",
     "contraction",
@@ -30,6 +32,7 @@ __all__ = [
     "lpv",
     "plot",
     "residuals",
+    "structure",
 ]
 
 
