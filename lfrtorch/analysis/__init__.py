@@ -1,4 +1,4 @@
-"""What a fitted model is, and how far it may be trusted: figure, residuals, poles, bounds."""
+"""What a fitted model is, and how far it may be trusted: figure, residuals, bands, bounds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 from lfrtorch.analysis.block_structure import Structure, structure
 from lfrtorch.analysis.bounds import Bound, bound
 from lfrtorch.analysis.canonical_form import Canonical, canonical
+from lfrtorch.analysis.confidence_bands import Band, Uncertainty, spread, uncertainty
 from lfrtorch.analysis.contraction import Contraction, contraction
+from lfrtorch.analysis.linear_bands import PoleBand, ResponseBand, pole_bands, response_band
 from lfrtorch.analysis.linearisation import linearise
 from lfrtorch.analysis.lpv_form import LPV, lpv
 from lfrtorch.analysis.residual_analysis import Residuals, residuals
@@ -20,19 +22,27 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LPV",
+    "Band",
     "Bound",
     "Canonical",
     "Contraction",
+    "PoleBand",
     "Residuals",
+    "ResponseBand",
     "Structure",
+    "Uncertainty",
     "bound",
     "canonical",
     "contraction",
     "linearise",
     "lpv",
     "plot",
+    "pole_bands",
     "residuals",
+    "response_band",
+    "spread",
     "structure",
+    "uncertainty",
 ]
 
 

@@ -1,0 +1,147 @@
+"""Derivatives of a simulated output with what the data can tell of the parameters, along a record.
+
+The columns are those of ``gauge``: the other parameters are held, which changes no output. A start
+state moves along with the parameters. That of a periodic record is its end; one that is estimated
+is that which fits best: with rows X of the start state, J of the parameters and weights W it moves
+by dx0 = -(W X)⁺ W J dθ. Then rows of the model's output are J + X dx0/dθ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lfrtorch.analysis.noise_model import NoiseModel
+from lfrtorch.engine.sensitivity import Linearisation, fixed_point
+from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
+from lfrtorch.least_squares.record_groups import RecordGroup
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+SEEN = 1e-9
+"""Directions of a start state that move the output by less than this part of others stay."""
+
+
+class Gradients:
+    """Rows dy/dθ of one record, block by block, normalised.
+
+    Args:
+        model: in float64.
+        record: how it starts, too.
+        kept: the columns, by their place in θ.
+        fitted: whether an estimated start was fitted together with the parameters. Otherwise it
+            follows from the skipped samples, as in ``Model.simulate``.
+        hold: whether to keep the rows, rather than compute them at each pass.
+
+    Example:
+        >>> from lfrtorch.analysis.gradients import Gradients
+        >>> along = Gradients(model, record, torch.arange(model.parameter_count), fitted=True)
+        >>> [rows.shape for _, rows in along.blocks()]
+        [torch.Size([400, 1, 21])]
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        record: Record,
+        kept: Int[Tensor, " K"],
+        *,
+        fitted: bool,
+        hold: bool = False,
+    ) -> None:
+        problem = SimulationProblem.of(model, [record], solve_initial_states=not fitted)
+        self.record, self.kept = record, kept
+        (self.trajectory,) = problem.trajectories(problem.theta)
+        group: RecordGroup = problem.groups[0].counted(self.trajectory.y)
+        self.group = group
+        periodic, self.estimated = group.start == "periodic", group.start == "estimated"
+        self._along = Linearisation(model.lfr.cell, group.u, self.trajectory, periodic=periodic)
+        self._hold = hold
+        self._held: list[tuple[slice, Tensor]] = []
+        self._initial: Tensor | None = None
+        self._inverse = self.group.y.new_zeros(0, 0)  # R⁻¹ of the weighted rows X: X R⁻¹ is Q
+        self._weight = group.weight if fitted else group.start_weight
+        if torch.isfinite(self.trajectory.y).all():
+            if periodic:
+                *_, (_, _, end) = self._blocks(start=True)
+                K = len(kept)
+                self._initial = fixed_point(end[None, :, K:], end[None, :, :K])[0]
+            elif self.estimated:
+                self._initial = self._estimated()
+
+    @property
+    def errors(self) -> Float[Tensor, "T ny"]:
+        """Simulated less measured output."""
+        return (self.trajectory.y - self.group.y)[0]
+
+    def blocks(self) -> Iterator[tuple[slice, Float[Tensor, "B ny C"]]]:
+        """Samples and their rows; nx columns of an estimated start state follow the K others."""
+        if self._held:
+            yield from self._held
+            return
+        K = len(self.kept)
+        for time, found, _ in self._blocks(start=self._initial is not None):
+            rows = found
+            if self._initial is not None:
+                rows = found[..., :K] + found[..., K:] @ self._initial
+                rows = torch.cat([rows, found[..., K:]], -1) if self.estimated else rows
+            if self._hold:
+                self._held.append((time, rows))
+            yield time, rows
+
+    def weighted(self) -> Iterator[tuple[slice, Float[Tensor, "m ny K"], Float[Tensor, "m ny"]]]:
+        """The K columns and the errors as they count in a fit, real and imaginary if by line."""
+        K, group = len(self.kept), self.group
+        for time, rows in self.blocks():
+            part, errors = rows[None, ..., :K], self.errors[None, time]
+            yield time, group.weigh(part, time=time)[0], group.weigh(errors, time=time)[0]
+
+    def _blocks(self, *, start: bool) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        out = None
+        if self.group.spectral:  # a spectrum is taken of the whole record
+            columns = len(self.kept) + self._along.state.shape[1] * start
+            out = self.group.y.new_empty(*self.group.y.shape, columns)
+        for block in self._along.rows(self.kept, initial_state=start, out=out):
+            yield block.time, block.rows[0], block.end[0]
+
+    def _estimated(self) -> Float[Tensor, "nx K"]:
+        total, nx = QRAccumulator(), self._along.state.shape[1]
+        for rows in self._start_rows():
+            total.fold(rows)
+        R = total.R[:nx]
+        self._inverse = torch.linalg.pinv(R[:, :nx], rtol=SEEN)
+        return -self._inverse @ R[:, nx:]
+
+    def start_factor(self, noise: NoiseModel) -> Float[Tensor, "nx m"]:
+        """S, so that S Sᵀ is what noise adds to the covariance of an estimated start state."""
+        nx = len(self._inverse)
+        total = GramAccumulator()
+        for rows in self._start_rows():
+            Q = (rows[:, :nx] @ self._inverse).unflatten(0, (-1, self.group.y.shape[2]))
+            total.fold(torch.as_tensor(noise.coloured(Q.numpy())))
+        return self._inverse @ root(total.G)
+
+    def _start_rows(self) -> Iterator[Float[Tensor, "m C"]]:
+        """Weighted rows of the start state, then of the parameters."""
+        assert self._weight is not None
+        K = len(self.kept)
+        for time, rows, _ in self._blocks(start=True):
+            weight = self._weight[0, time].unsqueeze(-1)
+            yield (torch.cat([rows[..., K:], rows[..., :K]], -1) * weight).flatten(0, 1)
+
+
+def root(G: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
+    """R with R Rᵀ = G, of a matrix that is positive semidefinite but for rounding errors.
+
+    Example:
+        >>> from lfrtorch.analysis.gradients import root
+        >>> R = root(torch.diag(torch.tensor([4.0, -1e-9])))
+        >>> (R @ R.mT).round(decimals=3).tolist()
+        [[4.0, 0.0], [0.0, 0.0]]
+    """
+    values, vectors = torch.linalg.eigh((G + G.mT) / 2)
+    return vectors * values.clamp_min(0.0).sqrt()

@@ -1,0 +1,164 @@
+"""Bands of a linear model's frequency response and poles, from the covariance of its matrices."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Complex128, Float
+from numpy.typing import ArrayLike
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array, Complex
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.resolvent import response_jacobian, solve_resolvents
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseBand:
+    """A frequency response and how far it is known, in physical units.
+
+    Args:
+        frequencies: in Hz.
+        response: complex.
+        covariance: of its real and imaginary part.
+
+    Shape:
+        frequencies: (F,), response: (F, ny, nu), covariance: (F, ny, nu, 2, 2).
+
+    Example:
+        >>> band = lfrtorch.analysis.response_band(bla, [1.0, 10.0])
+        >>> band.magnitude.shape, bool((band.magnitude_std <= band.std).all())
+        ((2, 1, 1), True)
+    """
+
+    frequencies: Float[Array, " F"]
+    response: Complex128[Complex, "F ny nu"]
+    covariance: Float[Array, "F ny nu 2 2"]
+
+    @property
+    def std(self) -> Float[Array, "F ny nu"]:
+        """Root of the mean squared distance in the complex plane."""
+        return np.sqrt(np.trace(self.covariance, axis1=-2, axis2=-1))
+
+    @property
+    def magnitude(self) -> Float[Array, "F ny nu"]:
+        """|G|."""
+        return np.abs(self.response)
+
+    @property
+    def magnitude_std(self) -> Float[Array, "F ny nu"]:
+        """Standard deviation of |G|: of G along itself."""
+        size = np.where(self.magnitude > 0, self.magnitude, 1.0)
+        along = np.stack([self.response.real, self.response.imag], -1) / size[..., None]
+        variance = np.einsum("...i,...ij,...j->...", along, self.covariance, along)
+        return np.sqrt(np.maximum(variance, 0.0))
+
+
+@dataclass(frozen=True)
+class PoleBand:
+    """A pole, or a conjugate pair, and how far it is known.
+
+    Args:
+        pole: in the z plane, with an imaginary part of 0 or more.
+        std: root of the mean squared distance in the z plane.
+        frequency, frequency_std: |s| / 2π in Hz, with z = exp(s / fs).
+        damping, damping_std: ratio -Re s / |s|.
+
+    Example:
+        >>> (pole,) = lfrtorch.analysis.pole_bands(bla)
+        >>> bool(pole.frequency_std < 0.2 * pole.frequency), round(pole.damping)
+        (True, 1)
+    """
+
+    pole: complex
+    std: float
+    frequency: float
+    frequency_std: float
+    damping: float
+    damping_std: float
+
+
+def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
+    """Frequency response with its covariance.
+
+    Args:
+        model: with a covariance, as ``Uncertainty.linearise`` or ``estimate_bla`` gives it.
+        frequencies: (F,) in Hz.
+
+    Raises:
+        ValueError: a model without covariance.
+
+    Example:
+        >>> lfrtorch.analysis.response_band(bla, [0.0, 10.0]).std.shape
+        (2, 1, 1)
+    """
+    covariance = _covariance(model)
+    f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+    z = np.exp(2j * np.pi * f / model.fs)
+    X, L = solve_resolvents(model.A, model.B, model.C, z)
+    nu = len(model.inputs)
+    J = response_jacobian(X, L, np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu)))
+    parts = np.stack([J.real, J.imag], axis=-2)
+    of = np.einsum("...ip,pq,...jq->...ij", parts, covariance, parts, optimize=True)
+    return ResponseBand(f, model.frf(f), of)
+
+
+def pole_bands(model: LinearModel) -> tuple[PoleBand, ...]:
+    """Poles with their standard deviations, by frequency; a conjugate pair counts once.
+
+    To first order: those of poles that lie together, or of a real pair that may be a complex one,
+    say little.
+
+    Args:
+        model: with a covariance, as ``Uncertainty.linearise`` or ``estimate_bla`` gives it.
+
+    Raises:
+        ValueError: a model without covariance.
+
+    Example:
+        >>> len(lfrtorch.analysis.pole_bands(bla))
+        1
+    """
+    nx = model.nx
+    covariance = _covariance(model)[: nx * nx, : nx * nx]
+    poles, right = np.linalg.eig(model.A)
+    left = np.linalg.pinv(right)
+    found = []
+    for i, z in enumerate(poles):
+        if z.imag < 0:
+            continue
+        # dz = left dA right, and s = fs log z.
+        d_z = np.asarray(np.outer(left[i], right[:, i]).ravel(), dtype=np.complex128)
+        radius = abs(z)
+        s = model.fs * complex(math.log(max(radius, 1e-300)), np.angle(z))
+        d_s = d_z * (model.fs / z) if radius > 0 else np.full_like(d_z, np.nan)
+        size = abs(s) or math.nan
+        d_size = (np.conj(s) * d_s).real / size
+        d_damping = -d_s.real / size + s.real * d_size / size**2
+        found.append(
+            PoleBand(
+                complex(z),
+                math.hypot(_std(d_z.real, covariance), _std(d_z.imag, covariance)),
+                size / (2 * math.pi),
+                _std(d_size, covariance) / (2 * math.pi),
+                -s.real / size,
+                _std(d_damping, covariance),
+            )
+        )
+    return tuple(sorted(found, key=lambda pole: (pole.frequency, pole.damping)))
+
+
+def _std(gradient: Array, covariance: Array) -> float:
+    variance = gradient @ covariance @ gradient
+    return math.sqrt(variance) if variance > 0 else 0.0 * float(variance)
+
+
+def _covariance(model: LinearModel) -> Array:
+    if model.covariance is None:
+        raise InputError(
+            "the covariance of this model is not known: take one of estimate_bla, or of "
+            "lfrtorch.analysis.uncertainty(model, records).linearise()."
+        )
+    return model.covariance
