@@ -512,6 +512,7 @@ def _doubts(
         )
     ]
     tests = 3 * len(parts)
+    free = sum(p.numel() for p in model.lfr.parameters() if p.requires_grad)
     wrong = [
         (part, name)
         for part in parts
@@ -536,10 +537,11 @@ def _doubts(
             f"the fit is not at its minimum: a step would be {number(left[0], 2)} standard errors "
             f"long and lower the squared error by {percent(left[1])}; bands are about the minimum."
         )
-    if rank < K:
+    told = min(K, free - (model.parameter_count - model.net_parameter_count))
+    if rank < told:
         found.append(
-            f"the data tell {rank} of {K} directions of the parameters; where the others matter, "
-            "surprise and bands are large."
+            f"the data tell {rank} of {told} directions of the parameters; where the others "
+            "matter, surprise and bands are large."
         )
     return tuple(found)
 
