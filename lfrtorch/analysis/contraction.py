@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,8 +19,8 @@ from lfrtorch.engine.linearised import linearise, spectral_radius
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.operating_point import double
 from lfrtorch.engine.reach import reach
-from lfrtorch.engine.static_enclosure import FAR, Enclosure, Interval, enclosure, everywhere
-from lfrtorch.least_squares.certificate import LARGEST, Certificate, Differences, certificate, gain
+from lfrtorch.engine.static_enclosure import FAR, Enclosure, enclosure, everywhere
+from lfrtorch.least_squares.certificate import SLOWEST, Certificate, Differences, certificate, gain
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
 
@@ -32,7 +31,7 @@ CLOSE, FARTHEST = 1.02, 2.0**20
 """Factors: to within the first the largest amplitude is found, to within the second of the data's
 rms it is looked for."""
 
-SLOWEST, HALVINGS = 1e-3, 9
+LEAST, HALVINGS = 1e-3, 9
 """The rate is looked for between this part of the best possible 1 - ρ and all of it, by so many
 halvings of the logarithm."""
 
@@ -174,24 +173,11 @@ def _proof(cell: LFRCell, slopes: Enclosure | None) -> _Proof | str:
                 f"linearised {place} it has an eigenvalue of modulus {radius:.4g}, so that no norm "
                 "shrinks there."
             )
-    for system in _systems(cell, slopes):
+    for system in Differences.of(cell, slopes):
         found = certificate(system, _slow(system))
         if found is not None:
             return system, found
     return "no norm was found that shrinks for all slopes within the bounds of the static map's."
-
-
-def _systems(cell: LFRCell, slopes: Enclosure | None) -> Iterator[Differences]:
-    """Systems of differences: by the entries of ∂w/∂z and by neurons, the smaller one first."""
-    if slopes is None:
-        yield Differences.by_entry(cell, Interval(np.zeros((0, 0)), np.zeros((0, 0))))
-        return
-    systems = [Differences.by_entry(cell, slopes.J)]
-    if is_network(cell.static) and cell.static.layers == 1:
-        systems.append(Differences.by_neuron(cell, cell.static, slopes.slopes))
-    systems.sort(key=lambda system: system.size)
-    yield systems[0]
-    yield from (system for system in systems[1:] if system.size <= LARGEST)
 
 
 def _steepest(cell: LFRCell, slopes: Enclosure) -> tuple[float, str]:
@@ -223,7 +209,10 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
         text = str(error).split("\n", 1)[0]
         return nothing, f"{reason}\nNor is there one for an amplitude: {text}"
     if isinstance(at_rest, str):
-        return nothing, f"{at_rest}\nThis is so for the smallest inputs."
+        return (
+            nothing,
+            f"{at_rest}\nSo it is within the bounds that are proven for the smallest inputs.",
+        )
     low, high, best = 1.0 / FARTHEST, FARTHEST, at_rest
     while high > CLOSE * low:
         factor = math.sqrt(low * high)
@@ -238,16 +227,17 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
 def _slow(system: Differences) -> float:
     """The largest rate that counts."""
     best = float(np.abs(np.linalg.eigvals(system.A)).max())
-    return 1.0 - SLOWEST * (1.0 - best)
+    return max(SLOWEST, 1.0 - LEAST * (1.0 - best))
 
 
 def _fastest(system: Differences, slow: Certificate) -> tuple[float, Certificate]:
     """The smallest rate that is proven, with its certificate."""
     rate, found = _slow(system), slow
-    low, high = SLOWEST, 1.0
+    best = float(np.abs(np.linalg.eigvals(system.A)).max())
+    low, high = LEAST, 1.0
     for _ in range(HALVINGS):
         part = math.sqrt(low * high)
-        tried = 1.0 - part / SLOWEST * (1.0 - _slow(system))
+        tried = 1.0 - part * (1.0 - best)
         closer = certificate(system, tried)
         if closer is None:
             high = part

@@ -77,6 +77,11 @@ class Trainer(Protocol):
         """Whether A's eigenvalues stay within the unit circle."""
         ...
 
+    @property
+    def contracting(self) -> bool:
+        """Whether every model on the way is proven to contract."""
+        ...
+
     def init(self, problem: Any, theta: Tensor) -> Any:
         """State at the start."""
         ...
@@ -262,7 +267,12 @@ class Fit:
             weights = parameters_to_vector(model.lfr.parameters())
             vector_to_parameters(ranks.first(weights), model.lfr.parameters())
         self.problem = SimulationProblem.of(
-            model, train, ridge=ridge, stable=self.trainer.stable, ranks=ranks
+            model,
+            train,
+            ridge=ridge,
+            stable=self.trainer.stable,
+            contracting=self.trainer.contracting,
+            ranks=ranks,
         )
         self.judge = SimulationProblem.judge(model, validation) if validation else None
         self.state: Any = None

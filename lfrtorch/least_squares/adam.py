@@ -55,6 +55,8 @@ class Adam:
         stable: whether A's eigenvalues stay within the unit circle. Then no bounded input makes a
             model with a bounded static map run away. If they are not inside at the start, they stay
             within the circle that they are in.
+        contracting: whether every model on the way is proven to contract, for all inputs, see
+            ``lfrtorch.analysis.contraction``. The start must be.
 
     Example:
         >>> trainer = lfrtorch.Adam(max_iter=20, learning_rate=1e-2)
@@ -66,11 +68,13 @@ class Adam:
     max_iter: int = 2000
     learning_rate: float = 1e-3
     stable: bool = False
+    contracting: bool = False
 
     def __post_init__(self) -> None:
         number("learning_rate", self.learning_rate, positive=True)
         integer("max_iter", self.max_iter, 0)
         true_or_false("stable", self.stable)
+        true_or_false("contracting", self.contracting)
 
     @property
     def limit(self) -> int:

@@ -37,14 +37,17 @@ from jaxtyping import Float
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network
-from lfrtorch.engine.static_enclosure import Interval
+from lfrtorch.engine.nonlinearity import Network, is_network
+from lfrtorch.engine.static_enclosure import Enclosure, Interval
 
 ACCURACY = 1e-9
 """Of the solver, relative."""
 
 ROUNDING = 10 * np.finfo(np.float64).eps
 """Of a sum, relative to the sum of its moduli, times the length: what an eigenvalue must exceed."""
+
+SLOWEST = 1.0 - 1e-6
+"""A rate that counts as contraction: a million samples to shrink to 1/e."""
 
 SHORTEST = 1e-9
 """Shorter rows of C and columns of B, relative to the longest, are scaled like this one."""
@@ -59,6 +62,7 @@ class Differences:
 
     Args:
         A, B, C, Bu, D, Cy, Dy, Dyu: its matrices.
+        neurons: whether the slopes are those of neurons.
     """
 
     A: Float[Array, "nx nx"]
@@ -69,6 +73,7 @@ class Differences:
     Cy: Float[Array, "ny nx"]
     Dy: Float[Array, "ny q"]
     Dyu: Float[Array, "ny nu"]
+    neurons: bool = False
 
     @classmethod
     def by_entry(cls, cell: LFRCell, J: Interval) -> Differences:
@@ -83,7 +88,8 @@ class Differences:
     def by_neuron(cls, cell: LFRCell, static: Network, slopes: Interval) -> Differences:
         """The slope of each neuron of one layer is anywhere in its interval."""
         Wz, Ww = _array(static.Wz), _array(static.Ww)
-        return cls._about(cell, Ww * slopes.middle @ Wz, Ww, slopes.radius[:, None] * Wz)
+        J = Ww * slopes.middle @ Wz
+        return replace(cls._about(cell, J, Ww, slopes.radius[:, None] * Wz), neurons=True)
 
     @classmethod
     def _about(cls, cell: LFRCell, J: Array, left: Array, right: Array) -> Differences:
@@ -103,28 +109,48 @@ class Differences:
             Dyu=Dyu + Dyw @ J @ Dzu,
         )
 
+    @classmethod
+    def of(cls, cell: LFRCell, slopes: Enclosure | None) -> list[Differences]:
+        """By entry and, of one layer, by neuron: the smaller one, and the other if not too large.
+
+        Args:
+            cell: with a network or no static map.
+            slopes: of the map, where it is used; ``None`` without one.
+        """
+        if slopes is None or not is_network(cell.static):
+            nothing = np.zeros((0, 0))
+            return [cls.by_entry(cell, Interval(nothing, nothing))]
+        systems = [cls.by_entry(cell, slopes.J)]
+        if cell.static.layers == 1:
+            systems.append(cls.by_neuron(cell, cell.static, slopes.slopes))
+        systems.sort(key=lambda system: system.size)
+        return [systems[0], *(system for system in systems[1:] if system.size <= LARGEST)]
+
     @property
     def size(self) -> int:
         """Rows of the inequality."""
         return sum(self.B.shape)
 
-    def moved(self, L: Float[Array, "nx nx"]) -> tuple[Differences, Float[Array, " q"]]:
-        """The same for L x and s v, s p, with s so that columns of B are as long as rows of C."""
+    def moved(
+        self, L: Float[Array, "nx nx"], s: Float[Array, " q"] | None = None
+    ) -> tuple[Differences, Float[Array, " q"]]:
+        """The same for L x and s v, s p; by default columns of B are then as long as rows of C."""
         back = np.linalg.inv(L)
         B, C = L @ self.B, self.C @ back
         lengths = np.array([np.linalg.norm(B, axis=0), np.linalg.norm(C, axis=1)])
-        s = np.sqrt(np.divide(*np.maximum(lengths, SHORTEST * lengths.max(initial=SHORTEST))))
+        lengths = np.maximum(lengths, SHORTEST * lengths.max(initial=SHORTEST))
+        by = np.sqrt(lengths[0] / lengths[1]) if s is None else s
         moved = Differences(
             A=L @ self.A @ back,
-            B=B / s,
-            C=s[:, None] * C,
+            B=B / by,
+            C=by[:, None] * C,
             Bu=L @ self.Bu,
-            D=s[:, None] * self.D,
+            D=by[:, None] * self.D,
             Cy=self.Cy @ back,
-            Dy=self.Dy / s,
+            Dy=self.Dy / by,
             Dyu=self.Dyu,
         )
-        return moved, s
+        return moved, by
 
 
 class Certificate(NamedTuple):
@@ -134,29 +160,48 @@ class Certificate(NamedTuple):
     T: Float[Array, " q"]
 
 
+class Margin(NamedTuple):
+    """The largest t with M(P, T) <= -t I in some coordinates, and trace P = nx.
+
+    Z is the multiplier: to first order, a change dM of the matrix changes t by -trace(Z dM).
+    """
+
+    t: float
+    P: Float[Array, "nx nx"]
+    T: Float[Array, " q"]
+    Z: Float[Array, "n n"]
+
+
+def margin(system: Differences, rate: float) -> Margin | None:
+    """The largest margin in the coordinates of the system; None if the solver fails."""
+    nx, q = system.B.shape
+    basis = _symmetric(nx)
+    F = [inequality(system, E, np.zeros(q), rate) for E in basis]
+    F += [inequality(system, np.zeros((nx, nx)), e, rate) for e in np.eye(q)]
+    F.append(np.eye(nx + q))
+    trace = np.array([*(np.trace(E) for E in basis), *np.zeros(q + 1)]) / nx
+    solved = _solved(np.array(F), 0.0 * F[-1], len(F) - 1, -1.0, trace)
+    if solved is None:
+        return None
+    found, Z = solved
+    return Margin(float(found[-1]), *_unpacked(found, nx, q), Z)
+
+
 def certificate(system: Differences, rate: float) -> Certificate | None:
     """P and T by which all differences shrink by the rate in every sample; None if none is found.
-
-    They are those of the largest margin t, M(P, T) <= -t I, about the coordinates in which the
-    system with p = 0 shrinks.
 
     Raises:
         ValueError: the solver is not installed.
     """
-    moved = _prepared(system, rate)
+    moved = prepared(system, rate)
     if moved is None:
         return None
     x, L, s = moved
-    nx, q = x.B.shape
-    basis = _symmetric(nx)
-    F = [inequality(x, E, np.zeros(q), rate) for E in basis]
-    F += [inequality(x, np.zeros((nx, nx)), e, rate) for e in np.eye(q)]
-    margin = np.eye(nx + q)
-    trace = np.array([*(np.trace(E) for E in basis), *np.zeros(q + 1)]) / nx
-    found = _solved(np.array([*F, margin]), np.zeros_like(margin), len(F), -1.0, trace)
-    if found is None or not found[-1] > 0:
+    found = margin(x, rate)
+    if found is None or not found.t > 0:
         return None
-    return _checked(system, L, s, found, rate, None)
+    back = returned(found.P, found.T, L, s)
+    return back if holds(system, back, rate) else None
 
 
 def gain(system: Differences) -> float | None:
@@ -168,7 +213,7 @@ def gain(system: Differences) -> float | None:
         Cy=system.Cy / y, Dy=system.Dy / y, Dyu=system.Dyu / (y * u),
         Bu=system.Bu / u, D=system.D / u,
     )  # fmt: skip
-    moved = _prepared(unit, 1.0)
+    moved = prepared(unit, 1.0)
     if moved is None:
         return None
     x, L, s = moved
@@ -179,11 +224,13 @@ def gain(system: Differences) -> float | None:
     F = [inequality(x, E, none, gain=0.0) - constant for E in basis]
     F += [inequality(x, zero, e, gain=0.0) - constant for e in np.eye(q)]
     F.append(inequality(x, zero, none, gain=1.0) - constant)
-    for margin in (1e-6, 1e-4, 1e-2):
-        found = _solved(np.array(F), constant + margin * np.eye(len(constant)), len(F) - 1, 1.0)
-        if found is not None and found[-1] > 0:
-            value = float(np.sqrt(found[-1]))
-            if _checked(unit, L, s, found, 1.0, value) is not None:
+    for slack in (1e-6, 1e-4, 1e-2):
+        shifted = constant + slack * np.eye(len(constant))
+        solved = _solved(np.array(F), shifted, len(F) - 1, 1.0)
+        if solved is not None and solved[0][-1] > 0:
+            value = float(np.sqrt(solved[0][-1]))
+            found = returned(*_unpacked(solved[0], nx, q), L, s)
+            if holds(unit, found, 1.0, value):
                 return value * y * u
     return None
 
@@ -218,7 +265,7 @@ def _terms(
     return terms
 
 
-def _prepared(system: Differences, rate: float) -> tuple[Differences, Array, Array] | None:
+def prepared(system: Differences, rate: float) -> tuple[Differences, Array, Array] | None:
     """The system for L x and s v, in which A nearly shrinks x, L and s; None if A is not stable."""
     A = system.A / rate
     if np.abs(np.linalg.eigvals(A)).max() >= 1.0 - ROUNDING:
@@ -236,16 +283,23 @@ def _prepared(system: Differences, rate: float) -> tuple[Differences, Array, Arr
     return moved, L, s
 
 
-def _checked(
-    system: Differences, L: Array, s: Array, found: Array, rate: float, gain: float | None
-) -> Certificate | None:
-    """P and T of what the solver found for L x and s v, if they do what they should."""
-    nx, q = system.B.shape
-    P = L.T @ np.einsum("k,kij->ij", found[: -q - 1], _symmetric(nx)) @ L
-    P, T = (P + P.T) / 2, found[-q - 1 : -1] * s**2
-    terms = _terms(system, P, T, rate, gain)
-    negative = _is_negative(terms) and (T >= 0).all() and _is_negative([(np.eye(nx), -P)])
-    return Certificate(P, T) if negative else None
+def returned(P: Array, T: Array, L: Array, s: Array) -> Certificate:
+    """P and T of a system from those for L x and s v."""
+    P = L.T @ P @ L
+    return Certificate((P + P.T) / 2, T * s**2)
+
+
+def _unpacked(found: Array, nx: int, q: int) -> tuple[Array, Array]:
+    """P and T among the solver's unknowns."""
+    return np.einsum("k,kij->ij", found[: -q - 1], _symmetric(nx)), found[-q - 1 : -1]
+
+
+def holds(system: Differences, found: Certificate, rate: float, gain: float | None = None) -> bool:
+    """Whether P and T do what they should, beyond rounding errors."""
+    P, T = found
+    if P.shape != system.A.shape or len(T) != len(system.C) or not (T >= 0).all():
+        return False
+    return _is_negative([(np.eye(len(P)), -P)]) and _is_negative(_terms(system, P, T, rate, gain))
 
 
 def _is_negative(terms: Sequence[tuple[Array, Array]]) -> bool:
@@ -276,8 +330,12 @@ def _solved(
     objective: int,
     weight: float,
     trace: Array | None = None,
-) -> Array | None:
-    """min weight ξ_objective with constant + Σ ξ_k F_k <= 0, and trace · ξ = 1 if it is given."""
+) -> tuple[Array, Array] | None:
+    """min weight ξ_objective with constant + Σ ξ_k F_k <= 0, and trace · ξ = 1 if it is given.
+
+    Returns:
+        ξ, and the multiplier of the inequality, a matrix.
+    """
     clarabel: Any = imported("clarabel", "certificate")
     n, count = F.shape[-1], len(F)
     j, i = np.tril_indices(n)  # the upper triangle, column by column
@@ -294,8 +352,12 @@ def _solved(
     nothing = scipy.sparse.csc_matrix((count, count))
     sparse = scipy.sparse.csc_matrix(rows)
     answer = clarabel.DefaultSolver(nothing, cost, sparse, right, cones, settings).solve()
-    found = np.array(answer.x)
-    return found if len(found) == count and np.isfinite(found).all() else None
+    found, dual = np.array(answer.x), np.array(answer.z)
+    if len(found) != count or not np.isfinite(found).all():
+        return None
+    Z = np.zeros((n, n))
+    Z[i, j] = Z[j, i] = dual[len(dual) - len(i) :] / weights
+    return found, Z
 
 
 def _array(parameter: Any) -> Array:

@@ -200,6 +200,8 @@ class LevenbergMarquardt:
         stable: whether A's eigenvalues stay within the unit circle. Then no bounded input makes a
             model with a bounded static map run away. If they are not inside at the start, they stay
             within the circle that they are in.
+        contracting: whether every model on the way is proven to contract, for all inputs, see
+            ``lfrtorch.analysis.contraction``. The start must be.
 
     Example:
         >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=10, acceleration=False)
@@ -220,6 +222,7 @@ class LevenbergMarquardt:
     max_damping: float = 1e12
     least_damping: float = 1e-8
     stable: bool = False
+    contracting: bool = False
 
     def __post_init__(self) -> None:
         for name in ("damping", "truncation", "finite_step", "acceleration_limit", "max_damping"):
@@ -230,6 +233,7 @@ class LevenbergMarquardt:
         integer("max_iter", self.max_iter, 0)
         integer("patience", self.patience, 1)
         true_or_false("stable", self.stable)
+        true_or_false("contracting", self.contracting)
 
     @property
     def limit(self) -> int:

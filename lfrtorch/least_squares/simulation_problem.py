@@ -20,6 +20,7 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, is_compiled
+from lfrtorch.least_squares.contracting import Contracting
 from lfrtorch.least_squares.exact_integrators import fixed_parameters, integrating_states
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.jacobian import Jacobian, Memory, Part
@@ -50,6 +51,8 @@ class SimulationProblem(LeastSquares):
             other groups get 0.
         stable: whether a search keeps A's eigenvalues within the unit circle, or, if they are not
             at θ_0, within the circle that they are in.
+        contracting: whether a search stays among models that are proven to contract; A is then
+            stable, too.
         solve_initial_states: estimated initial states are no part of θ, but solved for at every θ.
         ranks: the processes that share the records. All have the same θ, cost and gradient; each
             has the residual of its own records.
@@ -67,6 +70,7 @@ class SimulationProblem(LeastSquares):
         *,
         ridge: Ridge = 0.0,
         stable: bool = False,
+        contracting: bool = False,
         solve_initial_states: bool = False,
         ranks: Ranks | None = None,
     ) -> None:
@@ -92,6 +96,7 @@ class SimulationProblem(LeastSquares):
         self._ridge = self._ridge_of(ridge)
         self.fixed: Bool[Tensor, " free"] | None = fixed_parameters(lfr.cell)
         """Which entries of the module's free parameters are constants: columns of zeros in J."""
+        self._contracting = Contracting(lfr.cell) if contracting else None
         self._largest_pole = math.inf
         self._integrating = integrating_states(lfr.cell)
         if stable and lfr.cell.A.requires_grad and not self._integrating.all():
@@ -163,7 +168,9 @@ class SimulationProblem(LeastSquares):
         return torch.cat(errors)
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ with A's eigenvalues within the limit, if there is one."""
+        """θ with A's eigenvalues within the limit, or with a certificate, if there shall be one."""
+        if self._contracting is not None:
+            return self.ranks.first(self._contracting.admissible(theta))
         if not math.isfinite(self._largest_pole) or not torch.isfinite(theta).all():
             return theta
         nx = self.lfr.cell.nx
@@ -209,6 +216,10 @@ class SimulationProblem(LeastSquares):
         else:
             reduced = everything(theta)
         penalty, ridge = theta - self._theta_0, self._ridge.sqrt()
+        if self._contracting is not None:
+            self._contracting.begin(theta)
+            bounded = self._contracting.bounded
+            return Jacobian(parts, reduced, ridge, penalty, self.ranks, fixed, bounded)
         if not math.isfinite(self._largest_pole):
             return Jacobian(parts, reduced, ridge, penalty, self.ranks, fixed)
         bounded = partial(

@@ -85,6 +85,10 @@ class Walk:
     def stable(self) -> bool:
         return True
 
+    @property
+    def contracting(self) -> bool:
+        return False
+
     def prolonged(self, state: State) -> State:
         return state
 

@@ -1,0 +1,123 @@
+"""Fits that stay among models that are proven to contract."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from reference import measure, normal, polynomial_cell, random_cell, random_model
+
+from lfrtorch import analysis
+from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.contracting import Contracting, HeldSystem
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.linear_systems import CholeskySystem
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+pytestmark = pytest.mark.numeric
+
+
+def held(sizes: dict[str, Any]) -> tuple[HeldSystem, int]:
+    """Steps of |δ - free|² from a random model, by the unit matrix, and its parameters."""
+    default: dict[str, Any] = {"nx": 3, "feedback": 0.15}
+    cell = random_cell(**default | sizes)
+    theta = torch.cat([p.detach().flatten() for p in cell.parameters()])
+    system = CholeskySystem(torch.eye(len(theta), dtype=theta.dtype), len(theta))
+    keeper = Contracting(cell)
+    keeper.begin(theta)
+    found = keeper.bounded(system)
+    assert isinstance(found, HeldSystem)
+    return found, len(theta)
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    [{}, {"nz": 2, "nw": 2, "nn": 6}, {"nz": 3, "nw": 3, "nn": 4}, {"layers": 2, "nn": 4}],
+)
+def test_the_slope_is_that_of_the_margin(sizes: dict[str, Any]):
+    system, size = held(sizes)
+    step = 1e-5 * normal(size, seed=3)
+    change = system.after(step) - system.after(-step)
+    assert float(-2.0 * system.slope @ step) == pytest.approx(change, rel=0.05)
+
+
+def test_a_step_keeps_a_margin():
+    system, size = held({"nz": 2, "nw": 2, "nn": 6})
+    inside = -0.01 * system.slope
+    assert torch.equal(system.solve(-inside, 0.0), inside)
+    for far in (2.0, 20.0):
+        beyond = far * system.slope / system.slope.norm() + 0.1 * normal(size)
+        assert system.after(beyond) <= 0.0
+        step = system.solve(-beyond, 0.0)
+        assert system.after(step) > 0.0
+        across = beyond - step  # what the bound takes away is along its slope
+        assert float(across @ system.slope) == pytest.approx(
+            float(across.norm() * system.slope.norm())
+        )
+
+
+def bistable() -> tuple[Model, Record]:
+    """A contracting start, and data of a model with two states at rest."""
+    truth = random_model(random_cell(1, 1, 1, 1, 1, 4, seed=4))
+    cell, static = truth.lfr.cell, truth.lfr.cell.static
+    assert isinstance(static, Network)
+    with torch.no_grad():
+        for p in (cell.Dzu, cell.Dyu, cell.Dyw, static.bz, static.bw):
+            p.zero_()
+        for p in (cell.Cz, cell.Bw, cell.Bu, cell.Cy, static.Wz):
+            p.fill_(1.0)
+        cell.A.fill_(0.5)
+        static.Ww.fill_(0.2)
+    record = measure(truth, 200)
+    with torch.no_grad():
+        static.Ww.copy_(1e-3 * torch.tensor([[1.0, -1.0, 2.0, 0.5]]))
+        static.Wz.add_(0.1 * normal(4, 1))
+    return truth, record
+
+
+@pytest.mark.parametrize("trainer", [LevenbergMarquardt(max_iter=8), Adam(20, 8e-2)])
+def test_every_model_on_the_way_contracts(trainer):
+    found = {}
+    for contracting in (True, False):
+        model, record = bistable()
+        proofs = []
+
+        def watch(model: Model, _, proofs: list[bool] = proofs) -> None:
+            Contracting(model.lfr.cell)  # refuses a model without a certificate
+            proofs.append(True)
+
+        options = replace(trainer, contracting=contracting)
+        result = fit(model, record, trainer=options, monitors=[watch] if contracting else [])
+        assert result.history[-1].train < 0.8 * result.history[0].train
+        assert len(proofs) == (len(result.history) if contracting else 0)
+        found[contracting] = analysis.contraction(model).found
+    assert found == {True: True, False: False}
+
+
+def test_what_has_no_certificate_is_not_admitted():
+    model, record = bistable()
+    problem = SimulationProblem.of(model, record, contracting=True)
+    theta = problem.theta
+    assert problem.admissible(theta) is theta
+    problem.linearise(theta)
+    far = theta.clone()
+    far[0] = 1.5  # A
+    admitted = problem.admissible(far)
+    assert 0.9 < float(admitted[0]) < 1.0
+
+
+def test_a_start_without_a_certificate_is_refused():
+    model, record = bistable()
+    with torch.no_grad():
+        model.lfr.cell.A.fill_(1.1)
+    with pytest.raises(ValueError, match="needs a start that is proven to contract"):
+        SimulationProblem.of(model, record, contracting=True)
+    polynomial = random_model(polynomial_cell(1, 1, 2))
+    with pytest.raises(ValueError, match=r"needs a network .* not a Polynomial"):
+        fit(polynomial, measure(polynomial, 50), trainer=LevenbergMarquardt(contracting=True))
+    with pytest.raises(ValueError, match="contracting is 'yes'; give True or False"):
+        LevenbergMarquardt(contracting="yes")  # pyright: ignore[reportArgumentType]
