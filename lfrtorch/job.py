@@ -231,11 +231,14 @@ def scored_run(
     test_linear = linear_models_of_tests(dataset, settings)
     last = None if again is None else again.model
     simulations = respond(result.model, linear, dataset, test_linear, refitted=last)
-    verdict = judge(result, simulations)
-    residuals = worst_residuals(simulations)
+    judged = simulations
+    if settings.noise != "output":
+        judged = respond(result.model, linear, dataset, test_linear, refitted=last, ahead=True)
+    verdict = judge(result, judged)
+    residuals = worst_residuals(judged)
     found = evidence(
         result,
-        simulations,
+        judged,
         bla=linear,
         noise_rms=dataset.noise_rms,
         continued=settings.init_from is not None,

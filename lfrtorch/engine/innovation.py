@@ -20,6 +20,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import deepcopy
 
 import torch
@@ -57,16 +58,30 @@ def predictor_cell(cell: LFRCell, K: Float[Tensor, "nx ny"]) -> LFRCell:
 
 def split_predictor(cell: LFRCell) -> tuple[LFRCell, Float[Tensor, "nx ny"]]:
     """The cell of the system itself, and its innovation gain K, of a predictor."""
-    nu = cell.nu - cell.ny
     with torch.no_grad():
-        found, K = _like(cell, nu), cell.Bu[:, nu:].clone()
-        found.A.copy_(cell.A + K @ cell.Cy)
-        found.Bu.copy_(cell.Bu[:, :nu] + K @ cell.Dyu[:, :nu])
-        found.Bw.copy_(cell.Bw + K @ cell.Dyw)
-        for name in ("Dzu", "Dyu"):
-            getattr(found, name).copy_(getattr(cell, name)[:, :nu])
+        found = _like(cell, cell.nu - cell.ny)
+        weights, K = split_weights(dict(cell.named_parameters()))
+        for name, parameter in found.named_parameters():
+            parameter.copy_(weights[name])
     found.Dzu.requires_grad_(cell.Dzu.requires_grad)
     return found, K
+
+
+def split_weights(
+    weights: Mapping[str, Tensor],
+) -> tuple[dict[str, Tensor], Float[Tensor, "*axes nx ny"]]:
+    """The same of a predictor's parameters by name; they may have leading axes."""
+    nu = weights["Bu"].shape[-1] - weights["Cy"].shape[-2]
+    Bu, K = weights["Bu"][..., :nu], weights["Bu"][..., nu:].clone()
+    Dyu = weights["Dyu"][..., :nu]
+    changed = {
+        "A": weights["A"] + K @ weights["Cy"],
+        "Bu": Bu + K @ Dyu,
+        "Bw": weights["Bw"] + K @ weights["Dyw"],
+        "Dyu": Dyu,
+        "Dzu": weights["Dzu"][..., :nu],
+    }
+    return {**weights, **changed}, K
 
 
 def _like(cell: LFRCell, nu: int) -> LFRCell:

@@ -22,9 +22,10 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from math import ceil
 from threading import Event, Lock
-from typing import cast
+from typing import Any, cast
 
 import torch
 
@@ -37,7 +38,7 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.prediction import Noise, predicting, shown_innovation_form
+from lfrtorch.fitting.prediction import SIMULATION, Noise, predicting, shown_innovation_form
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import (
     Fit,
@@ -116,8 +117,10 @@ def fit(
         noise: where it acts. ``"output"``: on the outputs, and the simulation error is minimised.
             ``"innovation"``: inside the system, too, and the error of the prediction one sample
             ahead is minimised; all errors are those of predictions, and the model of the result
-            has K. The models need one, as ``initialise`` writes it from a linear model of
-            ``estimate_bla(..., refine="prediction")``; records in steady state are taken as others.
+            has K. ``"both"``: that of the simulation is minimised beside it, with three times the
+            weight, which keeps the model from running away. The models need a K, as ``initialise``
+            writes it from a linear model of ``estimate_bla(..., refine="prediction")``; records in
+            steady state are taken as others.
         average: most starts that the model of the result is the mean of
             (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
             averaged as bring the mean within 1 % of the least error on validation and selection,
@@ -160,15 +163,37 @@ def fit(
         >>> sorted(start.number for start in result.starts)
         [0, 1, 2]
     """
-    if noise != "output":
-        starts, *data = predicting(noise, models, train, validation, selection)
-        result = fit(
-            starts, *data,
-            trainer=trainer, ridge=ridge, average=average, monitors=shown_innovation_form(monitors),
-            watch=watch, ranks=ranks, snapshots=snapshots, stop=stop,
-        )  # fmt: skip
-        members = tuple(model.innovation_form() for model in result.members)
-        return replace(result, model=result.model.innovation_form(), members=members)
+    found = partial(
+        _fitted, trainer=trainer, ridge=ridge, average=average, watch=watch, ranks=ranks,
+        snapshots=snapshots, stop=stop,
+    )  # fmt: skip
+    if noise == "output":
+        return found(models, train, validation, selection, monitors=monitors)
+    starts, *data = predicting(noise, models, train, validation, selection)
+    result = found(
+        starts, *data, monitors=shown_innovation_form(monitors), simulation=SIMULATION[noise]
+    )
+    members = tuple(model.innovation_form() for model in result.members)
+    return replace(result, model=result.model.innovation_form(), members=members)
+
+
+def _fitted(
+    models: Model | Sequence[Model],
+    train: Record | Sequence[Record],
+    validation: Record | Sequence[Record],
+    selection: Record | Sequence[Record],
+    *,
+    trainer: Trainer | None,
+    ridge: Ridge,
+    average: int,
+    monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None,
+    watch: Callable[[Round], None],
+    ranks: Ranks | None,
+    snapshots: Snapshots | None,
+    stop: Stop | None,
+    simulation: float = 0.0,
+) -> FitResult:
+    """The fit of models to records as they are; ``simulation`` is that of ``Fit``."""
     alone = isinstance(models, Model)
     starts = [models] if alone else list(models)
     given = [monitors] if alone and monitors is not None else monitors
@@ -190,7 +215,8 @@ def fit(
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots
     halt = Event()
-    options = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
+    options: dict[str, Any] = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
+    options["simulation"] = simulation
     options["stop"] = any_of(halt, stop) if ranks is None or ranks.world == 1 else stop
     fits = [
         Fit(model, train, validation, **options, keep=snapshots.keeper(number))

@@ -11,14 +11,17 @@ from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, with_past_outputs
 
-Noise = Literal["output", "innovation"]
-"""Where noise acts: on the outputs alone, or inside the system, too."""
+Noise = Literal["output", "innovation", "both"]
+"""What is fitted: simulations, as if noise were at the outputs alone, predictions, or both."""
+
+SIMULATION: dict[str, float] = {"innovation": 0.0, "both": 3.0}
+"""Weight of simulation errors beside those of predictions, if both were as large at the start."""
 
 
 def check_noise(noise: str) -> None:
     """Refuse an unknown kind of noise with a ValueError."""
     if noise not in get_args(Noise):
-        raise InputError(f"noise is {noise!r}; use 'output' or 'innovation'.")
+        raise InputError(f"noise is {noise!r}; use 'output', 'innovation' or 'both'.")
 
 
 def predicting(

@@ -170,7 +170,8 @@ class Settings:
             integer(name, getattr(self, name), 1)
         check_noise(self.noise)
         if self.noise != "output":
-            object.__setattr__(self, "linear", {"refine": "prediction", **self.linear})
+            refine = self.linear.get("refine") or "prediction"
+            object.__setattr__(self, "linear", {**self.linear, "refine": refine})
             if self.distil:
                 raise InputError(
                     f"distil is for noise='output', and noise is {self.noise!r}; give one of them."

@@ -43,7 +43,7 @@ from lfrtorch.fitting.folds import Fold
 from lfrtorch.fitting.folds import folds as folds_of
 from lfrtorch.fitting.live_line import StartsLine
 from lfrtorch.fitting.multistart import Together, any_of, iterations_of
-from lfrtorch.fitting.prediction import Noise, predicting
+from lfrtorch.fitting.prediction import SIMULATION, Noise, predicting
 from lfrtorch.fitting.refit import all_records
 from lfrtorch.fitting.trainer import Fit, Monitor, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -345,6 +345,7 @@ def search_sizes(
     planned = race(len(drawn), finalists, trainer.limit)
     halt = Event()
     options: dict[str, Any] = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
+    options["simulation"] = SIMULATION.get(noise, 0.0)
     options["stop"] = any_of(halt, stop) if ranks.world == 1 else stop
     field = [
         _Runner(sizes, seed, Fit(start(sizes, seed), train, validation, **options))

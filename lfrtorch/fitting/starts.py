@@ -123,7 +123,7 @@ def initialise(
     if method not in ("zero_output", "paper"):
         raise InputError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
     if minor is None:
-        minor = 0.0 if method == "paper" else MINOR
+        minor = MINOR if method != "paper" and bla.K is None else 0.0  # noise has slow modes
     number("minor", minor)
     data = [without_coordinates(record) for record in as_records(records)]
     bla = without_slow_minor_modes(bla, data, minor) if minor else bla

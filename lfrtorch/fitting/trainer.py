@@ -20,6 +20,7 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.prediction_problem import PredictionProblem
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -239,6 +240,8 @@ class Fit:
 
     Args:
         model, train, validation, trainer, ridge, ranks: see :func:`lfrtorch.fit`.
+        simulation: weight of simulation errors beside those of predictions, of a predictor; see
+            ``PredictionProblem``.
         keep: called with the fit after every iteration, when it may be saved, and with True when
             it pauses.
         stop: asked before each iteration whether to end there. If there are several processes,
@@ -256,6 +259,7 @@ class Fit:
         *,
         trainer: Trainer | None = None,
         ridge: Ridge = 0.0,
+        simulation: float = 0.0,
         ranks: Ranks | None = None,
         keep: Keep = nothing,
         stop: Stop | None = None,
@@ -266,15 +270,24 @@ class Fit:
         if ranks.world > 1:
             weights = parameters_to_vector(model.lfr.parameters())
             vector_to_parameters(ranks.first(weights), model.lfr.parameters())
-        self.problem = SimulationProblem.of(
-            model,
-            train,
-            ridge=ridge,
-            stable=self.trainer.stable,
-            contracting=self.trainer.contracting,
-            ranks=ranks,
-        )
-        self.judge = SimulationProblem.judge(model, validation) if validation else None
+        options: dict[str, Any] = {
+            "ridge": ridge,
+            "stable": self.trainer.stable,
+            "contracting": self.trainer.contracting,
+            "ranks": ranks,
+        }
+        self.judge: SimulationProblem | None = None
+        if simulation:
+            both = PredictionProblem.of(model, train, simulation=simulation, **options)
+            self.problem: SimulationProblem = both
+            if validation:
+                self.judge = PredictionProblem.of(
+                    model, validation, solve_initial_states=True, weight=both.weight
+                )
+        else:
+            self.problem = SimulationProblem.of(model, train, **options)
+            if validation:
+                self.judge = SimulationProblem.judge(model, validation)
         self.state: Any = None
         """The trainer's; None before the first call of ``advance``."""
         self.history: list[Progress] = []

@@ -67,7 +67,7 @@ class Jacobian:
         fixed: Bool[Tensor, " P"] | None = None,
         bounded: Callable[[System], System] = lambda system: system,
     ) -> None:
-        self.parts, self._reduced, self._ranks = parts, reduced, ranks
+        self.parts, self._reduced, self.ranks = parts, reduced, ranks
         self._bounded = bounded
         self._fixed = torch.zeros_like(ridge, dtype=torch.bool) if fixed is None else fixed
         self._ridge, self._penalty = ridge.masked_fill(self._fixed, 0.0), penalty
@@ -87,7 +87,7 @@ class Jacobian:
         room = CACHED_BYTES
         for part in self.parts:
             room -= part.fold(kept, total, room)
-        total.combine(self._ranks)
+        total.combine(self.ranks)
         # The accumulators have taken in [J r] in the kept columns: the last column belongs to r.
         if isinstance(total, QRAccumulator):
             R, r = self._reduced.columns(total.R[:, :-1]), total.R[:, -1]
@@ -108,9 +108,20 @@ class Jacobian:
                 system = CholeskySystem(G + torch.diag(ridge), rank)
         gradient = gradient + self._ridge.square() * self._penalty
         system = self._bounded(system)
-        if self._ranks.world == 1:
+        if self.ranks.world == 1:
             return system, gradient
-        return BroadcastSystem(system, self._ranks), self._ranks.first(gradient)
+        return BroadcastSystem(system, self.ranks), self.ranks.first(gradient)
+
+    def factor(self) -> tuple[Float[Tensor, "k P"], Float[Tensor, " P"]]:
+        """R with RᵀR = JᵀJ, and the gradient Jᵀr, of all processes."""
+        total = QRAccumulator()
+        for part in self.parts:
+            part.fold(self._reduced.kept, total, 0)
+        total.combine(self.ranks)
+        R, r = self._reduced.columns(total.R[:, :-1]), total.R[:, -1]
+        R = R.masked_fill(self._fixed, 0.0)
+        gradient = R.mT @ r + self._ridge.square() * self._penalty
+        return torch.cat([R, torch.diag(self._ridge)] if self._penalised else [R]), gradient
 
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """J dθ."""
@@ -132,7 +143,7 @@ class Jacobian:
         gradient = gradient + self._reduced.expand.mT @ reduced
         if self._own_penalty:
             gradient = gradient + self._ridge * residual[first:]
-        return self._ranks.sum(gradient.masked_fill(self._fixed, 0.0))
+        return self.ranks.sum(gradient.masked_fill(self._fixed, 0.0))
 
     def whole(self) -> Float[Tensor, "M P"]:
         """J as one matrix, for small problems."""

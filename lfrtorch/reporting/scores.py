@@ -22,8 +22,11 @@ from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import nrmse, rms, rmse
 from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.records import Record, common_unit, without_coordinates
 from lfrtorch.reporting.verdict import Verdict
+
+HORIZONS = 1, 10, 100
+"""Samples ahead that predictions are scored at."""
 
 ERRORS = "rmse", "lti_rmse"
 """Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
@@ -245,6 +248,7 @@ def evaluation(
             ],
         )
         | lost[True],
+        "predictions": predictions(model, chosen, bla, dataset),
         "linear": {name: list(dataset.linear[name]) for name in own},
         "command": command,
         "versions": {
@@ -253,6 +257,49 @@ def evaluation(
         },
     }
     return _finite(entries)
+
+
+def predictions(
+    model: Model, chosen: Model, bla: LinearModel | None, dataset: Dataset
+) -> dict[str, dict[str, Any]]:
+    """RMSE of predictions by record: use, and errors of both models at each of ``HORIZONS``.
+
+    Args:
+        model, chosen, bla, dataset: see :func:`evaluation`; nothing of a model without K.
+    """
+    if model.K is None:
+        return {}
+    linear = None if bla is None or bla.K is None else bla.to_model()
+    found = {}
+    for use, records in (("test", dataset.tests), ("validation", dataset.validation)):
+        own = model if use == "test" else chosen
+        for record in map(without_coordinates, records):
+            found[record.name] = {"use": use, "unit": common_unit(record.outputs)} | {
+                name: {}
+                if one is None
+                else {str(h): rmse(record, one.predict(record, horizon=h)) for h in HORIZONS}
+                for name, one in (("rmse", own), ("lti_rmse", linear))
+            }
+    return found
+
+
+def prediction_table(result: Mapping[str, Any]) -> str:
+    """Errors of predictions, a line a record and model; nothing without them."""
+    listed = result["predictions"]
+    if not listed:
+        return ""
+    units = {of["unit"] for of in listed.values()}
+    errors = [e for of in listed.values() for part in ERRORS for e in of[part].values()]
+    factor, unit = tables.engineering(errors, units.pop() if len(units) == 1 else "")
+    rows = [
+        [name, of["use"], which, *(tables.times(factor, e) for e in of[part].values())]
+        for name, of in listed.items()
+        for part, which in (("lti_rmse", "linear"), ("rmse", "NL-LFR"))
+        if of[part]
+    ]
+    ahead = [f"{h} sample{'s' if h > 1 else ''} ahead" for h in HORIZONS]
+    title = f"Prediction RMSE{f' ({unit})' if unit else ''}"
+    return f"\n\n{title}\n\n{tables.table(['record', 'use', 'model', *ahead], rows)}"
 
 
 def _entries(
@@ -298,10 +345,12 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     title += f"nz {sizes['nz']}, nw {sizes['nw']}, {static}" if sizes["nz"] else "a linear model"
     if not rows:
         return f"{title}: nothing is scored, as there is no test and no validation record"
+    predicted = prediction_table(result)
     references = [f"{p.label}: {p.reference}" for p in others]
     if result["linear"]:
         references.insert(0, own_linear(result))
-    return "\n".join([title, "", tables.table(head, rows), *[""] * bool(references), *references])
+    simulated = [title, "", tables.table(head, rows), *[""] * bool(references), *references]
+    return "\n".join(simulated) + predicted
 
 
 def lines(

@@ -64,12 +64,20 @@ def respond(
     own: Mapping[str, LinearModel],
     *,
     refitted: Model | None = None,
+    ahead: bool = False,
 ) -> list[Response]:
     """All records beside their simulations; tests with linear models of their own have those.
 
     Estimated starts of training records are fitted to all samples, as in the fit. If the model was
     fitted again to all of them, the tests are simulated by what came of it.
+
+    Args:
+        model, bla, dataset: what is simulated.
+        own: linear models of single tests, by name.
+        refitted: the model that was fitted again.
+        ahead: predictions one sample ahead in the place of simulations, of models with K.
     """
+
     used = {
         "train": dataset.train,
         "validation": dataset.validation,
@@ -83,7 +91,9 @@ def respond(
             if use == "test":
                 linear, chosen = own.get(dataset.score_of(record), bla), refitted or model
             driven = fitted(record) if use == "train" else record
-            found.append(Response(record, use, linear.simulate(driven), chosen.simulate(driven)))
+            models = linear, chosen
+            outputs = [m.predict(driven) if ahead else m.simulate(driven) for m in models]
+            found.append(Response(record, use, *outputs))
     return found
 
 

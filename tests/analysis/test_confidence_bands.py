@@ -18,7 +18,6 @@ import lfrtorch
 from lfrtorch._support.types import Array
 from lfrtorch.analysis import uncertainty
 from lfrtorch.analysis.confidence_bands import Uncertainty
-from lfrtorch.analysis.noise_model import NoiseModel
 from lfrtorch.engine import sensitivity
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start
@@ -101,43 +100,6 @@ def test_regression_has_the_covariance_of_the_textbook():
     assert found.covariance == pytest.approx(expected, rel=0.03, abs=0.03 * expected.max())
     assert found.noise == pytest.approx(np.sqrt((e**2).sum() / 396) * s.y_scale)
     assert found.doubts == ()
-
-
-def test_records_have_noise_of_their_own_size():
-    """One record has 10 times the noise and a third of the input: of one size it is 5 times off."""
-    model, quiet, D = regression(400)
-    s = model.scaler
-    u = regression(400, seed=1)[1].u
-    v, w = 3.0 * s.normalise_u(quiet.u), s.normalise_u(u)
-    e, f = noise(np.random.default_rng(2), 800, 1).reshape(2, 400, 1) * [[[0.1]], [[1.0]]]
-    records = [
-        replace(quiet, u=x * s.u_scale + s.u_offset, y=s.restore_y(x @ D.T + n))
-        for x, n in ((v, e), (w, f))
-    ]
-    both, y = np.vstack([v, w]), np.vstack([v @ D.T + e, w @ D.T + f])
-    with torch.no_grad():
-        model.lfr.cell.Dyu.copy_(torch.as_tensor(np.linalg.lstsq(both, y, rcond=None)[0].T))
-    H = np.linalg.inv(both.T @ both)
-    expected = H @ (0.01 * v.T @ v + w.T @ w) @ H
-    found = uncertainty(model, records).covariance
-    assert np.diag(found) == pytest.approx(np.diag(expected), rel=0.5)
-
-
-def test_coloured_noise_of_two_outputs():
-    """VᵀV = QᵀΓQ, with Γ from long impulse responses."""
-    a = (np.array([1.0, -0.7]), np.array([1.0, 0.3, 0.4]))
-    size = np.array([[2.0, 0.8], [0.8, 1.0]])
-    Q = normal(30, 2, 3).numpy()
-    impulse = np.eye(1, 300)[0]
-    psi = np.stack([signal.lfilter([1.0], own, impulse) for own in a])
-    # e(t) = Σ ψ(j) ε(t - j): a matrix from ε at -299 ... 29 to e at 0 ... 29
-    M = np.zeros((30, 2, 330))
-    for t in range(30):
-        M[t, :, t + 1 : t + 301] = psi[:, ::-1]
-    covariance = np.einsum("tos,op,kps->tokp", M, size, M)
-    expected = np.einsum("toc,tokp,kpd->cd", Q, covariance, Q)
-    V = NoiseModel(a, size).coloured(Q)
-    assert pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(expected).max()) == V.T @ V
 
 
 @pytest.mark.parametrize("pole", [0.0, 0.8])
@@ -312,15 +274,6 @@ def test_directions_without_data_surprise():
     assert found.simulate(u).surprise < 1.2
     u[:, 1] += 0.1
     assert found.simulate(u).surprise > 100
-
-
-def test_a_constant_that_hides_in_the_state_is_no_doubt():
-    """Of two w and one output, one constant of the map may be any in the steady state."""
-    model = random_model(random_cell(nw=2, nn=2, feedback=0.3))
-    record = noisy(measure(model, 600, start="periodic"), 0.02)
-    found = uncertainty(model, record)
-    assert found.rank == model.net_parameter_count == len(found.kept) - 1
-    assert found.doubts == ()
 
 
 def test_spread_of_models(known: tuple[Model, Uncertainty]):
