@@ -26,7 +26,7 @@ from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.jacobian import Jacobian, Memory, Part
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
 from lfrtorch.least_squares.record_groups import group_records
-from lfrtorch.least_squares.stable_states import LIMIT, StableSystem, fading, stabilised
+from lfrtorch.least_squares.stable_states import StableSystem, fading, largest_modulus, stabilised
 from lfrtorch.model import Model
 from lfrtorch.records import NormalisedRecord, Record, as_records
 
@@ -101,7 +101,9 @@ class SimulationProblem(LeastSquares):
         self._integrating = integrating_states(lfr.cell)
         if stable and lfr.cell.A.requires_grad and not self._integrating.all():
             radius = spectral_radius(fading(lfr.cell.A, self._integrating)).double()
-            self._largest_pole = max(LIMIT, float(self.ranks.first(radius)))
+            longest = max((record.samples for record in data), default=1)
+            limit = largest_modulus(longest)
+            self._largest_pole = max(limit, float(self.ranks.first(radius)))
         self._reduced: Reduction | None = None
         self._memory = Memory()
         self.guesses: list[Tensor | None] = [None] * len(self.groups)

@@ -17,13 +17,24 @@ from torch import Tensor
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.least_squares.linear_systems import System
 
-LIMIT = 1.0 - 1e-6
-"""Largest modulus of an eigenvalue: a million samples to fade to 1/e."""
+
+def largest_modulus(samples: int) -> float:
+    """Of an eigenvalue that fades to 1/e within a record of so many samples.
+
+    Example:
+        >>> from lfrtorch.least_squares.stable_states import largest_modulus
+        >>> largest_modulus(1000)
+        0.999
+    """
+    return 1.0 - 1.0 / samples
 
 
 NEAR = 0.9
 """Moduli below this part of the limit are left out of a step's bounds: no step goes so far, and
 eigenvalues at 0, those of delays, have no derivative."""
+
+CORRECTIONS = 5
+"""Most rounds in which a step's bounds are tightened by what it passes the limit by."""
 
 ROUNDING = 1e-12
 """A modulus at the limit is not beyond it."""
@@ -35,7 +46,7 @@ def fading(A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"]) -> Float
 
 
 def stabilised(
-    A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"], limit: float = LIMIT
+    A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"], limit: float
 ) -> Float[Tensor, "nx nx"]:
     """A with each eigenvalue of a modulus above the limit scaled to it.
 
@@ -74,7 +85,8 @@ class StableSystem:
     """A system whose steps keep the eigenvalues of A within a limit, to first order.
 
     A step that would take the modulus of some eigenvalues beyond the limit is replaced by the best
-    one that takes them there: the minimum of |r + J δ|² + λ|δ|² under these equations.
+    one that takes them there: the minimum of |r + J δ|² + λ|δ|² under these bounds, which are
+    tightened until the step keeps them to all orders.
 
     Args:
         system: without the limit.
@@ -91,31 +103,51 @@ class StableSystem:
         limit: float,
     ) -> None:
         self._system, self.scale, self.rank = system, system.scale, system.rank
-        own = torch.nonzero(~integrating).flatten().cpu().numpy()
-        matrix = fading(A, integrating).double().cpu().numpy()
-        values, left, right = scipy.linalg.eig(matrix, left=True, right=True)
+        self._own = torch.nonzero(~integrating).flatten().cpu().numpy()
+        self._A = fading(A, integrating).double().cpu().numpy()
+        self._limit = limit
+        values, left, right = scipy.linalg.eig(self._A, left=True, right=True)
         near = np.flatnonzero((np.imag(values) >= 0) & (np.abs(values) > NEAR * limit))
-        slopes = np.zeros((len(near), len(A), len(A)))
+        self._values = values[near]
+        slopes = np.zeros((len(near), len(A), len(A)), complex)
         # dλ = leftᴴ dA right / leftᴴ right; d|λ| is its part along λ.
         for slope, i in zip(slopes, near, strict=True):
             y, x = np.conj(left[:, i]), right[:, i]
-            along = np.conj(values[i]) / abs(values[i])
-            slope[np.ix_(own, own)] = (along * np.outer(y, x) / (y @ x)).real
-        self._slopes = torch.as_tensor(slopes).flatten(1).to(A)
-        self._room = torch.as_tensor(limit - np.abs(values[near])).to(A)
+            slope[np.ix_(self._own, self._own)] = np.outer(y, x) / (y @ x)
+        self._changes = slopes.reshape(len(near), A.numel())
+        along = np.conj(self._values) / np.abs(self._values)
+        self._slopes = torch.as_tensor((along[:, None] * self._changes).real).to(A)
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient, within the limit."""
-        free = step = self._system.solve(gradient, damping)
-        size = self._slopes.shape[1]
-        held = torch.zeros(len(self._room), dtype=torch.bool, device=step.device)
-        while True:
-            passed = (self._slopes @ step[:size] > self._room + ROUNDING) & ~held
-            if not passed.any():  # also if the step is NaN
-                return step
-            held |= passed
-            C = step.new_zeros(int(held.sum()), len(step))
-            C[:, :size] = self._slopes[held]
-            across = torch.stack([-self._system.solve(c, damping) for c in C])
-            excess = C @ free - self._room[held]
-            step = free - across.mT @ torch.linalg.lstsq(across @ C.mT, excess).solution
+        free = self._system.solve(gradient, damping)
+        C = free.new_zeros(len(self._slopes), len(free))
+        C[:, : self._slopes.shape[1]] = self._slopes
+        room = torch.as_tensor(self._limit - np.abs(self._values)).to(free)
+        if not (C @ free - room > ROUNDING).any():  # also if the step is NaN
+            return free
+        across = torch.stack([-self._system.solve(c, damping) for c in C])
+        # Multipliers μ >= 0 of the bounds: the least |Lᵀμ - L⁻¹ excess|² for L Lᵀ = C across.
+        G = C @ across.mT
+        G.diagonal().add_(ROUNDING * G.diagonal().max())
+        L = torch.linalg.cholesky(G)
+        step = free
+        for _ in range(CORRECTIONS):
+            excess = (C @ free - room).unsqueeze(-1)
+            rest = torch.linalg.solve_triangular(L, excess, upper=False).squeeze(-1)
+            multipliers, _ = scipy.optimize.nnls(L.mT.cpu().numpy(), rest.cpu().numpy())
+            step = free - across.mT @ torch.as_tensor(multipliers).to(free)
+            beyond = self._beyond(step)
+            if beyond.max() < ROUNDING:
+                break
+            room -= torch.as_tensor(beyond).to(room)
+        return step
+
+    def _beyond(self, step: Float[Tensor, " P"]) -> Float[np.ndarray, " near"]:
+        """How far a step takes each pole beyond the limit, to all orders."""
+        dA = step[: self._slopes.shape[1]].double().cpu().numpy()
+        size = round(len(dA) ** 0.5)
+        after = np.linalg.eigvals(self._A + dA.reshape(size, size)[np.ix_(self._own, self._own)])
+        expected = self._values + self._changes @ dA
+        which = scipy.optimize.linear_sum_assignment(np.abs(expected[:, None] - after))[1]
+        return np.maximum(np.abs(after[which]) - self._limit, 0.0)
