@@ -1,6 +1,7 @@
 """Noise inside the system: the fit of predictions against that of the simulation error.
 
     python benchmarks/noise.py [--runs 50] [--samples 500 2000 8000] [--only innovations states]
+    python benchmarks/noise.py --observer
 
 An oscillator with a softening spring (two states, one neuron) is driven by white noise of unit
 variance. A force that nobody measures acts on it, and its sensor has noise: as innovations with the
@@ -17,7 +18,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -122,6 +125,19 @@ def fits(record: lfrtorch.Record) -> Iterator[tuple[str, lfrtorch.Model]]:
         yield noise, result.model
 
 
+def seconds_a_step(model: lfrtorch.Model) -> float:
+    """Of the observer: the median of 20 times 500 steps."""
+    observer = replace(model, K=torch.as_tensor(kalman_gain(model))).observer()
+    u, y, found = np.array([0.1]), np.array([0.0]), []
+    for _ in range(20):
+        clock = time.perf_counter()
+        for _ in range(500):
+            observer.predict(u)
+            observer.update(y)
+        found.append((time.perf_counter() - clock) / 500)
+    return float(np.median(found))
+
+
 def main() -> int:
     """The table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -129,8 +145,12 @@ def main() -> int:
     parser.add_argument("--samples", type=int, nargs="*", default=[500, 2000, 8000])
     parser.add_argument("--decibels", type=float, nargs="*", default=[30, 20, 10])
     parser.add_argument("--only", nargs="*", default=["innovations", "states"])
+    parser.add_argument("--observer", action="store_true", help="time a step of the observer")
     options = parser.parse_args()
     truth = oscillator()
+    if options.observer:
+        print(f"{1e6 * seconds_a_step(truth):.1f} µs a step of observer.predict and update")
+        return 0
     print(
         "| noise | SNR (dB) | samples | simulation fit | bias | prediction fit | bias | one step |"
     )

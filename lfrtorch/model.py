@@ -37,6 +37,12 @@ from lfrtorch.records import (
     check_start,
     with_past_outputs,
 )
+from lfrtorch.state_observer import StateObserver
+
+NO_GAIN = (
+    "this model has no innovation gain K: fit it with noise='innovation', from a start with the "
+    "linear model of estimate_bla(..., refine='prediction')."
+)
 
 
 def simulate_record(lfr: LFR, normalised: NormalisedRecord, start: Start) -> Trajectory:
@@ -267,6 +273,29 @@ class Model:
                 x = after[:-1]
         return record.shown(self.scaler.restore_y(y.double().cpu().numpy()))
 
+    def observer(
+        self, *, after: Record | None = None, x0: ArrayLike | None = None
+    ) -> StateObserver:
+        """What follows the states of the running system, sample by sample.
+
+        Args:
+            after: what was measured until now; the states go on from its end.
+            x0: where they begin otherwise, in the model's coordinates. Default: 0.
+
+        Raises:
+            ValueError: a model without K, both a record and a state, or a record of other channels
+                or another rate.
+        """
+        if self.K is None:
+            raise InputError(NO_GAIN)
+        if after is not None:
+            if x0 is not None:
+                raise InputError("after and x0 both say where the states begin; give one of them.")
+            self.check(after)
+            x0 = self.predictor().signals(with_past_outputs(after)).x[0, -1].double().numpy()
+        x0 = np.zeros(self.lfr.cell.nx) if x0 is None else x0
+        return StateObserver(self.lfr.cell, self.K, self.scaler, self.inputs, self.outputs, x0)
+
     def predictor(self) -> Model:
         """The model of the output one sample ahead; its inputs are u, then y.
 
@@ -280,10 +309,7 @@ class Model:
             Model(u, y -> y, 100 Hz, nx=1, nz=1, nw=1, nn=4)
         """
         if self.K is None:
-            raise InputError(
-                "this model has no innovation gain K: fit it with noise='innovation', from a start "
-                "with the linear model of estimate_bla(..., refine='prediction')."
-            )
+            raise InputError(NO_GAIN)
         s = self.scaler
         scaler = Scaler(
             np.concatenate([s.u_offset, s.y_offset]),

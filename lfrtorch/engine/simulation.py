@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -195,8 +195,17 @@ def _compiled(
         sizes = ((T + 1, cell.nx), (T, cell.nz), (T, cell.nw), (T, cell.ny))
         near = Trajectory(*(u.new_full((R, *size), torch.nan) for size in sizes))
     near.x[:, 0] = x0
+    met_within = MET_ROUNDING * torch.finfo(u.dtype).eps
+    arguments = [to_numpy(u), *kernel_arguments(cell), met_within]
+    spread(simulate_record, R, *arguments, *(signal.numpy() for signal in near))
+    return near
+
+
+def kernel_arguments(cell: LFRCell) -> list[Any]:
+    """What ``simulate_record`` takes between u and the tolerance: the weights of a cell."""
+    like = cell.A.detach()
     static, activation, growth = cell.static, "tanh", np.zeros((0, 2), np.int64)
-    vectors, matrices = [u.new_zeros(0), u.new_zeros(cell.nw)], [u.new_zeros(0, 0)] * 2
+    vectors, matrices = [like.new_zeros(0), like.new_zeros(cell.nw)], [like.new_zeros(0, 0)] * 2
     inner: list[Tensor] = []
     if is_network(static):
         vectors, matrices = [static.bz, static.bw], [static.Wz.mT, static.Ww]
@@ -208,10 +217,7 @@ def _compiled(
     # A leading axis, for one model or one a record.
     weights = [m if m.ndim == 3 else m.unsqueeze(0) for m in (*lti, *matrices)]
     weights += [v if v.ndim == 3 else v[None, None] for v in vectors]
-    layers = torch.cat(inner or [u.new_zeros(0, 0)], dim=-2)
+    layers = torch.cat(inner or [like.new_zeros(0, 0)], dim=-2)
     weights.append(layers if layers.ndim == 3 else layers.unsqueeze(0))
     weights = [w.expand(len(weights[0]), -1, -1) for w in weights]  # zeros in the place of others
-    met_within = MET_ROUNDING * torch.finfo(u.dtype).eps
-    arguments = [to_numpy(u), *map(to_numpy, weights), ACTIVATION_CODES[activation], growth]
-    spread(simulate_record, R, *arguments, met_within, *(signal.numpy() for signal in near))
-    return near
+    return [*map(to_numpy, weights), ACTIVATION_CODES[activation], growth]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -102,6 +103,58 @@ def test_a_fit_finds_the_innovations_and_the_past_outputs_stay_out_of_z():
     predictor = model.predictor().lfr.cell
     assert not predictor.Dzu[:, 2:].any()
     assert not predictor.Dyu[:, 2:].any()
+
+
+def with_own_map(model: Model) -> Model:
+    """The same model with a module that is not compiled."""
+    cell = copy.deepcopy(model.lfr.cell)
+    static = cell.static
+    assert static is not None
+    cell.static = torch.nn.Sequential(static)
+    return replace(model, lfr=lfrtorch.LFR(cell))
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_an_observer_predicts_sample_by_sample(own: bool):
+    model, record, e = noisy(80)
+    model = with_own_map(model) if own else model
+    observer = model.observer(after=record[:30])
+    y_hat, errors = [], []
+    for k in range(30, 80):
+        observer.predict(record.u[k] + 1.0)  # what is asked in between changes nothing
+        y_hat.append(observer.predict(record.u[k]))
+        errors.append(observer.update(record.y[k]))
+    np.testing.assert_allclose(y_hat, model.predict(record)[30:], atol=1e-10)
+    np.testing.assert_allclose(errors, e[30:], atol=1e-10)
+
+
+def test_an_observer_goes_on_without_outputs():
+    model, record, _ = noisy(40)
+    observer = model.observer()
+    y_hat = []
+    for u in record.u:
+        y_hat.append(observer.predict(u))
+        assert np.isnan(observer.update(None)).all()
+    np.testing.assert_allclose(y_hat, model.simulate(record), atol=1e-12)
+    again = model.observer(x0=observer.state)
+    np.testing.assert_array_equal(again.state, observer.state)
+
+
+@pytest.mark.parametrize(
+    ("said", "act"),
+    [
+        ("call predict", lambda m, r: m.observer().update(r.y[0])),
+        ("u has the shape", lambda m, r: m.observer().predict([1.0])),
+        ("give finite numbers", lambda m, r: m.observer().predict([1.0, np.nan])),
+        ("x0 has the shape", lambda m, r: m.observer(x0=[1.0])),
+        ("give one of them", lambda m, r: m.observer(after=r, x0=[0.0] * 3)),
+        ("no innovation gain K", lambda m, r: replace(m, K=None).observer()),
+    ],
+)
+def test_what_an_observer_cannot_follow_is_refused(said: str, act):
+    model, record, _ = noisy(20)
+    with pytest.raises(ValueError, match=said):
+        act(model, record)
 
 
 def test_the_derivatives_of_both_errors_are_those_of_differences():
