@@ -285,6 +285,13 @@ class Model:
         Raises:
             ValueError: a model without K, both a record and a state, or a record of other channels
                 or another rate.
+
+        Example:
+            >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
+            >>> started = lfrtorch.initialise(linear, record, nz=1, nw=1, nn=4)
+            >>> observer = started.observer(after=record[:100])
+            >>> np.allclose(observer.predict(record.u[100]), started.predict(record[:101])[100])
+            True
         """
         if self.K is None:
             raise InputError(NO_GAIN)
