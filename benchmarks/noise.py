@@ -1,6 +1,7 @@
 """Noise inside the system: the fit of predictions against that of the simulation error.
 
     python benchmarks/noise.py [--runs 50] [--samples 500 2000 8000] [--only innovations states]
+    python benchmarks/noise.py --circuit 2
     python benchmarks/noise.py --observer
 
 An oscillator with a softening spring (two states, one neuron) is driven by white noise of unit
@@ -12,6 +13,11 @@ start from linear models and are fitted 40 iterations at most.
 Printed: the median over the runs of the error against the true output without noise on another
 input, over its rms, of both fits, its bias (the mean over the runs), and the error of the
 prediction one sample ahead on another record, over the rms of the true innovations.
+
+``--circuit`` makes records like those of the Wiener-Hammerstein benchmark with process noise: two
+filters of third order, a saturation between them, and noise below 2 kHz before it, at levels that
+give the rms and the error's spectrum of the estimation records; ten random multisines, of which two
+validate and are simulated without noise in the end. Printed: errors in mV.
 """
 
 from __future__ import annotations
@@ -28,6 +34,7 @@ import scipy
 import torch
 
 import lfrtorch
+from lfrtorch._support.types import Array
 from lfrtorch.fitting.prediction import Noise
 from lfrtorch.linear.bla import Criterion
 from lfrtorch.metrics import rms
@@ -36,6 +43,9 @@ from lfrtorch.records import Scaler
 FORCE = 10.0
 """Deviation of the force that nobody measures over that of the sensor's noise, per sample, as
 deviations of the states."""
+
+RATE = 78125.0
+"""Of the circuit, Hz."""
 
 SETTLING = 200
 """Samples that are not scored."""
@@ -125,6 +135,58 @@ def fits(record: lfrtorch.Record) -> Iterator[tuple[str, lfrtorch.Model]]:
         yield noise, result.model
 
 
+def circuit(u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """The circuit's output as it is measured, and without any noise."""
+    before = scipy.signal.cheby1(3, 0.5, 4400, fs=RATE)
+    after = scipy.signal.cheby2(3, 40, 5000, fs=RATE)
+    low_pass = scipy.signal.butter(2, 2000, fs=RATE)
+    x = scipy.signal.lfilter(*before, u)
+    v = scipy.signal.lfilter(*low_pass, rng.standard_normal(len(u) + 4000))[4000:]
+    gain = rms(np.abs(scipy.signal.freqz(*low_pass, worN=8192)[1]))
+
+    def saturated(z: Array) -> Array:
+        return np.asarray(scipy.signal.lfilter(*after, 0.28 * np.tanh(z / 0.28)))
+
+    noise = 2.5e-4 * rng.standard_normal(len(u))
+    return saturated(x + 0.22 / gain * v) + noise, saturated(x)
+
+
+def of_circuit(seed: int) -> Iterator[tuple[str, float, float]]:
+    """Each fit, its error against the output without noise, and its error one sample ahead."""
+    rng, records, still = np.random.default_rng(seed), [], []
+    for number in range(10):
+        # Estimation records of the benchmark have such lines and this rms.
+        design = lfrtorch.multisine(
+            8192, fs=RATE, band=(10.0, 15e3), rms=0.76, seed=100 * seed + number
+        )
+        u = design.u[0, :, 0]
+        y, clean = circuit(u, rng)
+        record = lfrtorch.Record(u, y, fs=RATE, skip=100, name=f"r{number}")
+        records.append(record)
+        still.append(replace(record, y=clean))
+    train, validation, still = records[:8], records[8:], still[8:]
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=80)
+    linear = lfrtorch.estimate_bla(train, 6)
+    ahead = lfrtorch.estimate_bla(train, 8, refine="prediction")
+
+    def errors(model: lfrtorch.Model | lfrtorch.LinearModel) -> tuple[float, float]:
+        found = rms(np.array([lfrtorch.rmse(r, model.simulate(r)) for r in still]))
+        if model.K is None:
+            return float(found), float("nan")
+        each = [lfrtorch.rmse(r, model.predict(r)) for r in validation]
+        return float(found), float(rms(np.array(each)))
+
+    yield "linear", errors(linear)[0], errors(ahead)[1]
+    kinds: tuple[tuple[Noise, lfrtorch.LinearModel], ...]
+    kinds = ("output", linear), ("innovation", ahead), ("both", ahead)
+    for noise, begin in kinds:
+        starts = [lfrtorch.initialise(begin, train, nz=1, nw=1, nn=10, seed=s) for s in range(4)]
+        result = lfrtorch.fit(
+            starts, train, validation, noise=noise, trainer=trainer, monitors=[[]] * 4
+        )
+        yield noise, *errors(result.model)
+
+
 def seconds_a_step(model: lfrtorch.Model) -> float:
     """Of the observer: the median of 20 times 500 steps."""
     observer = replace(model, K=torch.as_tensor(kalman_gain(model))).observer()
@@ -145,11 +207,20 @@ def main() -> int:
     parser.add_argument("--samples", type=int, nargs="*", default=[500, 2000, 8000])
     parser.add_argument("--decibels", type=float, nargs="*", default=[30, 20, 10])
     parser.add_argument("--only", nargs="*", default=["innovations", "states"])
+    parser.add_argument("--circuit", type=int, default=0, help="draws of the circuit")
     parser.add_argument("--observer", action="store_true", help="time a step of the observer")
     options = parser.parse_args()
     truth = oscillator()
     if options.observer:
         print(f"{1e6 * seconds_a_step(truth):.1f} µs a step of observer.predict and update")
+        return 0
+    if options.circuit:
+        print("| draw | fit | simulation of the circuit without noise | one sample ahead |")
+        print("|---" * 4 + "|")
+        for seed in range(options.circuit):
+            for name, still, ahead in of_circuit(seed):
+                print(f"| {seed} | {name} | {1e3 * still:.2f} | {1e3 * ahead:.3f} |")
+                sys.stdout.flush()
         return 0
     print(
         "| noise | SNR (dB) | samples | simulation fit | bias | prediction fit | bias | one step |"

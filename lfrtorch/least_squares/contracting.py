@@ -74,9 +74,8 @@ class Contracting:
         self._last, self._found = start, self._certified(start, None)
         if self._found is None:
             raise InputError(
-                "contracting=true needs a start that is proven to contract, and this one is not: "
-                "use init=zero_output, a linear model whose poles are inside the unit circle, and "
-                "no integrators."
+                "contracting=true needs a start that is proven to contract: init=zero_output, a "
+                "linear model with its poles inside the unit circle, and no integrators."
             )
 
     @property
