@@ -231,10 +231,11 @@ def scored_run(
     test_linear = linear_models_of_tests(dataset, settings)
     last = None if again is None else again.model
     simulations = respond(result.model, linear, dataset, test_linear, refitted=last)
-    judged = simulations
+    judged, error = simulations, "error"
     if settings.noise != "output":
         judged = respond(result.model, linear, dataset, test_linear, refitted=last, ahead=True)
-    verdict = judge(result, judged)
+        error = "prediction error"
+    verdict = judge(result, judged, error=error)
     residuals = worst_residuals(judged)
     found = evidence(
         result,

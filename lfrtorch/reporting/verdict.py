@@ -149,7 +149,7 @@ class _Errors(NamedTuple):
     power: float
 
 
-def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
+def judge(result: FitResult, responses: Sequence[Response], *, error: str = "error") -> Verdict:
     """The verdict on a fit, from all records beside their simulations.
 
     Every record that was not fitted is looked at: one on which the NL-LFR is clearly worse is
@@ -159,6 +159,7 @@ def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
     Args:
         result: the fit.
         responses: see :func:`lfrtorch.reporting.simulations.respond`.
+        error: what it is called, for example ``"prediction error"``.
     """
     lost = [r for r in responses if not np.isfinite(rms(r.error))]
     failed = result.reason in (Reason.GRADIENT_DIVERGED, Reason.JACOBIAN_VANISHES)
@@ -180,7 +181,7 @@ def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
     elif worst is not None:
         kind, use = Kind.WORSE, LINEAR_MODEL
         text = (
-            f"Worse than the linear model: on {worst.name} the NL-LFR's error is "
+            f"Worse than the linear model: on {worst.name} the NL-LFR's {error} is "
             f"{of_linear(worst.ratio)}"
         )
     elif whole is None:
@@ -188,13 +189,13 @@ def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
     elif not held_out:
         kind, use = Kind.UNJUDGED, NL_LFR if whole.ratio < 1.0 - SAME else LINEAR_MODEL
         text = (
-            f"Not judged, as nothing was held out: on {whole.name} the error is "
+            f"Not judged, as nothing was held out: on {whole.name} the {error} is "
             f"{of_linear(whole.ratio)}"
         )
     elif whole.better:
         kind, use = Kind.BETTER, NL_LFR
         text = (
-            f"Better than the linear model: on {whole.name} the NL-LFR's error is "
+            f"Better than the linear model: on {whole.name} the NL-LFR's {error} is "
             f"{of_linear(whole.ratio)}"
         )
     elif abs(whole.ratio - 1.0) + whole.ratio_std < EQUAL:
@@ -205,7 +206,7 @@ def judge(result: FitResult, responses: Sequence[Response]) -> Verdict:
         kind, use = Kind.LINEAR, LINEAR_MODEL
         clearly = "clearly " * (whole.ratio < 1.0 - SAME)
         text = (
-            f"Not {clearly}better than the linear model: on {whole.name} the error is "
+            f"Not {clearly}better than the linear model: on {whole.name} the {error} is "
             f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of the linear "
             "model's"
         )

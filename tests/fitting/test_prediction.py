@@ -230,6 +230,7 @@ def test_a_run_predicts():
     own, linear = (lfrtorch.rmse(test, m.predict(test)) for m in (run.model, run.linear))
     assert own < 0.9 * linear
     assert own < 1.1 * rms(e[620:])
+    assert "prediction error" in run.verdict.text
 
 
 @pytest.mark.parametrize(
