@@ -428,6 +428,7 @@ def starting_model(
             relaxations=settings.relaxations,
             modes=settings.modes,
             z_feedthrough=settings.z_feedthrough,
+            structure=settings.structure,
         )
     nz, nw = cast(int, settings.nz), cast(int, settings.nw)
     model = begin(linear, train, nz=nz, nw=nw, seed=seed, **settings.static_map())

@@ -19,6 +19,7 @@ from lfrtorch._support import checkpoint
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
 from lfrtorch.engine.initial_state import simulate_estimated
@@ -158,8 +159,9 @@ class Model:
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters P."""
-        return sum(p.numel() for p in self.lfr.parameters())
+        """Number of parameters P; zeros of the model's structure are none."""
+        zeros = sum(int(each.sum()) for each in zeros_of(self.lfr.cell).values())
+        return sum(p.numel() for p in self.lfr.parameters()) - zeros
 
     @property
     def net_parameter_count(self) -> int:
@@ -167,10 +169,16 @@ class Model:
 
         nx² for the coordinates of x, nz² and nw² for those of z and w (a network and a polynomial
         absorb them), max(0, nw - ny) for a constant w that hides in the origin of the state, and
-        nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu hold as well.
+        nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu hold as well. States in
+        two halves have coordinates of their own, and branches scales alone.
         """
         cell = self.lfr.cell
-        gauge = cell.nx**2 + cell.past_outputs * (cell.nz + cell.ny)  # zeros of a predictor
+        halves = 2 if cell.structure in IN_SERIES else 1
+        gauge = cell.nx**2 // halves + cell.past_outputs * (
+            cell.nz + cell.ny
+        )  # zeros of a predictor
+        if cell.structure == "parallel":
+            return self.parameter_count - gauge - cell.nz - cell.nw
         if isinstance(cell.static, Network | Polynomial):
             gauge += cell.nz**2 + cell.nw**2 + max(0, cell.nw - cell.ny)
         if isinstance(cell.static, Polynomial):
@@ -404,6 +412,8 @@ class Model:
         }
         if not (cell.Dzu.requires_grad or cell.Dzu.any()):
             description["z_feedthrough"] = False
+        if cell.structure != "free":
+            description["structure"] = cell.structure
         if self.fitted_to:
             description["fitted_to"] = self.fitted_to
         weights = dict(self.lfr.cell.state_dict())
@@ -512,6 +522,9 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             raise InputError(f"K has the shape {tuple(K.shape)}")
         cell.load_state_dict(weights)
         cell.Dzu.requires_grad_(description.get("z_feedthrough", True))
+        cell.structure = description.get("structure", "free")
+        if cell.structure not in STRUCTURES:
+            raise InputError(f"structure is {cell.structure!r}")
         channels = [
             tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")
         ]

@@ -69,6 +69,8 @@ class LFRCell(nn.Module):
         self.Cz, self.Dzu = matrix(nz, nx), matrix(nz, nu)
         self.Cy, self.Dyu, self.Dyw = matrix(ny, nx), matrix(ny, nu), matrix(ny, nw)
         self.static = static
+        self.structure = "free"
+        """Of which blocks the model is made, see ``block_form``; a fit keeps to it."""
         self.past_outputs = 0
         """How many of the last inputs are measured outputs: columns of Dzu, Dyu that stay 0."""
 

@@ -90,6 +90,7 @@ class Settings:
             linear model, see :func:`lfrtorch.initialise`.
         z_feedthrough: whether the input acts on z at once; False for a nonlinearity of the states
             alone, see :func:`lfrtorch.initialise`.
+        structure: of which blocks the model is made, see :func:`lfrtorch.initialise`.
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge, average: see :func:`lfrtorch.fit`.
@@ -135,6 +136,7 @@ class Settings:
     relaxations: int = 0
     modes: int = 0
     z_feedthrough: bool = True
+    structure: str = "free"
     linear: Mapping[str, Any] = field(default_factory=dict)
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
     ridge: Ridge = 0.0
@@ -200,12 +202,23 @@ class Settings:
         integer("first_iterations", self.first_iterations, 1)
         for name in ("relaxations", "modes"):
             integer(name, getattr(self, name), 0)
-        for name, unused in (("relaxations", 0), ("modes", 0), ("z_feedthrough", True)):
+        unused_ones = (
+            ("relaxations", 0),
+            ("modes", 0),
+            ("z_feedthrough", True),
+            ("structure", "free"),
+        )
+        for name, unused in unused_ones:
             if self.init == "inference" and getattr(self, name) != unused:
                 raise InputError(
                     f"{name} is {getattr(self, name)}, which init='inference' has no use for; give "
                     f"{name}={unused}, or init='zero_output'."
                 )
+        if self.structure != "free" and (self.noise != "output" or self.searched):
+            raise InputError(
+                f"structure is {self.structure!r}, which is for noise='output' and given sizes; "
+                "give numbers for the sizes that are 'auto', or structure='free'."
+            )
         if self.dtype not in (torch.float32, torch.float64):
             raise InputError(f"dtype is {self.dtype}; give torch.float64 or torch.float32.")
         try:

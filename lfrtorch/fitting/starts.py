@@ -13,6 +13,7 @@ from torch.nn import Module
 
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
+from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
@@ -51,6 +52,7 @@ def initialise(
     relaxations: int = 0,
     modes: int = 0,
     z_feedthrough: bool = True,
+    structure: str = "free",
     dtype: torch.dtype = torch.float64,
 ) -> Model:
     """NL-LFR model whose output is that of the linear model.
@@ -83,6 +85,13 @@ def initialise(
     their states, and a fit leaves those columns of A and Cz as they are. Without ``z_feedthrough``
     Dzu is 0, and a fit of this model leaves it so: the nonlinearity sees the states alone.
 
+    ``structure`` makes the model of blocks, and a fit of it keeps to them: a static map of what is
+    made of the linear model's states acts on the output alone (``"wiener"``); one of the inputs
+    drives them (``"hammerstein"``); or it stands between the linear model and a second set of
+    states, a copy of the linear model's that w alone drives (``"wiener_hammerstein"``), so that nx
+    doubles. ``"parallel"`` is the latter with a map of nz = nw functions of one z each. In all of
+    these w never comes back to z.
+
     Args:
         bla: stable linear model, best in balanced coordinates.
         records: the data that are to be fitted.
@@ -97,6 +106,8 @@ def initialise(
         relaxations, modes: how many are added to those of the linear model, one and two states
             each.
         z_feedthrough: whether the input acts on z at once.
+        structure: ``"free"``, ``"wiener"``, ``"hammerstein"``, ``"wiener_hammerstein"`` or
+            ``"parallel"``.
         dtype: of the weights.
 
     Raises:
@@ -122,6 +133,8 @@ def initialise(
     integer("modes", modes, 0)
     if method not in ("zero_output", "paper"):
         raise InputError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
+    if structure != "free":
+        _check_structure(structure, nz, nw, nn, layers, static, relaxations + modes, z_feedthrough)
     if minor is None:
         minor = MINOR if method != "paper" and bla.K is None else 0.0  # noise has slow modes
     number("minor", minor)
@@ -178,6 +191,8 @@ def initialise(
                 "z_feedthrough is False, and all states integrate, which z must not see; raise nx."
             )
         cell.Cz[:, integrating] = 0.0
+        if structure == "hammerstein":
+            cell.Cz.zero_()
         cell.Dzu.mul_(z_feedthrough)
         z = (x / std) @ cell.Cz.mT + u @ cell.Dzu.mT
         spread = _deviation(z)[:, None]
@@ -202,8 +217,62 @@ def initialise(
         if K is not None:
             K = torch.cat([K, K.new_zeros(cell.nx - len(K), cell.ny)])
     model = replace(model, K=K)
+    if structure != "free":
+        model = replace(model, lfr=LFR(_in_blocks(cell, structure)))
     model.lfr.cell.Dzu.requires_grad_(z_feedthrough)
     return model
+
+
+@torch.no_grad()
+def _in_blocks(cell: LFRCell, structure: str) -> LFRCell:
+    """The cell in a structure: with the same linear model, and as long as w = 0 the same output."""
+    if structure in IN_SERIES:
+        both, before, none = torch.block_diag(cell.A, cell.A), cell, torch.zeros_like
+        sizes = cell.nu, cell.ny, 2 * cell.nx, cell.nz, cell.nw
+        cell = LFRCell(*sizes, before.static, device=both.device, dtype=both.dtype)
+        cell.A.copy_(both)
+        cell.Bu.copy_(torch.cat([before.Bu, none(before.Bu)]))
+        cell.Bw.copy_(torch.cat([none(before.Bw), before.Bw]))
+        cell.Cz.copy_(torch.cat([before.Cz, none(before.Cz)], dim=1))
+        cell.Cy.copy_(torch.cat([before.Cy, before.Cy], dim=1))
+        for name in ("Dzu", "Dyu", "Dyw"):
+            cell.get_parameter(name).copy_(before.get_parameter(name))
+    cell.structure = structure
+    for name, zeros in zeros_of(cell).items():
+        cell.get_parameter(name).masked_fill_(zeros, 0.0)
+    return cell
+
+
+def _check_structure(
+    structure: str,
+    nz: int,
+    nw: int,
+    nn: int | None,
+    layers: int,
+    static: Module | None,
+    driven: int,
+    z_feedthrough: bool,
+) -> None:
+    """Refuse what a structure has no place for with a ValueError."""
+    if structure not in STRUCTURES:
+        raise InputError(f"structure is {structure!r}; use one of {', '.join(STRUCTURES)}.")
+    if driven:
+        raise InputError(
+            f"structure is '{structure}', which has no relaxations or modes; give one of the two."
+        )
+    if structure == "hammerstein" and not z_feedthrough:
+        raise InputError(
+            "structure is 'hammerstein', whose z is of the inputs alone, and z_feedthrough is "
+            "False; give one of the two."
+        )
+    if structure == "parallel":
+        if nz != nw or layers > 1 or static is not None:
+            raise InputError(
+                "structure is 'parallel', which has a network with one hidden layer, and a w for "
+                f"each z; nz is {nz}, nw is {nw}, layers is {layers}."
+            )
+        if nn is not None and nn < nz:
+            raise InputError(f"structure is 'parallel', and {nn} neurons are fewer than {nz} z.")
 
 
 def _check_sizes(static: Module, nz: int, nw: int, dtype: torch.dtype) -> None:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from lfrtorch.engine.block_form import zeros_of
 from lfrtorch.engine.cell import LFRCell
 
 
@@ -38,15 +39,16 @@ def fixed_parameters(cell: LFRCell) -> Bool[Tensor, " free"] | None:
     """Which entries of the free parameters a fit must not change; None if there are none.
 
     Columns of exact integrators, and of past outputs in a predictor
-    (``lfrtorch.engine.innovation``).
+    (``lfrtorch.engine.innovation``), and the zeros of a structure (``lfrtorch.engine.block_form``).
     """
-    states = integrating_states(cell)
-    if not (states.any() or cell.past_outputs):
+    states, zeros = integrating_states(cell), zeros_of(cell)
+    if not (states.any() or cell.past_outputs or zeros):
         return None
     inputs = torch.arange(cell.nu, device=states.device) >= cell.nu - cell.past_outputs
     columns = {"A": states, "Cz": states, "Dzu": inputs, "Dyu": inputs}
+    none = states.new_zeros(())
     masks = [
-        columns.get(name, torch.zeros_like(p, dtype=torch.bool)).expand(p.shape)
+        (columns.get(name, none) | zeros.get(name, none)).expand(p.shape)
         for name, p in cell.named_parameters()
         if p.requires_grad
     ]

@@ -1,0 +1,59 @@
+"""Models that are made of blocks: which of their parameters are 0 for good.
+
+``LFRCell.structure`` says of which:
+
+- ``"free"``: none is;
+- ``"wiener"``: w acts on the output alone, Bw = 0;
+- ``"hammerstein"``: z is of the inputs alone, Cz = 0;
+- ``"wiener_hammerstein"``: the first half of the states, which u drives, makes z; the second half,
+  which w alone drives, sees nothing of the first. So w never comes back to z;
+- ``"parallel"``: the same with a network in which each neuron sees one z and acts on the w of the
+  same number: branches that share their poles at most.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lfrtorch.engine.cell import LFRCell
+
+STRUCTURES = ("free", "wiener", "hammerstein", "wiener_hammerstein", "parallel")
+"""What ``LFRCell.structure`` may be."""
+
+IN_SERIES = ("wiener_hammerstein", "parallel")
+"""Those with states before and after the static map, as many of each."""
+
+
+def zeros_of(cell: LFRCell) -> dict[str, Tensor]:
+    """Which entries of the parameters are 0 for good, by name; names without any are left out.
+
+    Example:
+        >>> from lfrtorch.engine.block_form import zeros_of
+        >>> cell = lfrtorch.LFRCell(nu=1, ny=1, nx=2, nz=1, nw=1, static=lfrtorch.Network(1, 1, 5))
+        >>> cell.structure = "wiener_hammerstein"
+        >>> zeros_of(cell)["Cz"], zeros_of(cell)["Bw"].tolist()
+        (tensor([[False,  True]]), [[True], [False]])
+    """
+    after = torch.arange(cell.nx, device=cell.A.device) >= cell.nx // 2
+    match cell.structure:
+        case "wiener":
+            found = {"Bw": torch.ones_like(cell.Bw, dtype=torch.bool)}
+        case "hammerstein":
+            found = {"Cz": torch.ones_like(cell.Cz, dtype=torch.bool)}
+        case "wiener_hammerstein" | "parallel":
+            found = {
+                "A": after[:, None] != after,
+                "Bu": after[:, None].expand(cell.Bu.shape),
+                "Bw": ~after[:, None].expand(cell.Bw.shape),
+                "Cz": after.expand(cell.Cz.shape),
+            }
+        case _:
+            found = {}
+    if cell.structure == "parallel":
+        assert cell.static is not None
+        neurons = cell.static.get_parameter("Wz")
+        own = torch.arange(len(neurons), device=neurons.device) * cell.nz // len(neurons)
+        apart = own[:, None] != torch.arange(cell.nz, device=neurons.device)
+        found |= {"static.Wz": apart, "static.Ww": apart.mT}
+    return found

@@ -1,0 +1,101 @@
+"""A model that is made of blocks stays so: in a fit, in a file, and in what it computes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from reference import measure, random_cell, random_model
+
+import lfrtorch
+from lfrtorch.analysis import structure
+from lfrtorch.engine.block_form import IN_SERIES, zeros_of
+from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+pytestmark = pytest.mark.numeric
+
+KINDS = ("wiener", "hammerstein", "wiener_hammerstein", "parallel")
+
+
+def begun(kind: str, record: Record, *, nx: int = 2, seed: int = 0, **sizes: Any) -> Model:
+    bla = lfrtorch.estimate_bla(record, nx=nx)
+    branches = 2 if kind == "parallel" else 1
+    sizes = {"nz": branches, "nw": branches, "nn": 6} | sizes
+    return lfrtorch.initialise(bla, record, **sizes, structure=kind, seed=seed)
+
+
+def truth(kind: str) -> Model:
+    """A system of that structure, strongly nonlinear."""
+    branches = 2 if kind == "parallel" else 1
+    nx = 4 if kind in IN_SERIES else 2
+    cell = random_cell(1, 1, nx, branches, branches, 6, radius=0.8, feedback=1.0, seed=3)
+    cell.structure = kind
+    assert isinstance(cell.static, Network)
+    with torch.no_grad():
+        for name, zeros in zeros_of(cell).items():
+            cell.get_parameter(name).masked_fill_(zeros, 0.0)
+        cell.Dyw.fill_(0.0 if kind in IN_SERIES or kind == "hammerstein" else 1.0)
+        cell.static.Ww.mul_(2.0)
+        cell.static.Wz.mul_(2.0)
+        if kind != "wiener":
+            cell.Bw.mul_(2.0)
+    return random_model(cell)
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    return measure(random_model(random_cell(nx=2, radius=0.8, feedback=0.4)), 200)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fit_and_a_file_keep_the_blocks(kind: str, record: Record, tmp_path: Path):
+    model = begun(kind, record)
+    linear = lfrtorch.estimate_bla(record, nx=2)
+    np.testing.assert_allclose(model.simulate(record), linear.simulate(record), atol=1e-8)
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=4)
+    fitted = lfrtorch.fit(model, record, record, trainer=trainer).model
+    cell = fitted.lfr.cell
+    error = np.std(fitted.simulate(record) - record.y)
+    assert error < 0.95 * np.std(linear.simulate(record) - record.y)
+    assert zeros_of(cell)
+    for name, zeros in zeros_of(cell).items():
+        assert not cell.get_parameter(name)[zeros].any(), name
+    again = lfrtorch.load(fitted.save(tmp_path / "model"))
+    assert again.lfr.cell.structure == kind
+    assert again.parameter_count == fitted.parameter_count
+    assert again.parameter_count < sum(p.numel() for p in again.lfr.parameters())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_planted_systems_are_recovered(kind: str):
+    """From noise-free data, to a thousandth of the linear model's error on other data."""
+    system = truth(kind)
+    train, test = measure(system, 2000, seed=1), measure(system, 500, seed=2)
+    linear = lfrtorch.estimate_bla(train, nx=2)
+    models = [begun(kind, train, seed=seed, nn=8) for seed in range(4)]
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=150)
+    fitted = lfrtorch.fit(models, train, measure(system, 500, seed=3), trainer=trainer).model
+    left = np.std(fitted.simulate(test) - test.y) / np.std(linear.simulate(test) - test.y)
+    assert left < 0.02, left
+    named = {"wiener_hammerstein": "Wiener-Hammerstein"}.get(kind, kind.capitalize())
+    if kind != "parallel":
+        assert structure(fitted, train).name == named
+
+
+def test_what_a_structure_has_no_place_for_is_refused(record: Record):
+    with pytest.raises(lfrtorch.InputError, match="a w for each z"):
+        begun("parallel", record, nz=2, nw=1)
+    with pytest.raises(lfrtorch.InputError, match="use one of free, wiener"):
+        begun("volterra", record)
+    with pytest.raises(lfrtorch.InputError, match="z_feedthrough"):
+        begun("hammerstein", record, z_feedthrough=False)
+    with pytest.raises(lfrtorch.InputError, match="no relaxations"):
+        begun("wiener", record, relaxations=1)
+    with pytest.raises(lfrtorch.InputError, match="given sizes"):
+        lfrtorch.Settings(nx=2, nz="auto", structure="wiener")
