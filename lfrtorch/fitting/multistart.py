@@ -206,6 +206,11 @@ def _fitted(
             "model its own."
         )
     integer("average", average, 1)
+    if average > 1 and any(model.lfr.cell.structure != "free" for model in starts):
+        raise InputError(
+            f"average is {average}, and a mean does not keep the structure of its models; give "
+            "average=1, or models whose structure is 'free'."
+        )
     if average > 1 and not all(is_network(model.lfr.cell.static) for model in starts):
         raise InputError(
             f"average is {average}, and the mean is of models with a network as their static "

@@ -219,6 +219,11 @@ class Settings:
                 f"structure is {self.structure!r}, which is for noise='output' and given sizes; "
                 "give numbers for the sizes that are 'auto', or structure='free'."
             )
+        if self.structure != "free" and self.average > 1:
+            raise InputError(
+                f"structure is {self.structure!r}, which a mean of models does not keep, and "
+                f"average is {self.average}; give average=1 or structure='free'."
+            )
         if self.dtype not in (torch.float32, torch.float64):
             raise InputError(f"dtype is {self.dtype}; give torch.float64 or torch.float32.")
         try:

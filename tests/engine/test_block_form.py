@@ -30,20 +30,19 @@ def begun(kind: str, record: Record, *, nx: int = 2, seed: int = 0, **sizes: Any
 
 
 def truth(kind: str) -> Model:
-    """A system of that structure, strongly nonlinear."""
+    """A system of that structure, strongly nonlinear; blocks in series have a state per branch."""
     branches = 2 if kind == "parallel" else 1
-    nx = 4 if kind in IN_SERIES else 2
-    cell = random_cell(1, 1, nx, branches, branches, 6, radius=0.8, feedback=1.0, seed=3)
+    nx = 2 * branches
+    cell = random_cell(1, 1, nx, branches, branches, 4, radius=0.8, feedback=1.0, seed=3)
     cell.structure = kind
     assert isinstance(cell.static, Network)
     with torch.no_grad():
         for name, zeros in zeros_of(cell).items():
             cell.get_parameter(name).masked_fill_(zeros, 0.0)
-        cell.Dyw.fill_(0.0 if kind in IN_SERIES or kind == "hammerstein" else 1.0)
+        cell.Dyw.fill_(1.0 if kind == "wiener" else 0.0)
         cell.static.Ww.mul_(2.0)
         cell.static.Wz.mul_(2.0)
-        if kind != "wiener":
-            cell.Bw.mul_(2.0)
+        cell.Bw.mul_(2.0)
     return random_model(cell)
 
 
@@ -74,18 +73,22 @@ def test_a_fit_and_a_file_keep_the_blocks(kind: str, record: Record, tmp_path: P
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_planted_systems_are_recovered(kind: str):
-    """From noise-free steady states, to a fiftieth of the linear model's error on other data."""
+    """From noise-free steady states, to a fiftieth of the linear model's error on other data.
+
+    Validation picks one of 16 starts if the blocks are in series: the linear model does not say
+    which of its poles are before the static map and which after it.
+    """
     system = truth(kind)
     train, judge, test = (
         measure(system, T, seed=seed, start="periodic")
-        for seed, T in enumerate([1000, 400, 400], start=1)
+        for seed, T in enumerate([1024, 1024, 400], start=1)
     )
-    linear = lfrtorch.estimate_bla(train, nx=2)
-    models = [begun(kind, train, seed=seed, nn=8) for seed in range(3)]
-    trainer = lfrtorch.LevenbergMarquardt(max_iter=80)
+    nx, starts = system.lfr.cell.nx, 16 if kind in IN_SERIES else 3
+    linear = lfrtorch.estimate_bla(train, nx=nx)
+    models = [begun(kind, train, nx=nx, seed=seed, nn=4) for seed in range(starts)]
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=100)
     fitted = lfrtorch.fit(models, train, judge, trainer=trainer).model
     left = np.std(fitted.simulate(test) - test.y) / np.std(linear.simulate(test) - test.y)
-    print(kind, left)
     assert left < 0.02, left
     named = {"wiener_hammerstein": "Wiener-Hammerstein"}.get(kind, kind.capitalize())
     if kind != "parallel":
@@ -103,3 +106,8 @@ def test_what_a_structure_has_no_place_for_is_refused(record: Record):
         begun("wiener", record, relaxations=1)
     with pytest.raises(lfrtorch.InputError, match="given sizes"):
         lfrtorch.Settings(nx=2, nz="auto", structure="wiener")
+    with pytest.raises(lfrtorch.InputError, match="average"):
+        lfrtorch.Settings(nx=2, structure="wiener", average=2)
+    models = [begun("wiener", record, seed=seed) for seed in range(2)]
+    with pytest.raises(lfrtorch.InputError, match="average"):
+        lfrtorch.fit(models, record, record, average=2)
