@@ -174,9 +174,8 @@ class Model:
         """
         cell = self.lfr.cell
         halves = 2 if cell.structure in IN_SERIES else 1
-        gauge = cell.nx**2 // halves + cell.past_outputs * (
-            cell.nz + cell.ny
-        )  # zeros of a predictor
+        predicting = cell.past_outputs * (cell.nz + cell.ny)  # zeros of a predictor
+        gauge = cell.nx**2 // halves + predicting
         if cell.structure == "parallel":
             return self.parameter_count - gauge - cell.nz - cell.nw
         if isinstance(cell.static, Network | Polynomial):

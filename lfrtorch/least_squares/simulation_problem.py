@@ -15,6 +15,7 @@ from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
+from lfrtorch.engine.block_form import zeros_of
 from lfrtorch.engine.initial_state import simulate_estimated
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
@@ -96,6 +97,12 @@ class SimulationProblem(LeastSquares):
         self._ridge = self._ridge_of(ridge)
         self.fixed: Bool[Tensor, " free"] | None = fixed_parameters(lfr.cell)
         """Which entries of the module's free parameters are constants: columns of zeros in J."""
+        if (stable or contracting) and zeros_of(lfr.cell):
+            option = "stable" if stable else "contracting"
+            raise InputError(
+                f"a fit with trainer.{option}=true does not keep the structure "
+                f"'{lfr.cell.structure}'; give structure=free, or trainer.{option}=false."
+            )
         self._contracting = Contracting(lfr.cell) if contracting else None
         self._largest_pole = math.inf
         self._integrating = integrating_states(lfr.cell)
