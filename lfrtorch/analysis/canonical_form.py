@@ -182,7 +182,8 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     _, turn = _ordered(np.einsum("fsi,fsj->ij", G.conj(), G).real)
     X = turn.T @ X
     seen = seen @ turn
-    X = np.sign(np.take_along_axis(seen, np.abs(seen).argmax(axis=0)[None], 0)).T * X
+    largest = np.take_along_axis(seen, np.abs(seen).argmax(axis=0)[None], 0)
+    X = np.where(largest < 0, -1.0, 1.0).T * X  # what nobody sees keeps its sign
     back, out = _inverse(X), _inverse(W)
     made = {
         "A": X @ A @ back, "Bu": X @ Bu, "Bw": X @ Bw @ out, "Cz": Z @ Cz @ back, "Dzu": Z @ Dzu,

@@ -56,11 +56,11 @@ def test_a_fit_and_a_file_keep_the_blocks(kind: str, record: Record, tmp_path: P
     model = begun(kind, record)
     linear = lfrtorch.estimate_bla(record, nx=2)
     np.testing.assert_allclose(model.simulate(record), linear.simulate(record), atol=1e-8)
-    trainer = lfrtorch.LevenbergMarquardt(max_iter=4)
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=25)
     fitted = lfrtorch.fit(model, record, record, trainer=trainer).model
     cell = fitted.lfr.cell
     error = np.std(fitted.simulate(record) - record.y)
-    assert error < 0.95 * np.std(linear.simulate(record) - record.y)
+    assert error < 0.98 * np.std(linear.simulate(record) - record.y)
     assert zeros_of(cell)
     for name, zeros in zeros_of(cell).items():
         assert not cell.get_parameter(name)[zeros].any(), name
