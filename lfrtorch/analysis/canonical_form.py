@@ -189,7 +189,8 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
         "A": X @ A @ back, "Bu": X @ Bu, "Bw": X @ Bw @ out, "Cz": Z @ Cz @ back, "Dzu": Z @ Dzu,
         "Cy": Cy @ back, "Dyu": Dyu, "Dyw": Dyw @ out,
     }  # fmt: skip
-    same = replace(model, lfr=LFR(_cell(cell, made, slope, _inverse(Z), W)))
+    K = None if model.K is None else torch.as_tensor(X) @ model.K.double().cpu()
+    same = replace(model, lfr=LFR(_cell(cell, made, slope, _inverse(Z), W)), K=K)
     return Canonical(same, power / power.sum(), bends / max(bends.sum(), 1e-300), X, Z)
 
 

@@ -38,7 +38,13 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.prediction import SIMULATION, Noise, predicting, shown_innovation_form
+from lfrtorch.fitting.prediction import (
+    SIMULATION,
+    Noise,
+    predicting,
+    shown_innovation_form,
+    without_gain,
+)
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import (
     Fit,
@@ -168,6 +174,7 @@ def fit(
         snapshots=snapshots, stop=stop,
     )  # fmt: skip
     if noise == "output":
+        models = without_gain(models)
         return found(models, train, validation, selection, monitors=monitors)
     starts, *data = predicting(noise, models, train, validation, selection)
     result = found(

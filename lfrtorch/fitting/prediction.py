@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 from lfrtorch._support.errors import InputError
@@ -22,6 +23,13 @@ def check_noise(noise: str) -> None:
     """Refuse an unknown kind of noise with a ValueError."""
     if noise not in get_args(Noise):
         raise InputError(f"noise is {noise!r}; use 'output', 'innovation' or 'both'.")
+
+
+def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
+    """Models whose simulation is fitted: K would be that of the models before the fit."""
+    if isinstance(models, Model):
+        return models if models.K is None else replace(models, K=None)
+    return [model if model.K is None else replace(model, K=None) for model in models]
 
 
 def predicting(

@@ -218,7 +218,7 @@ def initialise(
             K = torch.cat([K, K.new_zeros(cell.nx - len(K), cell.ny)])
     model = replace(model, K=K)
     if structure != "free":
-        model = replace(model, lfr=LFR(_in_blocks(cell, structure)))
+        model = replace(model, lfr=LFR(_in_blocks(cell, structure)), K=None)
     model.lfr.cell.Dzu.requires_grad_(z_feedthrough)
     return model
 

@@ -82,20 +82,12 @@ class Jacobian:
             truncation: singular values below this part of the largest are left out.
         """
         kept, expand = self._reduced
-        precise = damping <= NORMAL * torch.finfo(expand.dtype).eps
-        total = QRAccumulator() if precise else GramAccumulator()
-        room = CACHED_BYTES
-        for part in self.parts:
-            room -= part.fold(kept, total, room)
-        total.combine(self.ranks)
-        # The accumulators have taken in [J r] in the kept columns: the last column belongs to r.
-        if isinstance(total, QRAccumulator):
-            R, r = self._reduced.columns(total.R[:, :-1]), total.R[:, -1]
-            R = R.masked_fill(self._fixed, 0.0)
-            gradient = R.mT @ r
-            rows = [R, torch.diag(self._ridge)] if self._penalised else [R]
-            system = SVDSystem(torch.cat(rows), truncation)
+        if damping <= NORMAL * torch.finfo(expand.dtype).eps:
+            R, gradient = self.factor()
+            system = SVDSystem(R, truncation)
         else:
+            total = GramAccumulator()
+            self._fold(total)
             gradient = (expand.mT @ total.G[:-1, -1]).masked_fill(self._fixed, 0.0)
             G, ridge = total.G[:-1, :-1], self._ridge.square()
             if bool((ridge == ridge[0]).all()) and not self._fixed.any():
@@ -106,7 +98,7 @@ class Jacobian:
                 G = G.masked_fill(self._fixed | self._fixed.unsqueeze(1), 0.0)
                 rank = int((~self._fixed[kept]).sum())
                 system = CholeskySystem(G + torch.diag(ridge), rank)
-        gradient = gradient + self._ridge.square() * self._penalty
+            gradient = gradient + ridge * self._penalty
         system = self._bounded(system)
         if self.ranks.world == 1:
             return system, gradient
@@ -115,13 +107,18 @@ class Jacobian:
     def factor(self) -> tuple[Float[Tensor, "k P"], Float[Tensor, " P"]]:
         """R with RᵀR = JᵀJ, and the gradient Jᵀr, of all processes."""
         total = QRAccumulator()
-        for part in self.parts:
-            part.fold(self._reduced.kept, total, 0)
-        total.combine(self.ranks)
+        self._fold(total)
         R, r = self._reduced.columns(total.R[:, :-1]), total.R[:, -1]
         R = R.masked_fill(self._fixed, 0.0)
         gradient = R.mT @ r + self._ridge.square() * self._penalty
         return torch.cat([R, torch.diag(self._ridge)] if self._penalised else [R]), gradient
+
+    def _fold(self, total: QRAccumulator | GramAccumulator) -> None:
+        """Take [J r] in the kept columns into an accumulator; the last column belongs to r."""
+        room = CACHED_BYTES
+        for part in self.parts:
+            room -= part.fold(self._reduced.kept, total, room)
+        total.combine(self.ranks)
 
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """J dθ."""

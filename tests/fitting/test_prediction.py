@@ -204,6 +204,15 @@ def test_a_fit_of_both_simulates_better_than_that_of_predictions():
     assert errors["both"] < errors["innovation"]
 
 
+def test_a_gain_goes_with_its_model_or_not_at_all():
+    model, record, _ = noisy(300)
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=1)
+    assert lfrtorch.fit(model, record, trainer=trainer).model.K is None  # of a simulation error
+    assert lfrtorch.mean_model([model, model]).K is None
+    same = lfrtorch.analysis.canonical(model, record).model
+    np.testing.assert_allclose(same.predict(record), model.predict(record), atol=1e-8)
+
+
 def test_a_checkpoint_keeps_the_gain(tmp_path: Path):
     model, record, _ = noisy(50)
     again = lfrtorch.load(model.save(tmp_path / "model"))
