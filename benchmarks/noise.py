@@ -3,6 +3,7 @@
     python benchmarks/noise.py [--runs 50] [--samples 500 2000 8000] [--only innovations states]
     python benchmarks/noise.py --circuit 2
     python benchmarks/noise.py --observer
+    python benchmarks/noise.py --iteration 6 8 12
 
 An oscillator with a softening spring (two states, one neuron) is driven by white noise of unit
 variance. A force that nobody measures acts on it, and its sensor has noise: as innovations with the
@@ -18,6 +19,9 @@ prediction one sample ahead on another record, over the rms of the true innovati
 filters of third order, a saturation between them, and noise below 2 kHz before it, at levels that
 give the rms and the error's spectrum of the estimation records; ten random multisines, of which two
 validate and are simulated without noise in the end. Printed: errors in mV.
+
+``--iteration`` times iterations of both fits on eight such records, for these nx: the cost of the
+prediction over that of the simulation, in turns, on one thread.
 """
 
 from __future__ import annotations
@@ -36,9 +40,10 @@ import torch
 import lfrtorch
 from lfrtorch._support.types import Array
 from lfrtorch.fitting.prediction import Noise
+from lfrtorch.least_squares.simulation_problem import SimulationProblem
 from lfrtorch.linear.bla import Criterion
 from lfrtorch.metrics import rms
-from lfrtorch.records import Scaler
+from lfrtorch.records import Scaler, with_past_outputs
 
 FORCE = 10.0
 """Deviation of the force that nobody measures over that of the sensor's noise, per sample, as
@@ -187,6 +192,39 @@ def of_circuit(seed: int) -> Iterator[tuple[str, float, float]]:
         yield noise, *errors(result.model)
 
 
+def iteration_seconds(nx: int, turns: int = 9) -> list[float]:
+    """Medians of the seconds of an iteration: of the simulation's fit, and of the prediction's."""
+    torch.set_num_threads(1)
+    rng, records = np.random.default_rng(0), []
+    for seed in range(8):
+        design = lfrtorch.multisine(8192, fs=RATE, band=(10.0, 15e3), rms=0.76, seed=seed)
+        u = design.u[0, :, 0]
+        records.append(lfrtorch.Record(u, circuit(u, rng)[0], fs=RATE, skip=100))
+    linear = lfrtorch.estimate_bla(records, nx, refine="prediction", max_iter=5)
+    model = lfrtorch.initialise(linear, records, nz=1, nw=1, nn=15)
+    driven = [with_past_outputs(record) for record in records]
+    problems = [
+        SimulationProblem.of(model, records),
+        SimulationProblem.of(model.predictor(), driven),
+    ]
+    found = np.array([[_seconds(problem, turn) for problem in problems] for turn in range(turns)])
+    return np.median(found[1:], axis=0).tolist()
+
+
+def _seconds(problem: SimulationProblem, turn: int) -> float:
+    """Of one iteration of one trial, near the start."""
+    theta = problem.theta + 1e-9 * turn
+    clock = time.perf_counter()
+    residual = problem.residual(theta)
+    jacobian = problem.linearise(theta)
+    system, gradient = jacobian.system(1e-3, 1e-10)
+    step = system.solve(gradient, 1e-3 * system.scale)
+    jacobian.tangent(step)
+    jacobian.adjoint(residual)
+    problem.residual(theta + 1e-3 * step)
+    return time.perf_counter() - clock
+
+
 def seconds_a_step(model: lfrtorch.Model) -> float:
     """Of the observer: the median of 20 times 500 steps."""
     observer = replace(model, K=torch.as_tensor(kalman_gain(model))).observer()
@@ -209,7 +247,17 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=["innovations", "states"])
     parser.add_argument("--circuit", type=int, default=0, help="draws of the circuit")
     parser.add_argument("--observer", action="store_true", help="time a step of the observer")
+    parser.add_argument("--iteration", type=int, nargs="*", default=[], help="nx to time")
     options = parser.parse_args()
+    if options.iteration:
+        print("| nx | simulation: ms | prediction: ms | ratio |")
+        print("|---" * 4 + "|")
+    for nx in options.iteration:
+        own, ahead = iteration_seconds(nx)
+        print(f"| {nx} | {1e3 * own:.0f} | {1e3 * ahead:.0f} | {ahead / own:.2f} |")
+        sys.stdout.flush()
+    if options.iteration:
+        return 0
     truth = oscillator()
     if options.observer:
         print(f"{1e6 * seconds_a_step(truth):.1f} µs a step of observer.predict and update")

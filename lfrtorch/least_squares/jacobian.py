@@ -90,8 +90,9 @@ class Jacobian:
             self._fold(total)
             gradient = (expand.mT @ total.G[:-1, -1]).masked_fill(self._fixed, 0.0)
             G, ridge = total.G[:-1, :-1], self._ridge.square()
-            if bool((ridge == ridge[0]).all()) and not self._fixed.any():
-                system = ReducedSystem(G, expand, float(ridge[0]))
+            free = ridge[~self._fixed]
+            if bool((free == free[0]).all()) and not self._fixed[kept].any():
+                system = ReducedSystem(G, expand, float(free[0]))
             else:
                 # JᵀJ = expandᵀ G expand: the columns first, then the rows of a symmetric matrix.
                 G = self._reduced.columns(self._reduced.columns(G).mT)
