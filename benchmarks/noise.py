@@ -4,6 +4,7 @@
     python benchmarks/noise.py --circuit 2
     python benchmarks/noise.py --observer
     python benchmarks/noise.py --iteration 6 8 12
+    python benchmarks/noise.py --folds DIR
 
 An oscillator with a softening spring (two states, one neuron) is driven by white noise of unit
 variance. A force that nobody measures acts on it, and its sensor has noise: as innovations with the
@@ -22,6 +23,10 @@ validate and are simulated without noise in the end. Printed: errors in mV.
 
 ``--iteration`` times iterations of both fits on eight such records, for these nx: the cost of the
 prediction over that of the simulation, in turns, on one thread.
+
+``--folds`` leaves out each of the ten estimation records of the Wiener-Hammerstein benchmark with
+process noise in turn, and fits the others. ``DIR`` holds its files. Printed: errors one sample
+ahead on the record left out, in mV; of the simulation's fit it is its simulation error.
 """
 
 from __future__ import annotations
@@ -31,6 +36,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +57,10 @@ deviations of the states."""
 
 RATE = 78125.0
 """Of the circuit, Hz."""
+
+FOLDS: tuple[tuple[Noise, int, Criterion], ...]
+FOLDS = ("output", 6, "simulation"), ("innovation", 8, "prediction")
+"""Fits to the records of the benchmark: those of the filters, or with the noise."""
 
 SETTLING = 200
 """Samples that are not scored."""
@@ -192,6 +202,28 @@ def of_circuit(seed: int) -> Iterator[tuple[str, float, float]]:
         yield noise, *errors(result.model)
 
 
+def of_folds(root: Path) -> Iterator[tuple[str, dict[str, float]]]:
+    """Each record left out, and the errors one sample ahead of each fit to the others."""
+    data = lfrtorch.datasets.wh_process_noise.load(root=root)
+    records = [*data.train, *data.validation]
+    for number, left_out in enumerate(records):
+        train = [record for i, record in enumerate(records) if i != number]
+        errors: dict[str, float] = {}
+        for noise, nx, refine in FOLDS:
+            linear = lfrtorch.estimate_bla(train, nx, refine=refine)
+            starts = [
+                lfrtorch.initialise(linear, train, nz=1, nw=1, nn=15, seed=s) for s in range(2)
+            ]
+            trainer = lfrtorch.LevenbergMarquardt(max_iter=60)
+            result = lfrtorch.fit(starts, train, noise=noise, trainer=trainer, monitors=[[]] * 2)
+            for name, model in ("linear", linear), ("", result.model):
+                y_hat = (
+                    model.predict(left_out) if refine == "prediction" else model.simulate(left_out)
+                )
+                errors[f"{noise} {name}".strip()] = lfrtorch.rmse(left_out, y_hat)
+        yield left_out.name, errors
+
+
 def iteration_seconds(nx: int, turns: int = 9) -> list[float]:
     """Medians of the seconds of an iteration: of the simulation's fit, and of the prediction's."""
     torch.set_num_threads(1)
@@ -225,6 +257,24 @@ def _seconds(problem: SimulationProblem, turn: int) -> float:
     return time.perf_counter() - clock
 
 
+def print_folds(root: Path) -> int:
+    """The table of the records left out, and the mean differences with their standard errors."""
+    table: dict[str, list[float]] = {}
+    for name, errors in of_folds(root):
+        if not table:
+            print("| left out |", " | ".join(errors), "|\n" + "|---" * (1 + len(errors)) + "|")
+        print("|", " | ".join([name, *(f"{1e3 * error:.3f}" for error in errors.values())]), "|")
+        sys.stdout.flush()
+        for each, error in errors.items():
+            table.setdefault(each, []).append(1e3 * error)
+    ahead = np.array(table.pop("innovation"))
+    for each, found in table.items():
+        less = np.array(found) - ahead
+        deviation = less.std(ddof=1) / np.sqrt(len(less))
+        print(f"{each} - innovation: {less.mean():.3f} +- {deviation:.3f} mV")
+    return 0
+
+
 def seconds_a_step(model: lfrtorch.Model) -> float:
     """Of the observer: the median of 20 times 500 steps."""
     observer = replace(model, K=torch.as_tensor(kalman_gain(model))).observer()
@@ -248,7 +298,10 @@ def main() -> int:
     parser.add_argument("--circuit", type=int, default=0, help="draws of the circuit")
     parser.add_argument("--observer", action="store_true", help="time a step of the observer")
     parser.add_argument("--iteration", type=int, nargs="*", default=[], help="nx to time")
+    parser.add_argument("--folds", type=Path, help="folder of the estimation records")
     options = parser.parse_args()
+    if options.folds:
+        return print_folds(options.folds)
     if options.iteration:
         print("| nx | simulation: ms | prediction: ms | ratio |")
         print("|---" * 4 + "|")
