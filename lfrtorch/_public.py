@@ -18,6 +18,7 @@ from lfrtorch.linear.order_scan import OrderScan, scan_orders
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.model import Model, load, simulate_blocks
 
 # fits
@@ -25,6 +26,7 @@ from lfrtorch.fitting.distillation import distil
 from lfrtorch.fitting.inference import infer
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.noise_estimate import estimate_noise
 from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
@@ -61,6 +63,7 @@ __all__ = [
     "LinearModel",
     "Model",
     "Network",
+    "NoiseCovariance",
     "Observer",
     "OrderScan",
     "Polynomial",
@@ -79,6 +82,7 @@ __all__ = [
     "distributed",
     "estimate_bla",
     "estimate_frf",
+    "estimate_noise",
     "export",
     "fit",
     "identify",

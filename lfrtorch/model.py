@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -28,6 +28,11 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network
 from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
 from lfrtorch.engine.simulation import Trajectory
+from lfrtorch.extended_kalman_filter import (
+    ExtendedKalmanFilter,
+    NoiseCovariance,
+    inside_limits,
+)
 from lfrtorch.records import (
     Channel,
     NormalisedRecord,
@@ -38,11 +43,16 @@ from lfrtorch.records import (
     check_start,
     with_past_outputs,
 )
-from lfrtorch.state_observer import StateObserver
+from lfrtorch.state_observer import StateObserver, SteadyGainObserver
 
 NO_GAIN = (
     "this model has no innovation gain K: fit it with noise='innovation', from a start with the "
     "linear model of estimate_bla(..., refine='prediction')."
+)
+
+NO_OBSERVER = (
+    "this model has no innovation gain K: give noise=lfrtorch.NoiseCovariance(Q, R) for a Kalman "
+    "filter, or fit it with noise='innovation'."
 )
 
 
@@ -280,18 +290,45 @@ class Model:
                 x = after[:-1]
         return record.shown(self.scaler.restore_y(y.double().cpu().numpy()))
 
+    @overload
     def observer(
         self, *, after: Record | None = None, x0: ArrayLike | None = None
+    ) -> SteadyGainObserver: ...
+
+    @overload
+    def observer(
+        self,
+        *,
+        noise: NoiseCovariance,
+        after: Record | None = None,
+        x0: ArrayLike | None = None,
+        P0: ArrayLike = 1.0,
+    ) -> ExtendedKalmanFilter: ...
+
+    def observer(
+        self,
+        *,
+        noise: NoiseCovariance | None = None,
+        after: Record | None = None,
+        x0: ArrayLike | None = None,
+        P0: ArrayLike = 1.0,
     ) -> StateObserver:
         """What follows the states of the running system, sample by sample.
 
+        With the covariances of the noise it is an extended Kalman filter, of any model. Otherwise
+        it has the constant gain K of a model in innovation form.
+
         Args:
-            after: what was measured until now; the states go on from its end.
+            noise: on states and outputs. Default: the gain K.
+            after: what was measured until now; the states go on from its end. A filter begins at
+                its first sample from x = 0 and P0.
             x0: where they begin otherwise, in the model's coordinates. Default: 0.
+            P0: covariance of where a filter begins, variances, or one. Default: 1, as the states
+                of a model have about unit rms.
 
         Raises:
-            ValueError: a model without K, both a record and a state, or a record of other channels
-                or another rate.
+            ValueError: neither K nor noise, covariances that are none, both a record and a state,
+                or a record of other channels or another rate.
 
         Example:
             >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
@@ -299,16 +336,27 @@ class Model:
             >>> observer = started.observer(after=record[:100])
             >>> np.allclose(observer.predict(record.u[100]), started.predict(record[:101])[100])
             True
+            >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
+            >>> x0 = model.observer(noise=noise, after=record[:100]).state
+            >>> model.simulate(record.u[100:], start="given", x0=x0).shape
+            (300, 1)
         """
-        if self.K is None:
-            raise InputError(NO_GAIN)
         if after is not None:
             if x0 is not None:
                 raise InputError("after and x0 both say where the states begin; give one of them.")
             self.check(after)
+        known = self.lfr.cell, self.scaler, self.inputs, self.outputs
+        zero = np.zeros(self.lfr.cell.nx)
+        if noise is not None:
+            found = ExtendedKalmanFilter(*known, zero if x0 is None else x0, noise, P0)
+            if after is not None:
+                found.follow(after.u, inside_limits(after))
+            return found
+        if self.K is None:
+            raise InputError(NO_OBSERVER)
+        if after is not None:
             x0 = self.predictor().signals(with_past_outputs(after)).x[0, -1].double().numpy()
-        x0 = np.zeros(self.lfr.cell.nx) if x0 is None else x0
-        return StateObserver(self.lfr.cell, self.K, self.scaler, self.inputs, self.outputs, x0)
+        return SteadyGainObserver(*known, zero if x0 is None else x0, self.K)
 
     def predictor(self) -> Model:
         """The model of the output one sample ahead; its inputs are u, then y.

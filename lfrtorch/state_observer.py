@@ -1,9 +1,11 @@
-"""States online: predictions of a model in innovation form, one sample after another."""
+"""States online: a model follows a running system, one sample after another."""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from copy import deepcopy
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import torch
@@ -19,22 +21,121 @@ from lfrtorch.engine.simulation_kernel import simulate_record
 from lfrtorch.records import Channel, Scaler
 
 
-class StateObserver:
+class StateObserver(ABC):
     """Follows the states of a running system: ``predict`` the output, then ``update`` by it.
 
     It works in float64, in machine code if the static map is the package's own. ``Model.observer``
-    makes it.
+    makes one with the constant gain K, or an extended Kalman filter.
 
     Args:
         cell, scaler, inputs, outputs: of the model.
-        K: innovation gain, normalised.
         x0: where the states begin, in the model's coordinates.
 
     Shape:
-        K: (nx, ny), x0: (nx,).
+        x0: (nx,).
 
     Raises:
         ValueError: a state of another size.
+    """
+
+    def __init__(
+        self,
+        cell: LFRCell,
+        scaler: Scaler,
+        inputs: tuple[Channel, ...],
+        outputs: tuple[Channel, ...],
+        x0: ArrayLike,
+    ) -> None:
+        cell = deepcopy(cell).double().cpu()
+        self._cell, self._scaler, self._inputs, self._outputs = cell, scaler, inputs, outputs
+        self._u, self._x = np.zeros((1, 1, cell.nu)), np.zeros((1, 2, cell.nx))
+        z, w, self._y = (np.zeros((1, 1, size)) for size in (cell.nz, cell.nw, cell.ny))
+        self._weights = kernel_arguments(cell) if is_compiled(cell, cell.A.detach()) else None
+        self._call: list[Any] | None = None
+        if self._weights is not None:
+            self._call = [0, self._u, *self._weights, 0.0, self._x, z, w, self._y]
+        self._predicted = False
+        # Parts of those arrays: making one takes longer than a product of small matrices.
+        self._u_now, self._y_hat = self._u[0, 0], self._y[0, 0]
+        self._x_now, self._x_next = self._x[0]
+        x = np.asarray(x0, dtype=np.float64)
+        if x.shape != (cell.nx,) or not np.isfinite(x).all():
+            raise InputError(f"x0 has the shape {x.shape}; give {cell.nx} finite numbers.")
+        self._x_now[:] = x
+
+    @property
+    def state(self) -> Float[Array, " nx"]:
+        """The states at the next sample to be predicted, in the model's coordinates."""
+        return self._x_now.copy()
+
+    def predict(self, u: ArrayLike) -> Float[Array, " ny"]:
+        """The output at this sample, from its input and all samples before it; physical units.
+
+        It may be called several times, for several inputs; the last one counts.
+
+        Args:
+            u: the input now, (nu,) or a number.
+
+        Raises:
+            ValueError: another number of inputs, or one that is not finite.
+        """
+        scaler, given = self._scaler, _sample(u, self._inputs, "u")
+        if not all(map(math.isfinite, given.tolist())):
+            raise InputError(f"u is {given}; give finite numbers.")
+        np.subtract(given, scaler.u_offset, out=self._u_now)
+        np.divide(self._u_now, scaler.u_scale, out=self._u_now)
+        if self._call is not None:
+            self._x_next.fill(np.nan)  # no trajectory that this one could meet
+            simulate_record(*self._call)
+        else:
+            with torch.no_grad():
+                y, x = self._cell(torch.as_tensor(self._u[0]), torch.as_tensor(self._x[0, :1]))
+            self._y_hat[:], self._x_next[:] = y[0].numpy(), x[0].numpy()
+        self._predicted = True
+        y_hat = scaler.y_scale * self._y_hat
+        return np.add(y_hat, scaler.y_offset, out=y_hat)
+
+    def update(self, y: ArrayLike | None) -> Float[Array, " ny"]:
+        """Go on to the next sample; returns the error of the prediction, y - y_hat.
+
+        Args:
+            y: the output that was measured, (ny,) or a number, with NaN for one that is missing;
+                None if all are. The error of a missing output is NaN, and changes no state.
+
+        Raises:
+            ValueError: another number of outputs, an infinite one, or nothing was predicted.
+        """
+        if not self._predicted:
+            raise InputError("nothing was predicted at this sample: call predict(u) before.")
+        if y is None:
+            given = np.full(len(self._outputs), np.nan)
+        else:
+            given = _sample(y, self._outputs, "y")
+            if any(map(math.isinf, given.tolist())):
+                raise InputError(f"y is {given}; give finite numbers, or NaN for a missing output.")
+        measured = given - self._scaler.y_offset
+        np.divide(measured, self._scaler.y_scale, out=measured)
+        e = measured - self._y_hat
+        self._go_on(measured, e)
+        self._predicted = False
+        return np.multiply(e, self._scaler.y_scale, out=e)
+
+    @abstractmethod
+    def _go_on(self, y: Float[Array, " ny"], e: Float[Array, " ny"]) -> None:
+        """Write the next states over those of now, from y and e = y - y_hat, normalised."""
+
+
+@final
+class SteadyGainObserver(StateObserver):
+    """The predictor of the innovation form: x+ = f(x, u) + K e.
+
+    Args:
+        cell, scaler, inputs, outputs: of the model.
+        x0: where the states begin, in the model's coordinates.
+        K: innovation gain, normalised.
+
+    Shape:
+        x0: (nx,), K: (nx, ny).
 
     Example:
         >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
@@ -49,85 +150,25 @@ class StateObserver:
     def __init__(
         self,
         cell: LFRCell,
-        K: Tensor,
         scaler: Scaler,
         inputs: tuple[Channel, ...],
         outputs: tuple[Channel, ...],
         x0: ArrayLike,
+        K: Tensor,
     ) -> None:
-        cell = deepcopy(cell).double().cpu()
-        self._cell, self._scaler, self._inputs, self._outputs = cell, scaler, inputs, outputs
+        super().__init__(cell, scaler, inputs, outputs, x0)
         self._K = K.double().cpu().numpy()
-        self._u, self._x = np.zeros((1, 1, cell.nu)), np.zeros((1, 2, cell.nx))
-        z, w, self._y = (np.zeros((1, 1, size)) for size in (cell.nz, cell.nw, cell.ny))
-        self._call: list[Any] | None = None
-        if is_compiled(cell, cell.A.detach()):
-            weights = kernel_arguments(cell)
-            self._call = [0, self._u, *weights, 0.0, self._x, z, w, self._y]
-        self._predicted = False
-        x = np.asarray(x0, dtype=np.float64)
-        if x.shape != (cell.nx,) or not np.isfinite(x).all():
-            raise InputError(f"x0 has the shape {x.shape}; give {cell.nx} finite numbers.")
-        self._x[0, 0] = x
 
-    @property
-    def state(self) -> Float[Array, " nx"]:
-        """The states at the next sample to be predicted, in the model's coordinates."""
-        return self._x[0, 0].copy()
-
-    def predict(self, u: ArrayLike) -> Float[Array, " ny"]:
-        """The output at this sample, from its input and all samples before it; physical units.
-
-        It may be called several times, for several inputs; the last one counts.
-
-        Args:
-            u: the input now, (nu,) or a number.
-
-        Raises:
-            ValueError: another number of inputs, or one that is not finite.
-        """
-        scaler = self._scaler
-        self._u[0, 0] = (_sample(u, self._inputs, "u") - scaler.u_offset) / scaler.u_scale
-        if self._call is not None:
-            self._x[0, 1] = np.nan  # no trajectory that this one could meet
-            simulate_record(*self._call)
-        else:
-            with torch.no_grad():
-                y, x = self._cell(torch.as_tensor(self._u[0]), torch.as_tensor(self._x[0, :1]))
-            self._y[0, 0], self._x[0, 1] = y[0].numpy(), x[0].numpy()
-        self._predicted = True
-        return scaler.y_offset + scaler.y_scale * self._y[0, 0]
-
-    def update(self, y: ArrayLike | None) -> Float[Array, " ny"]:
-        """Go on to the next sample; returns the error of the prediction, y - y_hat.
-
-        Args:
-            y: the output that was measured, (ny,) or a number; None if it is missing: the states
-                then go on as the model has them, and the error is NaN.
-
-        Raises:
-            ValueError: another number of outputs, one that is not finite, or nothing was predicted.
-        """
-        if not self._predicted:
-            raise InputError("nothing was predicted at this sample: call predict(u) before.")
-        scaler, x = self._scaler, self._x
-        if y is None:
-            e = np.full(len(scaler.y_scale), np.nan)
-            x[0, 0] = x[0, 1]
-        else:
-            measured = (_sample(y, self._outputs, "y") - scaler.y_offset) / scaler.y_scale
-            e = measured - self._y[0, 0]
-            x[0, 0] = x[0, 1] + self._K @ e
-        self._predicted = False
-        return scaler.y_scale * e
+    def _go_on(self, y: Float[Array, " ny"], e: Float[Array, " ny"]) -> None:
+        missing = any(map(math.isnan, e.tolist()))
+        np.matmul(self._K, np.nan_to_num(e) if missing else e, out=self._x_now)
+        np.add(self._x_now, self._x_next, out=self._x_now)
 
 
 def _sample(values: ArrayLike, channels: tuple[Channel, ...], name: str) -> Array:
     """One sample of some channels."""
-    found = np.asarray(values, dtype=np.float64)
+    found = np.asarray(values, np.float64)
     if found.size != len(channels) or found.ndim > 1:
         names = ", ".join(channel.name for channel in channels)
         raise InputError(f"{name} has the shape {found.shape}; give a number for each of {names}.")
-    if not np.isfinite(found).all():
-        raise InputError(f"{name} is {found}; give finite numbers (None for a missing output).")
-    return found
+    return found.reshape(-1)

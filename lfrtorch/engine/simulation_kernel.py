@@ -35,7 +35,7 @@ def simulate_record(
     u, x, z, w, y = u[r], x[r], z[r], w[r], y[r]
     h, before = np.empty(Ww.shape[1], u.dtype), np.empty(Ww.shape[1], u.dtype)
     for k in range(len(u)):
-        _affine(Cz, x[k], Dzu, u[k], z[k])
+        affine(Cz, x[k], Dzu, u[k], z[k])
         if len(growth):
             h[0] = 1.0
             for n in range(len(growth)):
@@ -46,7 +46,7 @@ def simulate_record(
             for j in range(z.shape[1]):
                 for n in range(len(h)):
                     h[n] += WzT[j, n] * z[k, j]
-            _activate(activation, h)
+            activate(activation, h)
         for first in range(0, len(inner), len(h) + 1):
             h, before = before, h
             for n in range(len(h)):
@@ -54,10 +54,10 @@ def simulate_record(
             for j in range(len(h)):
                 for n in range(len(h)):
                     h[n] += inner[first + j, n] * before[j]
-            _activate(activation, h)
+            activate(activation, h)
         for i in range(w.shape[1]):
             w[k, i] = bw[i] + _dot(Ww[i], h)
-        _affine(Cy, x[k], Dyu, u[k], y[k])
+        affine(Cy, x[k], Dyu, u[k], y[k])
         for i in range(len(Dyw)):
             for j in range(w.shape[1]):
                 y[k, i] += Dyw[i, j] * w[k, j]
@@ -78,7 +78,7 @@ def simulate_record(
 
 
 @njit(nogil=True, inline="always")
-def _affine(C, x, D, u, out):
+def affine(C, x, D, u, out):
     """Out = C x + D u."""
     for i in range(len(out)):
         a = out.dtype.type(0)
@@ -98,7 +98,7 @@ def _dot(a, b):
 
 
 @njit(nogil=True, fastmath={"contract"})
-def _activate(activation, h):
+def activate(activation, h):
     """σ of all neurons in place, in loops that the compiler can turn into vector instructions."""
     if activation == 0:
         for n in range(len(h)):

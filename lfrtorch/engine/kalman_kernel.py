@@ -1,0 +1,230 @@
+"""The extended Kalman filter in machine code, on square roots of covariances.
+
+The states have the error covariance P = U Uᵀ, and the noise of a sample, that of the outputs and
+then that of the states, has the covariance G Gᵀ = [R Sᵀ; S Q]. With H = ∂y/∂x at the predicted
+state, the innovation e, the states x and their noise w together have the root M::
+
+        [ e ]   [ Gy  H U ]                   [ Λ½         ]
+        [ x ] : [ 0   U   ]  reflected to M = [ Lx  rest   ]
+        [ w ]   [ Gw  0   ]                   [ Lw  of M   ]
+
+Reflections of the columns (QR) make the first rows lower triangular. The state that knows the
+output is then x + Lx Λ^-½ e, the noise that the output tells of is Lw Λ^-½ e, and the rest of M is
+the root of what both still may be: no covariance is ever a difference of two. With F = ∂x+/∂x at
+that state, the root of the next covariance is [F I] times the rest. An output that is missing has
+no row in M.
+
+References:
+    Kailath, Sayed and Hassibi, "Linear Estimation", 2000, chapter 12 (array algorithms).
+    Anderson and Moore, "Optimal Filtering", 1979, section 8.2 (extended Kalman filter).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from lfrtorch.engine.simulation_kernel import activate, affine
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def filter_record(
+    u, y, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, inner, activation, growth, G, x, U
+):
+    """Take x and U over all samples; returns log p(y). NaN in y is a missing output.
+
+    The weights between y and G are those that ``simulate_record`` takes, of one model.
+
+    Shape:
+        u: (T, nu), y: (T, ny), G: (ny + nx, ny + nx), x: (nx,), U: (nx, nx).
+    """
+    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = A[0], Bu[0], Bw[0], Cz[0], Dzu[0], Cy[0], Dyu[0], Dyw[0]
+    WzT, Ww, bz, bw, inner = WzT[0], Ww[0], bz[0, 0], bw[0, 0], inner[0]
+    (nx, nw), nz, ny = Bw.shape, len(Cz), len(Cy)
+    z, w, J, by_x = np.empty(nz), np.empty(nw), np.empty((nw, nz)), np.empty((nw, nx))
+    e, H, F, w_hat = np.empty(ny), np.empty((ny, nx)), np.empty((nx, nx)), np.empty(nx)
+    x_next, total = np.empty(nx), 0.0
+    for k in range(len(u)):
+        affine(Cz, x, Dzu, u[k], z)
+        _static(z, WzT, Ww, bz, bw, inner, activation, growth, w, J)
+        affine(Cy, x, Dyu, u[k], e)
+        for i in range(ny):
+            e[i] = y[k, i] - e[i]
+            for q in range(nw):
+                e[i] -= Dyw[i, q] * w[q]
+        _slope(Cy, Dyw, J, Cz, by_x, H)
+        M, known, log_p = correct(e, H, G, x, U, w_hat)
+        total += log_p
+        affine(Cz, x, Dzu, u[k], z)
+        _static(z, WzT, Ww, bz, bw, inner, activation, growth, w, J)
+        affine(A, x, Bu, u[k], x_next)
+        for i in range(nx):
+            x_next[i] += w_hat[i]
+            for q in range(nw):
+                x_next[i] += Bw[i, q] * w[q]
+        _slope(A, Bw, J, Cz, by_x, F)
+        propagate(F, M, known, U)
+        for i in range(nx):
+            x[i] = x_next[i]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def correct(e, H, G, x, U, w_hat):
+    """Let x know the output; write the noise of the states into w_hat.
+
+    Returns:
+        M, the number of outputs that are known, and log p(e).
+
+    Shape:
+        e: (ny,), NaN if missing, H: (ny, nx), G: (ny + nx, ny + nx), x, w_hat: (nx,), U: (nx, nx).
+    """
+    ny, nx = H.shape
+    total, known = ny + nx, 0
+    for i in range(ny):
+        known += e[i] == e[i]
+    M, found = np.zeros((known + 2 * nx, total + nx)), np.empty(known)
+    row = 0
+    for i in range(ny):
+        if e[i] == e[i]:
+            found[row] = e[i]
+            for j in range(total):
+                M[row, j] = G[i, j]
+            for n in range(nx):
+                for j in range(nx):
+                    M[row, total + j] += H[i, n] * U[n, j]
+            row += 1
+    for i in range(nx):
+        for j in range(nx):
+            M[known + i, total + j] = U[i, j]
+        for j in range(total):
+            M[known + nx + i, j] = G[ny + i, j]
+        w_hat[i] = 0.0
+    reflect(M, known)
+    log_p = 0.0
+    for a in range(known):
+        for b in range(a):
+            found[a] -= M[a, b] * found[b]
+        found[a] /= M[a, a]
+        log_p -= 0.5 * (found[a] * found[a] + math.log(2.0 * math.pi * M[a, a] * M[a, a]))
+        for i in range(nx):
+            x[i] += M[known + i, a] * found[a]
+            w_hat[i] += M[known + nx + i, a] * found[a]
+    return M, known, log_p
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def propagate(F, M, known, U):
+    """Overwrite U by the root at the next sample, from the M and the count of ``correct``."""
+    nx, first = len(U), known + len(U)
+    N = M[first:, known:].copy()
+    for i in range(nx):
+        for n in range(nx):
+            for j in range(N.shape[1]):
+                N[i, j] += F[i, n] * M[known + n, known + j]
+    reflect(N, nx)
+    for i in range(nx):
+        for j in range(nx):
+            U[i, j] = N[i, j]
+
+
+@njit(nogil=True, error_model="numpy")
+def reflect(M, rows):
+    """M times an orthogonal matrix, in place, that makes its first rows lower triangular."""
+    for k in range(rows):
+        square = 0.0
+        for j in range(k, M.shape[1]):
+            square += M[k, j] * M[k, j]
+        if square == 0.0:
+            continue
+        # The mirror image of row k has -sign(M_kk) |row| on the diagonal; v is their difference.
+        diagonal = -math.copysign(math.sqrt(square), M[k, k])
+        v = M[k, k] - diagonal
+        scale = 1.0 / (square - diagonal * M[k, k])  # 2 / |v|²
+        for i in range(k + 1, len(M)):
+            a = M[i, k] * v
+            for j in range(k + 1, M.shape[1]):
+                a += M[i, j] * M[k, j]
+            a *= scale
+            M[i, k] -= a * v
+            for j in range(k + 1, M.shape[1]):
+                M[i, j] -= a * M[k, j]
+        M[k, k] = diagonal
+        for j in range(k + 1, M.shape[1]):
+            M[k, j] = 0.0
+
+
+@njit(nogil=True, error_model="numpy")
+def _static(z, WzT, Ww, bz, bw, inner, activation, growth, w, J):
+    """Write w = f(z) and J = ∂w/∂z: derivatives go forward with the values."""
+    nz, nn = len(z), Ww.shape[1]
+    h, dh = np.empty(nn), np.zeros((nn, nz))
+    if len(growth):
+        h[0] = 1.0
+        for n in range(len(growth)):
+            before, factor = growth[n, 0], growth[n, 1]
+            h[n + 1] = h[before] * z[factor]
+            for j in range(nz):
+                dh[n + 1, j] = dh[before, j] * z[factor]
+            dh[n + 1, factor] += h[before]
+    else:
+        for n in range(nn):
+            h[n] = bz[n]
+            for j in range(nz):
+                h[n] += WzT[j, n] * z[j]
+                dh[n, j] = WzT[j, n]
+        _activate(activation, h, dh)
+    for first in range(0, len(inner), nn + 1):
+        before, d_before = h, dh
+        h, dh = inner[first + nn].copy(), np.zeros((nn, nz))
+        for m in range(nn):
+            for n in range(nn):
+                h[n] += inner[first + m, n] * before[m]
+                for j in range(nz):
+                    dh[n, j] += inner[first + m, n] * d_before[m, j]
+        _activate(activation, h, dh)
+    for q in range(len(w)):
+        w[q] = bw[q]
+        for n in range(nn):
+            w[q] += Ww[q, n] * h[n]
+        for j in range(nz):
+            J[q, j] = 0.0
+            for n in range(nn):
+                J[q, j] += Ww[q, n] * dh[n, j]
+
+
+@njit(nogil=True, error_model="numpy")
+def _activate(activation, h, dh):
+    """h = σ(h), and the rows of dh times σ'(h)."""
+    v = h.copy()
+    activate(activation, h)
+    for n in range(len(h)):
+        if activation == 0:
+            slope = 1.0 - h[n] * h[n]
+        elif activation == 1:
+            slope = h[n] * (1.0 - h[n])
+        elif activation == 2:
+            slope = 1.0 if v[n] > 0.0 else 0.0
+        elif activation == 3:
+            slope = -2.0 * v[n] * h[n]
+        else:
+            slope = 1.0 / (1.0 + math.exp(-v[n]))
+        for j in range(dh.shape[1]):
+            dh[n, j] *= slope
+
+
+@njit(nogil=True, error_model="numpy")
+def _slope(constant, B, J, Cz, by_x, out):
+    """Out = constant + B J Cz; by_x is a place for J Cz."""
+    for q in range(len(by_x)):
+        for n in range(Cz.shape[1]):
+            by_x[q, n] = 0.0
+            for j in range(len(Cz)):
+                by_x[q, n] += J[q, j] * Cz[j, n]
+    for i in range(len(out)):
+        for n in range(Cz.shape[1]):
+            out[i, n] = constant[i, n]
+            for q in range(len(by_x)):
+                out[i, n] += B[i, q] * by_x[q, n]

@@ -1,0 +1,209 @@
+"""The extended Kalman filter of a model, and the covariances of noise that it needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.kalman_kernel import correct, filter_record, propagate
+from lfrtorch.engine.linearised import linearise
+from lfrtorch.records import Channel, Record, Scaler
+from lfrtorch.state_observer import StateObserver
+
+ROUNDING = 1e-9
+"""Eigenvalues of a covariance that are negative by this part of the largest one are rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseCovariance:
+    """Covariances of white noise w on the states and v on the outputs::
+
+        x+ = f(x, u) + w        Q = E w wᵀ,  R = E v vᵀ,  S = E w vᵀ
+        y  = h(x, u) + v
+
+    A number is the variance of each, a vector has the variances. ``lfrtorch.estimate_noise`` finds
+    them from records.
+
+    Args:
+        Q: of the states, in the model's coordinates. 0: nothing disturbs them.
+        R: of the outputs, in their units squared; positive definite.
+        S: of states and outputs. Default: 0, none of the noise is in both.
+
+    Shape:
+        Q: (nx, nx), (nx,) or a number, R: (ny, ny), (ny,) or a number, S: (nx, ny).
+
+    Example:
+        >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
+        >>> observer = model.observer(noise=noise, after=record[:100])
+        >>> y_hat = observer.predict(record.u[100])
+        >>> e = observer.update(record.y[100])
+        >>> observer.state.shape, observer.covariance.shape
+        ((1,), (1, 1))
+    """
+
+    Q: ArrayLike
+    R: ArrayLike
+    S: ArrayLike | None = None
+
+    def root(self, nx: int, ny: int) -> Float[Array, "n n"]:
+        """G with G Gᵀ = [R Sᵀ; S Q] in the same units, lower triangular in blocks.
+
+        Raises:
+            ValueError: a covariance of another size, one that is not finite, symmetric and
+                positive, or an S that is too large for Q and R.
+        """
+        Q, R = _covariance("Q", self.Q, nx), _covariance("R", self.R, ny)
+        S = np.zeros((nx, ny)) if self.S is None else np.asarray(self.S, dtype=np.float64)
+        if S.shape != (nx, ny) or not np.isfinite(S).all():
+            raise InputError(
+                f"S has the shape {S.shape}; give ({nx}, {ny}) finite numbers, states by outputs."
+            )
+        try:
+            Gy = np.linalg.cholesky(R)
+        except np.linalg.LinAlgError:
+            raise InputError(
+                "R is not positive definite; every output needs noise of its own, if only a little."
+            ) from None
+        across = np.linalg.solve(Gy, S.T).T
+        own = _root(Q - across @ across.T, np.abs(Q).max())
+        if own is None:
+            raise InputError(
+                "Q - S R⁻¹ Sᵀ has a negative eigenvalue; S is no covariance with this Q and R."
+            )
+        return np.block([[Gy, np.zeros((ny, nx))], [across, own]])
+
+
+@final
+class ExtendedKalmanFilter(StateObserver):
+    """The extended Kalman filter: the gain follows from the noise and the model's Jacobians.
+
+    ``update`` corrects the states by the output, with ∂y/∂x at their prediction, and takes them
+    to the next sample, with ∂x+/∂x where they now are. All covariances are kept as square roots,
+    and no covariance is a difference of two. A missing output corrects nothing, and the covariance
+    grows.
+
+    Args:
+        cell, scaler, inputs, outputs: of the model.
+        x0: where the states begin, in the model's coordinates.
+        noise: on states and outputs.
+        P0: covariance of x0, its variances, or one number for all states.
+
+    Shape:
+        x0: (nx,), P0: (nx, nx), (nx,) or a number.
+
+    Raises:
+        ValueError: a state or a covariance of another size, or one that is none.
+
+    References:
+        Anderson and Moore, "Optimal Filtering", 1979, section 8.2.
+
+    Example:
+        >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
+        >>> observer = model.observer(noise=noise)
+        >>> before = observer.covariance
+        >>> for u, y in zip(record.u[:50], record.y[:50]):
+        ...     y_hat = observer.predict(u)
+        ...     e = observer.update(y)
+        >>> bool(observer.covariance[0, 0] < 0.01 * before[0, 0])
+        True
+    """
+
+    def __init__(
+        self,
+        cell: LFRCell,
+        scaler: Scaler,
+        inputs: tuple[Channel, ...],
+        outputs: tuple[Channel, ...],
+        x0: ArrayLike,
+        noise: NoiseCovariance,
+        P0: ArrayLike = 1.0,
+    ) -> None:
+        super().__init__(cell, scaler, inputs, outputs, x0)
+        nx, ny = cell.nx, cell.ny
+        self._G = noise.root(nx, ny)
+        self._G[:ny] /= np.asarray(scaler.y_scale)[:, None]
+        P = _covariance("P0", P0, nx)
+        U = _root(P, np.abs(P).max())
+        if U is None:
+            raise InputError("P0 has a negative eigenvalue; give a covariance of the states.")
+        self._U = U
+
+    @property
+    def covariance(self) -> Float[Array, "nx nx"]:
+        """Of the error of ``state``, in the model's coordinates."""
+        return self._U @ self._U.T
+
+    def follow(self, u: Float[Array, "T nu"], y: Float[Array, "T ny"]) -> float:
+        """Go on over many samples at once, as ``predict`` and ``update`` would one by one.
+
+        Args:
+            u, y: inputs and outputs, physical units, NaN for missing outputs.
+
+        Returns:
+            The logarithm of the probability density of y, normalised by the scale of the outputs.
+        """
+        u = np.ascontiguousarray(self._scaler.normalise_u(u), dtype=np.float64)
+        y = np.ascontiguousarray(self._scaler.normalise_y(y), dtype=np.float64)
+        self._predicted = False
+        return self._filtered(u, y)
+
+    def _go_on(self, y: Float[Array, " ny"], e: Float[Array, " ny"]) -> None:
+        self._filtered(self._u[0], y[None])
+
+    def _filtered(self, u: Float[Array, "T nu"], y: Float[Array, "T ny"]) -> float:
+        x, total = self._x_now, 0.0
+        if self._weights is not None:
+            call: list[Any] = [u, y, *self._weights, self._G, x, self._U]
+            return filter_record(*call)
+        w_hat = np.zeros_like(x)
+        for u_k, y_k in zip(torch.as_tensor(u), y, strict=True):
+            y_hat, _, _, H = self._step(u_k, x)
+            M, known, log_p = correct(y_k - y_hat, H, self._G, x, self._U, w_hat)
+            _, x_next, F, _ = self._step(u_k, x)
+            propagate(F, M, known, self._U)
+            x[:], total = x_next + w_hat, total + log_p
+        return total
+
+    @torch.no_grad()
+    def _step(self, u: torch.Tensor, x: Array) -> tuple[Array, Array, Array, Array]:
+        """y, x+, F = ∂x+/∂x and H = ∂y/∂x of a map that is not compiled."""
+        state = torch.as_tensor(x)
+        y, x_next = self._cell(u, state)
+        F, H = linearise(self._cell, self._cell.internal(u, state)[0][None, None])
+        return y.numpy(), x_next.numpy(), F[0, 0].contiguous().numpy(), H[0, 0].contiguous().numpy()
+
+
+def inside_limits(record: Record) -> Float[Array, "T ny"]:
+    """The outputs of a record, NaN where they may be beyond its limits."""
+    return np.where(record.beyond, np.nan, record.y)
+
+
+def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
+    """A covariance from itself, its variances, or one variance."""
+    value = np.asarray(given, dtype=np.float64)
+    if value.ndim < 2 and value.size in (1, size):
+        value = np.diag(np.broadcast_to(value, size))
+    if value.shape != (size, size):
+        raise InputError(
+            f"{name} has the shape {value.shape}; give ({size}, {size}), {size} variances, or one."
+        )
+    rounding = ROUNDING * np.abs(value).max()
+    if not (np.isfinite(value).all() and (np.abs(value - value.T) <= rounding).all()):
+        raise InputError(f"{name} is not symmetric, or not finite; give a covariance.")
+    return (value + value.T) / 2.0
+
+
+def _root(P: Float[Array, "n n"], size: float) -> Float[Array, "n n"] | None:
+    """U with U Uᵀ = P; None if P has a negative eigenvalue, relative to a size."""
+    values, vectors = np.linalg.eigh(P)
+    if values[0] < -ROUNDING * size:
+        return None
+    return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0)))

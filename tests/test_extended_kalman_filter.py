@@ -1,0 +1,209 @@
+"""The extended Kalman filter beside textbook formulas, and on systems that have its noise."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+import torch
+from exported import MODELS, cell_step, inputs, jacobians
+from reference import normal, random_cell, random_model
+
+import lfrtorch
+from lfrtorch import NoiseCovariance
+from lfrtorch._support.types import Array
+from lfrtorch.model import Model
+
+pytestmark = pytest.mark.numeric
+
+
+def some_noise(model: Model, seed: int = 0) -> NoiseCovariance:
+    """Correlated noise on all states and outputs."""
+    nx, ny = model.lfr.cell.nx, model.lfr.cell.ny
+    root = 0.2 * np.random.default_rng(seed).normal(size=(nx + ny, nx + ny + 1))
+    joint, scale = root @ root.T, model.scaler.y_scale
+    R = joint[nx:, nx:] * scale[:, None] * scale
+    return NoiseCovariance(joint[:nx, :nx], R, joint[:nx, nx:] * scale)
+
+
+def step(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
+    """x+ and y, physical units."""
+    with torch.no_grad():
+        x_next, y = cell_step(model, torch.tensor(x), torch.tensor(u))
+    return x_next.numpy(), y.numpy()
+
+
+def textbook(
+    model: Model, noise: NoiseCovariance, x: Array, P: Array, u: Array, y: Array
+) -> tuple[Array, Array]:
+    """One sample by covariances, in physical units; outputs that are NaN are left out."""
+    Q, R, S = (np.asarray(each) for each in (noise.Q, noise.R, noise.S))
+    known = np.isfinite(y)
+    e = (y - step(model, x, u)[1])[known]
+    H = jacobians(model, x, u)[2][known]
+    R, S = R[known][:, known], S[:, known]
+    innovations = H @ P @ H.T + R
+    L, from_e = P @ H.T @ np.linalg.inv(innovations), S @ np.linalg.inv(innovations)
+    x = x + L @ e
+    F, I_LH = jacobians(model, x, u)[0], np.eye(len(x)) - L @ H
+    P = I_LH @ P @ I_LH.T + L @ R @ L.T
+    both = F @ L @ S.T
+    return step(model, x, u)[0] + from_e @ e, F @ P @ F.T + Q - from_e @ S.T - both - both.T
+
+
+def with_own_map(model: Model) -> Model:
+    """The same model with a module that is not compiled."""
+    cell = copy.deepcopy(model.lfr.cell)
+    assert cell.static is not None
+    cell.static = torch.nn.Sequential(cell.static)
+    return replace(model, lfr=lfrtorch.LFR(cell))
+
+
+CASES = MODELS | {"own": with_own_map(MODELS["layers"])}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_states_and_covariance_are_those_of_the_textbook(name: str):
+    model, T = CASES[name], 12
+    noise = some_noise(model)
+    rng = np.random.default_rng(1)
+    u = inputs(model, T)
+    y = model.simulate(u) + 0.3 * model.scaler.y_scale * rng.normal(size=(T, len(model.outputs)))
+    y[4, 0] = y[7] = np.nan
+    x, P = 0.1 * rng.normal(size=model.lfr.cell.nx), 0.5 * np.eye(model.lfr.cell.nx)
+    observer = model.observer(noise=noise, x0=x, P0=0.5)
+    at_once = model.observer(noise=noise, x0=x, P0=P)
+    for u_k, y_k in zip(u, y, strict=True):
+        y_hat = observer.predict(u_k)
+        np.testing.assert_allclose(y_hat, step(model, x, u_k)[1], rtol=1e-9, atol=1e-12)
+        e = observer.update(None if np.isnan(y_k).all() else y_k)
+        np.testing.assert_allclose(e, y_k - y_hat, atol=1e-12)
+        x, P = textbook(model, noise, x, P, u_k, y_k)
+        np.testing.assert_allclose(observer.state, x, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(observer.covariance, P, rtol=1e-9, atol=1e-12)
+    at_once.follow(u, y)
+    np.testing.assert_allclose(at_once.state, observer.state, rtol=1e-12)
+    np.testing.assert_allclose(at_once.covariance, observer.covariance, rtol=1e-12)
+
+
+def test_a_linear_model_settles_at_the_solution_of_the_riccati_equation():
+    model = MODELS["linear"]
+    noise = some_noise(model)
+    observer = model.observer(noise=noise)
+    u = inputs(model, 400)
+    observer.follow(u, model.simulate(u))
+    F, _, H, _ = jacobians(model, np.zeros(3), u[0])
+    P = scipy.linalg.solve_discrete_are(F.T, H.T, noise.Q, noise.R, s=noise.S)
+    np.testing.assert_allclose(observer.covariance, P, rtol=1e-9, atol=1e-12)
+
+
+def test_the_likelihood_is_that_of_all_outputs_together():
+    """y of a linear model is normal; its covariance is built from the responses to all noise."""
+    model, T = MODELS["linear"], 6
+    noise, s = some_noise(model), model.scaler
+    F, _, H, _ = jacobians(model, np.zeros(3), s.u_offset)
+    Q, R, S = (np.asarray(each) for each in (noise.Q, noise.R, noise.S))
+    joint = np.block([[Q, S], [S.T, R]])
+    responses = np.zeros((T, 2, 3 + 5 * T))  # to x0, and w and v of every sample
+    for k in range(T):
+        responses[k, :, :3] = H @ np.linalg.matrix_power(F, k)
+        for j in range(k):
+            at = 3 + 5 * j
+            responses[k, :, at : at + 3] = H @ np.linalg.matrix_power(F, k - 1 - j)
+        responses[k, :, 3 + 5 * k + 3 : 3 + 5 * k + 5] = np.eye(2)
+    flat = (responses / s.y_scale[:, None]).reshape(2 * T, -1)
+    inside = scipy.linalg.block_diag(2.0 * np.eye(3), *[joint] * T)
+    u = inputs(model, T)
+    y_hat = model.simulate(u)
+    y = y_hat + s.y_scale * np.random.default_rng(3).normal(size=(T, 2))
+    expected = scipy.stats.multivariate_normal.logpdf(
+        ((y - y_hat) / s.y_scale).ravel(), cov=flat @ inside @ flat.T
+    )
+    assert model.observer(noise=noise, P0=2.0).follow(u, y) == pytest.approx(expected, rel=1e-9)
+
+
+def test_with_the_noise_of_an_innovation_form_it_has_the_gain_K():
+    model = replace(random_model(random_cell(2, 2, 3, 2, 1, 4)), K=0.2 * normal(3, 2, seed=5))
+    assert model.K is not None
+    K, R = model.K.numpy() / model.scaler.y_scale, np.diag([0.3, 0.2])
+    noise = NoiseCovariance(K @ R @ K.T, R, K @ R)
+    steady, observer = model.observer(), model.observer(noise=noise, P0=0.0)
+    u = inputs(model, 50)
+    y = model.simulate(u) + np.random.default_rng(0).normal(size=(50, 2))
+    for u_k, y_k in zip(u, y, strict=True):
+        np.testing.assert_allclose(observer.predict(u_k), steady.predict(u_k), rtol=1e-9)
+        for each in (observer, steady):
+            each.update(y_k)
+    assert np.abs(observer.covariance).max() < 1e-12
+    observer.predict(u[0])
+    observer.update([np.nan, y[0, 1]])
+    assert np.trace(observer.covariance) > 1e-3  # what is not measured is not known
+
+
+@pytest.mark.parametrize("name", ["tanh", "polynomial"])
+def test_errors_are_as_large_as_the_covariance_says(name: str):
+    """NEES: e' P⁻¹ e has the mean nx; 60 independent runs leave the square root of 2 nx / 60."""
+    model, runs, T = MODELS[name], 60, 40
+    nx, ny = model.lfr.cell.nx, len(model.outputs)
+    scale, rng = model.scaler.y_scale, np.random.default_rng(0)
+    noise = NoiseCovariance(Q=4e-4, R=1e-2 * scale**2)
+    u, x, y = inputs(model, T), 0.1 * rng.normal(size=(runs, nx)), np.empty((runs, T, ny))
+    for k in range(T):
+        x_next, y[:, k] = step(model, x, np.tile(u[k], (runs, 1)))
+        y[:, k] += 0.1 * scale * rng.normal(size=(runs, ny))
+        x = x_next + 0.02 * rng.normal(size=(runs, nx))
+    squares = []
+    for each, end in zip(y, x, strict=True):
+        observer = model.observer(noise=noise, P0=0.01)
+        observer.follow(u, each)
+        e = observer.state - end
+        squares.append(e @ np.linalg.solve(observer.covariance, e))
+    low, high = scipy.stats.chi2.ppf([1e-4, 1 - 1e-4], runs * nx) / runs
+    assert low < np.mean(squares) < high
+
+
+def test_past_data_give_the_state_where_a_simulation_starts():
+    """Also without outputs in between: the start of a free run, from any x0."""
+    model, rng = MODELS["tanh"], np.random.default_rng(0)
+    u = inputs(model, 300)
+    truth = model.simulate(u, start="given", x0=[3.0, -2.0, 1.0, 2.0])
+    y = truth + 0.01 * model.scaler.y_scale * rng.normal(size=truth.shape)
+    record = lfrtorch.Record(u, y, fs=model.fs, inputs=model.inputs, outputs=model.outputs)
+    noise = NoiseCovariance(Q=0.0, R=(0.01 * model.scaler.y_scale) ** 2)
+    x0 = model.observer(noise=noise, after=record[:10]).state
+    found = model.simulate(u[10:], start="given", x0=x0)
+    error = np.abs(found - truth[10:]) / model.scaler.y_scale
+    assert error.max() < 0.05
+    rest = np.abs(model.simulate(u[10:]) - truth[10:]) / model.scaler.y_scale
+    assert rest.max() > 0.2
+
+
+@pytest.mark.parametrize(
+    ("said", "given"),
+    [
+        ("no innovation gain K: give noise", {}),
+        ("Q has the shape", {"noise": NoiseCovariance(Q=[1.0, 2.0], R=1.0)}),
+        ("Q is not symmetric", {"noise": NoiseCovariance(Q=np.triu(np.ones((3, 3))), R=1.0)}),
+        ("Q is not symmetric, or not finite", {"noise": NoiseCovariance(Q=np.inf, R=1.0)}),
+        ("negative eigenvalue", {"noise": NoiseCovariance(Q=-1.0, R=1.0)}),
+        ("negative eigenvalue", {"noise": NoiseCovariance(1.0, 1.0, 2.0 * np.ones((3, 2)))}),
+        ("R is not positive", {"noise": NoiseCovariance(Q=1.0, R=0.0)}),
+        ("S has the shape", {"noise": NoiseCovariance(1.0, 1.0, np.ones((2, 3)))}),
+        ("P0 has a negative", {"noise": NoiseCovariance(1.0, 1.0), "P0": [1.0, -1.0, 1.0]}),
+        ("x0 has the shape", {"noise": NoiseCovariance(1.0, 1.0), "x0": [1.0]}),
+    ],
+)
+def test_what_is_no_noise_is_refused(said: str, given: dict[str, Any]):
+    with pytest.raises(lfrtorch.InputError, match=said):
+        MODELS["linear"].observer(**given)
+
+
+def test_an_infinite_output_is_refused():
+    observer = MODELS["linear"].observer(noise=NoiseCovariance(1.0, 1.0))
+    observer.predict([0.0, 0.0])
+    with pytest.raises(lfrtorch.InputError, match="NaN for a missing output"):
+        observer.update([np.inf, 0.0])
