@@ -36,6 +36,7 @@ from lfrtorch.least_squares.linear_systems import (
 )
 from lfrtorch.least_squares.output_columns import OutputColumns
 from lfrtorch.least_squares.record_groups import RecordGroup
+from lfrtorch.least_squares.start_states import EliminatedSystem, Eliminator, StartStates
 
 NORMAL = 1e4
 """Relative damping, in rounding errors, above which the normal equations are as good as QR."""
@@ -49,7 +50,8 @@ class Jacobian:
 
     Args:
         parts: the rows of each group of records.
-        reduced: the columns that are computed.
+        reduced: the columns that are computed; of the shared parameters alone if the parts
+            eliminate start states.
         ridge: factors of θ - θ_0, the last entries of the residual of the first process.
         penalty: θ - θ_0.
         ranks: the processes that hold the parts.
@@ -82,6 +84,9 @@ class Jacobian:
             truncation: singular values below this part of the largest are left out.
         """
         kept, expand = self._reduced
+        if len(self._ridge) > self._shared:
+            system, gradient = self._eliminated(damping, truncation)
+            return self._bounded(system), gradient
         if damping <= NORMAL * torch.finfo(expand.dtype).eps:
             R, gradient = self.factor()
             system = SVDSystem(R, truncation)
@@ -105,6 +110,33 @@ class Jacobian:
             return system, gradient
         return BroadcastSystem(system, self.ranks), self.ranks.first(gradient)
 
+    @property
+    def _shared(self) -> int:
+        """Number of parameters whose columns all records have."""
+        return self._reduced.expand.shape[1]
+
+    def _eliminated(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
+        """The system and the gradient, the start states eliminated."""
+        gram = damping > NORMAL * torch.finfo(self._ridge.dtype).eps
+        total = GramAccumulator() if gram else QRAccumulator()
+        self._fold(total)
+        found = [part.states for part in self.parts if part.states is not None]
+        states = StartStates(*map(torch.cat, zip(*found, strict=True)))
+        fixed = self._fixed[: self._shared]
+        states = states._replace(A=states.A.masked_fill(fixed, 0.0))
+        if isinstance(total, GramAccumulator):
+            left, gradient = total.G[:-1, :-1], total.G[:-1, -1]
+            left = left.masked_fill(fixed | fixed.unsqueeze(1), 0.0)
+        else:
+            left = total.R[:, :-1].masked_fill(fixed, 0.0)
+            gradient = left.mT @ total.R[:, -1]
+        whole = torch.zeros_like(self._ridge)
+        whole[: self._shared] = gradient + torch.einsum("rij,ri->j", states.A, states.r)
+        whole[states.place] = torch.einsum("rij,ri->rj", states.Vh, states.s * states.r)
+        ridge = self._ridge.square()
+        system = EliminatedSystem(left, states, ridge, gram=gram, truncation=truncation)
+        return system, whole.masked_fill(self._fixed, 0.0) + ridge * self._penalty
+
     def factor(self) -> tuple[Float[Tensor, "k P"], Float[Tensor, " P"]]:
         """R with RᵀR = JᵀJ, and the gradient Jᵀr, of all processes."""
         total = QRAccumulator()
@@ -124,7 +156,7 @@ class Jacobian:
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """J dθ."""
         d_theta = d_theta.masked_fill(self._fixed, 0.0)
-        reduced = self._reduced.expand @ d_theta
+        reduced = self._reduced.expand @ d_theta[: self._shared]
         parts = [part.tangent(d_theta, reduced).flatten() for part in self.parts]
         return torch.cat([*parts, *([self._ridge * d_theta] if self._own_penalty else [])])
 
@@ -138,7 +170,7 @@ class Jacobian:
             own = residual[first : first + shape.numel()].reshape(shape)
             first += own.numel()
             part.adjoint(own, gradient, reduced)
-        gradient = gradient + self._reduced.expand.mT @ reduced
+        gradient[: self._shared] += self._reduced.expand.mT @ reduced
         if self._own_penalty:
             gradient = gradient + self._ridge * residual[first:]
         return self.ranks.sum(gradient.masked_fill(self._fixed, 0.0))
@@ -194,6 +226,8 @@ class Part:
         linearisation: the model along them.
         x0: where the initial state of each record stands in θ, if they are parameters.
         memory: buffers for the rows.
+        eliminate: whether ``fold`` eliminates these initial states, instead of taking their columns
+            into the accumulator.
     """
 
     def __init__(
@@ -202,8 +236,13 @@ class Part:
         linearisation: Linearisation,
         x0: Int[Tensor, "R nx"] | None,
         memory: Memory,
+        *,
+        eliminate: bool = False,
     ) -> None:
         self.group, self.linearisation, self.x0, self._memory = group, linearisation, x0, memory
+        self._eliminate = eliminate and x0 is not None
+        self.states: StartStates | None = None
+        """The initial states that the last ``fold`` eliminated."""
         self._buffer: Tensor | None = None
         self._cached: _Cached | None = None
         self._tied: tuple[Tensor, Tensor, Tensor] | None = None
@@ -233,7 +272,8 @@ class Part:
         among_kept = torch.arange(len(own), device=own.device)
         direct = None
         computed = size <= room or self.computed is not None
-        if isinstance(total, GramAccumulator) and group.plain and not computed:
+        plain = group.plain and not self._eliminate
+        if isinstance(total, GramAccumulator) and plain and not computed:
             direct = OutputColumns(linearisation, own)
             own, among_kept = direct.without(own), direct.without(among_kept)
             shape = (*errors.shape, shape[-1] - len(direct.place))
@@ -244,6 +284,9 @@ class Part:
         # record has an accumulator of its own then.
         each = self.has_initial_state
         accumulators = [type(total)() for _ in (group.u if each else group.u[:1])]
+        eliminator = None
+        if self._eliminate and self.x0 is not None:
+            eliminator = Eliminator(self.x0, group.u.shape[1], total)
         end = errors.new_empty(len(errors), nx, shape[-1] - 1)
         for block in blocks:
             rows, records = block.rows, block.records
@@ -251,7 +294,9 @@ class Part:
             weighted = group.weigh(rows, records, block.time)
             if cache and not group.plain:
                 rows.copy_(weighted)
-            if each:
+            if eliminator is not None:
+                eliminator.fold(weighted.flatten(1, 2), block.time)
+            elif each:
                 for accumulator, of_record in zip(accumulators[records], weighted, strict=True):
                     accumulator.fold(of_record.flatten(0, 1))
             else:
@@ -265,6 +310,8 @@ class Part:
         self._tied = None if initial is None else (kept, places, initial)
         # The residual is the last column before and after.
         last = places.new_full((len(places), 1), len(kept))
+        if eliminator is not None:
+            self.states, accumulators = eliminator.found(), []
         for r, accumulator in enumerate(accumulators):
             place = torch.cat([places, last], dim=1)[r]
             tie = None if initial is None else initial[r]
@@ -307,7 +354,7 @@ class Part:
         places = among_kept.to(end.device).expand(len(end), K)
         if self.linearisation.periodic:
             return places, fixed_point(end[:, :, K:], end[:, :, :K])
-        if self.x0 is not None:
+        if self.x0 is not None and not self._eliminate:
             before = (kept < self.linearisation.parameters).sum()
             own = self.x0.to(end.device) - self.linearisation.parameters + before
             places = torch.cat([places, own], dim=1)
@@ -323,6 +370,8 @@ class Part:
             if initial is not None:
                 d_x0 = (initial @ by_column.unsqueeze(-1)).squeeze(-1)
                 by_column = torch.cat([by_column, d_x0], dim=1)
+            elif self._eliminate:
+                by_column = torch.cat([by_column, d_theta[self.x0]], dim=1)
             d_y = rows.new_empty(rows.shape[:2])
             spread(_product, len(rows), rows, by_column, d_y)
             return d_y.reshape(self.group.residual_shape)
@@ -350,6 +399,9 @@ class Part:
             if initial is not None:
                 by_column, d_x0 = by_column.split([places.shape[1], initial.shape[1]], dim=1)
                 by_column = by_column + (initial.mT @ d_x0.unsqueeze(-1)).squeeze(-1)
+            elif self._eliminate:
+                by_column, d_x0 = by_column.split([places.shape[1], self.x0.shape[1]], dim=1)
+                gradient[self.x0] += d_x0
             reduced.index_add_(0, places.flatten(), by_column.flatten())
             return
         adjoint = self.linearisation.adjoint(self.group.unweigh(residual))

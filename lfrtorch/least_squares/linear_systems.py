@@ -94,7 +94,7 @@ class CholeskySystem:
         finite = bool(torch.isfinite(G).all())
         self._G, self.rank = G, rank
         self._latest: tuple[float, Tensor] | None = None  # damping and Cholesky factor
-        self.scale = _largest_eigenvalue(G) if finite else float("nan")
+        self.scale = largest_eigenvalue(G) if finite else float("nan")
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient; NaN if rounding errors leave no positive definite matrix."""
@@ -144,7 +144,7 @@ class ReducedSystem:
         return self._expand.mT @ kept.squeeze(-1)
 
 
-def _largest_eigenvalue(G: Float[Tensor, "P P"]) -> float:
+def largest_eigenvalue(G: Float[Tensor, "P P"]) -> float:
     """Of a symmetric matrix; of a large one by a Krylov subspace, some thirty products with it."""
     if len(G) < KRYLOV or G.device.type != "cpu":
         return float(torch.linalg.eigvalsh(G)[-1])

@@ -87,10 +87,8 @@ class PredictionProblem(SimulationProblem):
         change = (self._system_theta(own + steps) - self._system_theta(own - steps)).mT / 2.0
         change = torch.cat([change, change.new_zeros(len(change), len(theta) - P)], dim=1)
         simulated = self._simulated.linearise(self._system_theta(theta), reduce=reduce)
-        return _Both(
-            super().linearise(theta, reduce=reduce), simulated, change, self.weight,
-            self._simulations,
-        )  # fmt: skip
+        predicted = super().linearise(theta, reduce=reduce, eliminate=False)
+        return _Both(predicted, simulated, change, self.weight, self._simulations)
 
     @property
     def _parameter_count(self) -> int:

@@ -187,30 +187,39 @@ class SimulationProblem(LeastSquares):
         found = self.ranks.first(stabilised(A, self._integrating, self._largest_pole))
         return theta if found is A else torch.cat([found.flatten(), theta[nx**2 :]])
 
-    def linearise(self, theta: Float[Tensor, " P"], *, reduce: bool = True) -> Jacobian:
+    def linearise(
+        self, theta: Float[Tensor, " P"], *, reduce: bool = True, eliminate: bool = True
+    ) -> Jacobian:
         """dr/dθ at θ.
 
         Args:
             theta: θ.
             reduce: whether columns that gauge directions make dependent are left out of the rows.
+            eliminate: whether initial states are eliminated if they outnumber the parameters; a
+                system without damping, or its factor, needs them all.
         """
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
         self.guesses = [t.x for t in trajectories]
         cell = self.lfr.cell
-        parts, P = [], len(theta) - self._initial_states.numel()
+        states = self._initial_states.numel()
+        parts, P = [], len(theta) - states
+        eliminate = eliminate and states > P and self.ranks.world == 1
         for group, trajectory in zip(self.groups, trajectories, strict=True):
-            x0 = group.estimated if self._initial_states.numel() else None
+            x0 = group.estimated if states else None
             if x0 is not None:
                 x0 = P + cell.nx * x0.unsqueeze(1) + torch.arange(cell.nx)
             periodic = group.start == "periodic"
             linearisation = Linearisation(cell, group.u, trajectory, periodic=periodic)
-            parts.append(Part(group.counted(trajectory.y), linearisation, x0, self._memory))
+            counted = group.counted(trajectory.y)
+            parts.append(Part(counted, linearisation, x0, self._memory, eliminate=eliminate))
         fixed = None
         if self.fixed is not None:
             fixed = torch.zeros_like(theta, dtype=torch.bool)
             fixed[: len(self.fixed)] = self.fixed.to(fixed)
-        if reduce:
+        if eliminate:
+            reduced = everything(theta[:P])
+        elif reduce:
             held = any(group.x0 is not None for group in self.groups)
             held = bool(self.ranks.sum(self._theta_0.new_tensor(float(held))))
             reduced = reduction(

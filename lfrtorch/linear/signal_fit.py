@@ -88,7 +88,9 @@ class SignalFit:
         cell = problem.lfr.cell
         cost = problem.cost(problem.residual(problem.theta))
         if np.isfinite(cost):
-            system, gradient = problem.linearise(problem.theta).system(0.0, TRUNCATION)
+            system, gradient = problem.linearise(problem.theta, eliminate=False).system(
+                0.0, TRUNCATION
+            )
             if np.isfinite(system.scale):
                 theta = problem.theta + system.solve(gradient, 0.0)
                 cost = problem.cost(problem.residual(theta))
@@ -149,7 +151,7 @@ class SignalFit:
                 driven = K @ constant + Bu[:, -1]
                 at_rest = np.linalg.solve(np.eye(len(A)) - A - K @ C, driven)
                 constant = np.asarray(constant + C @ at_rest, dtype=np.float64)
-        system, _ = problem.linearise(state.theta).system(0.0, TRUNCATION)
+        system, _ = problem.linearise(state.theta, eliminate=False).system(0.0, TRUNCATION)
         assert isinstance(system, SVDSystem)
         covariance = None
         if state.iteration:

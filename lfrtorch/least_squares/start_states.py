@@ -1,0 +1,164 @@
+"""Start states that are parameters: each is eliminated from its own record.
+
+Of θ = (φ, x0 of record 1, x0 of record 2, ...) each record sees φ and its own start state. So
+JᵀJ + λI has entries between φ and everything else alone, and with A and B, the columns of φ and of
+x0 in the rows of a record, every x0 follows from φ: a system in φ is left, whose size does not
+grow with the number of records. That of all of θ takes time with the cube of it.
+
+With B = U s Vᵀ the start states leave A - U (Uᵀ A) of the rows for φ at λ = 0. A damping λ keeps
+them from following φ all the way, and λ / (s² + λ) of each row of Uᵀ A remains.
+
+References:
+    Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems
+    whose variables separate", SIAM J. Numerical Analysis 10, 1973.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lfrtorch.least_squares.linear_systems import (
+    GramAccumulator,
+    QRAccumulator,
+    SVDSystem,
+    largest_eigenvalue,
+)
+
+
+class StartStates(NamedTuple):
+    """What the rows of records say about their start states, in the coordinates Vᵀ x0.
+
+    Args:
+        place: where each start state stands in θ.
+        s, Vh: B = U s Vᵀ.
+        A, r: Uᵀ A and Uᵀ r.
+    """
+
+    place: Int[Tensor, "R nx"]
+    s: Float[Tensor, "R nx"]
+    Vh: Float[Tensor, "R nx nx"]
+    A: Float[Tensor, "R nx P"]
+    r: Float[Tensor, "R nx"]
+
+
+class Eliminator:
+    """Folds the rows of φ that the start states leave into an accumulator.
+
+    Args:
+        place: where each record's start state stands in θ.
+        samples: of each record.
+        total: takes in rows of [A r].
+    """
+
+    def __init__(
+        self,
+        place: Int[Tensor, "R nx"],
+        samples: int,
+        total: QRAccumulator | GramAccumulator,
+    ) -> None:
+        self._place, self._samples, self._total = place, samples, total
+        self._found: list[tuple[Tensor, ...]] = []
+        self._begun: list[QRAccumulator] = []
+
+    def fold(self, rows: Float[Tensor, "R m columns"], time: slice) -> None:
+        """Add rows [A B r] of some records at some samples; records come one after another."""
+        if time.start == 0 and time.stop == self._samples:
+            self._eliminate(rows)
+            return
+        if time.start == 0:
+            self._begun = [QRAccumulator() for _ in rows]
+        for begun, own in zip(self._begun, rows, strict=True):
+            begun.fold(own)
+        if time.stop == self._samples:
+            self._eliminate(torch.stack([begun.R for begun in self._begun]))
+
+    def found(self) -> StartStates:
+        """Those of all records."""
+        s, Vh, A, r = (torch.cat(parts) for parts in zip(*self._found, strict=True))
+        return StartStates(self._place.to(s.device), s, Vh, A, r)
+
+    def _eliminate(self, rows: Float[Tensor, "R m columns"]) -> None:
+        nx = self._place.shape[1]
+        A, B, r = rows.split([rows.shape[2] - nx - 1, nx, 1], dim=2)
+        A = torch.cat([A, r], dim=2)
+        if rows.shape[1] < nx:
+            A, B = (torch.nn.functional.pad(t, (0, 0, 0, nx - rows.shape[1])) for t in (A, B))
+        if not torch.isfinite(B).all():
+            A, B = torch.full_like(A, torch.nan), torch.zeros_like(B)
+        U, s, Vh = torch.linalg.svd(B, full_matrices=False)
+        seen = U.mT @ A
+        self._total.fold((A - U @ seen).flatten(0, 1))
+        self._found.append((s, Vh, seen[..., :-1], seen[..., -1]))
+
+
+class EliminatedSystem:
+    """The system of φ and start states, from what is left in φ.
+
+    Args:
+        left: GramAccumulator's matrix or QRAccumulator's factor of the rows that are left for φ.
+        gram: which of the two it is.
+        states: of all records.
+        ridge: what is added to the diagonal of JᵀJ; the same for all start states.
+        truncation: singular values below this part of the largest are left out, from a factor.
+    """
+
+    def __init__(
+        self,
+        left: Float[Tensor, "k P"],
+        states: StartStates,
+        ridge: Float[Tensor, " all"],
+        *,
+        gram: bool,
+        truncation: float,
+    ) -> None:
+        self._left, self._states, self._gram = left, states, gram
+        P = left.shape[1]
+        self._ridge, self._own = ridge[:P], float(ridge[P])
+        self._A = states.A.flatten(0, 1)
+        self._truncation = truncation
+        self._latest: tuple[float, SVDSystem | Tensor] | None = None
+        whole = (left if gram else left.mT @ left) + self._A.mT @ self._A + self._ridge.diag()
+        self.scale, self.rank = float("nan"), P + states.s.numel()
+        if torch.isfinite(whole).all():
+            # JᵀJ's largest eigenvalue is at most that of φ's block plus that of the states'.
+            largest = float(states.s.square().max()) + self._own
+            self.scale = max(largest_eigenvalue(whole), largest)
+
+    def solve(self, gradient: Float[Tensor, " all"], damping: float) -> Float[Tensor, " all"]:
+        """-(JᵀJ + λI)⁻¹ gradient."""
+        place, s, Vh, A, _ = self._states
+        P = self._left.shape[1]
+        own = (Vh @ gradient[place].unsqueeze(-1)).squeeze(-1)
+        damped = s.square() + self._own + damping
+        shared = gradient[:P] - (A.mT @ (s / damped * own).unsqueeze(-1)).sum(0).squeeze(-1)
+        step = self._shared_step(shared, damping)
+        moved = (own + s * (A @ step)) / damped
+        found = torch.zeros_like(gradient)
+        found[:P] = step
+        found[place] = -(Vh.mT @ moved.unsqueeze(-1)).squeeze(-1)
+        return found
+
+    def _shared_step(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
+        """That of φ."""
+        if self._latest is None or self._latest[0] != damping:
+            self._latest = damping, self._decomposed(damping)
+        found = self._latest[1]
+        if isinstance(found, SVDSystem):
+            return found.solve(gradient, damping)
+        return -torch.cholesky_solve(gradient.unsqueeze(-1), found).squeeze(-1)
+
+    def _decomposed(self, damping: float) -> SVDSystem | Tensor:
+        """A decomposition of what is left for φ at that damping."""
+        squares, extra = self._states.s.square().flatten(), self._own + damping
+        rest = (extra / (squares + extra)).sqrt().unsqueeze(1) * self._A
+        if not self._gram:
+            R = torch.cat([self._left, rest, self._ridge.sqrt().diag()])
+            return SVDSystem(torch.linalg.qr(R, mode="r").R, self._truncation)
+        G = self._left + rest.mT @ rest
+        G.diagonal().add_(self._ridge + damping)
+        L, failed = torch.linalg.cholesky_ex(G)
+        return torch.full_like(L, torch.nan) if failed else L
