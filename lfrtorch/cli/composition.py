@@ -22,6 +22,9 @@ from lfrtorch.cli.words import GROUPS
 SWEEPS = {"-m", "--multirun"}
 """Options that make several runs of several values."""
 
+WITHOUT_DATA = ("export",)
+"""Commands that read no data."""
+
 
 def take_words(command: str, whole: Callable[[Sequence[str]], list[str]] = list) -> None:
     """Check the command line, and leave it to Hydra with quotes around what it cannot read without.
@@ -69,7 +72,7 @@ def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) ->
     cfg = composed(command, [first_run(word) for word in every if is_choice(word)])
     for word in words:
         if not (is_choice(word) or word.is_delete() or taken(word, cfg)):
-            raise InputError(unknown(word, cfg))
+            raise InputError(unknown(command, word, cfg))
     composed(command, [first_run(word) for word in every])
 
 
@@ -136,12 +139,14 @@ def taken(word: Override, cfg: DictConfig) -> bool:
     return name in node.keys()  # noqa: SIM118, a DictConfig contains no key that is yet to be given
 
 
-def unknown(word: Override, cfg: DictConfig) -> str:
+def unknown(command: str, word: Override, cfg: DictConfig) -> str:
     """What to write for a setting that there is not."""
     key = word.key_or_group
     _, value = str(word.input_line).split("=", 1)
-    if key.startswith("data.") and cfg.get("data") is None:
-        return f"{key} is of no use before data are chosen: add data=file, or +bench=NAME."
+    if command not in WITHOUT_DATA and cfg.get("data") is None:
+        if key.startswith("data."):
+            return f"{key} is of no use before data are chosen: add data=file, or +bench=NAME."
+        cfg = DictConfig({**cfg, "data": OmegaConf.load(CONF / "data" / "file.yaml")})
     names = dict(spelt(cfg))
     close = get_close_matches(key, names, n=1, cutoff=0.75)
     if close:
@@ -158,9 +163,6 @@ def spelt(cfg: DictConfig) -> Iterator[tuple[str, str]]:
 
     Of a name in several groups the last of ``GROUPS`` is meant, and above all groups that without.
     """
-    if cfg.get("data") is None:
-        file = OmegaConf.load(CONF / "data" / "file.yaml")
-        cfg = DictConfig({**cfg, "data": file})
     groups = [name for name, node in cfg.items() if isinstance(node, DictConfig)]
     for group in sorted(map(str, groups), key=lambda name: (name in GROUPS, name)):
         for name in cfg[group]:

@@ -42,6 +42,9 @@ FILE = ["data=file", "data.path=x.csv"]
         ("linear", [*FILE, "frf.metod=fast"], "'frf.metod'; did you mean frf.method=fast?"),
         ("simulate", ["path=x.csv"], "'path'; did you mean data.path=x.csv?"),
         ("evaluate", ["checkpiont=x"], "'checkpiont'; did you mean checkpoint=x?"),
+        ("export", ["too=c"], "'too'; did you mean to=c?"),
+        ("export", ["ouput=x"], "'ouput'; did you mean out=x?"),  # not data.outputs: it reads none
+        ("export", ["data.path=x.csv"], "no setting 'data.path'; --help lists them all."),
     ],
 )
 def test_an_unknown_word_is_refused_in_one_line(command: str, words: list[str], message: str):
