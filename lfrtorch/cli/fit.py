@@ -151,9 +151,8 @@ class _Folder(Terminal):
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
     ) -> Watching:
-        self.cfg = cast(
-            DictConfig, OmegaConf.merge(self.cfg, settings.sizes, {"starts": settings.starts})
-        )
+        chosen = {**settings.sizes, "starts": settings.starts, "seed": settings.seed}
+        self.cfg = cast(DictConfig, OmegaConf.merge(self.cfg, chosen))
         with whole_file(self.folder / CONFIG) as fresh:
             OmegaConf.save(self.cfg, fresh, resolve=True)
         shown = (dataset.validation or dataset.train)[0]

@@ -67,12 +67,13 @@ def arguments(given: Sequence[str]) -> list[str]:
 
 
 def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:
-    """The configuration with the sizes and starts that the run to go on with chose."""
+    """The configuration with the sizes, starts and seed that the run to go on with chose."""
     if cfg.resume is None or not (folder / CONFIG).is_file():
         return cfg
     before = OmegaConf.load(folder / CONFIG)
     names = [n for n in ("nx", "nz", "nw", "nn", "degree") if cfg[n] == "auto"]
-    chosen = {name: OmegaConf.select(before, name) for name in [*names, *["starts"] * bool(names)]}
+    names += ["starts", "seed"] if names else []
+    chosen = {name: OmegaConf.select(before, name) for name in names}
     return cast(DictConfig, OmegaConf.merge(cfg, chosen))
 
 

@@ -45,7 +45,7 @@ from lfrtorch.fitting.live_line import StartsLine
 from lfrtorch.fitting.multistart import Together, any_of, iterations_of
 from lfrtorch.fitting.prediction import SIMULATION, Noise, predicting
 from lfrtorch.fitting.refit import all_records
-from lfrtorch.fitting.trainer import Fit, Monitor, Stop, StoppedError, Trainer
+from lfrtorch.fitting.trainer import Fit, FitResult, Monitor, Stop, StoppedError, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
@@ -97,6 +97,7 @@ class Candidate:
             relative to its rms, and its standard error; infinite if the model diverges.
         ratio: of this error to the linear model's; NaN if there is none to compare with.
         squares: the sum of the squared errors in each block of time, (B,).
+        model: as it was fitted, if the search keeps it.
     """
 
     sizes: Sizes
@@ -110,6 +111,7 @@ class Candidate:
     error_std: float
     ratio: float
     squares: Array = field(repr=False)
+    model: Model | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
         text = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
@@ -318,7 +320,7 @@ def search_sizes(
     """
     given = {} if nx is None else {"nx": nx}
     given |= {"nz": nz, "nw": nw} | ({"nn": nn} if degree is None else {"degree": degree})
-    tried = {name: _sizes(name, values) for name, values in given.items()}
+    tried = {name: sizes_to_try(name, values) for name, values in given.items()}
     integer("finalists", finalists, 1)
     integer("folds", folds, 0)
     if not seeds:
@@ -340,7 +342,7 @@ def search_sizes(
         model = start(first, seeds[0]) if linear is None else linear.to_model()
         validation, _ = settled(model, as_records(validation), as_records(train))
     scale = Scaler.of(as_records(validation)).y_scale
-    judge, clock = _Judge(as_records(validation), linear, ranks, scale), time.perf_counter()
+    judge, clock = Judge(as_records(validation), linear, ranks, scale), time.perf_counter()
     drawn = _drawn(tried, seeds, ROUNDS[0][0] * finalists)
     planned = race(len(drawn), finalists, trainer.limit)
     halt = Event()
@@ -364,7 +366,7 @@ def search_sizes(
             left = [judge.candidate(runner, number - 1) for runner in field[count:]] + left
             field = field[:count]
             together.advance([runner.fit for runner in field], until)
-            _check_whole([runner.fit for runner in field])
+            check_whole([runner.fit for runner in field])
             best = judge.candidate(min(field, key=lambda runner: runner.fit.best), number)
             seconds = time.perf_counter() - clock
             watch(SizeRound(number, len(planned), len(field), until, best, seconds))
@@ -372,7 +374,7 @@ def search_sizes(
         last = [judge.candidate(each, len(planned)) for each in field]
         if folds:
             parts = _left_out(given_records, folds, linear or field[0].fit.model)
-            judges = [_Judge(part.left_out, linear, ranks, scale) for part in parts]
+            judges = [Judge(part.left_out, linear, ranks, scale) for part in parts]
             fits = [
                 [
                     Fit(start(r.sizes, r.seed), part.train, part.left_out, **options)
@@ -382,7 +384,7 @@ def search_sizes(
             ]
             each = [fit for own in fits for fit in own]
             Together(each, [watching] * len(each), halt).advance(each, trainer.limit)
-            _check_whole(each)
+            check_whole(each)
             counts = np.concatenate([judge.counts for judge in judges])
             left = []
             last = [_crossed(c, own, judges) for c, own in zip(last, fits, strict=True)]
@@ -402,7 +404,7 @@ def _left_out(records: list[Record], count: int, model: Model | LinearModel) -> 
     return [part._replace(left_out=settled(model, part.left_out, part.train)[0]) for part in parts]
 
 
-def _crossed(candidate: Candidate, fits: Sequence[Fit], judges: Sequence[_Judge]) -> Candidate:
+def _crossed(candidate: Candidate, fits: Sequence[Fit], judges: Sequence[Judge]) -> Candidate:
     """A model of the last round with the errors of its fits in what was left out of each."""
     results = [fit.result() for fit in fits]
     pairs = zip(judges, results, strict=True)
@@ -447,7 +449,7 @@ def _drawn(
     return [(every[i], seed) for seed in seeds for i in rng.permutation(len(every))][:count]
 
 
-def _check_whole(fits: Sequence[Fit]) -> None:
+def check_whole(fits: Sequence[Fit]) -> None:
     """Refuse to go on with fits that were interrupted, or lost a process."""
     for fit in fits:
         if fit.reason == Reason.INTERRUPTED:
@@ -464,7 +466,7 @@ class _Runner(NamedTuple):
     fit: Fit
 
 
-class _Judge:
+class Judge:
     """Scores models on records that are not fitted; those of the first process count."""
 
     def __init__(
@@ -483,12 +485,15 @@ class _Judge:
 
     def candidate(self, runner: _Runner, rounds: int) -> Candidate:
         """What is known of a model that took part in some rounds."""
-        found = runner.fit.result()
+        return self.scored(runner.sizes, runner.seed, rounds, runner.fit.result())
+
+    def scored(self, sizes: Sizes, seed: int, rounds: int, found: FitResult) -> Candidate:
+        """The result of a fit of a model of these sizes."""
         squares = self.squares(found.model)
         error, error_std = _relative(squares, self.counts)
         ratio = _ratio(error, self.linear, self.counts)
         return Candidate(
-            runner.sizes, runner.seed, rounds, found.iterations, found.model.parameter_count,
+            sizes, seed, rounds, found.iterations, found.model.parameter_count,
             found.model.net_parameter_count, found.seconds, error, error_std, ratio, squares,
         )  # fmt: skip
 
@@ -510,7 +515,8 @@ def _ratio(error: float, linear: Array, counts: Integers) -> float:
     return error / least if least else nan
 
 
-def _sizes(name: str, given: int | Sequence[int]) -> list[int]:
+def sizes_to_try(name: str, given: int | Sequence[int]) -> list[int]:
+    """The numbers of one size, rising."""
     values = [given] if isinstance(given, int | str) else sorted(set(given))
     if not values:
         raise InputError(f"{name} is empty; give the numbers to try, for example [1, 2].")

@@ -19,6 +19,7 @@ from lfrtorch._support.reasons import Reason, told
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
+from lfrtorch.least_squares.group_lasso import GroupLassoProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.prediction_problem import PredictionProblem
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
@@ -242,6 +243,8 @@ class Fit:
         model, train, validation, trainer, ridge, ranks: see :func:`lfrtorch.fit`.
         simulation: weight of simulation errors beside those of predictions, of a predictor; see
             ``PredictionProblem``.
+        group_lasso: names of sizes that shall become smaller and the weight of their groups, see
+            ``GroupLassoProblem``. Default: there is no such penalty.
         keep: called with the fit after every iteration, when it may be saved, and with True when
             it pauses.
         stop: asked before each iteration whether to end there. If there are several processes,
@@ -260,6 +263,7 @@ class Fit:
         trainer: Trainer | None = None,
         ridge: Ridge = 0.0,
         simulation: float = 0.0,
+        group_lasso: tuple[Sequence[str], float] | None = None,
         ranks: Ranks | None = None,
         keep: Keep = nothing,
         stop: Stop | None = None,
@@ -285,7 +289,11 @@ class Fit:
                     model, validation, solve_initial_states=True, weight=both.weight
                 )
         else:
-            self.problem = SimulationProblem.of(model, train, **options)
+            kind: type[SimulationProblem] = SimulationProblem
+            if group_lasso is not None:
+                kind = GroupLassoProblem
+                options |= {"names": group_lasso[0], "weight": group_lasso[1]}
+            self.problem = kind.of(model, train, **options)
             if validation:
                 self.judge = SimulationProblem.judge(model, validation)
         self.state: Any = None

@@ -18,6 +18,7 @@ SCRIPTS = [
     "noise",
     "nonlinear",
     "parts",
+    "planted_sizes",
     "refit",
     "starts",
     "tanks",

@@ -35,7 +35,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 import lfrtorch
 from lfrtorch import InputError
-from lfrtorch.cli import config, errors, fit, interrupts, run_folder, words
+from lfrtorch.cli import config, errors, evaluate, fit, interrupts, run_folder, words
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
 from lfrtorch.reporting.advice import Advice
@@ -370,6 +370,44 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
     assert ends[0]["ranking"] == ends[1]["ranking"]
     weights = [(f / "model" / "weights.safetensors").read_bytes() for f in (cut, whole)]
     assert weights[0] == weights[1]
+
+
+@pytest.mark.numeric
+@pytest.mark.parametrize("method", ["race", "group_lasso"])
+def test_a_run_of_searched_sizes_goes_on(csv: Path, tmp_path: Path, method: str):
+    settings = [*file_overrides(csv), "nx=1", "nz=auto", "nw=1", "nn=2", "trainer.max_iter=4"]
+    settings += ["sizes_search.nz=[1,2]", f"sizes_search.method={method}", "sizes_search.starts=2"]
+    cut = tmp_path / "cut"
+    cut.mkdir()
+    fit.run(configuration(*settings, "seed=5"), cut)
+    ends = [json.loads((cut / "metrics.json").read_text())]
+    fit.run(configuration(*settings, "seed=5", "trainer.max_iter=6", f"resume={cut}"), cut)
+    ends.append(json.loads((cut / "metrics.json").read_text()))
+    assert [end["fit"]["iterations"] for end in ends] == [4, 6]
+    assert ends[0]["sizes"] == ends[1]["sizes"]
+
+
+@pytest.mark.numeric
+def test_a_run_of_before_there_were_structures_goes_on_and_is_scored(
+    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    folder, out = tmp_path / "run", tmp_path / "scores.json"
+    folder.mkdir()
+    settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=3"]
+    fit.run(configuration(*settings), folder)
+    saved: Any = OmegaConf.load(folder / "config.yaml")
+    assert saved.pop("structure") == "free"
+    OmegaConf.save(saved, folder / "config.yaml")
+    fit.run(configuration(*settings, "trainer.max_iter=5", f"resume={folder}"), folder)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["fit"]["iterations"] == 5
+    OmegaConf.save(saved, folder / "config.yaml")
+    monkeypatch.setattr(
+        sys, "argv", ["evaluate.py", f"checkpoint={folder}", f"out={out}", *file_overrides(csv)]
+    )
+    evaluate.main()
+    scores = json.loads(out.read_text())["scores"]
+    assert scores["test"]["rmse"] == pytest.approx(metrics["scores"]["test"]["rmse"], rel=1e-9)
 
 
 @pytest.mark.parametrize(
