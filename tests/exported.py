@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
-from reference import polynomial_cell, random_cell, random_model
+from reference import normal, polynomial_cell, random_cell, random_model
 from torch.func import jacrev
 
+from lfrtorch import NoiseCovariance
 from lfrtorch._support.types import Array
 from lfrtorch.engine.nonlinearity import ACTIVATIONS
 from lfrtorch.model import Model
@@ -25,6 +27,34 @@ MODELS: dict[str, Model] = {
     "smallest": random_model(random_cell(1, 1, 1, 1, 1, 1), fs=750.0),
 }
 """Every activation, several layers, polynomials, no static map, one of everything."""
+
+
+OBSERVED: dict[str, Model] = {
+    name: replace(
+        MODELS[name],
+        K=0.1 * normal(MODELS[name].lfr.cell.nx, len(MODELS[name].outputs), seed=2),
+    )
+    for name in ("softplus", "layers", "polynomial", "linear", "smallest")
+}
+"""Models with a gain K."""
+
+
+def some_noise(model: Model, seed: int = 0) -> NoiseCovariance:
+    """Correlated noise on all states and outputs."""
+    nx, ny = model.lfr.cell.nx, len(model.outputs)
+    root = 0.2 * np.random.default_rng(seed).normal(size=(nx + ny, nx + ny + 1))
+    joint, scale = root @ root.T, model.scaler.y_scale
+    R = joint[nx:, nx:] * scale[:, None] * scale
+    return NoiseCovariance(joint[:nx, :nx], R, joint[:nx, nx:] * scale)
+
+
+def measured_with_gaps(model: Model, T: int) -> tuple[Array, Array]:
+    """An input, and an output with errors in which some samples are missing (NaN)."""
+    u, rng = inputs(model, T), np.random.default_rng(1)
+    y = model.simulate(u)
+    y += 0.3 * model.scaler.y_scale * rng.normal(size=y.shape)
+    y[4, 0] = y[7] = np.nan
+    return u, y
 
 
 def inputs(model: Model, T: int) -> Array:

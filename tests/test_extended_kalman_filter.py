@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 import scipy
 import torch
-from exported import MODELS, cell_step, inputs, jacobians
+from exported import (
+    MODELS,
+    cell_step,
+    inputs,
+    jacobians,
+    measured_with_gaps,
+    some_noise,
+)
 from reference import normal, random_cell, random_model
 
 import lfrtorch
@@ -19,15 +26,6 @@ from lfrtorch._support.types import Array
 from lfrtorch.model import Model
 
 pytestmark = pytest.mark.numeric
-
-
-def some_noise(model: Model, seed: int = 0) -> NoiseCovariance:
-    """Correlated noise on all states and outputs."""
-    nx, ny = model.lfr.cell.nx, model.lfr.cell.ny
-    root = 0.2 * np.random.default_rng(seed).normal(size=(nx + ny, nx + ny + 1))
-    joint, scale = root @ root.T, model.scaler.y_scale
-    R = joint[nx:, nx:] * scale[:, None] * scale
-    return NoiseCovariance(joint[:nx, :nx], R, joint[:nx, nx:] * scale)
 
 
 def step(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
@@ -69,12 +67,8 @@ CASES = MODELS | {"own": with_own_map(MODELS["layers"])}
 @pytest.mark.parametrize("name", CASES)
 def test_states_and_covariance_are_those_of_the_textbook(name: str):
     model, T = CASES[name], 12
-    noise = some_noise(model)
-    rng = np.random.default_rng(1)
-    u = inputs(model, T)
-    y = model.simulate(u) + 0.3 * model.scaler.y_scale * rng.normal(size=(T, len(model.outputs)))
-    y[4, 0] = y[7] = np.nan
-    x, P = 0.1 * rng.normal(size=model.lfr.cell.nx), 0.5 * np.eye(model.lfr.cell.nx)
+    noise, (u, y) = some_noise(model), measured_with_gaps(model, T)
+    x, P = np.full(model.lfr.cell.nx, 0.1), 0.5 * np.eye(model.lfr.cell.nx)
     observer = model.observer(noise=noise, x0=x, P0=0.5)
     at_once = model.observer(noise=noise, x0=x, P0=P)
     for u_k, y_k in zip(u, y, strict=True):

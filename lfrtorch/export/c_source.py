@@ -8,7 +8,9 @@ import numpy as np
 
 from lfrtorch._support.types import Array
 from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
+from lfrtorch.export.observer_equations import KalmanNoise, SteadyGain, observer_equations
 from lfrtorch.export.rendering import rendered
+from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
@@ -28,7 +30,9 @@ LINE = 96
 """Most columns of a line of numbers."""
 
 
-def c_source(model: Model | LinearModel, name: str = "model") -> tuple[str, str]:
+def c_source(
+    model: Model | LinearModel, name: str = "model", *, observer: bool | NoiseCovariance = False
+) -> tuple[str, str]:
     """A model as C99: one step, its Jacobians, and the state at rest.
 
     ``NAME_step`` is one sample in physical units, ``NAME_jacobians`` the matrices of the model
@@ -36,15 +40,20 @@ def c_source(model: Model | LinearModel, name: str = "model") -> tuple[str, str]
     are macros, as ``NAME_NX`` and ``NAME_TS``. The code allocates nothing and keeps no state of
     its own. It computes in double precision.
 
+    With an observer there are ``NAME_observer_reset``, ``NAME_observer_predict`` and
+    ``NAME_observer_update`` as well, on a struct ``NAME_observer`` of the caller.
+
     Args:
         model: what is exported.
         name: beginning of all names of the code.
+        observer: ``True`` for that with the model's gain K, noise for an extended Kalman filter.
 
     Returns:
         The texts of ``NAME.h`` and ``NAME.c``.
 
     Raises:
-        ValueError: a static map of the user's own class, or a name that is no identifier.
+        ValueError: a static map of the user's own class, a name that is no identifier, or an
+            observer that the model has not.
 
     Example:
         >>> header, source = lfrtorch.export.c_source(model, "actuator")
@@ -57,6 +66,14 @@ def c_source(model: Model | LinearModel, name: str = "model") -> tuple[str, str]
     e = equations(model)
     known = {"name": name, "NAME": name.upper(), "ts": repr(1.0 / e.fs), **e.sizes}
     known |= {"about": comment(e.about(name)), "static": e.static, "arrays": list(_arrays(e))}
+    match observer_equations(model, observer):
+        case SteadyGain(K=K):
+            known["K"] = True
+            known["arrays"].append(constant("K", "NX * NY", K))
+        case KalmanNoise(G=G):
+            known["G"] = True
+            known["arrays"].append("/* G times G transposed: covariance of y's and x's noise. */")
+            known["arrays"].append(constant("G", "NG * NG", G))
     inner = {"NZ": e.sizes["nz"], "NW": e.sizes["nw"]} if e.static else {}
     match e.static:
         case Layers():

@@ -6,6 +6,8 @@ from typing import Any
 
 from lfrtorch._support.optional import imported
 from lfrtorch.export.equations import Layers, Monomials, check_name, equations
+from lfrtorch.export.observer_equations import KalmanNoise, observer_equations
+from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
@@ -46,6 +48,78 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
         w = _static(ca, e.static, ca.mtimes(e.Cz, x) + ca.mtimes(e.Dzu, v))
         x_next, y = x_next + ca.mtimes(e.Bw, w), y + ca.mtimes(e.Dyw, w)
     return ca.Function(name, [x, u], [x_next, y + e.y_offset], ["x", "u"], ["x_next", "y"])
+
+
+def casadi_observer(
+    model: Model | LinearModel, name: str = "model", *, observer: bool | NoiseCovariance = True
+) -> tuple[Any, Any]:
+    """An observer of a model as two ``casadi.Function``, physical units.
+
+    ``NAME_predict`` is (x, u) -> (y_hat). ``NAME_update`` is (x, u, y, missing) -> (x_next) with
+    the gain K, and (x, u, y, missing, P) -> (x_next, P_next) of an extended Kalman filter. An
+    output is left out if its ``missing`` is 1; by default none is. The covariance is updated in
+    Joseph's form.
+
+    Args:
+        model: what is exported.
+        name: first part of the functions' names.
+        observer: ``True`` for that with the model's gain K, noise for an extended Kalman filter.
+
+    Shape:
+        x: (nx,), P: (nx, nx), u: (nu,), y, missing: (ny,).
+
+    Raises:
+        ValueError: as ``casadi_function``, and for an observer that the model has not.
+
+    Example:
+        >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
+        >>> predict, update = lfrtorch.export.casadi_observer(model, "plant", observer=noise)
+        >>> update
+        Function(plant_update:(x,u,y,missing,P)->(x_next,P_next) SXFunction)
+        >>> after = update(x=0, u=0.5, y=0.2, P=1)
+        >>> online = model.observer(noise=noise)
+        >>> y_hat = online.predict(0.5)
+        >>> e = online.update(0.2)
+        >>> bool(abs(float(after["x_next"]) - online.state[0]) < 1e-12)
+        True
+        >>> bool(abs(float(after["P_next"]) - online.covariance[0, 0]) < 1e-12)
+        True
+    """
+    ca = imported("casadi", "casadi")
+    found, step = observer_equations(model, observer), casadi_function(model, name)
+    nx, ny = step.size1_in("x"), step.size1_out("y")
+    x, u = step.sx_in()
+    y, missing = ca.SX.sym("y", ny), ca.SX.sym("missing", ny)
+    x_next, y_hat = step(x, u)
+    predict = ca.Function(f"{name}_predict", [x, u], [y_hat], ["x", "u"], ["y_hat"])
+    e = ca.if_else(missing, 0.0, y - y_hat)
+    given, names = [x, u, y, missing], ["x", "u", "y", "missing"]
+    if not isinstance(found, KalmanNoise):
+        assert found is not None
+        made = [x_next + ca.mtimes(found.K, e)]
+        return predict, ca.Function(f"{name}_update", given, made, names, ["x_next"])
+    P, joint = ca.SX.sym("P", nx, nx), found.G @ found.G.T
+    Q, S, R = joint[ny:, ny:], joint[ny:, :ny], joint[:ny, :ny]
+    # A missing output has a row of zeros in H, and noise of its own alone.
+    known = ca.diag(1.0 - missing)
+    H, R, S = (
+        ca.mtimes(known, ca.jacobian(y_hat, x)),
+        ca.mtimes([known, R, known]) + ca.diag(missing),
+        ca.mtimes(S, known),
+    )
+    HP = ca.mtimes(H, P)
+    both = ca.solve(ca.mtimes(HP, H.T) + R, ca.horzcat(HP, S.T)).T
+    L, from_e = both[:nx, :], both[nx:, :]
+    corrected = x + ca.mtimes(L, e)
+    x_next = step(corrected, u)[0] + ca.mtimes(from_e, e)
+    F = ca.substitute(ca.jacobian(step(x, u)[0], x), x, corrected)
+    I_LH = ca.DM.eye(nx) - ca.mtimes(L, H)
+    P_known = ca.mtimes([I_LH, P, I_LH.T]) + ca.mtimes([L, R, L.T])
+    across = ca.mtimes([F, L, S.T])
+    P_next = ca.mtimes([F, P_known, F.T]) + Q - ca.mtimes(from_e, S.T) - across - across.T
+    made = [x_next, 0.5 * (P_next + P_next.T)]
+    update = ca.Function(f"{name}_update", [*given, P], made, [*names, "P"], ["x_next", "P_next"])
+    return predict, update
 
 
 def _static(ca: Any, static: Layers | Monomials, z: Any) -> Any:

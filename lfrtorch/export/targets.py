@@ -12,12 +12,13 @@ from lfrtorch._support import checkpoint
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
-from lfrtorch.export.casadi_function import casadi_function
+from lfrtorch.export.casadi_function import casadi_function, casadi_observer
 from lfrtorch.export.control_system import python_source
 from lfrtorch.export.equations import check_name, equations
 from lfrtorch.export.fmu import write_fmu
 from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
+from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
@@ -29,20 +30,31 @@ class Target(NamedTuple):
         endings: of the files NAME.h, ..
         write: model, name and paths -> files there.
         use: a line of a program that uses it, with {name} and the {path} of the first file.
+        observer: endings of further files with an observer; None if there is no observer.
+            ``write`` then takes one.
     """
 
     endings: tuple[str, ...]
-    write: Callable[[Model | LinearModel, str, list[Path]], None]
+    write: Callable[..., None]
     use: str
+    observer: tuple[str, ...] | None = None
 
 
-def _c(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
-    for path, text in zip(paths, c_source(model, name), strict=True):
+def _c(
+    model: Model | LinearModel, name: str, paths: list[Path], observer: bool | NoiseCovariance
+) -> None:
+    for path, text in zip(paths, c_source(model, name, observer=observer), strict=True):
         path.write_text(text, encoding="utf-8")
 
 
-def _casadi(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
-    casadi_function(model, name).save(str(paths[0]))
+def _casadi(
+    model: Model | LinearModel, name: str, paths: list[Path], observer: bool | NoiseCovariance
+) -> None:
+    functions = [casadi_function(model, name)]
+    if observer is not False:
+        functions += casadi_observer(model, name, observer=observer)
+    for function, path in zip(functions, [paths[0], *paths[2:]], strict=True):
+        function.save(str(path))
     paths[1].write_text(json.dumps(equations(model).description(name), indent=2) + "\n")
 
 
@@ -69,9 +81,12 @@ def _fmu(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
 
 
 TARGETS = {
-    "c": Target((".h", ".c"), _c, "{name}_step(x, u, x_next, y);"),
+    "c": Target((".h", ".c"), _c, "{name}_step(x, u, x_next, y);", ()),
     "casadi": Target(
-        (".casadi", "_channels.json"), _casadi, "x_next, y = casadi.Function.load('{path}')(x, u)"
+        (".casadi", "_channels.json"),
+        _casadi,
+        "x_next, y = casadi.Function.load('{path}')(x, u)",
+        ("_predict.casadi", "_update.casadi"),
     ),
     "onnx": Target(
         (".onnx", "_simulate.onnx"),
@@ -92,6 +107,7 @@ def write(
     *,
     name: str = "model",
     overwrite: bool = False,
+    observer: bool | NoiseCovariance = False,
 ) -> list[Path]:
     """Write a model as files of another tool.
 
@@ -105,14 +121,16 @@ def write(
         folder: where to; it is made if need be.
         name: of the files, and in them.
         overwrite: whether files that exist may be replaced.
+        observer: of C and CasADi, ``True`` for the observer with the model's gain K as well, or
+            noise for an extended Kalman filter.
 
     Returns:
         The files.
 
     Raises:
         ValueError: an unknown target, one whose package is not installed, a name that is no
-            identifier, a file that exists, the folder of a checkpoint, or a static map of the
-            user's own class.
+            identifier, a file that exists, the folder of a checkpoint, a static map of the user's
+            own class, or an observer that the target or the model has not.
 
     Example:
         >>> [path.name for path in lfrtorch.export.write(model, "c", "made", name="actuator")]
@@ -121,15 +139,23 @@ def write(
     if to not in TARGETS:
         raise InputError(f"to is {to!r}; give one of {', '.join(TARGETS)}.")
     check_name(name)
-    target = TARGETS[to]
+    target, given = TARGETS[to], {}
+    endings = target.endings
+    if target.observer is not None:
+        given = {"observer": observer}
+        endings += () if observer is False else target.observer
+    elif observer is not False:
+        known = ", ".join(name for name, each in TARGETS.items() if each.observer is not None)
+        raise InputError(f"there is no observer for to={to!r}; give one of {known}.")
     if (Path(folder) / checkpoint.DESCRIPTION).is_file():
         raise InputError(
             f"'{folder}' is a checkpoint, which holds nothing else; give another folder."
         )
-    paths = [Path(folder) / f"{name}{ending}" for ending in target.endings]
+    paths = [Path(folder) / f"{name}{ending}" for ending in endings]
     if not overwrite:
         for path in paths:
             refuse_existing(path, "overwrite=True")
     with ExitStack() as all_or_none:
-        target.write(model, name, [all_or_none.enter_context(whole_file(p)) for p in paths])
+        whole = [all_or_none.enter_context(whole_file(p)) for p in paths]
+        target.write(model, name, whole, **given)
     return paths

@@ -17,6 +17,7 @@ SCRIPTS = [
     "linear",
     "noise",
     "nonlinear",
+    "observer",
     "parts",
     "planted_sizes",
     "refit",

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from exported import MODELS
 
+from lfrtorch import NoiseCovariance
 from lfrtorch import export as exports
 from lfrtorch.cli import export
 
@@ -35,6 +36,14 @@ def test_c_is_written_with_its_use(folder: Path, monkeypatch, capsys):
     ]
 
 
+def test_an_observer_is_written_with_its_model(folder: Path, monkeypatch):
+    words = ["observer=true", "Q=1e-4", "R=[1e-2,1e-2,4e-2]"]
+    run(monkeypatch, "checkpoint=model", "to=c", *words)
+    noise = NoiseCovariance(Q=1e-4, R=[1e-2, 1e-2, 4e-2])
+    expected = exports.c_source(MODELS["tanh"], observer=noise)
+    assert tuple((folder / f"model.{kind}").read_text() for kind in "hc") == expected
+
+
 def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
     (folder / "model.c").write_text("old")
     run(monkeypatch, "checkpoint=model", "to=c", "overwrite=true")
@@ -50,6 +59,8 @@ def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
             ["checkpoint=model", "to=rust"],
             "to is 'rust'; give one of c, casadi, onnx, matlab, control, fmu",
         ),
+        (["checkpoint=model", "to=c", "Q=1"], "give observer=true Q=... R=..."),
+        (["checkpoint=model", "to=c", "observer=true"], "no innovation gain K"),
         (["checkpoint=model", "to=c", "name=1"], "name is '1'; give letters"),
         (
             ["checkpoint=model", "to=c", "name=there"],

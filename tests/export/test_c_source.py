@@ -6,16 +6,27 @@ import ctypes
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from exported import MODELS, check_run, check_step, inputs, jacobians
+from exported import (
+    MODELS,
+    OBSERVED,
+    check_run,
+    check_step,
+    inputs,
+    jacobians,
+    measured_with_gaps,
+    some_noise,
+)
 from reference import random_cell, random_model
 
-from lfrtorch import InputError
+from lfrtorch import InputError, NoiseCovariance
 from lfrtorch._support.types import Array
 from lfrtorch.export import c_source, write
+from lfrtorch.extended_kalman_filter import ExtendedKalmanFilter
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
 
@@ -25,13 +36,16 @@ STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wshadow", "-Werror", "-pedantic"]
 needs_compiler = pytest.mark.skipif(not GCC, reason="there is no C compiler, gcc or cc")
 
 
-def compiled(folder: Path, models: dict[str, Model], *options: str) -> ctypes.CDLL:
-    """A library of several models."""
+def compiled(
+    folder: Path, models: dict[str, Model], observers: dict[str, Any] | None = None
+) -> ctypes.CDLL:
+    """A library of several models, some with observers."""
     for name, model in models.items():
-        for kind, text in zip("hc", c_source(model, name), strict=True):
+        observer = (observers or {}).get(name, False)
+        for kind, text in zip("hc", c_source(model, name, observer=observer), strict=True):
             (folder / f"{name}.{kind}").write_text(text)
     sources = [f"{name}.c" for name in models]
-    command = [GCC, *STRICT, *options, "-shared", "-fPIC", "-o", "models.so", *sources, "-lm"]
+    command = [GCC, *STRICT, "-shared", "-fPIC", "-o", "models.so", *sources, "-lm"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     return ctypes.CDLL(str(folder / "models.so"))
@@ -40,6 +54,13 @@ def compiled(folder: Path, models: dict[str, Model], *options: str) -> ctypes.CD
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     return compiled(tmp_path_factory.mktemp("c"), MODELS)
+
+
+@pytest.fixture(scope="module")
+def observers(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    models = {f"{kind}_{name}": each for name, each in OBSERVED.items() for kind in ("k", "ekf")}
+    chosen = {name: name[0] == "k" or some_noise(each) for name, each in models.items()}
+    return compiled(tmp_path_factory.mktemp("observers"), models, chosen)
 
 
 def call(library: ctypes.CDLL, function: str, *arrays: Array) -> None:
@@ -72,6 +93,29 @@ def test_jacobians_are_those_of_the_model(name: str, library: ctypes.CDLL):
     call(library, f"{name}_jacobians", x, u, *found)
     for one, other in zip(found, expected, strict=True):
         assert np.abs(one - other).max() <= 1e-12 * np.abs(other).max()
+
+
+@needs_compiler
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", OBSERVED)
+@pytest.mark.parametrize("kind", ["k", "ekf"])
+def test_observers_are_those_of_the_model(name: str, kind: str, observers: ctypes.CDLL):
+    """The struct has x, then U with a filter, u and y_hat."""
+    model, (u, y) = OBSERVED[name], measured_with_gaps(OBSERVED[name], 200)
+    nx, nu, ny = model.lfr.cell.nx, len(model.inputs), len(model.outputs)
+    roots = nx * nx if kind == "ekf" else 0
+    expected = model.observer(noise=some_noise(model)) if roots else model.observer()
+    struct, y_hat = np.full(nx + roots + nu + ny, np.nan), np.empty(ny)
+    call(observers, f"{kind}_{name}_observer_reset", struct)
+    for u_k, y_k in zip(u, y, strict=True):
+        call(observers, f"{kind}_{name}_observer_predict", struct, u_k, y_hat)
+        call(observers, f"{kind}_{name}_observer_update", struct, y_k)
+        np.testing.assert_allclose(y_hat, expected.predict(u_k), rtol=1e-10, atol=1e-10)
+        expected.update(y_k)
+        np.testing.assert_allclose(struct[:nx], expected.state, rtol=1e-10, atol=1e-10)
+        if isinstance(expected, ExtendedKalmanFilter):
+            U = struct[nx : nx + roots].reshape(nx, nx)
+            np.testing.assert_allclose(U @ U.T, expected.covariance, rtol=1e-10, atol=1e-12)
 
 
 @needs_compiler
@@ -145,6 +189,20 @@ def test_what_has_no_equations_is_refused():
         lost.lfr.cell.A[0, 0] = torch.nan
     with pytest.raises(InputError, match="weights that are not finite"):
         c_source(lost)
+
+
+@pytest.mark.parametrize(
+    ("to", "observer", "said"),
+    [
+        ("c", True, "no innovation gain K"),
+        ("c", NoiseCovariance(Q=1.0, R=0.0), "R is not positive"),
+        ("onnx", NoiseCovariance(Q=1.0, R=1.0), "there is no observer for to='onnx'"),
+    ],
+)
+def test_observers_that_cannot_be_are_refused(to: str, observer: Any, said: str, tmp_path: Path):
+    with pytest.raises(InputError, match=said):
+        write(MODELS["smallest"], to, tmp_path, observer=observer)
+    assert list(tmp_path.iterdir()) == []
 
 
 @needs_compiler

@@ -8,11 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exported import MODELS, check_run, check_step, inputs, jacobians
+from exported import (
+    MODELS,
+    OBSERVED,
+    check_run,
+    check_step,
+    inputs,
+    jacobians,
+    measured_with_gaps,
+    some_noise,
+)
 
 from lfrtorch import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.export import casadi_function, write
+from lfrtorch.extended_kalman_filter import ExtendedKalmanFilter
 
 casadi = pytest.importorskip(
     "casadi", reason="casadi comes with the extra: pip install -e '.[casadi]'"
@@ -40,6 +50,36 @@ def test_jacobians_are_those_of_the_model(name: str):
     expected = jacobians(model, x, u)
     for found, one in zip(function.jacobian()(x, u, 0, 0), expected, strict=True):
         assert np.abs(np.array(found) - one).max() <= 1e-12 * np.abs(one).max()
+
+
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", OBSERVED)
+@pytest.mark.parametrize("kind", ["k", "ekf"])
+def test_observers_are_those_of_the_model(name: str, kind: str, tmp_path: Path):
+    model, (u, y) = OBSERVED[name], measured_with_gaps(OBSERVED[name], 40)
+    noise, nx = some_noise(model), model.lfr.cell.nx
+    if kind == "ekf":
+        expected, paths = (
+            model.observer(noise=noise),
+            write(model, "casadi", tmp_path, observer=noise),
+        )
+    else:
+        expected, paths = model.observer(), write(model, "casadi", tmp_path, observer=True)
+    assert [path.name for path in paths[2:]] == ["model_predict.casadi", "model_update.casadi"]
+    predict, update = (casadi.Function.load(str(path)) for path in paths[2:])
+    x, P = np.zeros(nx), np.eye(nx)
+    for u_k, y_k in zip(u, y, strict=True):
+        y_hat = np.array(predict(x, u_k))[:, 0]
+        np.testing.assert_allclose(y_hat, expected.predict(u_k), rtol=1e-10, atol=1e-10)
+        expected.update(y_k)
+        given = {"x": x, "u": u_k, "y": y_k} | ({"P": P} if kind == "ekf" else {})
+        missing = {"missing": np.isnan(y_k)} if np.isnan(y_k).any() else {}
+        after = update(**given, **missing)
+        x = np.array(after["x_next"])[:, 0]
+        np.testing.assert_allclose(x, expected.state, rtol=1e-10, atol=1e-10)
+        if isinstance(expected, ExtendedKalmanFilter):
+            P = np.array(after["P_next"])
+            np.testing.assert_allclose(P, expected.covariance, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.numeric

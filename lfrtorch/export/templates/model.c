@@ -10,6 +10,10 @@ enum {
 {% for letters, size in inner %}
     {{ letters }} = {{ size }},
 {% endfor %}
+{% if G %}
+    NG = NY + NX, /* noise of outputs and states */
+    NC = NG + NX, /* columns of M, and its most rows */
+{% endif %}
 };
 
 {% for array in arrays %}
@@ -24,7 +28,7 @@ static void add(double *to, const double *M, const double *v, int rows, int colu
             to[i] += M[i * columns + j] * v[j];
 }
 
-{% if static %}
+{% if static or G %}
 /* to += M N, with M of rows x inner and N of inner x columns. */
 static void add_product(double *to, const double *M, const double *N, int rows, int inner,
     int columns)
@@ -185,3 +189,115 @@ void {{ name }}_jacobians(const double x[NX], const double u[NU], double dx_dx[N
     (void)x, (void)u; /* the model is linear: the same everywhere */
 {% endif %}
 }
+{% if K or G %}
+
+void {{ name }}_observer_reset({{ name }}_observer *observer)
+{
+    static const {{ name }}_observer zero;
+    *observer = zero;
+{% if G %}
+    for (int i = 0; i < NX; i++)
+        observer->U[i * NX + i] = 1.0;
+{% endif %}
+}
+
+void {{ name }}_observer_predict({{ name }}_observer *observer, const double u[NU], double y_hat[NY])
+{
+    double next[NX];
+    copy(observer->u, u, NU);
+    {{ name }}_step(observer->x, u, next, observer->y_hat);
+    copy(y_hat, observer->y_hat, NY);
+}
+
+{% endif %}
+{% if K %}
+/* x_next = f(x, u) + K (y - y_hat). */
+void {{ name }}_observer_update({{ name }}_observer *observer, const double y[NY])
+{
+    double e[NY], y_hat[NY];
+    for (int i = 0; i < NY; i++)
+        e[i] = isnan(y[i]) ? 0.0 : y[i] - observer->y_hat[i];
+    {{ name }}_step(observer->x, observer->u, observer->x, y_hat);
+    add(observer->x, K, e, NX, NY);
+}
+{% endif %}
+{% if G %}
+/* M times an orthogonal matrix that makes its first rows lower triangular. Each of its rows has
+ * some columns, and begins NC numbers after the last. */
+static void reflect(double *M, int rows, int count, int columns)
+{
+    for (int k = 0; k < rows; k++) {
+        double *row = M + k * NC, square = 0.0;
+        for (int j = k; j < columns; j++)
+            square += row[j] * row[j];
+        if (square == 0.0)
+            continue;
+        double diagonal = row[k] > 0.0 ? -sqrt(square) : sqrt(square);
+        double v = row[k] - diagonal, scale = 1.0 / (square - diagonal * row[k]);
+        for (int i = k + 1; i < count; i++) {
+            double *other = M + i * NC, a = other[k] * v;
+            for (int j = k + 1; j < columns; j++)
+                a += other[j] * row[j];
+            a *= scale;
+            other[k] -= a * v;
+            for (int j = k + 1; j < columns; j++)
+                other[j] -= a * row[j];
+        }
+        row[k] = diagonal;
+        for (int j = k + 1; j < columns; j++)
+            row[j] = 0.0;
+    }
+}
+
+/* The extended Kalman filter on square roots. The rows of M are roots, of the innovations that are
+ * known, of the states and of their noise; the columns are the noise and the states before. */
+void {{ name }}_observer_update({{ name }}_observer *observer, const double y[NY])
+{
+    double *x = observer->x, *U = observer->U, M[NC * NC] = {0.0}, N[NX * NC] = {0.0};
+    double F[NX * NX], B[NX * NU], H[NY * NX], D[NY * NU], HU[NY * NX] = {0.0};
+    double e[NY], noise[NX] = {0.0}, y_hat[NY];
+    int known = 0;
+
+    /* The output: with H = dy/dx, at the state before. */
+    {{ name }}_jacobians(x, observer->u, F, B, H, D);
+    add_product(HU, H, U, NY, NX, NX);
+    for (int i = 0; i < NY; i++) {
+        if (isnan(y[i]))
+            continue;
+        e[known] = y[i] - observer->y_hat[i];
+        copy(M + known * NC, G + i * NG, NG);
+        copy(M + known * NC + NG, HU + i * NX, NX);
+        known++;
+    }
+    double *states = M + known * NC, *moved = states + NX * NC;
+    for (int i = 0; i < NX; i++) {
+        copy(states + i * NC + NG, U + i * NX, NX);
+        copy(moved + i * NC, G + (NY + i) * NG, NG);
+    }
+    reflect(M, known, known + 2 * NX, NC);
+    for (int a = 0; a < known; a++) {
+        for (int b = 0; b < a; b++)
+            e[a] -= M[a * NC + b] * e[b];
+        e[a] /= M[a * NC + a];
+        for (int i = 0; i < NX; i++) {
+            x[i] += states[i * NC + a] * e[a];
+            noise[i] += moved[i * NC + a] * e[a];
+        }
+    }
+
+    /* The next sample: with F = dx_next/dx, at the state that knows the output. */
+    {{ name }}_jacobians(x, observer->u, F, B, H, D);
+    {{ name }}_step(x, observer->u, x, y_hat);
+    for (int i = 0; i < NX; i++) {
+        x[i] += noise[i];
+        for (int j = 0; j < NC - known; j++) {
+            N[i * NC + j] = moved[i * NC + known + j];
+            for (int n = 0; n < NX; n++)
+                N[i * NC + j] += F[i * NX + n] * states[n * NC + known + j];
+        }
+    }
+    reflect(N, NX, NX, NC - known);
+    for (int i = 0; i < NX; i++)
+        copy(U + i * NX, N + i * NC, NX);
+}
+{% endif %}

@@ -24,6 +24,27 @@ void {{ name }}_jacobians(const double x[{{ NAME }}_NX], const double u[{{ NAME 
     double dx_dx[{{ NAME }}_NX * {{ NAME }}_NX], double dx_du[{{ NAME }}_NX * {{ NAME }}_NU],
     double dy_dx[{{ NAME }}_NY * {{ NAME }}_NX], double dy_du[{{ NAME }}_NY * {{ NAME }}_NU]);
 
+{% if K or G %}
+/* An observer: the states of the running system, from its inputs and its outputs. */
+typedef struct {
+    double x[{{ NAME }}_NX]; /* the state at the next sample to be predicted */
+{% if G %}
+    double U[{{ NAME }}_NX * {{ NAME }}_NX]; /* the covariance of its error is U times U transposed */
+{% endif %}
+    double u[{{ NAME }}_NU], y_hat[{{ NAME }}_NY]; /* of the last call of predict */
+} {{ name }}_observer;
+
+/* The state to start from: x = 0{% if G %}, with the covariance 1{% endif %}. */
+void {{ name }}_observer_reset({{ name }}_observer *observer);
+
+/* The output at this sample, y_hat, from the input now and all samples before. */
+void {{ name }}_observer_predict({{ name }}_observer *observer, const double u[{{ NAME }}_NU],
+    double y_hat[{{ NAME }}_NY]);
+
+/* Go on to the next sample with the measured output; NaN is one that is missing. */
+void {{ name }}_observer_update({{ name }}_observer *observer, const double y[{{ NAME }}_NY]);
+
+{% endif %}
 #ifdef __cplusplus
 }
 #endif
