@@ -19,6 +19,7 @@ from lfrtorch._support import checkpoint
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.engine.beyond_linear import Beyond, base_of
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
@@ -146,12 +147,13 @@ class Model:
         """
         cell = self.lfr.cell
         sizes = {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw}
-        if isinstance(cell.static, Polynomial):
-            return sizes | {"degree": cell.static.degree}
-        if not is_network(cell.static):
+        static = base_of(cell.static)
+        if isinstance(static, Polynomial):
+            return sizes | {"degree": static.degree}
+        if not is_network(static):
             return sizes | {"nn": 0}
-        layers = {"layers": cell.static.layers} if cell.static.layers > 1 else {}
-        return sizes | {"nn": len(cell.static.bz)} | layers
+        layers = {"layers": static.layers} if static.layers > 1 else {}
+        return sizes | {"nn": len(static.bz)} | layers
 
     @property
     def parameters(self) -> int:
@@ -188,9 +190,10 @@ class Model:
         gauge = cell.nx**2 // halves + predicting
         if cell.structure == "parallel":
             return self.parameter_count - gauge - cell.nz - cell.nw
-        if isinstance(cell.static, Network | Polynomial):
+        static = base_of(cell.static)
+        if isinstance(static, Network | Polynomial):
             gauge += cell.nz**2 + cell.nw**2 + max(0, cell.nw - cell.ny)
-        if isinstance(cell.static, Polynomial):
+        if isinstance(static, Polynomial):
             gauge += cell.nz * cell.nw
         return self.parameter_count - gauge
 
@@ -439,19 +442,9 @@ class Model:
             True
         """
         cell, s = self.lfr.cell, self.scaler
-        static: dict[str, Any] | None = None
-        if is_network(cell.static):
-            static = {"type": "Network", "nn": len(cell.static.bz)}
-            static["activation"] = cell.static.activation
-            if cell.static.layers > 1:
-                static["layers"] = cell.static.layers
-        elif type(cell.static) is Polynomial:
-            static = {"type": "Polynomial", "degree": cell.static.degree}
-        elif cell.static is not None:
-            static = {"type": "own", "class": type(cell.static).__qualname__}
         description = {
             "sizes": {"nu": cell.nu, "ny": cell.ny, "nx": cell.nx, "nz": cell.nz, "nw": cell.nw},
-            "static": static,
+            "static": _described(cell.static),
             "dtype": str(cell.A.dtype).removeprefix("torch."),
             "fs": self.fs,
             "inputs": [c._asdict() for c in self.inputs],
@@ -514,6 +507,36 @@ def simulate_blocks(
         first, state = first + len(u), trajectory.x[0, -1].numpy()
 
 
+def _described(static: Module | None) -> dict[str, Any] | None:
+    """A static map in a checkpoint's description."""
+    if static is None:
+        return None
+    if isinstance(static, Beyond):
+        return {"type": "Beyond", "base": _described(static.base)}
+    if is_network(static):
+        found = {"type": "Network", "nn": len(static.bz), "activation": static.activation}
+        return found | ({"layers": static.layers} if static.layers > 1 else {})
+    if type(static) is Polynomial:
+        return {"type": "Polynomial", "degree": static.degree}
+    return {"type": "own", "class": type(static).__qualname__}
+
+
+def _made(
+    description: Any, nz: int, nw: int, dtype: torch.dtype, own: Module | None
+) -> Module | None:
+    """The static map of a description, its weights yet to be loaded."""
+    match description:
+        case {"type": "Beyond", "base": base}:
+            if (found := _made(base, nz, nw, dtype, own)) is None:
+                raise InputError("the static map that a linear one is taken off is missing")
+            return Beyond(found, torch.zeros(nw, nz), torch.eye(nz), torch.eye(nw))
+        case {"type": "Network", "nn": nn, "activation": activation, **more}:
+            return Network(nz, nw, nn, activation, layers=more.get("layers", 1), dtype=dtype)
+        case {"type": "Polynomial", "degree": degree}:
+            return Polynomial(nz, nw, degree, dtype=dtype)
+    return own
+
+
 def load(folder: str | Path, *, static: Module | None = None) -> Model:
     """The model in a checkpoint folder, or in the ``model/`` folder of a run's folder.
 
@@ -538,10 +561,12 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             "read it with lfrtorch.LinearModel.load."
         )
     made = description.get("static")
-    built_in = ("Network", "Polynomial")
-    if isinstance(made, dict) and made.get("type") not in built_in and static is None:
+    own = made
+    while isinstance(own, dict) and own.get("type") == "Beyond":
+        own = own.get("base")
+    if isinstance(own, dict) and own.get("type") not in ("Network", "Polynomial") and not static:
         raise InputError(
-            f"'{folder}' holds a static nonlinearity of class {made.get('class')}, which is not "
+            f"'{folder}' holds a static nonlinearity of class {own.get('class')}, which is not "
             "part of this package; pass an instance of it: load(folder, static=...)."
         )
     try:
@@ -555,14 +580,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
                 for name in ("u_offset", "u_scale", "y_offset", "y_scale")
             )
         )
-        match made:
-            case {"type": "Network", "nn": nn, "activation": activation}:
-                layers = made.get("layers", 1)
-                static = Network(
-                    sizes["nz"], sizes["nw"], nn, activation, layers=layers, dtype=dtype
-                )
-            case {"type": "Polynomial", "degree": degree}:
-                static = Polynomial(sizes["nz"], sizes["nw"], degree, dtype=dtype)
+        static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         K = weights.pop("K", None)
         if K is not None and K.shape != (cell.nx, cell.ny):

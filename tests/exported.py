@@ -7,16 +7,23 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from reference import normal, polynomial_cell, random_cell, random_model
+from reference import measure, normal, polynomial_cell, random_cell, random_model
 from torch.func import jacrev
 
 from lfrtorch import NoiseCovariance
 from lfrtorch._support.types import Array
+from lfrtorch.analysis import canonical
 from lfrtorch.engine.nonlinearity import ACTIVATIONS
 from lfrtorch.model import Model
 
 Step = Callable[[Array, Array], tuple[Array, Array]]
 """(x, u) -> (x_next, y), physical units."""
+
+
+def in_canonical_form(model: Model) -> Model:
+    """The same model, the linear part of its map in the linear block."""
+    return canonical(model, measure(model, 60, seed=1)).model
+
 
 MODELS: dict[str, Model] = {
     **{name: random_model(random_cell(2, 3, 4, 2, 3, 5, activation=name)) for name in ACTIVATIONS},
@@ -24,9 +31,10 @@ MODELS: dict[str, Model] = {
     "polynomial": random_model(polynomial_cell(2, 2, 3)),
     "affine": random_model(polynomial_cell(1, 1, 1)),
     "linear": random_model(random_cell(2, 2, 3, 0, 0)),
+    "canonical": in_canonical_form(random_model(random_cell(2, 3, 4, 2, 3, 5))),
     "smallest": random_model(random_cell(1, 1, 1, 1, 1, 1), fs=750.0),
 }
-"""Every activation, several layers, polynomials, no static map, one of everything."""
+"""Every activation, several layers, polynomials, no static map, a canonical form, one of all."""
 
 
 OBSERVED: dict[str, Model] = {

@@ -19,11 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Complex128, Float
-from torch import Tensor
-from torch.nn import Module
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
+from lfrtorch.engine.beyond_linear import Beyond
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import of_static
@@ -40,45 +39,6 @@ ANGLES = 1024
 
 FLAT = 1e-12
 """Least variance in a direction that is scaled to 1, relative to the largest."""
-
-
-class Beyond(Module):
-    """What a map is beyond a linear one, in other coordinates: w = W (f(Z z) - L Z z).
-
-    Args:
-        base: f.
-        slope: L.
-        into: Z, from the coordinates of this map to those of f.
-        out: W.
-
-    Example:
-        >>> from lfrtorch.analysis.canonical_form import Beyond
-        >>> one = torch.eye(1)
-        >>> Beyond(torch.nn.Tanh(), one, one, 2 * one)(torch.tensor([0.5])).round(decimals=3)
-        tensor([-0.0760])
-    """
-
-    slope: Tensor
-    into: Tensor
-    out: Tensor
-
-    def __init__(
-        self,
-        base: Module,
-        slope: Float[Tensor, "nw nz"],
-        into: Float[Tensor, "nz nz"],
-        out: Float[Tensor, "nw nw"],
-    ) -> None:
-        super().__init__()
-        self.base = base
-        self.register_buffer("slope", slope)
-        self.register_buffer("into", into)
-        self.register_buffer("out", out)
-
-    def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
-        """w of z."""
-        z = z @ self.into.mT
-        return (self.base(z) - z @ self.slope.mT) @ self.out.mT
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +73,9 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     """A model in its canonical form: the same for all weights that are the same model.
 
     Its static map is what is left of the model's beyond the nearest affine map over the records,
-    a module of class ``Beyond`` that holds the map itself. So it simulates to rounding as the
-    model does, but without its compiled code, and ``lfrtorch.export`` refuses it: export the model.
+    a module of class ``Beyond`` that holds the map itself. It simulates as the model does, to
+    rounding and in the same compiled code. Where only u, x and y count, as in ``lfrtorch.export``,
+    the linear part goes back to the map: exported are the matrices of the model, with these x.
 
     Args:
         model: nonlinear.
@@ -263,4 +224,4 @@ def _signs(G: Complex128[Complex, "F n m"], axis: int) -> Float[Array, " K"]:
     return np.where(largest < 0, -1.0, 1.0)
 
 
-__all__ = ["Beyond", "Canonical", "canonical"]
+__all__ = ["Canonical", "canonical"]

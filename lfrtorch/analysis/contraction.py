@@ -14,6 +14,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.bounds import amplitudes, levels_of
+from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import linearise, spectral_radius
 from lfrtorch.engine.nonlinearity import is_network
@@ -122,7 +123,7 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
         >>> nearby.found
         True
     """
-    cell = double(model.lfr.cell)
+    cell = folded(double(model.lfr.cell))
     if cell.static is not None and not is_network(cell.static):
         raise InputError(
             f"the static map is a {type(cell.static).__name__}, whose slopes are not known to be "

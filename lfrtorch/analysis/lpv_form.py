@@ -21,6 +21,7 @@ from torch.nn import Module
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import vector
+from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import of_static
 from lfrtorch.engine.nonlinearity import (
@@ -203,7 +204,7 @@ def lpv(
         >>> form.A.shape, bool(np.isfinite(form.bounds).all())
         ((2, 1, 1), True)
     """
-    cell, s = double(model.lfr.cell), model.scaler
+    cell, s = folded(double(model.lfr.cell)), model.scaler
     one_layer = has_one_layer(cell.static)
     if schedule not in (None, "neurons", "map"):
         raise InputError(f"schedule is {schedule!r}; give 'neurons' or 'map'.")

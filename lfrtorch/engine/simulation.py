@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.threads import spread
+from lfrtorch.engine.beyond_linear import base_of, folded
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import monodromy
 from lfrtorch.engine.linear_recurrence import has_kernels, to_numpy
@@ -152,7 +153,8 @@ def steady_state(
 
 def is_compiled(cell: LFRCell, u: Tensor) -> bool:
     """Whether the cell is simulated in machine code on the device of ``u``."""
-    known = cell.static is None or is_network(cell.static) or is_polynomial(cell.static)
+    static = base_of(cell.static)
+    known = static is None or is_network(static) or is_polynomial(static)
     return known and has_kernels(u)
 
 
@@ -196,9 +198,10 @@ def _compiled(
         near = Trajectory(*(u.new_full((R, *size), torch.nan) for size in sizes))
     near.x[:, 0] = x0
     met_within = MET_ROUNDING * torch.finfo(u.dtype).eps
-    arguments = [to_numpy(u), *kernel_arguments(cell), met_within]
+    simulated = folded(cell)
+    arguments = [to_numpy(u), *kernel_arguments(simulated), met_within]
     spread(simulate_record, R, *arguments, *(signal.numpy() for signal in near))
-    return near
+    return near if simulated is cell else signals(cell, u, near.x)
 
 
 def kernel_arguments(cell: LFRCell) -> list[Any]:

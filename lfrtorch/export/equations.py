@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 from torch import Tensor
+from torch.nn import Module
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.nonlinearity import is_network, is_polynomial
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -166,7 +168,7 @@ def equations(model: Model | LinearModel) -> Equations:
         ValueError: a static map of the user's own class, or weights that are not finite.
     """
     model = model.to_model() if isinstance(model, LinearModel) else model
-    cell, s = model.lfr.cell, model.scaler
+    cell, s = folded(model.lfr.cell), model.scaler
     found = Equations(
         A=numbers(cell.A),
         Bu=numbers(cell.Bu) / s.u_scale,
@@ -178,7 +180,7 @@ def equations(model: Model | LinearModel) -> Equations:
         Dyw=numbers(cell.Dyw) * s.y_scale[:, None],
         u_offset=np.asarray(s.u_offset, dtype=np.float64),
         y_offset=np.asarray(s.y_offset, dtype=np.float64),
-        static=static_map(model),
+        static=static_map(cell.static),
         fs=model.fs,
         inputs=model.inputs,
         outputs=model.outputs,
@@ -189,9 +191,8 @@ def equations(model: Model | LinearModel) -> Equations:
     return found
 
 
-def static_map(model: Model) -> Layers | Monomials | None:
+def static_map(static: Module | None) -> Layers | Monomials | None:
     """f, as far as this package knows its equations."""
-    static = model.lfr.cell.static
     if static is None:
         return None
     if is_network(static):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lfrtorch.analysis.lpv_form import gauss_legendre, lpv
+from lfrtorch.engine.beyond_linear import base_of
 from lfrtorch.export.equations import Layers, Monomials, check_name, equations
 from lfrtorch.export.rendering import rendered
 from lfrtorch.linear.model import LinearModel
@@ -109,7 +110,7 @@ def matlab_function(
     found["lpv"] |= {letters: value[:, None] for letters, value in points.items()}
     found["lpv"] |= {"Cz": form.Cz, "Dzu": form.Dzu, "bounds": form.bounds}
     if isinstance(e.static, Monomials):
-        nodes = gauss_legendre(model.lfr.cell.static)
+        nodes = gauss_legendre(base_of(model.lfr.cell.static))
         found["lpv"] |= dict(zip(("nodes", "weights"), nodes, strict=True))
     known["schedule"] = form.schedule
     known |= e.sizes

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import reference
 import torch
-from reference import measure, normal, random_cell, random_model
+from reference import measure, normal, polynomial_cell, random_cell, random_model
+from torch.testing import assert_close
 
 import lfrtorch
 from lfrtorch.analysis import canonical
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.engine.simulation import is_compiled, simulate, steady_state
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -97,6 +101,28 @@ def test_it_is_the_same_model_with_a_map_of_no_slope_and_unit_covariances():
     assert (np.diff(found.bends) <= 0).all()
     assert found.shares.sum() == pytest.approx(1.0)
     assert found.bends.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("polynomial", [False, True])
+def test_it_is_compiled_saved_and_taken_apart_again(polynomial: bool, tmp_path: Path):
+    model = random_model(polynomial_cell(2, 2, 3)) if polynomial else strong()
+    record = measure(model, 80, seed=1)
+    found = canonical(model, record).model
+    cell, u = found.lfr.cell, torch.as_tensor(model.scaler.normalise_u(record.u))[None]
+    assert is_compiled(cell, u)
+    x0 = normal(1, cell.nx)
+    for one, other in zip(simulate(cell, u, x0), reference.simulate(cell, u, x0), strict=True):
+        assert_close(one, other, rtol=0, atol=1e-10)
+    periodic = steady_state(cell, u)
+    assert_close(periodic.y, steady_state(model.lfr.cell, u).y, rtol=0, atol=1e-8)
+    assert_close(periodic.w, cell.internal(u, periodic.x[:, :-1])[1], rtol=0, atol=1e-10)
+    again = lfrtorch.load(found.save(tmp_path / "model"))
+    assert np.array_equal(again.simulate(record), found.simulate(record))
+    assert again.sizes == model.sizes
+    assert again.net_parameter_count == model.net_parameter_count
+    twice = canonical(found, record)
+    np.testing.assert_allclose(twice.model.simulate(record), record.y, atol=1e-9)
+    np.testing.assert_allclose(np.abs(twice.Z), np.eye(cell.nz), atol=1e-6)
 
 
 @pytest.mark.parametrize("change", ["first", "second", "linear"])

@@ -1,0 +1,87 @@
+"""A static map without a linear part, which the linear block holds in its place."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import Module
+
+from lfrtorch.engine.cell import LFRCell
+
+
+class Beyond(Module):
+    """What a map is beyond a linear one, in other coordinates: w = W (f(Z z) - L Z z).
+
+    Args:
+        base: f.
+        slope: L.
+        into: Z, from the coordinates of this map to those of f.
+        out: W.
+
+    Example:
+        >>> from lfrtorch.engine.beyond_linear import Beyond
+        >>> one = torch.eye(1)
+        >>> Beyond(torch.nn.Tanh(), one, one, 2 * one)(torch.tensor([0.5])).round(decimals=3)
+        tensor([-0.0760])
+    """
+
+    slope: Tensor
+    into: Tensor
+    out: Tensor
+
+    def __init__(
+        self,
+        base: Module,
+        slope: Float[Tensor, "nw nz"],
+        into: Float[Tensor, "nz nz"],
+        out: Float[Tensor, "nw nw"],
+    ) -> None:
+        super().__init__()
+        self.base = base
+        self.register_buffer("slope", slope)
+        self.register_buffer("into", into)
+        self.register_buffer("out", out)
+
+    def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
+        """w of z."""
+        z = z @ self.into.mT
+        return (self.base(z) - z @ self.slope.mT) @ self.out.mT
+
+    def __repr__(self) -> str:
+        return f"{self.base!r} less a linear map"
+
+
+def base_of(static: Module | None) -> Module | None:
+    """The map itself, or f of a ``Beyond``."""
+    return base_of(static.base) if isinstance(static, Beyond) else static
+
+
+@torch.no_grad()
+def folded(cell: LFRCell) -> LFRCell:
+    """The cell with f itself in the place of its ``Beyond``; any other cell as it is.
+
+    L, Z and W go into the linear block. x, u and y are the same signals as before; z and w are
+    those of f.
+
+    Example:
+        >>> from lfrtorch.engine.beyond_linear import folded
+        >>> folded(model.lfr.cell) is model.lfr.cell
+        True
+    """
+    beyond = cell.static
+    if not isinstance(beyond, Beyond):
+        return cell
+    sizes = cell.nu, cell.ny, cell.nx, cell.nz, cell.nw
+    found = LFRCell(*sizes, beyond.base, device=cell.A.device, dtype=cell.A.dtype)
+    L, Z, W = beyond.slope, beyond.into, beyond.out
+    Cz, Dzu, Bw, Dyw = Z @ cell.Cz, Z @ cell.Dzu, cell.Bw @ W, cell.Dyw @ W
+    found.A.copy_(cell.A - Bw @ L @ Cz)
+    found.Bu.copy_(cell.Bu - Bw @ L @ Dzu)
+    found.Bw.copy_(Bw)
+    found.Cz.copy_(Cz)
+    found.Dzu.copy_(Dzu)
+    found.Cy.copy_(cell.Cy - Dyw @ L @ Cz)
+    found.Dyu.copy_(cell.Dyu - Dyw @ L @ Dzu)
+    found.Dyw.copy_(Dyw)
+    return folded(found)
