@@ -5,11 +5,13 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 from torch.nn import Module
 
@@ -62,6 +64,22 @@ class Monomials:
 
 
 @dataclass(frozen=True, eq=False)
+class Own:
+    """w = f(z) of a class of the user's own.
+
+    Args:
+        module: f, on the CPU in float64.
+    """
+
+    module: Module
+
+    @property
+    def name(self) -> str:
+        """Its class."""
+        return type(self.module).__name__
+
+
+@dataclass(frozen=True, eq=False)
 class Equations:
     """A model with u and y as measured and x in the coordinates of the model::
 
@@ -89,7 +107,7 @@ class Equations:
     Dyw: Array
     u_offset: Array
     y_offset: Array
-    static: Layers | Monomials | None
+    static: Layers | Monomials | Own | None
     fs: float
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
@@ -116,6 +134,8 @@ class Equations:
                 static = [f"w      = f(z) = Ww {h} + bw{MEANT.get(sigma, '')}"]
             case Monomials():
                 static = ["w      = f(z) = C m, m = 1, z1, z2, .., z1 z1, z1 z2, .."]
+            case Own(name=name):
+                static = [f"w      = f(z), the map {printable(name)}"]
             case None:
                 static = []
         z, w, bw = (["z      = Cz x + Dzu v"], " + Dyw w", " + Bw w") if static else ([], "", "")
@@ -161,11 +181,15 @@ def printable(text: str) -> str:
     return "".join(sign if sign.isprintable() else " " for sign in text)
 
 
-def equations(model: Model | LinearModel) -> Equations:
+def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
     """The equations of a model.
 
+    Args:
+        model: nonlinear or linear.
+        own: whether a static map of the user's own class is taken as it is.
+
     Raises:
-        ValueError: a static map of the user's own class, or weights that are not finite.
+        ValueError: otherwise such a map, or weights that are not finite.
     """
     model = model.to_model() if isinstance(model, LinearModel) else model
     cell, s = folded(model.lfr.cell), model.scaler
@@ -180,18 +204,20 @@ def equations(model: Model | LinearModel) -> Equations:
         Dyw=numbers(cell.Dyw) * s.y_scale[:, None],
         u_offset=np.asarray(s.u_offset, dtype=np.float64),
         y_offset=np.asarray(s.y_offset, dtype=np.float64),
-        static=static_map(cell.static),
+        static=static_map(cell.static, own),
         fs=model.fs,
         inputs=model.inputs,
         outputs=model.outputs,
     )
-    parts: list[Array] = [a for part in (found, found.static) if part for a in arrays(part)]
+    parts = [a for part in (found, found.static) if part for a in arrays(part)]
+    if isinstance(found.static, Own):
+        parts += map(numbers, found.static.module.state_dict().values())
     if not all(np.isfinite(part).all() for part in parts):
         raise InputError("the model has weights that are not finite; nothing can be exported.")
     return found
 
 
-def static_map(static: Module | None) -> Layers | Monomials | None:
+def static_map(static: Module | None, own: bool) -> Layers | Monomials | Own | None:
     """f, as far as this package knows its equations."""
     if static is None:
         return None
@@ -201,9 +227,11 @@ def static_map(static: Module | None) -> Layers | Monomials | None:
         return Layers(tuple(map(numbers, W)), tuple(map(numbers, b)), static.activation)
     if is_polynomial(static):
         return Monomials(numbers(static.C), static.growth, static.slopes)
+    if own:
+        return Own(deepcopy(static).to(device="cpu", dtype=torch.float64).eval())
     raise InputError(
         f"the static map is a {type(static).__name__}, a class of your own, whose equations are "
-        "not known; a Network or a Polynomial can be exported."
+        "not known; a Network or a Polynomial can be exported, and your class to onnx alone."
     )
 
 
@@ -212,7 +240,7 @@ def numbers(weight: Tensor) -> Array:
     return weight.detach().cpu().double().numpy()
 
 
-def arrays(part: Equations | Layers | Monomials) -> list[Array]:
+def arrays(part: Equations | Layers | Monomials | Own) -> list[Array]:
     """All arrays of a part."""
     found: list[Array] = []
     for field in fields(part):

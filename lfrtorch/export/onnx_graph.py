@@ -10,12 +10,10 @@ import numpy as np
 
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
-from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
+from lfrtorch.export.equations import Equations, Layers, Monomials, Own, check_name, equations
+from lfrtorch.export.traced_map import IR, OPSET, traced
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
-
-OPSET, IR = 17, 8
-"""Operators and file format of 2022, which every runtime since then reads."""
 
 
 def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, Any]:
@@ -34,12 +32,15 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
         sample: x (n, nx), u (n, nu) -> x_next (n, nx), y (n, ny);
         simulation: x0 (n, nx), u (n, T, nu) -> x_end (n, nx), y (n, T, ny).
 
+    A static map of the user's own class goes through ``torch.onnx.export``, which traces its
+    ``forward``.
+
     Returns:
         Two ``onnx.ModelProto``.
 
     Raises:
-        ValueError: onnx is not installed, a static map of the user's own class, or a name that is
-            no identifier.
+        ValueError: onnx is not installed, a static map of the user's own class that cannot be
+            traced, or a name that is no identifier.
 
     Example:
         >>> sample, simulation = lfrtorch.export.onnx_models(model, "actuator")
@@ -47,7 +48,7 @@ def onnx_models(model: Model | LinearModel, name: str = "model") -> tuple[Any, A
         (['x', 'u'], ['x_end', 'y'])
     """
     check_name(name)
-    e, graph = equations(model), Graph(imported("onnx", "onnx"))
+    e, graph = equations(model, own=True), Graph(imported("onnx", "onnx"))
     _sample(e, graph)
     sample, simulation = graph.sample(e, name), graph.simulation(e, name)
     return graph.model(sample, e, name), graph.model(simulation, e, name)
@@ -67,8 +68,14 @@ def _sample(e: Equations, graph: Graph) -> None:
 
     x_next, y = {"A": "x", "Bu": v}, {"Cy": "x", "Dyu": v}
     if e.static:
-        z, f = combined("z", {"Cz": "x", "Dzu": v}), e.static
-        w = _network(graph, f, z) if isinstance(f, Layers) else _polynomial(graph, f, z)
+        z = combined("z", {"Cz": "x", "Dzu": v})
+        match e.static:
+            case Layers():
+                w = _network(graph, e.static, z)
+            case Monomials():
+                w = _polynomial(graph, e.static, z)
+            case Own():
+                w = graph.spliced(traced(e.static, e.sizes["nz"]), "f_", z)
         x_next["Bw"], y["Dyw"] = w, w
     combined("x_next", x_next)
     combined("y", y, graph.constant("y_offset", e.y_offset))
@@ -135,6 +142,14 @@ class Graph:
         """Add a node of several outputs; their names."""
         self.nodes.append(self.onnx.helper.make_node(operator, inputs, to, **options))
         return to
+
+    def spliced(self, model: Any, prefix: str, z: str) -> str:
+        """Add the nodes of a model from z to w, their names behind a prefix; the name of w."""
+        added = self.onnx.compose.add_prefix(model, prefix).graph
+        self.node("Identity", z, to=f"{prefix}z")
+        self.nodes += added.node
+        self.constants |= {one.name: one for one in added.initializer}
+        return f"{prefix}w"
 
     def signal(self, name: str, *shape: int | str) -> Any:
         """An input or an output of float64."""

@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exported import MODELS, check_output, check_run, check_step, inputs
+import torch
+from exported import MODELS, check_output, check_run, check_step, in_canonical_form, inputs
+from reference import random_cell, random_model
 
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.export import onnx_models, write
 
@@ -55,6 +58,76 @@ def test_simulations_are_those_of_the_model(name: str, tmp_path: Path):
     several = sample.run(None, {"x": x0, "u": u[:2]})
     one = sample.run(None, {"x": x0[1:], "u": u[1:2]})
     assert all(np.allclose(a[1], b[0], rtol=1e-12) for a, b in zip(several, one, strict=True))
+
+
+class Law(torch.nn.Module):
+    """Two laws of one's own, of several layers and branches."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.layers = torch.nn.Sequential(
+            torch.nn.Linear(2, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1), torch.nn.Softsign()
+        )
+        self.b = torch.nn.Parameter(torch.tensor(0.3))
+
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        first, second = z.unbind(-1)
+        dry = torch.where(second.abs() < 1, second**3, second.clamp(min=-1.2, max=0.8).sin())
+        return torch.stack([self.layers(z)[..., 0] - self.b * first * first.abs(), dry], dim=-1)
+
+
+@pytest.mark.numeric
+@pytest.mark.parametrize("form", ["itself", "canonical"])
+def test_a_map_of_ones_own_is_in_the_graph(form: str):
+    model = random_model(random_cell(2, 2, 3, 2, 2, static=Law(), feedback=0.05))
+    model = in_canonical_form(model) if form == "canonical" else model
+    sample, simulation = onnx_models(model)
+    for graph in (sample, simulation):
+        onnx.checker.check_model(graph, full_check=True)
+    assert "w      = f(z), the map Law" in sample.doc_string
+    u, x0 = inputs(model, 300), np.zeros((2, 3))
+    y = session(simulation.SerializeToString()).run(None, {"x0": x0, "u": np.stack([u, u])})[1]
+    check_output(y[1], model, u)
+    first = session(sample.SerializeToString()).run(None, {"x": x0[:1], "u": u[:1]})[1]
+    np.testing.assert_allclose(first, y[0, :1], rtol=1e-12)
+
+
+class Branches(torch.nn.Linear):
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        return super().forward(z) if z.sum() > 0 else -z
+
+
+class Unknown(torch.nn.Linear):
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        return torch.special.i0(z)
+
+
+class Single(torch.nn.Linear):
+    """ONNX holds the slope in single precision."""
+
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.leaky_relu(z, 0.01)
+
+
+class Drawn(torch.nn.Linear):
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        return z * float(torch.rand(()))
+
+
+@pytest.mark.parametrize(
+    ("static", "why"),
+    [
+        (Branches, "branches in Python"),
+        (Unknown, "aten::i0"),
+        (Single, "single precision"),
+        (Drawn, "other numbers"),
+    ],
+)
+def test_a_map_that_has_no_graph_is_refused(static: type[torch.nn.Linear], why: str):
+    model = random_model(random_cell(1, 1, 1, 1, 1, static=static(1, 1)))
+    with pytest.raises(InputError, match=f"(?s)static map {static.__name__}.*{why}"):
+        onnx_models(model)
 
 
 def test_metadata_say_what_the_numbers_are():

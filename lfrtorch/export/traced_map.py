@@ -1,0 +1,86 @@
+"""A static map of the user's own class as a graph of ONNX, which is compared with the map."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.optional import imported
+from lfrtorch.export.equations import Own
+
+OPSET, IR = 17, 8
+"""Operators and file format of 2022, which every runtime since then reads."""
+
+SAMPLES = (1, 5, 64)
+"""Of the inputs on which the graph is compared with the map."""
+
+LARGEST = 3.0
+"""Standard deviation of the loudest of them; z is of about unit size."""
+
+ROUNDING = 1e-11
+"""Largest error of the graph, relative to 1 and to the largest w."""
+
+
+def traced(static: Own, nz: int) -> Any:
+    """The graph z (n, nz) -> w (n, nw) of a map, an ``onnx.ModelProto``.
+
+    Args:
+        static: the map.
+        nz: its inputs.
+
+    Raises:
+        ValueError: onnx is not installed, or a map whose graph cannot be made, or is another map:
+            a ``forward`` that branches in Python on values, or computes in float32.
+
+    Example:
+        >>> from lfrtorch.export.equations import Own
+        >>> from lfrtorch.export.traced_map import traced
+        >>> [node.op_type for node in traced(Own(torch.nn.Tanh()), nz=2).graph.node]
+        ['Tanh']
+    """
+    onnx = imported("onnx", "onnx")
+    generator, file = torch.Generator().manual_seed(0), io.BytesIO()
+    z = torch.randn(max(SAMPLES), nz, generator=generator, dtype=torch.float64)
+    # Since torch 2.9 another exporter is the default, which needs one package more.
+    older = {"dynamo": False} if "dynamo" in inspect.signature(torch.onnx.export).parameters else {}
+    try:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            torch.onnx.export(
+                static.module, (z,), file, input_names=["z"], output_names=["w"],
+                opset_version=OPSET, dynamic_axes={"z": {0: "n"}, "w": {0: "n"}}, **older,
+            )  # fmt: skip
+    except Exception as error:  # of many classes, by what its forward does
+        raise _refused(static, f"torch.onnx.export says: {error}") from None
+    if any("Python boolean" in str(one.message) for one in said):
+        raise _refused(static, "Its forward branches in Python on values; use torch.where.")
+    model = onnx.load_from_string(file.getvalue())
+    run = imported("onnx.reference", "onnx").ReferenceEvaluator(model).run
+    for scale, count in zip(np.linspace(LARGEST, 0.0, len(SAMPLES) + 1), SAMPLES, strict=False):
+        point = float(scale) * z[:count]
+        with torch.no_grad():
+            expected = static.module(point).numpy()
+        (found,) = run(None, {"z": point.numpy()})
+        size = max(1.0, np.abs(np.nan_to_num(expected)).max())
+        if found.shape != expected.shape or not np.allclose(
+            found, expected, rtol=0, atol=ROUNDING * size, equal_nan=True
+        ):
+            raise _refused(
+                static,
+                "The graph computes other numbers than its forward in float64. Some options of "
+                "layers have single precision in ONNX: a slope of 0.01, not one of 1/64.",
+            )
+    return model
+
+
+def _refused(static: Own, why: str) -> InputError:
+    return InputError(
+        f"the static map {static.name}, a class of your own, has no graph of ONNX: its forward "
+        f"must be made of torch's functions.\n{why}"
+    )
