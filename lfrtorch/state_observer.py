@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.simulation import is_compiled, kernel_arguments
 from lfrtorch.engine.simulation_kernel import simulate_record
@@ -46,7 +47,7 @@ class StateObserver(ABC):
         outputs: tuple[Channel, ...],
         x0: ArrayLike,
     ) -> None:
-        cell = deepcopy(cell).double().cpu()
+        cell = folded(deepcopy(cell).double().cpu())
         self._cell, self._scaler, self._inputs, self._outputs = cell, scaler, inputs, outputs
         self._u, self._x = np.zeros((1, 1, cell.nu)), np.zeros((1, 2, cell.nx))
         z, w, self._y = (np.zeros((1, 1, size)) for size in (cell.nz, cell.nw, cell.ny))

@@ -42,7 +42,7 @@ OBSERVED: dict[str, Model] = {
         MODELS[name],
         K=0.1 * normal(MODELS[name].lfr.cell.nx, len(MODELS[name].outputs), seed=2),
     )
-    for name in ("softplus", "layers", "polynomial", "linear", "smallest")
+    for name in ("softplus", "layers", "polynomial", "linear", "canonical", "smallest")
 }
 """Models with a gain K."""
 
