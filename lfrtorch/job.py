@@ -443,6 +443,7 @@ def starting_model(
             relaxations=settings.relaxations,
             modes=settings.modes,
             z_feedthrough=settings.z_feedthrough,
+            feedthrough=settings.feedthrough,
             structure=settings.structure,
         )
     nz, nw = cast(int, settings.nz), cast(int, settings.nw)

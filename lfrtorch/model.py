@@ -452,6 +452,8 @@ class Model:
         }
         if not (cell.Dzu.requires_grad or cell.Dzu.any()):
             description["z_feedthrough"] = False
+        if not (cell.Dyu.requires_grad or cell.Dyu.any()):
+            description["feedthrough"] = False
         if cell.structure != "free":
             description["structure"] = cell.structure
         if self.fitted_to:
@@ -586,7 +588,9 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         if K is not None and K.shape != (cell.nx, cell.ny):
             raise InputError(f"K has the shape {tuple(K.shape)}")
         cell.load_state_dict(weights)
-        cell.Dzu.requires_grad_(description.get("z_feedthrough", True))
+        cell.free_feedthrough(
+            z=description.get("z_feedthrough", True), y=description.get("feedthrough", True)
+        )
         cell.structure = description.get("structure", "free")
         if cell.structure not in STRUCTURES:
             raise InputError(f"structure is {cell.structure!r}")

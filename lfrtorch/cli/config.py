@@ -54,7 +54,7 @@ def configured(cfg: DictConfig) -> Settings:
 
 AS_THEY_ARE = (
     "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "layers", "z_feedthrough",
-    "structure", "activation", "degree", "ridge", "noise", "average", "distil", "refit",
+    "feedthrough", "structure", "activation", "degree", "ridge", "noise", "average", "distil", "refit",
     "first_part", "first_iterations", "starts", "seed", "device",
 )  # fmt: skip
 """Settings that are the words of the configuration."""

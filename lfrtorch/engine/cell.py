@@ -89,6 +89,15 @@ class LFRCell(nn.Module):
         z = x @ self.Cz.mT + u @ self.Dzu.mT
         return z, (z if self.static is None else self.static(z))
 
+    def free_feedthrough(self, *, z: bool, y: bool) -> None:
+        """Which of z and y a fit lets the input act on at once; zeros elsewhere stay zeros.
+
+        On y it acts through w, too, so without ``y`` that path is closed: at Dzu, or else at Dyw.
+        """
+        self.Dzu.requires_grad_(z)
+        self.Dyu.requires_grad_(y)
+        self.Dyw.requires_grad_(y or not z)
+
     def extra_repr(self) -> str:
         """Sizes, for ``print(module)``."""
         return f"nu={self.nu}, ny={self.ny}, nx={self.nx}, nz={self.nz}, nw={self.nw}"

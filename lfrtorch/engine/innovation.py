@@ -52,7 +52,7 @@ def predictor_cell(cell: LFRCell, K: Float[Tensor, "nx ny"]) -> LFRCell:
         found.Bw.copy_(cell.Bw - K @ cell.Dyw)
         for name in ("Dzu", "Dyu"):
             getattr(found, name)[:, : cell.nu] = getattr(cell, name)
-    found.Dzu.requires_grad_(cell.Dzu.requires_grad)
+    found.free_feedthrough(z=cell.Dzu.requires_grad, y=cell.Dyu.requires_grad)
     return found
 
 
@@ -63,7 +63,7 @@ def split_predictor(cell: LFRCell) -> tuple[LFRCell, Float[Tensor, "nx ny"]]:
         weights, K = split_weights(dict(cell.named_parameters()))
         for name, parameter in found.named_parameters():
             parameter.copy_(weights[name])
-    found.Dzu.requires_grad_(cell.Dzu.requires_grad)
+    found.free_feedthrough(z=cell.Dzu.requires_grad, y=cell.Dyu.requires_grad)
     return found, K
 
 

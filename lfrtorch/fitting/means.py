@@ -87,7 +87,9 @@ def mean_model(models: Sequence[Model]) -> Model:
         for name, weight in network.named_parameters():
             parts = [n.get_parameter(name) for n in networks]
             weight.copy_(torch.block_diag(*parts) if weight.ndim == 2 else torch.cat(parts))
-    cell.Dzu.requires_grad_(any(c.Dzu.requires_grad for c in cells))
+    cell.free_feedthrough(
+        z=any(c.Dzu.requires_grad for c in cells), y=any(c.Dyu.requires_grad for c in cells)
+    )
     return replace(first, lfr=LFR(cell), K=None)  # gains of models do not make one of their mean
 
 

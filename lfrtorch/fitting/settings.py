@@ -103,6 +103,8 @@ class Settings:
             linear model, see :func:`lfrtorch.initialise`.
         z_feedthrough: whether the input acts on z at once; False for a nonlinearity of the states
             alone, see :func:`lfrtorch.initialise`.
+        feedthrough: whether it acts on the output at once; False for data under feedback without a
+            delay. The linear model has none then, either.
         structure: of which blocks the model is made, see :func:`lfrtorch.initialise`.
         linear: options of :func:`lfrtorch.estimate_bla`, for example ``{"offset": False}``.
         trainer: the search. Default: Levenberg-Marquardt.
@@ -149,6 +151,7 @@ class Settings:
     relaxations: int = 0
     modes: int = 0
     z_feedthrough: bool = True
+    feedthrough: bool = True
     structure: str = "free"
     linear: Mapping[str, Any] = field(default_factory=dict)
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
@@ -192,8 +195,10 @@ class Settings:
                     f"distil is for noise='output', and noise is {self.noise!r}; give one of them."
                 )
         integer("seed", self.seed, 0)
-        for name in ("distil", "refit", "z_feedthrough"):
+        for name in ("distil", "refit", "z_feedthrough", "feedthrough"):
             true_or_false(name, getattr(self, name))
+        if not self.feedthrough:
+            object.__setattr__(self, "linear", {**self.linear, "feedthrough": False})
         known = [*signature(estimate_bla).parameters][2:]
         for name in self.linear:
             if name not in known:
@@ -219,6 +224,7 @@ class Settings:
             ("relaxations", 0),
             ("modes", 0),
             ("z_feedthrough", True),
+            ("feedthrough", True),
             ("structure", "free"),
         )
         for name, unused in unused_ones:

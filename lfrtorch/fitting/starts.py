@@ -52,6 +52,7 @@ def initialise(
     relaxations: int = 0,
     modes: int = 0,
     z_feedthrough: bool = True,
+    feedthrough: bool = True,
     structure: str = "free",
     dtype: torch.dtype = torch.float64,
 ) -> Model:
@@ -83,7 +84,9 @@ def initialise(
 
     Exact integrators of the linear model (``estimate_bla(..., integrators=1)``) stay so: no z sees
     their states, and a fit leaves those columns of A and Cz as they are. Without ``z_feedthrough``
-    Dzu is 0, and a fit of this model leaves it so: the nonlinearity sees the states alone.
+    Dzu is 0, and a fit of this model leaves it so: the nonlinearity sees the states alone. Without
+    ``feedthrough`` the input does not act on the output at once, neither by Dyu nor through w: then
+    Dyw is 0 as well, unless Dzu is. It must be so for data under feedback whose loop has no delay.
 
     ``structure`` makes the model of blocks, and a fit of it keeps to them: a static map of what is
     made of the linear model's states acts on the output alone (``"wiener"``); one of the inputs
@@ -106,13 +109,15 @@ def initialise(
         relaxations, modes: how many are added to those of the linear model, one and two states
             each.
         z_feedthrough: whether the input acts on z at once.
+        feedthrough: whether it acts on the output at once; if not, the linear model has D = 0.
         structure: ``"free"``, ``"wiener"``, ``"hammerstein"``, ``"wiener_hammerstein"`` or
             ``"parallel"``.
         dtype: of the weights.
 
     Raises:
         ValueError: sizes below 1, an unknown method, a static map of other sizes, modes and no
-            errors above the band of the inputs, or nothing that z may see.
+            errors above the band of the inputs, nothing that z may see, or a linear model with
+            feedthrough for a model without.
 
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
@@ -135,6 +140,8 @@ def initialise(
         raise InputError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
     if structure != "free":
         _check_structure(structure, nz, nw, nn, layers, static, relaxations + modes, z_feedthrough)
+    if not feedthrough:
+        _check_no_feedthrough(bla, structure, z_feedthrough)
     if minor is None:
         minor = MINOR if method != "paper" and bla.K is None else 0.0  # noise has slow modes
     number("minor", minor)
@@ -201,8 +208,9 @@ def initialise(
         for name in OUTPUT_WEIGHTS.get(type(static), ()) if method == "zero_output" else ():
             static.get_parameter(name).zero_()
         if method == "zero_output" and not static((z / spread.mT).unsqueeze(0)).any():
-            uniform(cell.Bw, 0.0 if end == "output" else OUTPUT_RANGE)
-            uniform(cell.Dyw, OUTPUT_RANGE)
+            to_output = feedthrough or not z_feedthrough
+            uniform(cell.Bw, 0.0 if end == "output" and to_output else OUTPUT_RANGE)
+            uniform(cell.Dyw, OUTPUT_RANGE if to_output else 0.0)
     if relaxations or modes:
         inputs = [record.u for record in data]
         corners = relaxation_frequencies(inputs, relaxations)
@@ -219,7 +227,7 @@ def initialise(
     model = replace(model, K=K)
     if structure != "free":
         model = replace(model, lfr=LFR(_in_blocks(cell, structure)), K=None)
-    model.lfr.cell.Dzu.requires_grad_(z_feedthrough)
+    model.lfr.cell.free_feedthrough(z=z_feedthrough, y=feedthrough)
     return model
 
 
@@ -273,6 +281,20 @@ def _check_structure(
             )
         if nn is not None and nn < nz:
             raise InputError(f"structure is 'parallel', and {nn} neurons are fewer than {nz} z.")
+
+
+def _check_no_feedthrough(bla: LinearModel, structure: str, z_feedthrough: bool) -> None:
+    """Refuse what lets the input act on the output at once with a ValueError."""
+    if bla.D.any():
+        raise InputError(
+            "feedthrough is False, and the linear model has one; estimate it with "
+            "estimate_bla(..., feedthrough=False)."
+        )
+    if structure == "wiener" and z_feedthrough:
+        raise InputError(
+            "structure is 'wiener', whose w acts on the output alone, and feedthrough is False; "
+            "give z_feedthrough=False as well."
+        )
 
 
 def _check_sizes(static: Module, nz: int, nw: int, dtype: torch.dtype) -> None:

@@ -334,6 +334,38 @@ def test_a_nonlinearity_of_the_states_alone(method, tmp_path):
         assert not torch.equal(model.lfr.cell.Cz, before)
 
 
+@pytest.mark.parametrize("z_feedthrough", [True, False])
+@pytest.mark.parametrize("noise", ["output", "innovation", "both"])
+def test_without_feedthrough_an_input_acts_later(noise, z_feedthrough, tmp_path):
+    """Neither by Dyu nor through w, before and after a fit, and saved so."""
+    refine = "simulation" if noise == "output" else "prediction"
+    bla = estimate_bla(RECORDS, 3, refine=refine, feedthrough=False, max_iter=5)
+    options = {"z_feedthrough": z_feedthrough, "feedthrough": False}
+    models = [initialise(bla, RECORDS, **SIZES, seed=seed, **options) for seed in range(2)]
+    fresh = [models[0], load(models[1].save(tmp_path / "model"))]
+    for model in [*fresh, mean_model(models)][: 2 if noise != "output" else 3]:
+        trainer = LevenbergMarquardt(max_iter=2)
+        found = fit(model, RECORDS, noise=noise, trainer=trainer, monitors=[]).model
+        cell = found.lfr.cell
+        assert cell.Bw.any()
+        assert not cell.Dyu.any()
+        assert bool(cell.Dzu.any()) == z_feedthrough
+        assert bool(cell.Dyw.any()) != z_feedthrough
+        u = RECORDS[1].u.copy()
+        before = found.simulate(u)
+        u[-1] += 1.0
+        assert np.array_equal(found.simulate(u), before)
+
+
+def test_a_model_without_feedthrough_from_one_with_is_refused():
+    sizes: dict[str, Any] = {"nz": 1, "nw": 1, "nn": 2, "feedthrough": False}
+    with pytest.raises(ValueError, match=r"estimate it with estimate_bla\(..., feedthrough=False"):
+        initialise(estimate_bla(RECORDS, 3, max_iter=0), RECORDS, **sizes)
+    bla = estimate_bla(RECORDS, 3, max_iter=0, feedthrough=False)
+    with pytest.raises(ValueError, match="give z_feedthrough=False as well"):
+        initialise(bla, RECORDS, **sizes, structure="wiener")
+
+
 def test_integrators_leave_z_something_to_see():
     u = np.random.default_rng(0).normal(size=300)
     record = Record(u, np.cumsum(u) - u, start="estimated")
