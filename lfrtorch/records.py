@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -99,14 +99,18 @@ class Record:
         inputs, outputs: channel names and units, one a column of ``u`` and ``y``.
         period: samples of one period of the input, if it repeats; a ``"periodic"`` record holds
             a whole number of them. Default: one.
+        reference: what the experimenter sets if a controller makes the input, or what a generator
+            plays if the input is measured with noise: a channel for each input, without noise. Best
+            linear approximations are estimated from it, see :func:`lfrtorch.estimate_frf`.
 
     Shape:
-        u: (T, nu), y: (T, ny), x0: (nx,), weight: () or (ny,),
+        u: (T, nu), y: (T, ny), reference: (T, nu), x0: (nx,), weight: () or (ny,),
         line_weight: (T // 2 + 1,) or (T // 2 + 1, ny), limits: (2, ny).
 
     Raises:
         ValueError: NaN or infinite samples, different lengths, wrong shapes, negative weights, a
-            ``skip`` that leaves no sample, or a period that does not fit.
+            ``skip`` that leaves no sample, a period that does not fit, or a reference of other
+            samples or channels than the input.
 
     Example:
         >>> record = lfrtorch.Record(np.sin(np.arange(100.0)), np.zeros(100), fs=50.0, skip=10)
@@ -131,6 +135,7 @@ class Record:
     line_weight: Array | None = None
     skip_more: bool = False
     limits: Sequence[ArrayLike | None] | Array | None = None
+    reference: Array | None = None
 
     def __post_init__(self) -> None:
         inputs = _channels(self.inputs, self.u, "u")
@@ -167,6 +172,7 @@ class Record:
             object.__setattr__(self, "x0", x0)
         self._check_weights(len(u), y.shape[1])
         self._check_limits(y.shape[1])
+        self._check_reference(u)
         for field, value in (("u", u), ("y", y), ("inputs", inputs), ("outputs", outputs)):
             object.__setattr__(self, field, value)
 
@@ -237,10 +243,23 @@ class Record:
             )
         object.__setattr__(self, "limits", limits)
 
+    def _check_reference(self, u: Array) -> None:
+        if self.reference is None:
+            return
+        what = f"record '{self.name}': reference"
+        r = as_signal(self.reference, _channels((), self.reference, "r"), what)
+        if r.shape != u.shape:
+            raise InputError(
+                f"{what} has shape {r.shape} and the input {u.shape}; give as many samples, and a "
+                "reference for each input."
+            )
+        object.__setattr__(self, "reference", r)
+
     def __repr__(self) -> str:
         parts = [f"{self.samples} samples at {self.fs:g} Hz", f"start {self.start}"]
         parts += [f"skip {self.skip}"] if self.skip else []
         parts += [f"period {self.period}"] if self.period else []
+        parts += ["with reference"] if self.reference is not None else []
         return f"Record({self.name!r}: {signals(self)}, {', '.join(parts)})"
 
     @property
@@ -285,12 +304,63 @@ class Record:
         """
         if not isinstance(window, slice) or window.step not in (None, 1):
             raise InputError(f"a record is cut by record[first:last], not by {window!r}.")
-        u, y = self.u[window], self.y[window]
-        period = self.period if self.period is not None and self.period <= len(u) else None
+        part = self.signals_in(window)
+        period = self.period if self.period is not None and self.period <= len(part["u"]) else None
         return replace(
-            self, u=u, y=y, start="zero", skip=0, period=period, x0=None, line_weight=None,
+            self, **part, start="zero", skip=0, period=period, x0=None, line_weight=None,
             skip_more=False,
         )  # fmt: skip
+
+    def mean_period(self) -> Record:
+        """One period, the mean of all of a record in steady state, that weighs as much as they do.
+
+        A fit of simulations is the same if the input has no noise, and faster. If it has, what P
+        periods average to has 1 / P of its power, and so has the bias that it leaves in a model.
+
+        Raises:
+            ValueError: the record is not in steady state.
+
+        Example:
+            >>> from dataclasses import replace
+            >>> halves = replace(record, period=200).mean_period()
+            >>> halves.samples, halves.weight, halves.start
+            (200, array(2.), 'periodic')
+        """
+        if self.start != "periodic":
+            raise InputError(
+                f"record '{self.name}': start is {self.start!r}; mean_period is for whole periods "
+                "in steady state: start='periodic'."
+            )
+        N = self.period or self.samples
+        P = self.samples // N
+        whole = self.signals_in(slice(None))
+        means = {
+            name: None if signal is None else signal.reshape(P, N, -1).mean(axis=0)
+            for name, signal in whole.items()
+        }
+        lines = None if self.line_weight is None else self.line_weight[::P]
+        return replace(
+            self,
+            **means,
+            skip=0,
+            weight=P * np.asarray(self.weight),
+            line_weight=lines,
+            limits=None,
+        )
+
+    def signals_in(self, window: slice) -> dict[str, Any]:
+        """The signals in ``window`` by name, for ``dataclasses.replace``.
+
+        Example:
+            >>> sorted(record.signals_in(slice(20)))
+            ['reference', 'u', 'y']
+        """
+        r = self.reference
+        return {
+            "u": self.u[window],
+            "y": self.y[window],
+            "reference": r if r is None else r[window],
+        }
 
 
 def signals(record: Record) -> str:
@@ -326,6 +396,7 @@ def with_past_outputs(record: Record) -> Record:
         start="estimated" if record.start == "periodic" else record.start,
         period=None,
         line_weight=None,
+        reference=None,
     )
 
 

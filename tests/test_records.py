@@ -12,6 +12,7 @@ from lfrtorch.records import (
     Scaler,
     as_records,
     rms_scale,
+    with_past_outputs,
     without_coordinates,
 )
 
@@ -264,6 +265,38 @@ def test_every_output_has_its_weights(T: int, F: int):
     one = lab(u=U[:T], y=U[:T], start="periodic", line_weight=lines[:, :1])
     assert one.line_weight is not None
     assert np.array_equal(one.line_weight, lines[:, [0, 0]])
+
+
+def test_a_reference_goes_with_the_signals():
+    record = lab(reference=U[::-1], start="periodic", period=5)
+    assert repr(record).endswith("period 5, with reference)")
+    assert record[2:6].reference is not None
+    assert np.array_equal(record[2:6].reference, U[::-1][2:6])
+    with pytest.raises(ValueError, match="read-only"):
+        record.reference[0] = 0.0  # pyright: ignore[reportOptionalSubscript]
+    assert with_past_outputs(record).reference is None
+
+
+@pytest.mark.parametrize("reference", [U[:, :1], U[:5], np.zeros(10)])
+def test_a_reference_of_another_shape(reference):
+    refused(
+        "and the input (10, 2); give as many samples, and a reference for each", reference=reference
+    )
+
+
+def test_a_mean_period_weighs_as_much_as_all():
+    lines = np.arange(6.0)
+    record = lab(start="periodic", period=5, weight=3.0, line_weight=lines, reference=U)
+    mean = record.mean_period()
+    assert np.allclose(mean.u, (U[:5] + U[5:]) / 2)
+    assert np.allclose(mean.y[:, 0], (Y[:5] + Y[5:]) / 2)
+    assert mean.reference is not None
+    assert np.allclose(mean.reference, mean.u)
+    assert mean.line_weight is not None
+    assert (mean.samples, float(mean.weight)) == (5, 6.0)
+    assert mean.line_weight[:, 0].tolist() == [0.0, 2.0, 4.0]
+    with pytest.raises(ValueError, match="start is 'zero'; mean_period is for whole periods"):
+        lab().mean_period()
 
 
 def test_errors_count_by_the_root_of_their_weight_where_they_are_scored():

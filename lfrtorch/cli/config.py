@@ -54,8 +54,8 @@ def configured(cfg: DictConfig) -> Settings:
 
 AS_THEY_ARE = (
     "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "layers", "z_feedthrough",
-    "feedthrough", "structure", "activation", "degree", "ridge", "noise", "average", "distil", "refit",
-    "first_part", "first_iterations", "starts", "seed", "device",
+    "feedthrough", "structure", "activation", "degree", "ridge", "noise", "average", "distil",
+    "refit", "first_part", "first_iterations", "starts", "seed", "device",
 )  # fmt: skip
 """Settings that are the words of the configuration."""
 
@@ -88,7 +88,12 @@ def loaded(cfg: DictConfig) -> Dataset:
     """The records; what is to be known of them is printed, and kept for the report."""
     dataset: Dataset = instantiate(cfg.data)
     measured = [record for record in dataset.train if record.source == "file"]
-    notes = (*dataset.notes, *(notes_on(measured, given=cfg.get("bla")) if measured else ()))
+    given = dict(cfg.get("bla") or {})
+    if not cfg.get("feedthrough", True):
+        given["feedthrough"] = False
+    if cfg.get("noise", "output") != "output":
+        given["refine"] = given.get("refine") or "prediction"
+    notes = (*dataset.notes, *(notes_on(measured, given=given) if measured else ()))
     notes = tuple(translated(note, cfg) for note in notes)
     for note in notes:
         print(in_lines(f"note: {note}"))

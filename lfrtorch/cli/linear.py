@@ -36,6 +36,7 @@ from lfrtorch.cli.words import Terminal
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.job import linear_model, linear_records, windowed
+from lfrtorch.linear.requirements import of_response
 from lfrtorch.linear.score_window import fitted
 from lfrtorch.metrics import rms
 from lfrtorch.reporting import figures as run_figures
@@ -54,7 +55,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     frf, notes = response(cfg, dataset.train)
     # A fit to the response takes the one that the figures show.
     terminal = Terminal(cfg)
-    data = frf if frf and cfg.bla.refine == "frequency" else None
+    data = frf if frf and wants_response(cfg, dataset.train) else None
     data = data or linear_records(dataset.train, settings, terminal)
     model, scan = linear_model(data, settings, dataset.validation, observer=terminal, ranks=Ranks())
     dataset = windowed(dataset, model.to_model(), terminal)
@@ -85,7 +86,7 @@ def response(
     cfg: DictConfig, records: Sequence[lfrtorch.Record]
 ) -> tuple[lfrtorch.FRF | None, list[str]]:
     """The measured frequency response, if the records give one, and notes."""
-    asked_for = cfg.frf.method != "auto" or cfg.bla.refine == "frequency"
+    asked_for = cfg.frf.method != "auto" or wants_response(cfg, records)
     try:
         frf: lfrtorch.FRF = instantiate(cfg.frf, records)
     except InstantiationException as failed:
@@ -93,6 +94,11 @@ def response(
             raise
         return None, [f"no measured frequency response: {failed.__cause__}"]
     return frf, list(frf.notes)
+
+
+def wants_response(cfg: DictConfig, records: Sequence[lfrtorch.Record]) -> bool:
+    """Whether the model is fitted to the measured frequency response."""
+    return cfg.bla.refine == "frequency" or (cfg.bla.refine is None and of_response(records))
 
 
 def figures(

@@ -72,6 +72,7 @@ def load_records(
     skip: int | Literal["auto"] | None = None,
     gaps: Gaps = "error",
     limits: Sequence[ArrayLike | None] | None = None,
+    reference: Columns | None = None,
 ) -> Dataset:
     """Measurements from files, each a record, by use: training, validation and test.
 
@@ -107,6 +108,9 @@ def load_records(
             of every stretch between them.
         limits: least and greatest output that the sensors show, see :class:`lfrtorch.Record`; for
             example ``(None, 10)``.
+        reference: what is set if a controller makes the inputs, or what a generator plays if the
+            inputs are measured with noise: one or several columns, as for ``inputs``, one for each
+            of these; see :class:`lfrtorch.Record`.
 
     Shape:
         u, y of a record: (its samples, inputs), (its samples, outputs), in the file's units.
@@ -129,7 +133,7 @@ def load_records(
         [1, 1, 1]
     """
     reader = _Reader(
-        Wanted(inputs, outputs, fs, time, dict(units or {}), gaps),
+        Wanted(inputs, outputs, fs, time, dict(units or {}), gaps, reference),
         start,
         period,
         None if skip == "auto" else skip,
@@ -276,9 +280,9 @@ class _Reader:
         self, name: str, measured: Measurement, stretch: Stretch
     ) -> tuple[Record, list[str]]:
         """The record of a stretch, and what was found of its period."""
-        u, y, T = stretch.u, stretch.y, len(stretch.u)
+        u, y, r, T = stretch.u, stretch.y, stretch.reference, len(stretch.u)
         automatic = self.period == "auto"
-        N = find_period(u) if automatic else cast("int | None", self.period)
+        N = find_period(u if r is None else r) if automatic else cast("int | None", self.period)
         settling = 0 if N is None or self.skip is not None else find_transient(y, N)
         start: Start = self.start
         if start == "periodic":
@@ -334,6 +338,7 @@ class _Reader:
             period=N,
             skip_more=self.skip is None and start == "estimated",
             limits=self.limits,
+            reference=None if r is None else r[kept],
         )
         return record, notes
 

@@ -34,6 +34,7 @@ class Wanted:
     time: str | int | None = None
     units: Mapping[str | int, str] = field(default_factory=dict)
     gaps: Gaps = "error"
+    reference: Columns | None = None
 
     def __post_init__(self) -> None:
         if self.fs is not None:
@@ -43,11 +44,15 @@ class Wanted:
 
 
 class Stretch(NamedTuple):
-    """Consecutive samples: u (T, nu), y (T, ny), and which sample of the file is the first."""
+    """Consecutive samples: u (T, nu), y (T, ny), and which sample of the file is the first.
+
+    ``reference`` (T, nr) is that of the inputs, if one was asked for.
+    """
 
     u: Array
     y: Array
     first: int
+    reference: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -72,15 +77,21 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
     table = open_table(path)
     u = table.find(wanted.inputs, "inputs")
     y = table.find(wanted.outputs, "outputs")
+    r = () if wanted.reference is None else table.find(wanted.reference, "reference")
+    if r and len(r) != len(u):
+        raise InputError(
+            f"reference is {wanted.reference!r}, {len(r)} column(s) for {len(u)} input(s); name "
+            "one for each input."
+        )
     stamps = () if wanted.time is None else table.find(wanted.time, "time")
     if len(stamps) > 1:
         raise InputError(f"time is {wanted.time!r}, which is {len(stamps)} columns; name one.")
-    columns = (*u, *y, *stamps)
+    columns = (*u, *y, *r, *stamps)
     twice = [table.headers[i] for i in dict.fromkeys(columns) if columns.count(i) > 1]
     if twice:
         raise InputError(
-            f"'{path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs "
-            "and time; name every column once."
+            f"'{path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs, "
+            "reference and time; name every column once."
         )
     notes, fs = [*table.notes], wanted.fs
     if fs is None and not stamps:
@@ -116,7 +127,8 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
         raise _gap(table, values, columns, grid)
     if not stretches:
         raise InputError(f"'{path}' has no sample in which all columns have a value.")
-    nu, ny = len(u), len(u) + len(y)
+    ends = np.cumsum([0, len(u), len(y), len(r)])
+    parts = [slice(a, b) for a, b in pairwise(ends)]
     fs = fs if grid is None else grid.fs
     assert fs is not None
     return Measurement(
@@ -124,7 +136,15 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
         fs,
         _channels(table, u, wanted.units),
         _channels(table, y, wanted.units),
-        [Stretch(values[a:b, :nu], values[a:b, nu:ny], int(a)) for a, b in stretches],
+        [
+            Stretch(
+                values[a:b, parts[0]],
+                values[a:b, parts[1]],
+                int(a),
+                values[a:b, parts[2]] if r else None,
+            )
+            for a, b in stretches
+        ],
         notes,
     )
 

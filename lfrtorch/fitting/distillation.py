@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -80,9 +81,8 @@ def distil(
         y = result.model.simulate(u, start=start)
         if np.isfinite(y).all():
             start = "periodic" if record.start == "periodic" else "estimated"
-            copies.append(
-                replace(record, u=u, y=y, start=start, skip=0, x0=None, limits=None, period=None)
-            )
+            made: dict[str, Any] = {"u": u, "y": y, "start": start, "reference": None}
+            copies.append(replace(record, **made, skip=0, x0=None, limits=None, period=None))
     return fit(
         deepcopy(result.members[0]),
         [*train, *copies],

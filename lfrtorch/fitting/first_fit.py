@@ -102,4 +102,4 @@ def part_of(records: Sequence[Record], part: float) -> list[Record]:
 def _beginning(record: Record, part: float) -> Record:
     """What is skipped, and a part of the other samples."""
     end = record.skip + math.ceil(part * (record.samples - record.skip))
-    return replace(record, u=record.u[:end], y=record.y[:end], period=None)
+    return replace(record, **record.signals_in(slice(end)), period=None)

@@ -107,11 +107,12 @@ def all_records(train: Sequence[Record], held_out: Sequence[Record]) -> list[Rec
         if at is None:
             found.append(record)
             continue
-        u, y = (
-            np.concatenate([before, after[record.skip :]])
-            for before, after in ((found[at].u, record.u), (found[at].y, record.y))
-        )
-        found[at] = replace(found[at], u=u, y=y)
+        before, after = found[at], record.signals_in(slice(record.skip, None))
+        both = {
+            name: None if signal is None else np.concatenate([getattr(before, name), signal])
+            for name, signal in after.items()
+        }
+        found[at] = replace(before, **both)
     return found
 
 

@@ -39,6 +39,7 @@ from lfrtorch.linear.requirements import (
     check_signals,
     check_spectral_data,
     excitation_notes,
+    of_response,
     steady_state,
 )
 from lfrtorch.linear.response_fit import ResponseFit
@@ -94,16 +95,19 @@ def estimate_bla(
     the best of these models in the error of choice. Unstable poles of a subspace estimate are
     reflected into the unit circle, and the refinement rejects every step to an unstable model.
 
-    - ``"simulation"``, the default for records: simulated minus measured output. For periodic
-      records in steady state, also if that begins after the skipped samples, it is computed from
-      their spectra at the excited lines, at a fraction of the work. A note names their band if a
-      measured input has power elsewhere. Poles are kept from being narrower than the lines are
-      apart, and than their distance from the band, unless the data clearly ask for that.
+    - ``"simulation"``, the default for records in steady state or without a reference: simulated
+      minus measured output. For periodic records in steady state, also if that begins after the
+      skipped samples, it is computed from their spectra at the excited lines, at a fraction of the
+      work. A note names their band if a measured input has power elsewhere. Noise of the inputs,
+      which two periods tell, and what a controller feeds back to them leave no bias there. Poles
+      are kept from being narrower than the lines are apart, and than their distance from the band,
+      unless the data clearly ask for that.
     - ``"prediction"``: output predicted one sample ahead by an innovation model, more precise if
       disturbances act on the states. The gain K is part of the model. For records in steady state
       an initial state is estimated, as their noise does not repeat.
-    - ``"frequency"``, the default for a response and its only one: the nonparametric response,
-      weighted by its variance if wanted. ``estimate_frf`` turns records into a response.
+    - ``"frequency"``, the default for a response and its only one, and that for other records with
+      a reference: the nonparametric response, weighted by its variance if wanted. ``estimate_frf``
+      turns records into a response.
 
     Args:
         data: records, or a nonparametric response. A given ``x0`` of a record is in the coordinates
@@ -168,7 +172,7 @@ def estimate_bla(
     else:
         data = [without_coordinates(record) for record in as_records(data)]
         check_signals(data)
-        refine = refine or "simulation"
+        refine = refine or ("frequency" if of_response(data) else "simulation")
     if refine != "frequency" and weight is not None:
         raise InputError("weight is that of a response: use refine='frequency'.")
     settings = _Settings(refine, weight, offset, feedthrough, coordinates, max_iter)

@@ -24,7 +24,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array, Complex, Integers
 from lfrtorch.linear.local_polynomial import fit_local_polynomials, half_width
-from lfrtorch.linear.regression import Regression, covariance, outer, regress
+from lfrtorch.linear.regression import Regression, covariance, divided, outer, regress
 from lfrtorch.linear.spectra import (
     Removal,
     Spectra,
@@ -33,6 +33,7 @@ from lfrtorch.linear.spectra import (
     powered_lines,
     spectra_of_periods,
     spectra_of_records,
+    without_noise,
 )
 from lfrtorch.records import Channel, Record, as_records
 
@@ -226,6 +227,11 @@ def estimate_frf(
 
     ``"auto"``: robust if every record has periods, else local polynomials.
 
+    If the records have a ``reference`` r, G is the response from r to y over that from r to u, so
+    that noise which a controller feeds back to the input, or that of the input's sensor, leaves no
+    bias. Without a reference the mean over periods removes most of such noise, and its share in the
+    power of the input, known from two periods or more, is subtracted.
+
     Args:
         records: data. A record is periodic if it has a ``period`` or ``start="periodic"`` (then of
             one period unless it says otherwise).
@@ -258,7 +264,8 @@ def estimate_frf(
 
     References:
         Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,
-        2012, chapters 2, 3.4, 4.3 (robust and fast method) and 7 (local polynomial method).
+        2012, chapters 2 (with noise on the input and feedback), 3.4, 4.3 (robust and fast method)
+        and 7 (local polynomial method).
     """
     data = as_records(records)
     if method not in get_args(Method):
@@ -395,8 +402,13 @@ def _local_polynomial(
         lines = chosen
     lines = in_band(lines, spectra.resolution, band)
     # Line 0 holds the offsets and stays out of all windows.
-    U, Y = spectra.U[1 : last + 1], spectra.Y[1 : last + 1]
-    G, cov, determined = fit_local_polynomials(U, Y, lines - 1, order=order, n=n)
+    driven, outputs = spectra.Y, None
+    if spectra.reference is not None:
+        driven, outputs = np.concatenate([spectra.Y, spectra.U], axis=2), spectra.Y.shape[2]
+    inside = slice(1, last + 1)
+    G, cov, determined = fit_local_polynomials(
+        spectra.excitation[inside], driven[inside], lines - 1, order=order, n=n, outputs=outputs
+    )
     if not determined.any():
         raise InputError(
             "the inputs determine the response at no line: they depend on each other, or excite "
@@ -443,7 +455,11 @@ def _response(spectra: Spectra, lines: Integers) -> Regression:
             f"{R} record(s) cannot tell {nu} inputs apart at one line; give at least {nu} "
             "experiments (lfrtorch.multisine), or use method='local_polynomial'."
         )
-    fitted = regress(spectra.U[lines], spectra.Y[lines], nu)
+    if spectra.reference is None:
+        fitted = _without_noise(regress(spectra.U[lines], spectra.Y[lines], nu), spectra, lines)
+    else:
+        driven = np.concatenate([spectra.Y, spectra.U], axis=2)[lines]
+        fitted = divided(regress(spectra.reference[lines], driven, nu), spectra.Y.shape[2])
     if not fitted.determined.all():
         line = lines[np.argmin(fitted.determined)]
         raise InputError(
@@ -452,6 +468,27 @@ def _response(spectra: Spectra, lines: Integers) -> Regression:
             "or leave the line out."
         )
     return fitted
+
+
+def _without_noise(fitted: Regression, spectra: Spectra, lines: Integers) -> Regression:
+    """Least squares of noisy inputs without the bias that their noise has.
+
+    Of R experiments as many as there are inputs fit exactly, whatever the noise; the others leave
+    its share (R - nu) / R in UᴴU and UᴴY, which is subtracted, to first order in the noise.
+    """
+    U, Y = spectra.U[lines], spectra.Y[lines]
+    R, nu = U.shape[1:]
+    noise = spectra.C[lines].swapaxes(1, 2) * ((R - nu) / R * np.sum(1 / spectra.P))
+    Uh = U.conj().swapaxes(1, 2)
+    left, clear = without_noise(Uh @ U, noise[:, -nu:, -nu:])
+    if left is None:
+        return fitted
+    both = np.concatenate([Uh @ Y - noise[:, -nu:, :-nu], Uh], axis=2)
+    solved = np.asarray(np.linalg.solve(left, both), dtype=np.complex128)
+    G, weights = solved[:, :, :-R].swapaxes(1, 2), solved[:, :, -R:]
+    own = Regression(G, weights, Y - U @ G.swapaxes(1, 2), fitted.determined)
+    pairs = zip(own, fitted, strict=True)
+    return Regression(*(np.where(clear.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
 
 
 def _noise(spectra: Spectra, lines: Integers, fitted: Regression) -> Complex:
@@ -471,7 +508,7 @@ def _block_covariance(spectra: Spectra, lines: Integers) -> Complex | None:
     """Covariance of the mean over blocks of orthogonal experiments, ``None`` for other designs."""
     R, nu = spectra.U.shape[1:]
     M = R // nu
-    if nu == 1 or R % nu:  # with one input the residuals give the same
+    if nu == 1 or R % nu or spectra.reference is not None:  # the residuals give the same
         return None
     X = spectra.U[lines].reshape(len(lines), M, nu, nu)  # (line, block, experiment, input)
     products = X.conj().swapaxes(2, 3) @ X

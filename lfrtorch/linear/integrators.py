@@ -52,12 +52,13 @@ def differenced(
         pole: λ.
         feedthrough: whether v(k) = y(k) - y(k - 1), so that the input acts on the output at once.
     """
-    u, v, n = record.u, record.y, integrators
+    u, r, v, n = record.u, record.reference, record.y, integrators
     if record.start == "periodic":
         for _ in range(n):
             v = v - np.roll(v, 1, axis=0) if feedthrough else np.roll(v, -1, axis=0) - v
         return replace(record, y=v, limits=None)
-    v, u = np.diff(v, n, axis=0), u[n:] if feedthrough else u[: len(u) - n]
+    kept = slice(n, None) if feedthrough else slice(len(u) - n)
+    v, u, r = np.diff(v, n, axis=0), u[kept], None if r is None else r[kept]
     skip = record.skip
     if pole:
         for _ in range(n):
@@ -66,8 +67,9 @@ def differenced(
     outputs = tuple(Channel(f"{c.name} differenced", c.unit) for c in record.outputs)
     skip = min(skip, len(u) - 1)
     return replace(
-        record, u=u, y=v, skip=skip, start="estimated", outputs=outputs, period=None, limits=None
-    )
+        record, u=u, y=v, reference=r, skip=skip, start="estimated", outputs=outputs, period=None,
+        limits=None,
+    )  # fmt: skip
 
 
 def whitening_pole(errors: Sequence[Array], integrators: int) -> float:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Complex128, Int64
 from numpy.typing import NDArray
 
 from lfrtorch._support.types import Complex, Integers
-from lfrtorch.linear.regression import DEPENDENT, covariance, outer, regress
+from lfrtorch.linear.regression import DEPENDENT, covariance, divided, outer, regress
 
 CHUNK = 2**21
 """Complex numbers of the windows that are in memory at a time: 32 MiB, and as many in copies."""
@@ -30,11 +30,12 @@ def half_width(order: int, degrees_of_freedom: int, nu: int, records: int) -> in
 
 def fit_local_polynomials(
     U: Complex128[Complex, "lines R nu"],
-    Y: Complex128[Complex, "lines R ny"],
+    Y: Complex128[Complex, "lines R driven"],
     centres: Int64[Integers, " F"],
     *,
     order: int,
     n: int,
+    outputs: int | None = None,
 ) -> tuple[
     Complex128[Complex, "F ny nu"],
     Complex128[Complex, "F ny*nu ny*nu"],
@@ -54,6 +55,8 @@ def fit_local_polynomials(
         centres: at which lines, counted from the first one of the spectra.
         order: of the polynomials.
         n: half width of the window.
+        outputs: how many of Y are outputs if U is a reference: the others are the inputs, and G is
+            the response from these to the outputs. Default: all.
 
     Returns:
         G, the covariance of vec(G) from the residuals (noise and nonlinear distortion together),
@@ -82,6 +85,8 @@ def fit_local_polynomials(
         projected = np.einsum("wm,fwry->frmy", complement, Y[window], optimize=True)
         shape = len(window), rows, -1
         fitted = regress(X.reshape(shape), projected.reshape(shape), nu)
+        if outputs is not None:
+            fitted = divided(fitted, outputs)
         C = outer(fitted.residual) / freedom
         # If one line alone has power, some columns are rounding errors, which pass as independent.
         sizes = np.linalg.norm(X, axis=(1, 2))  # (line, s, input)

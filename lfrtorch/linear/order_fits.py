@@ -26,7 +26,7 @@ from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.minima import ALIKE, scaled, transformation
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Matrices, Refined, Search
-from lfrtorch.linear.requirements import check_spectral_data
+from lfrtorch.linear.requirements import check_spectral_data, of_response
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.spectral_data import (
     spectral_data_of_parts,
@@ -103,6 +103,8 @@ class OrderFits:
         known = {"refine", "weight", "offset", "feedthrough", "coordinates", "max_iter"}
         given = {name: value for name, value in options.items() if value is not None}
         refine = given.get("refine")
+        if refine is None and not isinstance(data, FRF) and of_response(data):
+            refine = "frequency"
         if refine == "prediction" or any(given[name] for name in given.keys() - known):
             return None
         offset, through = given.get("offset", True), given.get("feedthrough", True)

@@ -49,6 +49,21 @@ def regress(
     return Regression(G, weights, Y - Q @ QhY, determined)
 
 
+def divided(fitted: Regression, ny: int) -> Regression:
+    """The response between the columns of Y, from the last nu of them to the first ny.
+
+    Y = [y, u] follows from X as y = G_y X and u = G_u X, and so y = G_y G_u⁻¹ u: what X drives
+    through u, without what else moves y and u together.
+    """
+    Gy, Gu = fitted.G[:, :ny], fitted.G[:, ny:]
+    size = np.linalg.svd(Gu, compute_uv=False)
+    determined = fitted.determined & (size[:, -1] > DEPENDENT * size[:, 0])
+    inverse = np.linalg.inv(np.where(determined[:, None, None], Gu, np.eye(Gu.shape[1])))
+    G = Gy @ inverse
+    residual = fitted.residual[:, :, :ny] - fitted.residual[:, :, ny:] @ G.swapaxes(1, 2)
+    return Regression(G, inverse.swapaxes(1, 2) @ fitted.weights, residual, determined)
+
+
 def outer(
     errors: Complex128[Complex, "F R n"], other: Complex128[Complex, "F R m"] | None = None
 ) -> Complex128[Complex, "F n _"]:

@@ -58,6 +58,15 @@ def steady_state(records: Sequence[Record]) -> list[Record] | None:
     return [record for record in found if record] if all(found) else None
 
 
+def of_response(records: Sequence[Record]) -> bool:
+    """Whether records are best fitted by their response: a reference drives them, not in periods.
+
+    A controller makes such inputs, so that a simulation error of what they do is biased.
+    """
+    referred = all(record.reference is not None for record in records)
+    return referred and steady_state(records) is None
+
+
 def _steady_part(record: Record) -> Record | None:
     N, scored = record.period, record.samples - record.skip
     if record.start == "periodic" and not record.skip:
@@ -68,12 +77,14 @@ def _steady_part(record: Record) -> Record | None:
     P = (scored - settling) // N
     if (1 if record.skip >= N else 2) > P or settling > TRANSIENT * scored:
         return None
-    u, y = (s[record.samples - P * N :] for s in (record.u, record.y))
-    changes = (u.reshape(P, N, -1) - u.reshape(P, N, -1).mean(axis=0)).std(axis=(0, 1))
+    part = record.signals_in(slice(record.samples - P * N, None))
+    y, repeated = part["y"], part["u"] if record.reference is None else part["reference"]
+    periods = repeated.reshape(P, N, -1)
+    changes = (periods - periods.mean(axis=0)).std(axis=(0, 1))
     drift = y.reshape(P, N, -1).mean(axis=1).std(axis=0)
-    if (changes > REPEATS * u.std(axis=0)).any() or (drift > REPEATS * y.std(axis=0)).any():
+    if (changes > REPEATS * repeated.std(axis=0)).any() or (drift > REPEATS * y.std(axis=0)).any():
         return None
-    return replace(record, u=u, y=y, start="periodic", skip=0, skip_more=False)
+    return replace(record, **part, start="periodic", skip=0, skip_more=False)
 
 
 def check_spectral_data(data: SpectralData, nx: int) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex128, Float, Int64
+from jaxtyping import Bool, Complex128, Float, Int64
 from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._support.checks import dft_lines
@@ -45,6 +45,12 @@ weaker ones ..."""
 FEW = 3
 """... if they are this many. Of 3 weakest lines of a random input it is so once in 1e6."""
 
+ROUNDING = 1e-24
+"""Power of the changes of an input from period to period that are rounding, relative to its own."""
+
+CLEAR = 0.5
+"""The noise of an input is subtracted if it leaves this part of the power at a line."""
+
 LARGEST_CHANGE = 0.1
 """Largest rms deviation of a period of an input from the mean period, relative to the input's rms
 over all records."""
@@ -63,6 +69,7 @@ class Spectra(NamedTuple):
         P: numbers of periods.
         N: samples of a period.
         resolution: fs / N, Hz.
+        reference: mean spectra of the references, if the records have them.
     """
 
     U: Complex128[Complex, "F R nu"]
@@ -72,6 +79,12 @@ class Spectra(NamedTuple):
     P: Int64[Integers, " R"]
     N: int
     resolution: float
+    reference: Complex128[Complex, "F R nu"] | None = None
+
+    @property
+    def excitation(self) -> Complex128[Complex, "F R nu"]:
+        """What is known without noise to excite: the references, or else the inputs."""
+        return self.U if self.reference is None else self.reference
 
     def frequencies(self, lines: Int64[Integers, " F"]) -> Float[Array, " F"]:
         """Frequencies of the lines, Hz."""
@@ -140,30 +153,32 @@ def _spectra(
     """Spectra of whole periods of N samples in a window of each record."""
     if N < 3:
         raise InputError(f"{N} samples have no line between 0 and fs / 2; give more.")
+    known = given_references(data)
+    excitation = [record.u if r is None else r for record, r in zip(data, known, strict=True)]
     constant = np.all(
-        [
-            np.ptp(record.u[window], axis=0) == 0
-            for record, window in zip(data, windows, strict=True)
-        ],
+        [np.ptp(e[window], axis=0) == 0 for e, window in zip(excitation, windows, strict=True)],
         axis=0,
     )
     if constant.any():
+        what = "input" if known[0] is None else "the reference of input"
         raise InputError(
-            f"input '{data[0].inputs[int(np.argmax(constant))].name}' is constant in all records; "
+            f"{what} '{data[0].inputs[int(np.argmax(constant))].name}' is constant in all records; "
             "leave it out, or give records in which it is excited."
         )
     ny = data[0].y.shape[1]
     size = ny + data[0].u.shape[1]
     C = np.zeros((N // 2 + 1, size, size), np.complex128)
-    means, P, changes, freedom = [], [], [], 0
-    for record, window in zip(data, windows, strict=True):
+    means, references, P, changes, freedom = [], [], [], [], 0
+    for record, window, excited in zip(data, windows, excitation, strict=True):
         signals = np.concatenate([record.y[window], record.u[window]], axis=1)
         Z = np.fft.rfft(signals.reshape(-1, N, size), axis=1) * (np.sqrt(2) / N)
         mean = Z.mean(axis=0)
         D = (Z - mean).swapaxes(0, 1)
         count = len(Z) - 1
+        E = np.fft.rfft(excited[window].reshape(-1, N, size - ny), axis=1) * (np.sqrt(2) / N)
+        references.append(E.mean(axis=0))
         # Line 0 is left out: a drift of the offset is no change of the input.
-        change = np.sum(np.abs(D[1:, :, ny:]) ** 2, axis=(0, 1)) / max(count, 1)
+        change = np.sum(np.abs(E - references[-1])[:, 1:] ** 2, axis=(0, 1)) / max(count, 1)
         if removal:
             mean, D = _without_transient(signals, N, removal)
             count = D.shape[1]
@@ -175,10 +190,28 @@ def _spectra(
         changes.append(change)
     both = np.stack(means, axis=1)
     Y, U = both[:, :, :ny], both[:, :, ny:]
-    rms = np.sqrt(np.sum(np.abs(U[1:]) ** 2, axis=(0, 1)) / len(data))
+    R = np.stack(references, axis=1)
+    rms = np.sqrt(np.sum(np.abs(R[1:]) ** 2, axis=(0, 1)) / len(data))
     _check_repetition(data, np.sqrt(changes) / rms, N)
     C /= max(freedom, 1)
-    return Spectra(U, Y, C, freedom, np.array(P), N, data[0].fs / N)
+    reference = None if known[0] is None else R
+    return Spectra(U, Y, C, freedom, np.array(P), N, data[0].fs / N, reference)
+
+
+def given_references(data: Sequence[Record]) -> list[Array | None]:
+    """The references of the records.
+
+    Raises:
+        ValueError: some records have one and others none.
+    """
+    with_one = [record.name for record in data if record.reference is not None]
+    without = [record.name for record in data if record.reference is None]
+    if with_one and without:
+        raise InputError(
+            f"record '{with_one[0]}' has a reference and '{without[0]}' has none; give all records "
+            "one, or none."
+        )
+    return [record.reference for record in data]
 
 
 def _without_transient(signals: Array, N: int, removal: Removal) -> tuple[Complex, Complex]:
@@ -220,7 +253,8 @@ def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
         raise InputError(
             f"record '{data[r].name}': the periods of {N} samples of input "
             f"'{data[r].inputs[channel].name}' deviate from their mean by "
-            f"{100 * change[r, channel]:.0f} %; give period=N, skip=N or method='local_polynomial'."
+            f"{100 * change[r, channel]:.0f} %; give period=N, skip=N, reference=r or "
+            "method='local_polynomial'."
         )
 
 
@@ -232,7 +266,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     """
     last = (spectra.N - 1) // 2
     inputs = data[0].inputs
-    power = np.mean(np.abs(spectra.U[1 : last + 1]) ** 2, axis=1)  # (lines, nu), from line 1
+    power = np.mean(np.abs(spectra.excitation[1 : last + 1]) ** 2, axis=1)  # (lines, nu), from 1
     if given is not None:
         lines = dft_lines(given, spectra.N)
         weak = np.argwhere(power[lines - 1] <= NO_POWER * power.max(axis=0))
@@ -244,7 +278,8 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
             )
         return lines
     noise = np.diagonal(spectra.C, axis1=1, axis2=2).real[1 : last + 1, -len(inputs) :]
-    shown = _smooth(noise, NOISE_LINES) * np.mean(1 / spectra.P)
+    noise = noise if spectra.reference is None else np.zeros_like(noise)
+    shown = smoothed(noise, NOISE_LINES) * np.mean(1 / spectra.P)
     excited = power > np.maximum(RELATIVE_POWER * power.max(axis=0), NOISE_RATIO * shown)
     if not noise.any():  # one period does not tell noise from a weak line
         excited &= np.stack([carrying(channel) for channel in power.T], axis=1)
@@ -282,15 +317,30 @@ def powered_lines(spectra: Spectra, n: int) -> Integers:
     Estimates at other lines would be made of rounding errors.
     """
     last = (spectra.N - 1) // 2
-    power = _smooth(np.mean(np.abs(spectra.U[1 : last + 1]) ** 2, axis=1), 2 * n + 1)
+    power = smoothed(np.mean(np.abs(spectra.excitation[1 : last + 1]) ** 2, axis=1), 2 * n + 1)
     return 1 + np.flatnonzero((power > NO_POWER * power.max(axis=0)).all(axis=1))
 
 
-def _smooth(power: Array, width: int) -> Array:
+def smoothed(power: Array, width: int) -> Array:
     """Means (F, n) of the power over ``width`` lines about each one, over fewer at the ends."""
     window = np.ones(min(width, len(power)))
     count = np.convolve(np.ones(len(power)), window, "same")
     return np.stack([np.convolve(channel, window, "same") / count for channel in power.T], axis=1)
+
+
+def without_noise(
+    power: Complex128[Complex, "F nu nu"], noise: Complex128[Complex, "F nu nu"]
+) -> tuple[Complex128[Complex, "F nu nu"] | None, Bool[NDArray[np.bool_], " F"]]:
+    """UᴴU of inputs without the part of their noise, and at which lines that is most of it.
+
+    Elsewhere it is the unit matrix. It is ``None`` if the inputs have no noise.
+    """
+    clear = np.ones(len(power), dtype=bool)
+    if not np.abs(noise).max(initial=0.0) > ROUNDING * np.abs(power).max(initial=0.0):
+        return None, clear
+    left = power - noise
+    clear = np.linalg.eigvalsh(left)[:, 0] > CLEAR * np.linalg.eigvalsh(power)[:, 0]
+    return np.where(clear[:, None, None], left, np.eye(power.shape[1])), clear
 
 
 def in_band(lines: Integers, resolution: float, band: tuple[float, float] | None) -> Integers:

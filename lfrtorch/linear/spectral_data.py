@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex128, Float
@@ -18,7 +18,15 @@ from jaxtyping import Complex128, Float
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.frf import FRF
-from lfrtorch.linear.spectra import SILENT, carrying
+from lfrtorch.linear.regression import outer
+from lfrtorch.linear.spectra import (
+    NOISE_LINES,
+    SILENT,
+    carrying,
+    given_references,
+    smoothed,
+    without_noise,
+)
 from lfrtorch.records import NormalisedRecord, Scaler, rms_scale
 
 Weight = Literal["total", "noise", "none"]
@@ -29,6 +37,11 @@ averaged until it has them."""
 
 VANISHING = 1e-12
 """Smallest variance that enters a weight, relative to the largest."""
+
+
+FOUND = 10.0
+"""A noisy input excites a line if it has this many times the power of its noise, which is averaged
+over neighbouring lines; a line of noise alone passes once in 1e4."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +87,11 @@ def spectral_data_of_records(
     The spectra of many records are compressed to nu columns by a QR decomposition: the rest of the
     outputs is a constant error, which no linear model changes.
 
+    Noise of the inputs would make every response too small, and what a controller feeds back would
+    bias it, too. What the periods of a record differ by tells its share in U Uᴴ and Y Uᴴ, on which
+    alone the fit depends: it is subtracted (Pintelon and Schoukens, 2012, chapter 9). References
+    of several experiments tell more: there, only what follows them is kept.
+
     Args:
         normalised: the records, with their weights and periods.
         offset: whether the model has a constant in its output. It is eliminated from line 0.
@@ -83,24 +101,40 @@ def spectral_data_of_records(
         return None
     if ny > 1 and any(np.ptp(r.weight) > 0 or r.line_weight is not None for r in records):
         return None
-    groups: dict[int, list[tuple[Complex, Complex]]] = {}
+    groups: dict[int, list[_Lines]] = {}
+    references = given_references(records)
     means: list[tuple[Complex, Complex, float]] = []
     total = sum(record.samples for record in records)
-    for each in normalised:
+    for each, r in zip(normalised, references, strict=True):
         u, y, record = each.u, each.y, each.record
         N = record.period or len(u)
+
+        def periods(signal: Array, N: int = N) -> Complex:
+            return np.fft.rfft(signal.reshape(-1, N, signal.shape[1]), axis=1) / N
+
         U, Y = (np.fft.rfft(s.reshape(-1, N, s.shape[1]).mean(0), axis=0) / N for s in (u, y))
         weight = np.max(record.weight) * _twice(N) * len(u) / total
         if record.line_weight is not None:
             weight = weight * record.line_weight[:: len(u) // N]
         root = np.sqrt(weight)
         means.append((root[0] * U[0], root[0] * Y[0], float(root[0, 0])))
-        groups.setdefault(N, []).append((root[1:] * U[1:], root[1:] * Y[1:]))
+        noise = None
+        if len(u) > N and np.ptp(u.reshape(-1, N, u.shape[1]), axis=0).any():
+            Z = np.concatenate([periods(u), periods(y)], axis=2).swapaxes(0, 1)
+            P = Z.shape[1]
+            noise = outer(root[:, :, None] * (Z - Z.mean(axis=1, keepdims=True))) / (P * (P - 1))
+        groups.setdefault(N, []).append(
+            _Lines(
+                root[1:] * U[1:],
+                root[1:] * Y[1:],
+                None if noise is None else noise[1:],
+                None if r is None else root[1:] * periods(r).mean(axis=0)[1:],
+            )
+        )
     parts = [_line_0(means, offset=offset)]
     for N, group in groups.items():
-        U, Y = (np.stack([pair[side] for pair in group], axis=-1) for side in (0, 1))
-        z = np.exp(2j * np.pi * np.arange(1, len(U) + 1) / N)
-        parts.append((z, *_compressed(U, Y)))
+        z = np.exp(2j * np.pi * np.arange(1, len(group[0].U) + 1) / N)
+        parts.append((z, *_together(group)))
     m = max(U.shape[2] for _, U, _ in parts)
 
     def together(which: int) -> Complex:
@@ -169,6 +203,56 @@ def _line_0(
         one /= max(float(np.linalg.norm(one)), np.finfo(float).tiny)
         U, Y = (S - np.outer(S @ one, one) for S in (U, Y))
     return np.ones(1, dtype=complex), *_compressed(U[None], Y[None])
+
+
+class _Lines(NamedTuple):
+    """Spectra of a record at lines from 1 on, weighted.
+
+    Args:
+        U, Y: means over the periods, (F, nu) and (F, ny).
+        noise: covariance (F, nu + ny, nu + ny) of the noise of [U, Y]; ``None`` without any.
+        reference: (F, nu), or ``None``.
+    """
+
+    U: Complex
+    Y: Complex
+    noise: Complex | None
+    reference: Complex | None
+
+
+def _together(group: Sequence[_Lines]) -> tuple[Complex, Complex]:
+    """U and Y in at most nu columns, of records of one period, without the noise of U."""
+    U = np.stack([record.U for record in group], axis=-1)
+    Y = np.stack([record.Y for record in group], axis=-1)
+    nu, R = U.shape[1:]
+    shares = [record.noise for record in group if record.noise is not None]
+    noise = np.sum(shares, axis=0) if shares else None
+    known = [record.reference for record in group if record.reference is not None]
+    excited = None
+    if known:
+        reference = np.stack(known, axis=-1)
+        excited = carrying((np.abs(reference) ** 2).sum(axis=(1, 2)))
+        if nu < R:
+            Q = np.linalg.qr(reference.swapaxes(1, 2).conj())[0]
+            Z = np.concatenate([U, Y], axis=1)
+            along = Z @ Q
+            rest = Z - along @ Q.conj().swapaxes(1, 2)
+            noise = rest @ rest.conj().swapaxes(1, 2) * (nu / (R - nu))
+            U, Y = along[:, :nu], along[:, nu:]
+    if noise is None:
+        return _compressed(U, Y)
+    Uh = U.conj().swapaxes(1, 2)
+    left, clear = without_noise(U @ Uh, noise[:, :nu, :nu])
+    if left is None:
+        return _compressed(U, Y)
+    if excited is None:
+        shown, power = (np.trace(S, axis1=1, axis2=2).real for S in (noise[:, :nu, :nu], U @ Uh))
+        excited = power > FOUND * smoothed(shown[:, None], NOISE_LINES)[:, 0]
+    counts = (excited & clear)[:, None, None]
+    root = np.asarray(np.linalg.cholesky(left) * counts, dtype=np.complex128)
+    across = (Y @ Uh - noise[:, nu:, :nu]) * counts
+    right = np.linalg.inv(np.where(counts, root, np.eye(nu))).conj().swapaxes(1, 2)
+    return root, np.asarray(across @ right, dtype=np.complex128)
 
 
 def _compressed(U: Complex, Y: Complex) -> tuple[Complex, Complex]:

@@ -28,12 +28,13 @@ LEVELS = 16
 """Steps of an input that has at most this number of values turn the motion: no sign of friction."""
 
 
-def reacting(u: Array, y: Array) -> Array:
+def reacting(u: Array, y: Array, *, feedthrough: bool = True) -> Array:
     """Part of each input's surprises that the outputs' past surprises explain; 0 if by chance.
 
     The surprise is what is left of a prediction from past samples. Inputs of an experiment without
-    feedback do not depend on the noise of the outputs. A controller that acts in the same sample is
-    not seen: a system whose input acts at once looks like it.
+    feedback do not depend on the noise of the outputs. A controller that acts in the same sample
+    alone is seen only if ``feedthrough`` is False, so that the input does not act on the output at
+    once: a system where it does looks like it.
 
     Shape:
         u: (T, nu), y: (T, ny) -> (nu,).
@@ -50,12 +51,14 @@ def reacting(u: Array, y: Array) -> Array:
     if n < 1 or T < FEWEST or not nu * ny:
         return np.zeros(nu)
     u, y = ((s - s.mean(axis=0)) / s.std(axis=0) for s in (u, y))
-    e = _left(y[n:], u[n:], _past(u, n), _past(y, n))
+    e = _left(y[n:], u[n:, : nu * feedthrough], _past(u, n), _past(y, n))
     e = e[:, e.std(axis=0) > 1e-7]  # rounding
     if not e.size:
         return np.zeros(nu)
     e = e / e.std(axis=0)
     before, own = _past(e, n), _past(u[n:], n)
+    if not feedthrough:
+        before = np.hstack([before, e[n:]])
     alone, both = (_left(u[2 * n :], own, *more) for more in ((), (before,)))
     power = np.maximum(np.sum(alone**2, axis=0), 1e-300)
     part = 1.0 - np.sum(both**2, axis=0) / power

@@ -130,10 +130,13 @@ def notes_on(
     by_kind: dict[str, list[tuple[str, str]]] = {}
     for r in data:
         scored = slice(r.skip, r.skip + MOST)
+        known = {**(given or {})}
+        if r.reference is not None:  # no advice on feedback
+            known |= {"feedthrough": False, "refine": "prediction"}
         found = survey_measurement(
             r.u[scored], r.y[scored], r.fs, inputs=r.inputs, outputs=r.outputs, period=r.period
         )
-        for kind, text in examine(found, r.u[scored], r.y[scored], skipped=r.skip, given=given):
+        for kind, text in examine(found, r.u[scored], r.y[scored], skipped=r.skip, given=known):
             if kind.startswith("integrates") and r.start == "estimated":
                 continue  # a fit says it, if its model does not integrate
             by_kind.setdefault(kind, []).append((r.name, text))
@@ -292,14 +295,16 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
     counts = [integrators(u, channel) for channel in y.T]
     changes = ["feedthrough=False"] if given.get("feedthrough", True) else []
     if given.get("refine") != "prediction" and not any(counts):
-        changes.append("refine='prediction' if it is noisy")
+        changes.append("refine='prediction' (of an NL-LFR noise='innovation')")
     moving = [one for one, signal in zip(found.inputs, u.T, strict=True) if np.ptp(signal) > 0]
-    for one, part in zip(moving, reacting(u, y), strict=True):
+    parts = reacting(u, y, feedthrough=bool(given.get("feedthrough", True)))
+    for one, part in zip(moving, parts, strict=True):
         if part and changes:
             yield Note(
                 f"feedback {one.channel.name}",
-                f"input '{one.channel.name}' reacts to the output: a controller closes the loop "
-                f"and noise biases a model; use {', and '.join(changes)}.",
+                f"input '{one.channel.name}' reacts to the output: a controller closes the loop, "
+                "and the noise that it feeds back biases what is fitted to simulations or spectra; "
+                f"use {' and '.join(changes)}, or give what drives the loop, reference=r.",
             )
     for i, output in enumerate(found.outputs):
         pairs = {j: pair for (k, j), pair in between.items() if k == i}

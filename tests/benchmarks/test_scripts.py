@@ -12,6 +12,7 @@ SCRIPTS = [
     "cases",
     "engine",
     "export",
+    "feedback",
     "first_try",
     "large_linear",
     "linear",

@@ -89,6 +89,26 @@ def test_limits_of_the_sensors_are_those_of_all_records(tmp_path, signals):
         assert np.array_equal(record.shown(record.y), np.minimum(record.y, 1.0))
 
 
+def test_a_reference_is_cut_like_the_inputs(tmp_path, signals):
+    path = write(tmp_path / "a.csv", np.hstack([signals, 2 * signals[:, :2]]), "u1,u2,y,r1,r2")
+    data = load_records(path, **USE, reference=["r1", "r2"])
+    for record in (*data.train, *data.validation, *data.tests):
+        assert record.reference is not None
+        assert np.array_equal(record.reference, 2 * record.u)
+    with pytest.raises(ValueError, match=r"1 column\(s\) for 2 input\(s\); name one for each"):
+        load_records(path, **USE, reference="r1")
+
+
+def test_the_period_is_that_of_the_reference(tmp_path):
+    """Noise that a controller feeds back hides that of the input."""
+    rng, r = np.random.default_rng(0), np.tile(multisine(50).u[0, :, 0], 4)
+    u, y = r + rng.standard_normal((2, 200))
+    path = write(tmp_path / "a.csv", np.column_stack([u, y, r]), "u,y,r")
+    options: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 1.0, "validation": 0, "test": 0}
+    data = load_records(path, **options, reference="r", start="periodic", skip=0)
+    assert data.train[0].period == 50
+
+
 @pytest.mark.parametrize("samples", [51, 53, 97])
 @pytest.mark.parametrize("skip", [0, 3])
 def test_every_sample_after_the_first_warm_up_is_scored_once(tmp_path, signals, samples, skip):

@@ -311,15 +311,32 @@ def test_feedback():
 
 
 def test_feedback_of_a_system_that_forgets(rng):
-    u, y, x = np.zeros(T), np.zeros(T), 0.0
+    u, y, x, r = np.zeros(T), np.zeros(T), 0.0, rng.standard_normal(T)
     for k in range(T):
-        u[k] = rng.standard_normal() - 0.5 * y[k - 1]
+        u[k] = r[k] - 0.5 * y[k - 1]
         y[k] = x + 0.5 * rng.standard_normal()
         x = 0.9 * x + 0.1 * u[k]
-    assert "feedthrough=False, and refine='prediction'" in found(u, y)["feedback"]
+    assert "feedthrough=False and refine='prediction'" in found(u, y)["feedback"]
     (note,) = notes_on(Record(u, y), given={"feedthrough": False})
-    assert note.endswith("use refine='prediction' if it is noisy.")
+    assert "use refine='prediction'" in note
+    assert note.endswith("or give what drives the loop, reference=r.")
+    assert notes_on(Record(u, y, reference=r)) == []
     assert notes_on(Record(u, y), given={"feedthrough": False, "refine": "prediction"}) == []
+
+
+def test_feedback_in_the_same_sample_is_seen_without_feedthrough(rng):
+    u, y, x = np.zeros(T), np.zeros(T), 0.0
+    e = rng.standard_normal((2, T))
+    for k in range(T):
+        y[k] = x + e[0, k]
+        u[k] = e[1, k] - 0.5 * y[k]
+        x = 0.9 * x + 0.1 * u[k]
+    assert "feedback" not in found(u, y)
+    given = {"feedthrough": False}
+    (note,) = notes_on(Record(u, y), given=given)
+    assert note.startswith("input 'u' reacts to the output")
+    y = np.append(0.0, lfilter([0.1], [1, -0.9], e[1])[:-1]) + e[0]
+    assert not any("reacts" in note for note in notes_on(Record(e[1], y), given=given))
 
 
 def test_unrelated(u, rng):
