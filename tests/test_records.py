@@ -270,8 +270,9 @@ def test_every_output_has_its_weights(T: int, F: int):
 def test_a_reference_goes_with_the_signals():
     record = lab(reference=U[::-1], start="periodic", period=5)
     assert repr(record).endswith("period 5, with reference)")
-    assert record[2:6].reference is not None
-    assert np.array_equal(record[2:6].reference, U[::-1][2:6])
+    part = record[2:6].reference
+    assert part is not None
+    assert np.array_equal(part, U[::-1][2:6])
     with pytest.raises(ValueError, match="read-only"):
         record.reference[0] = 0.0  # pyright: ignore[reportOptionalSubscript]
     assert with_past_outputs(record).reference is None

@@ -253,8 +253,8 @@ def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
         raise InputError(
             f"record '{data[r].name}': the periods of {N} samples of input "
             f"'{data[r].inputs[channel].name}' deviate from their mean by "
-            f"{100 * change[r, channel]:.0f} %; give period=N, skip=N, reference=r or "
-            "method='local_polynomial'."
+            f"{100 * change[r, channel]:.0f} %; give period=N, skip=N or "
+            "method='local_polynomial',\nor the reference of an input with noise."
         )
 
 

@@ -295,7 +295,7 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
     counts = [integrators(u, channel) for channel in y.T]
     changes = ["feedthrough=False"] if given.get("feedthrough", True) else []
     if given.get("refine") != "prediction" and not any(counts):
-        changes.append("refine='prediction' (of an NL-LFR noise='innovation')")
+        changes.append("refine='prediction' or noise='innovation'")
     moving = [one for one, signal in zip(found.inputs, u.T, strict=True) if np.ptp(signal) > 0]
     parts = reacting(u, y, feedthrough=bool(given.get("feedthrough", True)))
     for one, part in zip(moving, parts, strict=True):
@@ -303,8 +303,7 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
             yield Note(
                 f"feedback {one.channel.name}",
                 f"input '{one.channel.name}' reacts to the output: a controller closes the loop, "
-                "and the noise that it feeds back biases what is fitted to simulations or spectra; "
-                f"use {' and '.join(changes)}, or give what drives the loop, reference=r.",
+                f"and noise biases a fit; use {' and '.join(changes)}, or give its reference=r.",
             )
     for i, output in enumerate(found.outputs):
         pairs = {j: pair for (k, j), pair in between.items() if k == i}

@@ -319,7 +319,7 @@ def test_feedback_of_a_system_that_forgets(rng):
     assert "feedthrough=False and refine='prediction'" in found(u, y)["feedback"]
     (note,) = notes_on(Record(u, y), given={"feedthrough": False})
     assert "use refine='prediction'" in note
-    assert note.endswith("or give what drives the loop, reference=r.")
+    assert note.endswith("or give its reference=r.")
     assert notes_on(Record(u, y, reference=r)) == []
     assert notes_on(Record(u, y), given={"feedthrough": False, "refine": "prediction"}) == []
 
