@@ -171,6 +171,7 @@ def _identified(
         trainer=settings.trainer,
         ridge=settings.ridge,
         noise=settings.noise,
+        horizon=settings.horizon,
         average=average,
         monitors=monitors,
         watch=watch,
@@ -377,7 +378,7 @@ def choose_sizes(
         tried["nx"] = list(linears)
     search_by: Callable[..., SizeSearch] = search_sizes
     own: dict[str, Any] = {"finalists": grid.finalists, "folds": grid.folds}
-    own |= {"noise": settings.noise, "ranks": ranks}
+    own |= {"noise": settings.noise, "horizon": settings.window, "ranks": ranks}
     if grid.method == "group_lasso":
         if ranks.world > 1:
             raise InputError(

@@ -54,8 +54,8 @@ def configured(cfg: DictConfig) -> Settings:
 
 AS_THEY_ARE = (
     "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "layers", "z_feedthrough",
-    "feedthrough", "structure", "activation", "degree", "ridge", "noise", "average", "distil",
-    "refit", "first_part", "first_iterations", "starts", "seed", "device",
+    "feedthrough", "structure", "activation", "degree", "ridge", "noise", "horizon", "average",
+    "distil", "refit", "first_part", "first_iterations", "starts", "seed", "device",
 )  # fmt: skip
 """Settings that are the words of the configuration."""
 

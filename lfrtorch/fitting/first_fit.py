@@ -58,6 +58,7 @@ def begun_on_part(
         trainer=replace(trainer, max_iter=settings.first_iterations),
         ridge=settings.ridge,
         noise=settings.noise,
+        horizon=settings.horizon,
         monitors=None if monitor is None else [[monitor]] * len(models),
         ranks=ranks,
         stop=stop,
@@ -73,7 +74,7 @@ def begun_on_part(
         f"{quantity(result.seconds, 's')}, error {quantity(chosen.train, unit)}, "
         f"seed {seed}"
     )
-    return replace(settings, seed=seed, starts=1), [result.model]
+    return replace(settings, seed=seed, starts=1, horizon=settings.window), [result.model]
 
 
 def part_of(records: Sequence[Record], part: float) -> list[Record]:

@@ -106,6 +106,7 @@ def refitted(
             trainer=settings.trainer,
             ridge=settings.ridge,
             noise=settings.noise,
+            horizon=settings.window,
             iterations=iterations,
             monitor=observer.searching(),
             ranks=ranks,

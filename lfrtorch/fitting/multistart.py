@@ -36,6 +36,7 @@ from lfrtorch._support.threads import each_alone, spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.fitting.growing_horizon import grow
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.prediction import (
@@ -58,6 +59,7 @@ from lfrtorch.fitting.trainer import (
     StoppedError,
     Trainer,
 )
+from lfrtorch.fitting.windows import Horizon, check_horizon
 from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
@@ -88,6 +90,7 @@ def fit(
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
     noise: Noise = "output",
+    horizon: Horizon = None,
     average: int = 1,
     monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None = None,
     watch: Callable[[Round], None] = lambda _: None,
@@ -127,6 +130,12 @@ def fit(
             weight, which keeps the model from running away. The models need a K, as ``initialise``
             writes it from a linear model of ``estimate_bla(..., refine="prediction")``; records in
             steady state are taken as others.
+        horizon: samples of the windows that training records are cut into, each simulated from a
+            start state of its own that is fitted with the parameters
+            (``lfrtorch.fitting.windows``). Errors of training and validation are then those in
+            windows. ``"grow"``: the fit of whole records comes after fits over windows of 20
+            samples for each state, of 4 times as many, and so on, each until the cost settles or
+            half of the iterations are spent. Default: whole records.
         average: most starts that the model of the result is the mean of
             (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
             averaged as bring the mean within 1 % of the least error on validation and selection,
@@ -171,8 +180,9 @@ def fit(
     """
     found = partial(
         _fitted, trainer=trainer, ridge=ridge, average=average, watch=watch, ranks=ranks,
-        snapshots=snapshots, stop=stop,
+        snapshots=snapshots, stop=stop, horizon=horizon,
     )  # fmt: skip
+    check_horizon(horizon, noise)
     if noise == "output":
         models = without_gain(models)
         return found(models, train, validation, selection, monitors=monitors)
@@ -192,6 +202,7 @@ def _fitted(
     *,
     trainer: Trainer | None,
     ridge: Ridge,
+    horizon: Horizon,
     average: int,
     monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None,
     watch: Callable[[Round], None],
@@ -229,7 +240,17 @@ def _fitted(
     halt = Event()
     options: dict[str, Any] = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
     options["simulation"] = simulation
+    options["horizon"] = None if horizon == "grow" else horizon
     options["stop"] = any_of(halt, stop) if ranks is None or ranks.world == 1 else stop
+    if horizon == "grow":
+        grow(
+            starts,
+            as_records(train),
+            trainer=LevenbergMarquardt() if trainer is None else trainer,
+            ridge=ridge,
+            ranks=Ranks() if ranks is None else ranks,
+            stop=stop,
+        )
     fits = [
         Fit(model, train, validation, **options, keep=snapshots.keeper(number))
         for number, model in enumerate(starts)

@@ -34,6 +34,7 @@ def refit(
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
     noise: Noise = "output",
+    horizon: int | None = None,
     iterations: int | None = None,
     monitor: Monitor | None = None,
     ranks: Ranks | None = None,
@@ -49,7 +50,7 @@ def refit(
         train: records that it was fitted to.
         held_out: records that chose its iterate. One that begins in a training record, as the
             parts of a measurement do, continues that record.
-        trainer, ridge, noise: of the fit; ridge pulls towards the model that was chosen.
+        trainer, ridge, noise, horizon: of the fit; ridge pulls towards the model that was chosen.
         iterations: that were chosen. Default: those of the fit, without what came before it.
         monitor: called after every iteration. Default: a line on a terminal or in a notebook.
         ranks, stop: see :func:`lfrtorch.fit`.
@@ -84,6 +85,7 @@ def refit(
         trainer=replace(base, max_iter=limit),
         ridge=ridge,
         noise=noise,
+        horizon=horizon,
         average=len(models),
         monitors=None if monitor is None else [[monitor]] * len(models),
         ranks=ranks,

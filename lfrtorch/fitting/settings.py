@@ -15,6 +15,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.prediction import Noise, check_noise
 from lfrtorch.fitting.trainer import Trainer
+from lfrtorch.fitting.windows import Horizon, check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.bla import estimate_bla
@@ -112,6 +113,8 @@ class Settings:
         noise: where it acts, ``"output"`` or ``"innovation"``, see :func:`lfrtorch.fit`. In the
             latter case the linear model has ``refine="prediction"``, too, and validation errors
             are those of predictions one sample ahead.
+        horizon: samples of the windows that training and validation records are cut into in a
+            fit, or ``"grow"``, see :func:`lfrtorch.fit`. Default: records are simulated whole.
         distil: whether one model takes the place of a mean of several if it does as well, see
             :func:`lfrtorch.distil`.
         refit: whether the model that validation chose is fitted to all estimation records at last,
@@ -157,6 +160,7 @@ class Settings:
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
     ridge: Ridge = 0.0
     noise: Noise = "output"
+    horizon: Horizon = None
     average: int = 1
     distil: bool = False
     refit: bool = False
@@ -187,6 +191,7 @@ class Settings:
         for name in ("layers", "nx_max", "starts", "average"):
             integer(name, getattr(self, name), 1)
         check_noise(self.noise)
+        check_horizon(self.horizon, self.noise)
         if self.noise != "output":
             refine = self.linear.get("refine") or "prediction"
             object.__setattr__(self, "linear", {**self.linear, "refine": refine})
@@ -244,6 +249,11 @@ class Settings:
                 "sizes_search.method is 'group_lasso', which is for static='network' and "
                 f"noise='output', not {self.static!r} and {self.noise!r}; use 'race'."
             )
+        if shrinks and self.window is not None:
+            raise InputError(
+                "sizes_search.method is 'group_lasso', which is for whole records, and horizon is "
+                f"{self.horizon}; use 'race', or horizon=None."
+            )
         if self.structure != "free" and self.average > 1:
             raise InputError(
                 f"structure is {self.structure!r}, which a mean of models does not keep, and "
@@ -298,6 +308,11 @@ class Settings:
     def sizes(self) -> dict[str, Size | None]:
         """nx, and the sizes of the static nonlinearity."""
         return {name: getattr(self, name) for name in ("nx", *self.size_names)}
+
+    @property
+    def window(self) -> int | None:
+        """Samples of the windows to the end of a fit; None: whole records."""
+        return None if self.horizon == "grow" else self.horizon
 
     @property
     def seeds(self) -> tuple[int, ...]:

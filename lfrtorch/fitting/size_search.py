@@ -46,6 +46,7 @@ from lfrtorch.fitting.multistart import Together, any_of, iterations_of
 from lfrtorch.fitting.prediction import SIMULATION, Noise, predicting
 from lfrtorch.fitting.refit import all_records
 from lfrtorch.fitting.trainer import Fit, FitResult, Monitor, Stop, StoppedError, Trainer
+from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
@@ -271,6 +272,7 @@ def search_sizes(
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
     noise: Noise = "output",
+    horizon: int | None = None,
     monitor: Monitor | None = None,
     watch: Callable[[SizeRound], None] = lambda _: None,
     ranks: Ranks | None = None,
@@ -297,7 +299,7 @@ def search_sizes(
             training and validation records in turn (:func:`lfrtorch.fitting.folds.folds`), and the
             errors in the stretches that were left out choose, those of finalists alone.
         trainer: the search. Default: Levenberg-Marquardt with 75 iterations.
-        ridge, noise, ranks, stop: see :func:`lfrtorch.fit`.
+        ridge, noise, horizon, ranks, stop: see :func:`lfrtorch.fit`.
         monitor: called after every iteration of any model. Default: a line on a terminal or in a
             notebook, and nothing elsewhere.
         watch: called after each round.
@@ -347,7 +349,8 @@ def search_sizes(
     planned = race(len(drawn), finalists, trainer.limit)
     halt = Event()
     options: dict[str, Any] = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
-    options["simulation"] = SIMULATION.get(noise, 0.0)
+    check_horizon(horizon, noise)
+    options["simulation"], options["horizon"] = SIMULATION.get(noise, 0.0), horizon
     options["stop"] = any_of(halt, stop) if ranks.world == 1 else stop
     field = [
         _Runner(sizes, seed, Fit(start(sizes, seed), train, validation, **options))

@@ -19,12 +19,13 @@ from lfrtorch._support.reasons import Reason, told
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
+from lfrtorch.fitting.windows import windows
 from lfrtorch.least_squares.group_lasso import GroupLassoProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.prediction_problem import PredictionProblem
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
 from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.records import Record, as_records
 
 EXPLOSION = 100.0
 """Growth of the squared validation error, beyond the start's, in a step that is taken back."""
@@ -245,6 +246,8 @@ class Fit:
             ``PredictionProblem``.
         group_lasso: names of sizes that shall become smaller and the weight of their groups, see
             ``GroupLassoProblem``. Default: there is no such penalty.
+        horizon: samples of the windows that the records are cut into, see
+            ``lfrtorch.fitting.windows``. Default: they are whole.
         keep: called with the fit after every iteration, when it may be saved, and with True when
             it pauses.
         stop: asked before each iteration whether to end there. If there are several processes,
@@ -264,6 +267,7 @@ class Fit:
         ridge: Ridge = 0.0,
         simulation: float = 0.0,
         group_lasso: tuple[Sequence[str], float] | None = None,
+        horizon: int | None = None,
         ranks: Ranks | None = None,
         keep: Keep = nothing,
         stop: Stop | None = None,
@@ -280,6 +284,10 @@ class Fit:
             "contracting": self.trainer.contracting,
             "ranks": ranks,
         }
+        if horizon is not None:
+            nx = model.lfr.cell.nx
+            train = windows(as_records(train), horizon, nx)
+            validation = windows(as_records(validation), horizon, nx) if validation else ()
         self.judge: SimulationProblem | None = None
         if simulation:
             both = PredictionProblem.of(model, train, simulation=simulation, **options)

@@ -88,7 +88,8 @@ class GroupLassoProblem(SimulationProblem):
         self, theta: Float[Tensor, " P"], *, reduce: bool = True
     ) -> _Penalised:
         """dr/dθ at θ."""
-        return _Penalised(super().linearise(theta, reduce=reduce), *self._penalty(theta))
+        simulated = super().linearise(theta, reduce=reduce, eliminate=False)
+        return _Penalised(simulated, *self._penalty(theta))
 
     def _penalty(
         self, theta: Float[Tensor, " P"]

@@ -399,7 +399,7 @@ class Part:
             if initial is not None:
                 by_column, d_x0 = by_column.split([places.shape[1], initial.shape[1]], dim=1)
                 by_column = by_column + (initial.mT @ d_x0.unsqueeze(-1)).squeeze(-1)
-            elif self._eliminate:
+            elif self._eliminate and self.x0 is not None:
                 by_column, d_x0 = by_column.split([places.shape[1], self.x0.shape[1]], dim=1)
                 gradient[self.x0] += d_x0
             reduced.index_add_(0, places.flatten(), by_column.flatten())

@@ -16,7 +16,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.block_form import zeros_of
-from lfrtorch.engine.initial_state import simulate_estimated
+from lfrtorch.engine.initial_state import simulate_estimated, simulate_from_beginning
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.sensitivity import Linearisation
@@ -332,7 +332,7 @@ class SimulationProblem(LeastSquares):
                 weight = group.weight
                 if group.beyond is not None:
                     weight = weight * (group.beyond == 0)
-                found = simulate_estimated(cell, group.u, group.y, weight)
+                found = simulate_from_beginning(cell, group.u, group.y, weight)
                 states[group.estimated] = found.x[:, 0]
         return self.ranks.sum(states)
 

@@ -14,6 +14,7 @@ SCRIPTS = [
     "export",
     "feedback",
     "first_try",
+    "horizon",
     "large_linear",
     "linear",
     "noise",

@@ -1,0 +1,154 @@
+"""Fits over windows of records, and over longer and longer ones."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference import measure, normal, random_cell, random_model
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+import lfrtorch
+from lfrtorch._support.errors import InputError
+from lfrtorch.fitting.growing_horizon import horizons
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.trainer import Fit, StoppedError
+from lfrtorch.fitting.windows import windows
+from lfrtorch.model import Model
+from lfrtorch.records import Record
+
+numeric = pytest.mark.numeric
+
+LASSO = lfrtorch.SizesSearch(method="group_lasso")
+
+
+@pytest.fixture
+def model() -> Model:
+    return random_model(random_cell(1, 1, 2, 1, 1, 2))
+
+
+def counted(T: int, **options) -> Record:
+    """A record whose samples say where they stand."""
+    return Record(np.arange(T, dtype=float), np.arange(T, dtype=float), **options)
+
+
+@pytest.mark.parametrize("start", ["zero", "estimated", "periodic"])
+@pytest.mark.parametrize(("T", "skip", "horizon"), [(100, 0, 25), (103, 7, 20), (60, 10, 49)])
+def test_windows_have_every_scored_sample_and_the_weight_of_the_record(start, T, skip, horizon):
+    record = counted(T, start=start, skip=skip, weight=2.0)
+    found = windows([record], horizon, nx=2)
+    scored = [window.y[window.skip :, 0] for window in found]
+    assert all(len(samples) == horizon for samples in scored)
+    assert set(np.concatenate(scored)) == set(range(skip, T))
+    total = sum(float(window.weight) * horizon for window in found)
+    assert total == pytest.approx(2.0 * (T - skip))
+    first, *others = found
+    assert {window.start for window in others} == {"estimated"}
+    assert first.start == ("estimated" if start == "periodic" else start)
+    assert first.skip == (0 if start == "periodic" else skip)
+
+
+def test_a_record_that_is_no_longer_than_a_window_stays_as_it_is():
+    record = counted(50, start="periodic", skip=10)
+    (same,) = windows([record], 40, nx=2)
+    assert same is record
+
+
+def test_a_given_start_and_the_limits_are_kept():
+    record = counted(50, start="given", x0=np.ones(2), limits=(None, 40.0))
+    first, second = windows([record], 25, nx=2)
+    assert first.start == "given"
+    assert second.x0 is None
+    assert second.limits is not None
+
+
+@pytest.mark.parametrize(
+    ("horizon", "options", "message"),
+    [
+        (3, {}, "too few samples of 1 output"),
+        (20, {"start": "periodic", "line_weight": np.ones(51)}, "line_weight"),
+    ],
+)
+def test_windows_that_cannot_be_say_so(horizon, options, message):
+    with pytest.raises(InputError, match=message):
+        windows([counted(100, **options)], horizon, nx=2)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"horizon": 1}, "horizon is 1; give a whole number of at least 2, or grow"),
+        ({"horizon": "all"}, "horizon is 'all'"),
+        ({"horizon": 50, "noise": "innovation"}, "predictions one sample"),
+        ({"horizon": 50, "nz": "auto", "sizes_search": LASSO}, "which is for whole records"),
+    ],
+)
+def test_horizons_that_cannot_be_say_so(given, message):
+    with pytest.raises(InputError, match=message):
+        Settings(nx=2, **given)
+
+
+def test_horizons_grow_up_to_whole_records():
+    assert horizons([counted(1000), counted(80)], nx=2) == [40, 160, 640]
+    assert horizons([counted(1000, skip=360)], nx=2) == [40, 160]
+    assert horizons([counted(30)], nx=2) == []
+
+
+def moved(model: Model) -> Model:
+    """The model with other weights."""
+    found = deepcopy(model)
+    weights = parameters_to_vector(found.lfr.parameters()).detach()
+    vector_to_parameters(weights + 0.03 * normal(len(weights)), found.lfr.parameters())
+    return found
+
+
+@numeric
+@pytest.mark.parametrize("horizon", [20, "grow"])
+def test_a_fit_over_windows_finds_the_system(model: Model, horizon):
+    train, test = (measure(model, T, seed=T) for T in (400, 300))
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=60)
+    result = lfrtorch.fit(moved(model), train, trainer=trainer, horizon=horizon, monitors=[])
+    error = lfrtorch.rmse(test, result.model.simulate(test))
+    assert error < 1e-4 * lfrtorch.rmse(test, moved(model).simulate(test))
+
+
+@numeric
+def test_errors_of_training_and_validation_are_of_windows(model: Model):
+    record = measure(model, 200, seed=1)
+    fit = Fit(moved(model), record, record, horizon=20)
+    fit.begin()
+    (start,) = fit.history
+    whole = lfrtorch.rmse(record, fit.model.simulate(record))
+    assert max(start.train, start.validation) < 0.95 * whole
+
+
+@numeric
+def test_a_fit_that_grows_begins_where_the_last_windows_end(model: Model):
+    record = measure(model, 200, seed=1)
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=6)
+    options = {"trainer": trainer, "monitors": []}
+    whole, grown = (
+        lfrtorch.fit(moved(model), record, horizon=horizon, **options) for horizon in (None, "grow")
+    )
+    assert grown.history[0].train < 0.5 * whole.history[0].train
+    assert grown.history[0].iteration == 0
+
+
+@numeric
+def test_growing_that_ends_early_says_so(model: Model):
+    record = measure(model, 200, seed=1)
+    with pytest.raises(StoppedError, match="horizon grew"):
+        lfrtorch.fit(moved(model), record, horizon="grow", stop=lambda: True, monitors=[])
+
+
+@numeric
+def test_the_job_takes_a_horizon(model: Model):
+    train, test = (replace(measure(model, 300, seed=i), name=f"record {i}") for i in (1, 2))
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=4)
+    settings = Settings(nx=2, nz=1, nn=2, horizon=30, refit=True, first_part=0.5, trainer=trainer)
+    dataset = lfrtorch.Dataset("windows", [train], [replace(train[200:], skip=20)], [test])
+    run = lfrtorch.identify(dataset, settings, observer=lfrtorch.Observer())
+    assert run.settings.horizon == 30
+    assert run.refit is not None
