@@ -44,7 +44,7 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
     u = ca.vertcat(*(ca.SX.sym(channel.name) for channel in e.inputs))
     v = u - e.u_offset
     x_next, y = ca.mtimes(e.A, x) + ca.mtimes(e.Bu, v), ca.mtimes(e.Cy, x) + ca.mtimes(e.Dyu, v)
-    if e.static:
+    if isinstance(e.static, Layers | Monomials):
         w = _static(ca, e.static, ca.mtimes(e.Cz, x) + ca.mtimes(e.Dzu, v))
         x_next, y = x_next + ca.mtimes(e.Bw, w), y + ca.mtimes(e.Dyw, w)
     return ca.Function(name, [x, u], [x_next, y + e.y_offset], ["x", "u"], ["x_next", "y"])

@@ -45,9 +45,11 @@ def traced(static: Own, nz: int) -> Any:
         ['Tanh']
     """
     onnx = imported("onnx", "onnx")
-    generator, file = torch.Generator().manual_seed(0), io.BytesIO()
+    generator = torch.Generator().manual_seed(0)
+    file: Any = io.BytesIO()  # which it takes, whatever its types say
     z = torch.randn(max(SAMPLES), nz, generator=generator, dtype=torch.float64)
     # Since torch 2.9 another exporter is the default, which needs one package more.
+    older: dict[str, Any]
     older = {"dynamo": False} if "dynamo" in inspect.signature(torch.onnx.export).parameters else {}
     try:
         with warnings.catch_warnings(record=True) as said:

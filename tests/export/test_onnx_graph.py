@@ -94,25 +94,25 @@ def test_a_map_of_ones_own_is_in_the_graph(form: str):
 
 
 class Branches(torch.nn.Linear):
-    def forward(self, z: torch.Tensor) -> torch.Tensor:
-        return super().forward(z) if z.sum() > 0 else -z
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        return super().forward(input) if input.sum() > 0 else -input
 
 
 class Unknown(torch.nn.Linear):
-    def forward(self, z: torch.Tensor) -> torch.Tensor:
-        return torch.special.i0(z)
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        return torch.special.i0(input)
 
 
 class Single(torch.nn.Linear):
     """ONNX holds the slope in single precision."""
 
-    def forward(self, z: torch.Tensor) -> torch.Tensor:
-        return torch.nn.functional.leaky_relu(z, 0.01)
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.leaky_relu(input, 0.01)
 
 
 class Drawn(torch.nn.Linear):
-    def forward(self, z: torch.Tensor) -> torch.Tensor:
-        return z * float(torch.rand(()))
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        return input * float(torch.rand(()))
 
 
 @pytest.mark.parametrize(
