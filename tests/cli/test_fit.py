@@ -298,9 +298,15 @@ def judged_when_interrupted(folder: Path) -> None:
 
 @pytest.mark.numeric
 def test_the_interrupt_key_keeps_the_best_model_and_its_scores(
-    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    csv: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    request: pytest.FixtureRequest,
 ):
     words = [*file_overrides(csv), "nx=1", "trainer._target_=cli.test_fit.Interrupted"]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words, "figures=false")
     assert f"to go on: python train.py resume={tmp_path}" in capsys.readouterr().out
     judged_when_interrupted(tmp_path)

@@ -186,7 +186,8 @@ def test_gradient(nz: int, nw: int, ny: int, monkeypatch: pytest.MonkeyPatch):
     # The damping of β is no part of the cost.
     monkeypatch.setattr(import_module("lfrtorch.fitting.inference"), "CONDITION", 1e-14)
     generator = np.random.default_rng(0)
-    u, y = generator.normal(size=(100, 2)), generator.normal(size=(100, ny))
+    u = np.tile(generator.normal(size=(50, 2)), (2, 1))
+    y = generator.normal(size=(100, ny))
     data = [Record(u[:50], y[:50], 1.0, "periodic"), Record(u, y, 1.0, "periodic", period=50)]
     bla = estimate_bla(data, 3)
     model = initialise(bla, data, nz=nz, nw=nw, nn=1)
