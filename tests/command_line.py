@@ -31,7 +31,7 @@ SHORTER = {  # fewer samples and iterations, so that two iterations take a secon
     "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1 starts=1",
     "silverbox": "data.validation=0.8 bla.max_iter=1 starts=1",
     "wh_process_noise": "data.validation=9 bla.max_iter=1 starts=1",
-    "wiener_hammerstein": "data.validation=0.9 bla.max_iter=1 starts=1",
+    "wiener_hammerstein": "data.validation=0.9 nx=4 nz=1 nw=1 nn=4 bla.max_iter=1 starts=1",
 }
 SIMULATED = ("boucwen", "boucwen_record", "parwh")
 """All others are measured."""

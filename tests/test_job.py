@@ -224,6 +224,7 @@ def test_a_run_is_written_for_people_and_programs(
     assert events.read_bytes() != b"of an earlier run"
 
 
+@pytest.mark.slow
 @pytest.mark.numeric
 def test_starts_that_are_kept_go_on(dataset: Dataset, tmp_path: Path):
     whole = identify(dataset, settings(starts=2))
@@ -297,6 +298,7 @@ def test_a_part_has_the_shortest_records():
     assert all(np.array_equal(a.y, b.y[: a.samples]) for a, b in zip(short, records, strict=True))
 
 
+@pytest.mark.slow
 def test_one_model_takes_the_place_of_a_mean_if_it_does_as_well(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

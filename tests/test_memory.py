@@ -78,6 +78,7 @@ def test_memory_of_a_long_record_does_not_depend_on_the_number_of_neurons(blocks
     assert few < SIGNALS + blocks
 
 
+@pytest.mark.slow
 def test_memory_of_a_long_periodic_record(blocks: int):
     peak, _ = peak_of_an_iteration(T, "periodic")
     assert peak < SIGNALS + blocks

@@ -116,7 +116,7 @@ LM = LevenbergMarquardt(max_iter=2)
         (LM, dict, math.inf, jacobian.CACHED_BYTES),  # orthogonal
         (LM, dict, 0.0, 0),  # rows in blocks
         (LM, dict, math.inf, 0),
-        (LM, own_map, 0.0, jacobian.CACHED_BYTES),
+        pytest.param(LM, own_map, 0.0, jacobian.CACHED_BYTES, marks=pytest.mark.slow),
         (Adam(max_iter=2), dict, 0.0, jacobian.CACHED_BYTES),
         (Adam(max_iter=2), own_map, 0.0, jacobian.CACHED_BYTES),
     ],

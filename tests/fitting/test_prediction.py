@@ -182,6 +182,7 @@ def test_both_errors_are_as_large_at_the_start_as_the_weight_says():
     assert float(simulated / predicted) == pytest.approx(2.0)
 
 
+@pytest.mark.slow
 def test_a_fit_of_both_simulates_better_than_that_of_predictions():
     """One sample ahead y is nearly y(k - 1), whatever u is: predictions hardly tell of the gain."""
     rng = np.random.default_rng(2)

@@ -102,6 +102,7 @@ def test_a_second_input_of_the_map_is_found():
     assert found.notes == ("nz 2 is the largest tried; a larger one may do better.",)
 
 
+@pytest.mark.slow
 def test_states_are_searched_with_the_other_sizes():
     planted = train, _, bla = plant(2, 1)
     models = {nx: bla if nx == 2 else estimate_bla(train, nx) for nx in (1, 2, 3)}

@@ -75,6 +75,7 @@ def test_a_shift_stays_for_good():
     assert np.allclose(ahead - at, (ahead - at)[0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_starts_that_go_in_step_keep_them():
     record, models = axis(1), [started(1, seed=seed) for seed in range(2)]
     before = [bits(model, 1) for model in models]
@@ -83,6 +84,7 @@ def test_starts_that_go_in_step_keep_them():
     assert [bits(model, 1) for model in models] == before
 
 
+@pytest.mark.slow
 def test_a_mean_has_those_of_all():
     mean = mean_model([started(1, seed=seed) for seed in range(3)])
     assert integrating_states(mean.lfr.cell).tolist() == 3 * [False, True]

@@ -62,6 +62,7 @@ def test_a_system_that_integrates_is_recovered(integrators: Literal[1, 2], start
     np.testing.assert_allclose(model.simulate(data), data.y, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_input_that_acts_at_once():
     u = np.random.default_rng(0).standard_normal(T)
     y = lfilter([0.1, 0.02], np.convolve(LAG, [1, -1]), u)
@@ -98,6 +99,7 @@ def test_noise_of_the_output_costs_no_precision():
     assert np.std(left) < 1.02 * noise
 
 
+@pytest.mark.slow
 def test_errors_that_the_system_integrates():
     """A fit to the output follows their drift; the fast part is then anything."""
     data = record(start="estimated")
@@ -139,6 +141,7 @@ def test_states_have_unit_deviation_and_start_a_nonlinear_model():
     assert np.abs(model.lfr.cell.A.detach().numpy()).max() < 3
 
 
+@pytest.mark.slow
 def test_orders_below_the_integrators(tmp_path):
     data = record(2, start="estimated", noise=0.1)
     scan = scan_orders(data, [1, 2, 3], integrators=2)

@@ -226,6 +226,7 @@ def test_an_order_that_the_input_cannot_carry_is_left_out():
     assert found.notes[0].startswith("orders from 2 on are left out: the input excites 4 of the 5")
 
 
+@pytest.mark.slow
 def test_an_order_that_leaves_nothing_but_integrators_is_left_out():
     record = driven(0, 300)
     position = Record(record.u, np.cumsum(record.y, axis=0), 10.0, start="estimated", skip=20)
@@ -238,7 +239,7 @@ def part(record: Record, end: int, skip: int) -> Record:
     return replace(record[:end], start="estimated", skip=skip)
 
 
-@pytest.mark.parametrize("why", ["short", "unlike"])
+@pytest.mark.parametrize("why", ["short", pytest.param("unlike", marks=pytest.mark.slow)])
 def test_a_poor_validation_part_is_replaced_by_folds_over_all(why: str):
     record = driven(0, 700)
     train, validation = part(record, 300, 20), part(record, 340 if why == "short" else 700, 300)

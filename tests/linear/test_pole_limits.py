@@ -56,6 +56,7 @@ def test_no_power_is_no_line():
     assert carrying(np.array([0.0, 1.0, 1e-30, 1.0])).tolist() == [False, True, False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.numeric
 def test_a_measured_input_gives_no_pole_outside_its_band():
     """Two resonances and two orders too many, a force with noise, and drift."""
