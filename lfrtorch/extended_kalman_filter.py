@@ -135,6 +135,10 @@ class ExtendedKalmanFilter(StateObserver):
         if U is None:
             raise InputError("P0 has a negative eigenvalue; give a covariance of the states.")
         self._U = U
+        self._now = self._u[0], self._y_now[None]
+        self._filter: list[Any] | None = None
+        if self._weights is not None:
+            self._filter = [*self._weights, self._G, self._x_now, U]
 
     @property
     def covariance(self) -> Float[Array, "nx nx"]:
@@ -156,13 +160,12 @@ class ExtendedKalmanFilter(StateObserver):
         return self._filtered(u, y)
 
     def _go_on(self, y: Float[Array, " ny"], e: Float[Array, " ny"]) -> None:
-        self._filtered(self._u[0], y[None])
+        self._filtered(*self._now)
 
     def _filtered(self, u: Float[Array, "T nu"], y: Float[Array, "T ny"]) -> float:
+        if self._filter is not None:
+            return filter_record(u, y, *self._filter)
         x, total = self._x_now, 0.0
-        if self._weights is not None:
-            call: list[Any] = [u, y, *self._weights, self._G, x, self._U]
-            return filter_record(*call)
         w_hat = np.zeros_like(x)
         for u_k, y_k in zip(torch.as_tensor(u), y, strict=True):
             y_hat, _, _, H = self._step(u_k, x)

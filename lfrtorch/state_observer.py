@@ -17,6 +17,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.sample_scaling import innovation, normalise, restored
 from lfrtorch.engine.simulation import is_compiled, kernel_arguments
 from lfrtorch.engine.simulation_kernel import simulate_record
 from lfrtorch.records import Channel, Scaler
@@ -58,6 +59,10 @@ class StateObserver(ABC):
         self._predicted = False
         # Parts of those arrays: making one takes longer than a product of small matrices.
         self._u_now, self._y_hat = self._u[0, 0], self._y[0, 0]
+        self._y_now, self._e, self._zero = np.zeros((3, cell.ny))
+        at = scaler.u_offset, scaler.u_scale, scaler.y_offset, scaler.y_scale
+        floats = (np.ascontiguousarray(values, dtype=np.float64) for values in at)
+        self._u_offset, self._u_scale, self._y_offset, self._y_scale = floats
         self._x_now, self._x_next = self._x[0]
         x = np.asarray(x0, dtype=np.float64)
         if x.shape != (cell.nx,) or not np.isfinite(x).all():
@@ -80,11 +85,9 @@ class StateObserver(ABC):
         Raises:
             ValueError: another number of inputs, or one that is not finite.
         """
-        scaler, given = self._scaler, _sample(u, self._inputs, "u")
-        if not all(map(math.isfinite, given.tolist())):
+        given = _sample(u, self._inputs, "u")
+        if not normalise(given, self._u_offset, self._u_scale, self._u_now):
             raise InputError(f"u is {given}; give finite numbers.")
-        np.subtract(given, scaler.u_offset, out=self._u_now)
-        np.divide(self._u_now, scaler.u_scale, out=self._u_now)
         if self._call is not None:
             self._x_next.fill(np.nan)  # no trajectory that this one could meet
             simulate_record(*self._call)
@@ -93,8 +96,7 @@ class StateObserver(ABC):
                 y, x = self._cell(torch.as_tensor(self._u[0]), torch.as_tensor(self._x[0, :1]))
             self._y_hat[:], self._x_next[:] = y[0].numpy(), x[0].numpy()
         self._predicted = True
-        y_hat = scaler.y_scale * self._y_hat
-        return np.add(y_hat, scaler.y_offset, out=y_hat)
+        return restored(self._y_hat, self._y_offset, self._y_scale)
 
     def update(self, y: ArrayLike | None) -> Float[Array, " ny"]:
         """Go on to the next sample; returns the error of the prediction, y - y_hat.
@@ -108,18 +110,12 @@ class StateObserver(ABC):
         """
         if not self._predicted:
             raise InputError("nothing was predicted at this sample: call predict(u) before.")
-        if y is None:
-            given = np.full(len(self._outputs), np.nan)
-        else:
-            given = _sample(y, self._outputs, "y")
-            if any(map(math.isinf, given.tolist())):
-                raise InputError(f"y is {given}; give finite numbers, or NaN for a missing output.")
-        measured = given - self._scaler.y_offset
-        np.divide(measured, self._scaler.y_scale, out=measured)
-        e = measured - self._y_hat
-        self._go_on(measured, e)
+        given = np.full(len(self._outputs), np.nan) if y is None else _sample(y, self._outputs, "y")
+        if not innovation(given, self._y_offset, self._y_scale, self._y_hat, self._y_now, self._e):
+            raise InputError(f"y is {given}; give finite numbers, or NaN for a missing output.")
+        self._go_on(self._y_now, self._e)
         self._predicted = False
-        return np.multiply(e, self._scaler.y_scale, out=e)
+        return restored(self._e, self._zero, self._y_scale)
 
     @abstractmethod
     def _go_on(self, y: Float[Array, " ny"], e: Float[Array, " ny"]) -> None:
@@ -168,8 +164,8 @@ class SteadyGainObserver(StateObserver):
 
 def _sample(values: ArrayLike, channels: tuple[Channel, ...], name: str) -> Array:
     """One sample of some channels."""
-    found = np.asarray(values, np.float64)
+    found = np.array(values, np.float64, ndmin=1)
     if found.size != len(channels) or found.ndim > 1:
         names = ", ".join(channel.name for channel in channels)
         raise InputError(f"{name} has the shape {found.shape}; give a number for each of {names}.")
-    return found.reshape(-1)
+    return found
