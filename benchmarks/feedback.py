@@ -93,13 +93,13 @@ def level_of(model: lfrtorch.Model, decibels: float) -> float:
 
 
 def measured(
-    model: lfrtorch.Model, level: float, runs: int, *, periodic: bool
+    model: lfrtorch.Model, level: float, runs: int, seed: int, *, periodic: bool
 ) -> list[lfrtorch.Record]:
     """A record a run, with its reference."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng([0, seed])
     T = PERIOD * PERIODS
     if periodic:
-        periods = [lfrtorch.multisine(PERIOD, seed=seed).u[0, :, 0] for seed in range(runs)]
+        periods = [lfrtorch.multisine(PERIOD, seed=run).u[0, :, 0] for run in range(runs)]
         r = np.tile(np.array(periods), (1, PERIODS + SETTLING // PERIOD))
     else:
         r = rng.standard_normal((runs, T + SETTLING))
@@ -180,7 +180,7 @@ def response(model: lfrtorch.LinearModel | lfrtorch.LFRCell) -> Complex:
 
 
 def table(
-    references: list[str], *, nonlinear: bool, decibels: list[float], runs: int
+    references: list[str], *, nonlinear: bool, decibels: list[float], runs: int, seed: int
 ) -> Iterator[tuple[str, float, str, float, float, float]]:
     """Reference, SNR and fit, then error, bias and standard error of the bias."""
     planted = system(nonlinear=nonlinear)
@@ -189,7 +189,7 @@ def table(
     for reference in references:
         for snr in decibels:
             records = measured(
-                planted, level_of(planted, snr), runs, periodic=reference == "periodic"
+                planted, level_of(planted, snr), runs, seed, periodic=reference == "periodic"
             )
             found: dict[str, list[Any]] = {}
             for record in records:
@@ -213,6 +213,7 @@ def main() -> int:
     """The tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0, help="of the noise, the same at all levels")
     parser.add_argument("--decibels", type=float, nargs="*", default=[20.0, 10.0, 5.0])
     parser.add_argument("--references", nargs="*", default=["arbitrary", "periodic"])
     parser.add_argument("--only", nargs="*", default=["linear", "nonlinear"])
@@ -227,6 +228,7 @@ def main() -> int:
             nonlinear=kind == "nonlinear",
             decibels=options.decibels,
             runs=options.runs,
+            seed=options.seed,
         )
         for reference, snr, name, error, bias, standard in rows:
             numbers = f"{error:.4f} | {bias:.4f} | {standard:.4f} | {bias / standard:.1f}"
