@@ -576,6 +576,9 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         dtype = getattr(torch, description["dtype"])
         if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
             raise InputError(f"dtype is {description['dtype']}")
+        lost = [name for name, tensor in weights.items() if not tensor.isfinite().all()]
+        if lost:
+            raise InputError(f"{', '.join(lost)} have numbers that are not finite")
         scaler = Scaler(
             *(
                 weights.pop(f"scaler.{name}").numpy()
@@ -601,6 +604,8 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         widths = [s.shape for s in vars(scaler).values()] + [(len(c),) for c in channels]
         if widths != [(size,) for size in 2 * [cell.nu] + 2 * [cell.ny] + [cell.nu, cell.ny]]:
             raise InputError("scales or channels are more or fewer than inputs and outputs")
+        if not all((scale > 0).all() for scale in (scaler.u_scale, scaler.y_scale)):
+            raise InputError("a scale is not positive")
         if not (math.isfinite(fs) and fs > 0):
             raise InputError(f"fs is {fs}")
         inputs, outputs = channels

@@ -400,9 +400,13 @@ class LinearModel:
                 found = (arrays | optional).get(name)
                 if found is not None and found.shape != shape:
                     raise InputError(f"{name} is {found.shape}, not {shape}")
-            return cls(
-                **arrays, fs=float(made["fs"]), inputs=inputs, outputs=outputs, **optional, fit=fit
-            )
+            lost = [name for name, array in arrays.items() if not np.isfinite(array).all()]
+            if lost:
+                raise InputError(f"{', '.join(lost)} have numbers that are not finite")
+            fs = float(made["fs"])
+            if not (np.isfinite(fs) and fs > 0):
+                raise InputError(f"fs is {fs}")
+            return cls(**arrays, fs=fs, inputs=inputs, outputs=outputs, **optional, fit=fit)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"'{folder}' is damaged: its description and weights do not fit ({error})."
