@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from lfrtorch._support.errors import InputError
+
+TEMPORARY = ".lfrtorch-"
+"""How the names of files and folders begin that are not whole yet."""
 
 
 def refuse_existing(path: str | Path, option: str) -> None:
@@ -25,15 +29,47 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path).resolve()  # a link's target is replaced, not the link
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=TEMPORARY, suffix=path.suffix, dir=path.parent)
     os.close(handle)
     fresh = Path(name)
     try:
         yield fresh
-        os.chmod(fresh, 0o666 & ~umask())  # a temporary file is its owner's alone
-        os.replace(fresh, path)
+        put(fresh, path)
     finally:
         fresh.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A folder beside ``path`` to write files to; it becomes ``path``, which is new or empty."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=path.parent))
+    try:
+        yield fresh
+        for file in fresh.iterdir():
+            flush(file)
+        put(fresh, path)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+
+
+def put(fresh: Path, path: Path) -> None:
+    """Let what is whole take its place, on the disk before its name is: power may fail."""
+    full = 0o777 if fresh.is_dir() else 0o666
+    os.chmod(fresh, full & ~umask())  # what tempfile makes is its owner's alone
+    flush(fresh)
+    os.replace(fresh, path)
+    flush(path.parent)
+
+
+def flush(path: Path) -> None:
+    """Have the system write a file, or the names in a folder, to the disk."""
+    with suppress(OSError) if path.is_dir() else nullcontext():  # some systems open no folder
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def umask() -> int:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,12 +11,15 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from lfrtorch._support.atomic import umask
+from lfrtorch._support.atomic import TEMPORARY, whole_file, whole_folder
 from lfrtorch._support.errors import InputError
 
 FORMAT = "lfrtorch"
 VERSION = 1
 DESCRIPTION, WEIGHTS = "model.json", "weights.safetensors"
+
+NEXT = "next.safetensors"
+"""Weights while another model takes the place of the one in a checkpoint."""
 
 CODE = (".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".joblib", ".py", ".pyc", ".so")
 """Extensions of files that may carry code: none of them belongs to a checkpoint."""
@@ -28,33 +28,43 @@ CODE = (".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".joblib", ".py", ".pyc", ".s
 def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Tensor]) -> Path:
     """Write a checkpoint folder whole or not at all; an existing checkpoint is replaced.
 
+    An existing one stays readable at every moment. Other files in its folder stay where they are.
+
     Raises:
         ValueError: ``folder`` exists and is not a checkpoint.
+        OSError: it cannot be written, as on a full disk.
     """
     folder = Path(folder).resolve()  # a link's target is replaced, not the link
-    if folder.exists() and not (folder / DESCRIPTION).is_file() and _occupied(folder):
+    replaced = (folder / DESCRIPTION).is_file()
+    if folder.exists() and not replaced and _occupied(folder):
         raise InputError(
             f"'{folder}' exists and is not a checkpoint; choose another folder to save to."
         )
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        text = json.dumps({"format": FORMAT, "version": VERSION, **description}, indent=2) + "\n"
-        (fresh / DESCRIPTION).write_text(text)
-        save_file({k: t.detach().contiguous().cpu() for k, t in weights.items()}, fresh / WEIGHTS)
-        os.chmod(fresh, 0o777 & ~umask())
-        if _holds(folder, text):  # other weights of the same model: at no moment is there neither
-            os.replace(fresh / WEIGHTS, folder / WEIGHTS)
-        elif folder.exists():
-            old = fresh.with_name(fresh.name + "-old")
-            folder.rename(old)
-            fresh.rename(folder)
-            shutil.rmtree(old)
-        else:
-            fresh.rename(folder)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
+    described = {"format": FORMAT, "version": VERSION, **description}
+    if not replaced:
+        with whole_folder(folder) as fresh:
+            _describe(fresh / DESCRIPTION, described)
+            write_tensors(fresh / WEIGHTS, weights)
+        return folder
+    before = _described(folder)
+    if before == json.loads(json.dumps(described)):  # the same model with other weights
+        _replace(folder / WEIGHTS, weights)
+    else:  # two files cannot be replaced at once: never the weights that the description names
+        for name in (WEIGHTS,) if before.get("weights") == NEXT else (NEXT, WEIGHTS):
+            _replace(folder / name, weights)
+            with whole_file(folder / DESCRIPTION) as fresh:
+                _describe(fresh, described if name == WEIGHTS else {**described, "weights": NEXT})
+    (folder / NEXT).unlink(missing_ok=True)
     return folder
+
+
+def write_tensors(path: Path, tensors: dict[str, Tensor], **metadata: str) -> None:
+    """Write a safetensors file; a full disk is an OSError, as of any other file."""
+    held = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
+    try:
+        save_file(held, path, metadata=metadata or None)
+    except SafetensorError as error:
+        raise OSError(f"'{path.parent}' cannot be written to: {error}") from None
 
 
 def read(
@@ -80,16 +90,25 @@ def read(
         ) from None
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise InputError(f"'{folder / DESCRIPTION}' was not written by {FORMAT}.")
-    if not isinstance(description.get("version"), int) or description["version"] > VERSION:
+    version = description.get("version")
+    if type(version) is not int or version < 1:
         raise InputError(
-            f"'{folder}' has checkpoint version {description.get('version')} and this program "
-            f"reads up to {VERSION}; install a newer {FORMAT}."
+            f"'{folder / DESCRIPTION}' is damaged (version {version!r}); "
+            "copy the checkpoint again from where it was saved."
         )
+    if version > VERSION:
+        raise InputError(
+            f"'{folder}' has checkpoint version {version} and this program reads up to {VERSION}; "
+            f"install a newer {FORMAT}."
+        )
+    file = folder / (NEXT if description.get("weights") == NEXT else WEIGHTS)
     try:
-        weights = load_file(folder / WEIGHTS)
+        if file.exists() and not file.is_file():
+            raise OSError("it is no file")
+        weights = load_file(file)
     except (SafetensorError, OSError) as error:
         raise InputError(
-            f"'{folder / WEIGHTS}' is damaged or missing ({error}); "
+            f"'{file}' is damaged or missing ({error}); "
             "copy the checkpoint again from where it was saved, or train anew."
         ) from None
     return description, weights
@@ -100,7 +119,8 @@ def _below(folder: Path, at: str, inside: Sequence[str]) -> list[str]:
     return [
         str(path)
         for path in sorted(folder.glob(at))
-        if any((path / name / DESCRIPTION).is_file() for name in ("", *inside))
+        if not path.name.startswith(TEMPORARY)
+        and any((path / name / DESCRIPTION).is_file() for name in ("", *inside))
     ]
 
 
@@ -140,12 +160,24 @@ def _located(folder: Path, inside: Sequence[str]) -> Path:
     return found
 
 
-def _holds(folder: Path, description: str) -> bool:
-    """Whether ``folder`` is a checkpoint with that description."""
+def _replace(path: Path, weights: dict[str, Tensor]) -> None:
+    """Replace a file of weights."""
+    with whole_file(path) as fresh:
+        write_tensors(fresh, weights)
+
+
+def _describe(path: Path, description: dict[str, Any]) -> None:
+    """Write a description."""
+    path.write_text(json.dumps(description, indent=2) + "\n")
+
+
+def _described(folder: Path) -> dict[str, Any]:
+    """The description in a checkpoint, empty if it is damaged."""
     try:
-        return (folder / DESCRIPTION).read_text() == description
-    except (OSError, UnicodeDecodeError):
-        return False
+        found = json.loads((folder / DESCRIPTION).read_text())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _occupied(folder: Path) -> bool:

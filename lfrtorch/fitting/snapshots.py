@@ -65,8 +65,9 @@ class Snapshots:
     @property
     def least(self) -> float:
         """Normalised squared error of the best iterate of all; infinite if there is none."""
-        files = [] if self.folder is None else sorted(self.folder.glob("*.safetensors"))
-        return min((state_file.read(file)[0]["best"] for file in files), default=math.inf)
+        files = [self._file(number) for number in range(self._count or 0)]
+        found = [state_file.read(file)[0]["best"] for file in files if file.is_file()]
+        return min(found, default=math.inf)
 
     def begun(self, model: Model | None) -> Model | None:
         """The model that the first start begins with, if its weights are not drawn: it is kept.

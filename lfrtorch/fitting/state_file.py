@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from lfrtorch._support.atomic import whole_file
+from lfrtorch._support.checkpoint import write_tensors
 from lfrtorch._support.errors import InputError
 
 State = TypeVar("State")
@@ -28,9 +28,8 @@ FORMAT = "lfrtorch snapshot 1"
 
 def write(path: Path, numbers: Numbers, tensors: Tensors) -> None:
     """Replace the file at once."""
-    held = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     with whole_file(path) as fresh:
-        save_file(held, fresh, metadata={"format": FORMAT, "numbers": json.dumps(numbers)})
+        write_tensors(fresh, tensors, format=FORMAT, numbers=json.dumps(numbers))
 
 
 def read(path: Path) -> tuple[Numbers, Tensors]:

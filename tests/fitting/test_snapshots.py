@@ -13,6 +13,7 @@ from reference import measure, random_cell, random_model
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
+from lfrtorch._support.atomic import TEMPORARY
 from lfrtorch._support.reasons import Reason
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting import state_file, trainer
@@ -226,6 +227,13 @@ def test_files_are_written_when_it_is_time_and_at_the_end(
 def test_the_best_score_of_all(tmp_path: Path):
     assert Snapshots(tmp_path).least == Snapshots().least == float("inf")
     result = run(starts(3), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=2))
+    assert Snapshots(tmp_path).least == min(p.score for p in result.history)
+
+
+def test_a_file_that_a_kill_left_half_written_is_no_start(tmp_path: Path):
+    result = run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=2))
+    (tmp_path / f"{TEMPORARY}0.safetensors").write_bytes(b"half")
+    (tmp_path / ".0-half.safetensors").write_bytes(b"as an older version named it")
     assert Snapshots(tmp_path).least == min(p.score for p in result.history)
 
 

@@ -1,6 +1,9 @@
 """Saved and loaded to the same bits; everything else is refused with nothing lost."""
 
+import contextlib
+import itertools
 import json
+import os
 import pickle
 import re
 from pathlib import Path
@@ -181,7 +184,7 @@ def test_newer_version(saved: Path):
 
 def test_version_that_is_missing(saved: Path):
     edit(saved, version=None)
-    refused(saved, "has checkpoint version None")
+    refused(saved, "is damaged (version None)")
 
 
 @pytest.mark.parametrize("entry", ["sizes", "static", "dtype", "fs", "inputs", "outputs"])
@@ -238,6 +241,29 @@ def test_scales_of_another_model(saved: Path):
         mixed |= {name: scale for name, scale in scales if name.startswith("scaler.")}
         save_file(mixed, saved / "weights.safetensors")
         refused(saved, "scales or channels are more or fewer than inputs and outputs")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("A", float("nan"), "A have numbers that are not finite"),
+        ("scaler.y_scale", float("inf"), "scaler.y_scale have numbers that are not finite"),
+        ("scaler.u_scale", 0.0, "a scale is not positive"),
+        ("scaler.y_scale", -1.0, "a scale is not positive"),
+    ],
+)
+def test_weights_that_make_no_model(saved: Path, name: str, value: float, message: str):
+    weights = load_file(saved / "weights.safetensors")
+    weights[name] = torch.full_like(weights[name], value)
+    save_file(weights, saved / "weights.safetensors")
+    refused(saved, message)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_weights_that_are_no_file_are_not_waited_for(saved: Path):
+    (saved / "weights.safetensors").unlink()
+    os.mkfifo(saved / "weights.safetensors")
+    refused(saved, "is damaged or missing (it is no file)")
 
 
 # --- code is never run ----------------------------------------------------------------------
@@ -355,11 +381,47 @@ def test_other_weights_of_the_same_model_replace_one_file(saved: Path):
     assert after[1] != before[1]
 
 
-def test_another_model_replaces_both_files(saved: Path):
+def test_another_model_replaces_both_files_and_no_other(saved: Path):
+    (saved / "notes.txt").write_text("three years")
     newer = random_model(random_cell(2, 2, 2))
     newer.save(saved)
     assert np.array_equal(load(saved).simulate(U), newer.simulate(U))
+    names = sorted(p.name for p in saved.iterdir())
+    assert names == ["model.json", "notes.txt", "weights.safetensors"]
     assert [p.name for p in saved.parent.iterdir()] == ["saved"]
+
+
+def test_a_checkpoint_is_readable_wherever_a_save_stops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Power fails after each of the renames; then a third model is saved, and power fails again."""
+    models = [small(), random_model(random_cell(2, 2, 2)), small(activation="relu")]
+    whole = [model.simulate(U) for model in models]
+    rename, left = os.replace, 0
+
+    def failing(source: Path, target: Path) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise KeyboardInterrupt
+        rename(source, target)
+
+    def saved_until(model: Model, renames: int) -> None:
+        nonlocal left
+        left = renames
+        with contextlib.suppress(KeyboardInterrupt):
+            model.save(folder)
+
+    monkeypatch.setattr(os, "replace", failing)
+    for first, second in itertools.product(range(5), (1, 2, 3)):
+        folder = tmp_path / f"{first}{second}"
+        saved_until(models[0], 1)
+        for model, renames in zip(models[1:], (first, second), strict=True):
+            saved_until(model, renames)
+            assert any(np.array_equal(load(folder).simulate(U), y) for y in whole)
+        saved_until(models[1], 9)
+        assert np.array_equal(load(folder).simulate(U), whole[1])
+        assert sorted(p.name for p in folder.iterdir()) == ["model.json", "weights.safetensors"]
 
 
 def test_link_to_a_checkpoint_is_replaced(saved: Path):
@@ -372,7 +434,7 @@ def test_link_to_a_checkpoint_is_replaced(saved: Path):
 
 
 def test_save_that_fails_keeps_the_old_checkpoint(saved: Path, monkeypatch: pytest.MonkeyPatch):
-    def full(*_):
+    def full(*_, **__):
         raise OSError("no space left on device")
 
     monkeypatch.setattr(checkpoint, "save_file", full)
