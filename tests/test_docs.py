@@ -11,6 +11,7 @@ from matplotlib import pyplot
 
 import lfrtorch
 from lfrtorch.cli import CONF
+from lfrtorch.cli.composition import first_run, parsed
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -63,7 +64,8 @@ def test_reference_has_all_that_is_exported():
 def test_command_of_the_guide_has_settings_that_exist(name: str, words: str):
     overrides = [word for word in shlex.split(words) if word not in ("-m", "--help")]
     if "-m" in words.split():
-        overrides = [word.split(",")[0] for word in overrides]
+        read = [parsed(word) for word in overrides]
+        overrides = [first_run(word) for word in read if not word.is_hydra_override()]
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         compose("config" if name == "fit" else name, overrides)
 

@@ -1,6 +1,7 @@
 """Identify an NL-LFR model: records -> linear model -> starts -> fit -> scores -> files.
 
 lfrtorch fit +bench=boucwen
+lfrtorch fit -m +bench=boucwen 'seed=range(20)' nn=5,10 hydra.sweep.dir=DIR
 lfrtorch fit resume=runs/boucwen/DATE
 lfrtorch fit data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750 nx=3
 torchrun --nproc-per-node 2 -m lfrtorch.cli fit ...
@@ -26,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.reasons import Reason
-from lfrtorch.cli import CONF
+from lfrtorch.cli import CONF, study
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import configured, loaded
 from lfrtorch.cli.errors import user_errors
@@ -180,9 +181,18 @@ class _Folder(Terminal):
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(cfg: DictConfig) -> float:
     """The command line."""
-    job, rank = HydraConfig.get(), os.environ.get("RANK", "0")
-    command = shlex.join([*program("train.py"), *job.overrides.task])
+    job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
+    if study.of_several(job):
+        command = shlex.join(["lfrtorch", "fit", *job.overrides.task])
+        return study.job(lambda own: launched(own, folder, command), cfg, folder, hydra=job)
+    command = shlex.join([*program("train.py"), *job.overrides.task])
+    return launched(cfg, folder, command)
+
+
+def launched(cfg: DictConfig, folder: Path, command: str) -> float:
+    """One run, by all processes that torchrun started; errors of users end the program."""
+    rank = os.environ.get("RANK", "0")
     with ExitStack() as stack:
         stack.enter_context(user_errors(rank, cfg))
         if rank == "0":
@@ -196,10 +206,14 @@ def main(cfg: DictConfig) -> float:
 
 def launch() -> None:
     """``main``; of several processes the first alone has Hydra write files."""
-    if WORLD > 1 and {"-m", "--multirun"} & set(sys.argv):
+    if WORLD > 1 and study.is_study(sys.argv):
         sys.exit("error: torchrun shares one fit; start several runs one after another.")
     with user_errors(os.environ.get("RANK", "0")):
-        take_words("config", arguments)
+        several = study.is_study(sys.argv)
+        take_words("config", study.study_words if several else arguments)
     if WORLD > 1 and os.environ["RANK"] != "0":
         sys.argv += WITHOUT_FILES
-    main()
+    if several:
+        study.went_on(main)
+    else:
+        main()

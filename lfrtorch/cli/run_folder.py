@@ -55,14 +55,13 @@ def arguments(given: Sequence[str]) -> list[str]:
     for word in given:
         if now(word) != word:
             raise InputError(f"{word} is called {now(word)} now.")
-    for name, mark in (("hydra.run.dir", CONFIG), ("hydra.sweep.dir", "multirun.yaml")):
-        folder = values.get(name, "").strip("'\"")
-        taken = bool(folder) and (Path(folder) / mark).exists()
-        if taken and values.get("overwrite", "").lower() != "true":
-            raise InputError(
-                f"{name} is '{folder}', which holds a run; give another folder, resume={folder} "
-                "to go on with that run, or overwrite=true to replace it."
-            )
+    folder = values.get("hydra.run.dir", "").strip("'\"")
+    taken = bool(folder) and (Path(folder) / CONFIG).exists()
+    if taken and values.get("overwrite", "").lower() != "true":
+        raise InputError(
+            f"hydra.run.dir is '{folder}', which holds a run; give another folder, "
+            f"resume={folder} to go on with that run, or overwrite=true to replace it."
+        )
     return list(given)
 
 

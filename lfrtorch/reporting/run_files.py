@@ -23,8 +23,9 @@ def write(
     """Write the files of a run into a folder, which is made if it is missing.
 
     ``model/`` and ``linear/`` are checkpoints for :func:`lfrtorch.load` and
-    ``LinearModel.load``; ``metrics.json`` has the numbers, ``figures/`` the figures and
-    ``report.html`` both; ``tensorboard --logdir FOLDER`` shows the history.
+    ``LinearModel.load``; ``figures/`` has the figures, ``report.html`` them and the numbers, and
+    ``metrics.json`` the numbers: it is written last. ``tensorboard --logdir FOLDER`` shows the
+    history.
 
     Args:
         run: what :func:`lfrtorch.identify` returned.
@@ -39,8 +40,6 @@ def write(
     run.model.save(folder / "model")
     run.linear.save(folder / "linear")
     metrics = {**run.metrics, "command": command}
-    with whole_file(folder / "metrics.json") as fresh:
-        fresh.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
     board = TensorBoard(folder) if board is None else board
     if not board.begun:
         for earlier in folder.glob("events.out.tfevents.*"):
@@ -71,3 +70,5 @@ def write(
         with whole_file(folder / "report.html") as path:
             path.write_text(page, encoding="utf-8")
     board.close()
+    with whole_file(folder / "metrics.json") as fresh:
+        fresh.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")

@@ -497,13 +497,10 @@ def test_resume_needs_a_run(tmp_path: Path):
     assert "hydra" not in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("option", "mark"), [("hydra.run.dir", "config.yaml"), ("hydra.sweep.dir", "multirun.yaml")]
-)
-def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path, option: str, mark: str):
-    given = [f"{option}='{tmp_path}'"]
+def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path):
+    given = [f"hydra.run.dir='{tmp_path}'"]
     assert run_folder.arguments(given) == given
-    (tmp_path / mark).touch()
+    (tmp_path / "config.yaml").touch()
     with pytest.raises(ValueError, match="overwrite=true"):
         run_folder.arguments(given)
     assert run_folder.arguments([*given, "overwrite=true"]) == [*given, "overwrite=true"]

@@ -1,0 +1,285 @@
+"""Several runs by one command: each in a process and a folder of its own, and no run twice."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shlex
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from hashlib import sha256
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import torch
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from threadpoolctl import threadpool_limits
+
+from lfrtorch._support import tables
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.reasons import CUT_SHORT
+from lfrtorch.cli.composition import SWEEPS, parsed
+from lfrtorch.cli.run_folder import SNAPSHOTS
+
+LOG, FAILED, LOCK = "log.txt", "failed.txt", ".lock"
+"""In the folder of a run: what it printed, why it failed, and what says that a process is at it."""
+
+NOT_COMPARED = ("overwrite", "resume")
+"""Words that are not about what a run computes."""
+
+LONGEST = 120
+"""Characters of a folder's name; file systems take 255 bytes."""
+
+ATTEMPTS = 3
+"""How often the runs that are left are begun if processes are killed that many runs share."""
+
+KILLED = {"BrokenProcessPool", "UncompletedJobError"}
+"""Errors of joblib and submitit if one of their processes is."""
+
+LAUNCHERS = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit"}
+"""What starts several runs at once, and the plugin of Hydra that has it."""
+
+IN_SEQUENCE = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+
+FORKS = sys.platform == "linux"
+"""Whether a process may be copied safely: the libraries of other systems do not allow it."""
+
+
+def folder_name(varied: str) -> str:
+    """The name of a run's folder, from its own words: ``nn=5,seed=0``.
+
+    Example:
+        >>> from lfrtorch.cli.study import folder_name
+        >>> folder_name("data.path=a/b.csv,nn=5")
+        'data.path=a%2Fb.csv,nn=5'
+    """
+    name = quote(varied, safe="=,+[]{}:() ") or "run"
+    if len(name) <= LONGEST:
+        return name
+    return f"{name[: LONGEST - 9]}-{sha256(name.encode()).hexdigest()[:8]}"
+
+
+OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+
+
+def study_words(given: Sequence[str]) -> list[str]:
+    """The command line of several runs, with what names their folders.
+
+    Raises:
+        ValueError: ``hydra.sweep.dir`` holds a study of other settings, or the launcher is missing.
+    """
+    if any(word.startswith("resume=") for word in given):
+        raise InputError(
+            "resume is of one run; several go on by the same command with hydra.sweep.dir=DIR."
+        )
+    words = [parsed(word) for word in given if not word.startswith("-")]
+    for word in words:
+        plugin = word.key_or_group == "hydra/launcher" and LAUNCHERS.get(str(word.value()))
+        if plugin and find_spec(f"hydra_plugins.hydra_{plugin}_launcher") is None:
+            raise InputError(f"{word.input_line} needs: pip install 'lfrtorch[sweep]'.")
+    common = [word for word in words if not (word.is_sweep_override() or word.is_hydra_override())]
+    for word in words:
+        if word.get_key_element() == "hydra.sweep.dir" and "overwrite=true" not in given:
+            _same_study(Path(str(word.value())), sorted(str(word.input_line) for word in common))
+    keys = ",".join(dict.fromkeys(word.key_or_group for word in common))
+    return [*given, f"hydra.job.config.override_dirname.exclude_keys=[{keys}]"]
+
+
+def _same_study(folder: Path, common: Sequence[str]) -> None:
+    """Refuse a folder whose runs were made with other words than those they share now."""
+    if not (folder / "multirun.yaml").is_file():
+        return
+    listed = OmegaConf.load(folder / "multirun.yaml")
+    before: Any = OmegaConf.to_container(OmegaConf.select(listed, "hydra.overrides.task"))
+    words = [word for word in map(parsed, before) if not word.is_sweep_override()]
+    old, new = _compared([str(word.input_line) for word in words]), _compared(common)
+    if old != new:
+        changed = ", ".join(sorted(set(old) ^ set(new)))
+        raise InputError(
+            f"hydra.sweep.dir is '{folder}', whose runs have other settings ({changed}); give "
+            "another folder, or overwrite=true to replace those runs."
+        )
+
+
+def _compared(words: Sequence[str]) -> list[str]:
+    """The words that say what a run computes, in an order of their own."""
+    return sorted(word for word in words if word.partition("=")[0] not in NOT_COMPARED)
+
+
+def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, hydra: Any) -> float:
+    """One of several runs, unless it is done; its outcome is a line on the terminal.
+
+    A run that fails, or is killed, is noted in its folder and stops no other.
+
+    Args:
+        work: the run; returns its validation RMSE.
+        cfg: of the run; one that was killed goes on, on as many threads as its place has.
+        folder: of its files.
+        hydra: the configuration of Hydra.
+
+    Returns:
+        The validation RMSE, nan if the run failed.
+    """
+    with _alone(folder):
+        known = None if cfg.overwrite else done(folder, list(hydra.overrides.task))
+        if known is not None:
+            print(f"{folder.name}: done before", flush=True)
+            return known
+        if cfg.threads is None and hydra.launcher._target_ != IN_SEQUENCE:
+            cfg.threads = hydra.launcher.get("cpus_per_task") or 1
+        if not cfg.overwrite and cfg.resume is None and (folder / SNAPSHOTS).is_dir():
+            cfg.resume = str(folder)
+        for old in (FAILED, LOG):
+            (folder / old).unlink(missing_ok=True)
+        begun = time.perf_counter()
+        value, end = _apart(work, cfg, folder / LOG)
+        if value is None:
+            (folder / FAILED).write_text(f"{end}\n", encoding="utf-8")
+            print(f"{folder.name}: failed: {end}", flush=True)
+            return math.nan
+        took = tables.quantity(time.perf_counter() - begun, "s")
+        print(f"{folder.name}: error {tables.number(value)}, {took}", flush=True)
+        return value
+
+
+def done(folder: Path, words: Sequence[str]) -> float | None:
+    """The validation RMSE of a run with these words that came to its end; None if none did."""
+    if not (folder / "metrics.json").is_file():
+        return None
+    found = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    made = shlex.split(found["command"])[2:]
+    if _compared(made) != _compared(words) or found["fit"]["reason"].startswith(tuple(CUT_SHORT)):
+        return None
+    judged = found["validation"]["rmse"]
+    return found["ranking"][0]["train"] if judged is None else judged
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """No other process is at this run: one that is left of a study that was killed ends first."""
+    try:
+        import fcntl
+    except ImportError:  # not on Windows
+        yield
+        return
+    with (folder / LOCK).open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _apart(
+    work: Callable[[DictConfig], float], cfg: DictConfig, log: Path
+) -> tuple[float | None, str]:
+    """The value of the work, None if it failed, and how it ended; what it prints is in a file."""
+    if not FORKS:
+        return _logged(work, cfg, log)
+    context = get_context("fork")
+    ours, theirs = context.Pipe(duplex=False)
+
+    def send() -> None:
+        with log.open("a") as file:
+            for number in (1, 2):
+                os.dup2(file.fileno(), number)  # of libraries that are not Python's, too
+        theirs.send(_logged(work, cfg, log))
+
+    process = context.Process(target=send)
+    process.start()
+    theirs.close()
+    try:
+        process.join()
+    except KeyboardInterrupt:  # it was asked to end as well, and keeps what it found
+        process.join()
+        raise
+    if process.exitcode == 0:
+        return ours.recv()
+    code = process.exitcode or 0
+    return None, f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+def _logged(
+    work: Callable[[DictConfig], float], cfg: DictConfig, log: Path
+) -> tuple[float | None, str]:
+    """The same in this process."""
+    with (
+        log.open("a", buffering=1, encoding="utf-8") as file,
+        redirect_stdout(file),
+        redirect_stderr(file),
+        threadpool_limits(cfg.threads),
+    ):
+        before = torch.get_num_threads()
+        try:
+            return work(cfg), "done"
+        except SystemExit as end:
+            error = f"exit code {end.code}"
+        except Exception:
+            traceback.print_exc()
+            error = "a bug"
+        finally:
+            torch.set_num_threads(before)
+    lines = log.read_text(encoding="utf-8").splitlines()
+    said = [line for line in lines if line.startswith("error: ")] or [x for x in lines if x.strip()]
+    return None, said[-1].removeprefix("error: ") if said else error
+
+
+class Report(Callback):
+    """Says where the runs are, and at the end what became of them; Hydra calls it."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Before the first run."""
+        folder = shlex.quote(f"hydra.sweep.dir={config.hydra.sweep.dir}")
+        print(f"Runs in {config.hydra.sweep.dir}; the same command with {folder} goes on there")
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """After the last one."""
+        folder = Path(config.hydra.sweep.dir)
+        runs = sorted(path.parents[1] for path in folder.rglob(".hydra/overrides.yaml"))
+        failed = [run for run in runs if (run / FAILED).is_file()]
+        ended = sum((run / "metrics.json").is_file() for run in runs if run not in failed)
+        print(f"\n{ended} of {len(runs)} runs in {folder} are done")
+        if failed:
+            rows = [
+                [str(run.relative_to(folder)), (run / FAILED).read_text(encoding="utf-8").strip()]
+                for run in failed
+            ]
+            print(f"\n{tables.table(['failed', 'why'], rows)}")
+            sys.exit(1)
+
+
+def went_on(launched: Callable[[], Any]) -> None:
+    """Start the runs; those that are left again if a process that works on them is killed.
+
+    Raises:
+        SystemExit: runs failed, or processes were killed several times.
+    """
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, and not as a traceback
+    for _ in range(ATTEMPTS):
+        try:
+            return launched()
+        except KeyboardInterrupt:
+            print("interrupted: the same command with that folder goes on", file=sys.stderr)
+            sys.exit(128 + signal.SIGINT)
+        except Exception as error:
+            if not {kind.__name__ for kind in type(error).__mro__} & KILLED:
+                raise
+            print("a process was killed: going on with the runs that are left", file=sys.stderr)
+    sys.exit(f"processes were killed {ATTEMPTS} times: is there memory enough for so many at once?")
+
+
+def is_study(given: Sequence[str]) -> bool:
+    """Whether the command line asks for several runs."""
+    return not SWEEPS.isdisjoint(given)
+
+
+def of_several(hydra: Any) -> bool:
+    """Whether this run is one of them."""
+    return hydra.mode == RunMode.MULTIRUN
