@@ -10,6 +10,12 @@ from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 
 
+def check_dtype(dtype: torch.dtype) -> None:
+    """Refuse what a model does not compute in with a ValueError."""
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError(f"dtype is {dtype!r}; give torch.float64 or torch.float32.")
+
+
 class LFRCell(nn.Module):
     """One time step (u, x) -> (y, x+) of the NL-LFR state-space model::
 

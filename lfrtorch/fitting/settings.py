@@ -12,6 +12,7 @@ from torch.nn import Module
 
 from lfrtorch._support.checks import integer, number, true_or_false
 from lfrtorch._support.errors import InputError
+from lfrtorch.engine.cell import check_dtype
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.prediction import Noise, check_noise
 from lfrtorch.fitting.trainer import Trainer
@@ -259,8 +260,7 @@ class Settings:
                 f"structure is {self.structure!r}, which a mean of models does not keep, and "
                 f"average is {self.average}; give average=1 or structure='free'."
             )
-        if self.dtype not in (torch.float32, torch.float64):
-            raise InputError(f"dtype is {self.dtype}; give torch.float64 or torch.float32.")
+        check_dtype(self.dtype)
         try:
             torch.empty(0, device=self.device)
         except (RuntimeError, AssertionError) as error:

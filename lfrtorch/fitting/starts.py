@@ -14,7 +14,7 @@ from torch.nn import Module
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
-from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.cell import LFRCell, check_dtype
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting.driven_states import (
@@ -115,9 +115,9 @@ def initialise(
         dtype: of the weights.
 
     Raises:
-        ValueError: sizes below 1, an unknown method, a static map of other sizes, modes and no
-            errors above the band of the inputs, nothing that z may see, or a linear model with
-            feedthrough for a model without.
+        ValueError: sizes below 1, a dtype that is no float32 or float64, an unknown method, a
+            static map of other sizes, modes and no errors above the band of the inputs, nothing
+            that z may see, or a linear model with feedthrough for a model without.
 
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
@@ -136,6 +136,7 @@ def initialise(
     integer("seed", seed, 0)
     integer("relaxations", relaxations, 0)
     integer("modes", modes, 0)
+    check_dtype(dtype)
     if method not in ("zero_output", "paper"):
         raise InputError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
     if structure != "free":

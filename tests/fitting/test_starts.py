@@ -234,6 +234,12 @@ def test_neither_neurons_nor_a_map(bla: LinearModel):
         initialise(bla, RECORDS, nz=2, nw=3)
 
 
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float16, "float64"])
+def test_numbers_that_a_model_does_not_compute_with(bla: LinearModel, dtype: Any):
+    with pytest.raises(ValueError, match=r"dtype is .*; give torch.float64 or torch.float32"):
+        initialise(bla, RECORDS, nz=2, nw=3, nn=4, dtype=dtype)
+
+
 # --- a nonlinearity at one end --------------------------------------------------------------
 
 
