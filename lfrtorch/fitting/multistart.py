@@ -183,6 +183,7 @@ def fit(
         snapshots=snapshots, stop=stop, horizon=horizon,
     )  # fmt: skip
     check_horizon(horizon, noise)
+    models = models if isinstance(models, Model) else _different(models)
     if noise == "output":
         models = without_gain(models)
         return found(models, train, validation, selection, monitors=monitors)
@@ -192,6 +193,26 @@ def fit(
     )
     members = tuple(model.innovation_form() for model in result.members)
     return replace(result, model=result.model.innovation_form(), members=members)
+
+
+def _different(models: Sequence[Model]) -> list[Model]:
+    """The models as a list; refuse one that is none, or has its weights in common with another."""
+    starts = list(models)
+    for number, model in enumerate(starts):
+        if not isinstance(model, Model):
+            raise InputError(
+                f"models[{number}] is a {type(model).__name__}; give models, as initialise and "
+                "load return them."
+            )
+    seen: dict[int, int] = {}
+    for number, model in enumerate(starts):
+        first = seen.setdefault(id(model.lfr.cell.A), number)
+        if first != number:
+            raise InputError(
+                f"models[{number}] shares its weights with models[{first}], and a fit changes them "
+                "in place; give a start with another seed, or copy.deepcopy(model)."
+            )
+    return starts
 
 
 def _fitted(

@@ -2,6 +2,7 @@
 
 import math
 import threading
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -285,6 +286,11 @@ def test_bad_calls_are_refused():
     models, train, _ = several(2)
     with pytest.raises(ValueError, match="no model to start from"):
         fit([], train)
+    with pytest.raises(ValueError, match=r"models\[1\] is a str"):
+        fit([models[0], "model"], train)
+    twice = [*models, replace(models[0], fitted_to="again")]
+    with pytest.raises(ValueError, match=r"models\[2\] shares its weights with models\[0\]"):
+        fit(twice, train)
     with pytest.raises(ValueError, match=r"2 models and 1 lists"):
         fit(models, train, monitors=[[]])
 
