@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfrtorch._support import checks
-from lfrtorch._support.checks import dft_lines, integer, number
+from lfrtorch._support.checks import dft_lines, integer, number, reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Integers
 
@@ -185,7 +185,7 @@ def _amplitudes(amplitude: ArrayLike | None, samples: int, nu: int, excited: Int
     """Relative amplitudes (F, nu) of the excited lines."""
     if amplitude is None:
         return np.ones((excited.size, nu))
-    given = np.asarray(amplitude, dtype=np.float64)
+    given = reals("amplitude", amplitude)
     if given.ndim == 1:
         given = given[:, None]
     F = samples // 2 + 1
@@ -201,7 +201,7 @@ def _amplitudes(amplitude: ArrayLike | None, samples: int, nu: int, excited: Int
 
 
 def _rms(rms: ArrayLike, nu: int) -> Array:
-    given = np.asarray(rms, dtype=np.float64)
+    given = reals("rms", rms)
     if given.shape not in ((), (nu,)) or not (np.isfinite(given).all() and (given > 0).all()):
         raise InputError(f"rms is {rms}; give a positive number, or one for each of {nu} input(s).")
     return given

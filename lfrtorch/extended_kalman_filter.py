@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
@@ -61,7 +62,7 @@ class NoiseCovariance:
                 positive, or an S that is too large for Q and R.
         """
         Q, R = _covariance("Q", self.Q, nx), _covariance("R", self.R, ny)
-        S = np.zeros((nx, ny)) if self.S is None else np.asarray(self.S, dtype=np.float64)
+        S = np.zeros((nx, ny)) if self.S is None else reals("S", self.S)
         if S.shape != (nx, ny) or not np.isfinite(S).all():
             raise InputError(
                 f"S has the shape {S.shape}; give ({nx}, {ny}) finite numbers, states by outputs."
@@ -191,7 +192,7 @@ def inside_limits(record: Record) -> Float[Array, "T ny"]:
 
 def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
     """A covariance from itself, its variances, or one variance."""
-    value = np.asarray(given, dtype=np.float64)
+    value = reals(name, given)
     if value.ndim < 2 and value.size in (1, size):
         value = np.diag(np.broadcast_to(value, size))
     if value.shape != (size, size):

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from lfrtorch._support import checkpoint
-from lfrtorch._support.checks import integer
+from lfrtorch._support.checks import integer, reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.beyond_linear import Beyond, base_of
@@ -248,9 +248,14 @@ class Model:
             raise InputError("start='given' needs a start state: pass x0.")
         like = self.lfr.cell.A
         v = torch.as_tensor(self.scaler.normalise_u(u)).to(like).unsqueeze(0)
-        state = None if x0 is None else torch.as_tensor(np.asarray(x0)).to(like).reshape(1, -1)
-        if state is not None and state.shape[1] != self.lfr.cell.nx:
-            raise InputError(f"x0 has {state.shape[1]} entries; the model has {self.lfr.cell.nx}.")
+        state = None
+        if x0 is not None:
+            given = reals("x0", x0).ravel()
+            if len(given) != self.lfr.cell.nx:
+                raise InputError(f"x0 has {len(given)} entries; the model has {self.lfr.cell.nx}.")
+            if not np.isfinite(given).all():
+                raise InputError("x0 has NaN, infinite or masked entries; give finite numbers.")
+            state = torch.tensor(given).to(like).reshape(1, -1)
         if start == "estimated":
             if not isinstance(data, Record):
                 raise InputError("start='estimated' needs a record: the state is fitted to its y.")

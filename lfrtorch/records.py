@@ -23,13 +23,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lfrtorch._support.checks import integer
+from lfrtorch._support.checks import integer, number, reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 
@@ -37,6 +36,10 @@ Start = Literal["zero", "given", "estimated", "periodic"]
 
 _LISTED = 4
 """Most channels of a side that a printed record names."""
+
+_SMALLEST, _LARGEST = 1e-100, 1e100
+"""Levels of a signal, and sampling frequencies, beyond which squares may leave the range of numbers
+(1e-308 to 1e308)."""
 
 _MANY_CHANNELS = 16
 """An array of more channels than this and fewer samples is taken for a transposed one."""
@@ -108,9 +111,9 @@ class Record:
         line_weight: (T // 2 + 1,) or (T // 2 + 1, ny), limits: (2, ny).
 
     Raises:
-        ValueError: NaN or infinite samples, different lengths, wrong shapes, negative weights, a
-            ``skip`` that leaves no sample, a period that does not fit, or a reference of other
-            samples or channels than the input.
+        ValueError: NaN, infinite or masked samples, levels or an ``fs`` beyond 1e-100 to 1e100,
+            different lengths, wrong shapes, negative weights, a ``skip`` that leaves no sample, a
+            period that does not fit, or a reference of other samples or channels than the input.
 
     Example:
         >>> record = lfrtorch.Record(np.sin(np.arange(100.0)), np.zeros(100), fs=50.0, skip=10)
@@ -138,19 +141,18 @@ class Record:
     reference: Array | None = None
 
     def __post_init__(self) -> None:
-        inputs = _channels(self.inputs, self.u, "u")
-        outputs = _channels(self.outputs, self.y, "y")
-        u = as_signal(self.u, inputs, f"record '{self.name}': input")
-        y = as_signal(self.y, outputs, f"record '{self.name}': output")
+        inputs, u = _side(self.inputs, self.u, "u", f"record '{self.name}': input")
+        outputs, y = _side(self.outputs, self.y, "y", f"record '{self.name}': output")
         if len(u) != len(y):
             raise InputError(
                 f"record '{self.name}': the input has {len(u)} samples and the output {len(y)}; "
                 "both must be sampled at the same instants: cut or resample one of them."
             )
-        if not (isinstance(self.fs, Real) and np.isfinite(self.fs) and self.fs > 0):
+        number(f"record '{self.name}': the sampling frequency", self.fs, positive=True)
+        if not _SMALLEST <= self.fs <= _LARGEST:
             raise InputError(
-                f"record '{self.name}': the sampling frequency is {self.fs} Hz; "
-                "give a positive number of samples per second."
+                f"record '{self.name}': the sampling frequency is {self.fs} Hz; give one between "
+                f"{_SMALLEST:g} and {_LARGEST:g} Hz."
             )
         check_start(self.start, f"record '{self.name}'")
         integer(f"record '{self.name}': skip", self.skip, 0)
@@ -166,7 +168,7 @@ class Record:
                 "a start state goes with start='given', and only with it."
             )
         if self.x0 is not None:
-            x0 = np.array(self.x0, dtype=np.float64).reshape(-1)
+            x0 = reals(f"record '{self.name}': x0", self.x0).reshape(-1).copy()
             if not np.isfinite(x0).all():
                 raise InputError(f"record '{self.name}': x0 is {x0}; give finite numbers.")
             object.__setattr__(self, "x0", x0)
@@ -191,7 +193,7 @@ class Record:
             )
 
     def _check_weights(self, T: int, ny: int) -> None:
-        weight = np.array(self.weight, dtype=np.float64)
+        weight = reals(f"record '{self.name}': weight", self.weight).copy()
         if weight.shape not in ((), (1,), (ny,)):
             raise InputError(
                 f"record '{self.name}': weight has shape {weight.shape}; give one number, or one "
@@ -199,7 +201,7 @@ class Record:
             )
         lines = self.line_weight
         if lines is not None:
-            given = np.array(lines, dtype=np.float64)
+            given = reals(f"record '{self.name}': line_weight", lines).copy()
             lines = given[:, None] if given.ndim == 1 else given
             F = T // 2 + 1
             if lines.shape not in ((F, 1), (F, ny)):
@@ -247,7 +249,7 @@ class Record:
         if self.reference is None:
             return
         what = f"record '{self.name}': reference"
-        r = as_signal(self.reference, _channels((), self.reference, "r"), what)
+        _, r = _side((), self.reference, "r", what)
         if r.shape != u.shape:
             raise InputError(
                 f"{what} has shape {r.shape} and the input {u.shape}; give as many samples, and a "
@@ -521,17 +523,28 @@ def rms_scale(signals: Sequence[Array], offset: Array) -> NDArray:
     return np.where(scale > 0, scale, 1.0)
 
 
-def _channels(given: tuple[Channel, ...], signal: ArrayLike, letter: str) -> tuple[Channel, ...]:
-    shape = np.shape(signal)
-    width = shape[1] if len(shape) == 2 else 1
-    if not given:
-        return tuple(Channel(letter if width == 1 else f"{letter}{i + 1}") for i in range(width))
-    if len(given) != width:
+def _side(
+    given: tuple[Channel, ...], signal: ArrayLike, letter: str, what: str
+) -> tuple[tuple[Channel, ...], Array]:
+    """Channels and samples of the inputs or the outputs of a record."""
+    array = reals(what, signal)
+    width = array.shape[1] if array.ndim == 2 else 1
+    if given and len(given) != width:
         raise InputError(
             f"{letter} has {width} column(s) but {len(given)} channel name(s) were given; "
             "name every column once."
         )
-    return tuple(Channel(*c) for c in given)
+    default = (Channel(letter if width == 1 else f"{letter}{i + 1}") for i in range(width))
+    channels = tuple(Channel(*c) for c in given) or tuple(default)
+    array = as_signal(array, channels, what)
+    largest = np.abs(array).max(axis=0)
+    odd = np.flatnonzero((largest > _LARGEST) | ((largest > 0) & (largest < _SMALLEST)))
+    if odd.size:
+        raise InputError(
+            f"{what} '{channels[odd[0]].name}' goes up to {largest[odd[0]]:g}; give it in a unit "
+            f"that brings it between {_SMALLEST:g} and {_LARGEST:g}."
+        )
+    return channels, array
 
 
 def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: int = 0) -> Array:
@@ -546,10 +559,7 @@ def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: 
     Raises:
         ValueError: another type or shape, no sample, NaN or infinite samples.
     """
-    array = np.asarray(x)
-    if array.dtype.kind not in "biuf":
-        raise InputError(f"{what} has type {array.dtype}; give real numbers.")
-    array = np.array(array, dtype=np.float64, order="C")  # a copy: it is frozen below
+    array = np.array(reals(what, x), order="C")  # a copy: it is frozen below
     if array.ndim == 1:
         array = array[:, None]
     if array.ndim != 2:
@@ -573,8 +583,8 @@ def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: 
     if bad.any():
         k, channel = np.argwhere(bad)[0]
         raise InputError(
-            f"{what} '{channels[channel].name}' has {bad.sum()} NaN or infinite sample(s), the "
-            f"first at index {first + k}; cut the record there or interpolate the gap."
+            f"{what} '{channels[channel].name}' has {bad.sum()} NaN, infinite or masked sample(s), "
+            f"the first at index {first + k}; cut the record there or interpolate the gap."
         )
     array.flags.writeable = False
     return array

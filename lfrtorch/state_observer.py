@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.beyond_linear import folded
@@ -64,7 +65,7 @@ class StateObserver(ABC):
         floats = (np.ascontiguousarray(values, dtype=np.float64) for values in at)
         self._u_offset, self._u_scale, self._y_offset, self._y_scale = floats
         self._x_now, self._x_next = self._x[0]
-        x = np.asarray(x0, dtype=np.float64)
+        x = reals("x0", x0)
         if x.shape != (cell.nx,) or not np.isfinite(x).all():
             raise InputError(f"x0 has the shape {x.shape}; give {cell.nx} finite numbers.")
         self._x_now[:] = x

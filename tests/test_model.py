@@ -198,10 +198,18 @@ def test_size_of_the_start_state(model: Model):
     refused(model, "x0 has 2 entries; the model has 3.", np.ones((9, 2)), x0=np.zeros(2))
 
 
+def test_start_states_that_are_no_finite_numbers(model: Model):
+    u = np.ones((9, 2))
+    for x0 in ([np.nan, 0.0, 0.0], np.ma.masked_array(np.zeros(3), mask=[1, 0, 0])):
+        refused(model, "x0 has NaN, infinite or masked entries", u, x0=x0)
+    for x0 in ([1j, 0.0, 0.0], "abc"):
+        refused(model, "give real numbers", u, x0=x0)
+
+
 def test_input_that_is_not_finite(model: Model):
     u = np.ones((9, 2))
     u[3, 1] = np.nan
-    refused(model, "input 'u2' has 1 NaN or infinite sample(s), the first at index 3", u)
+    refused(model, "input 'u2' has 1 NaN, infinite or masked sample(s), the first at index 3", u)
 
 
 def test_unknown_start(model: Model):

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+import torch
 
 from lfrtorch.records import (
     Channel,
@@ -112,7 +113,7 @@ def test_different_lengths():
 def test_samples_that_are_not_finite(bad: float):
     u = U.copy()
     u[4:6, 1] = bad
-    refused("input 'u2' has 2 NaN or infinite sample(s), the first at index 4;", u=u)
+    refused("input 'u2' has 2 NaN, infinite or masked sample(s), the first at index 4;", u=u)
     y = Y.copy()
     y[7] = bad
     refused("output 'force' has 1 NaN", y=y, outputs=(Channel("force"),))
@@ -121,6 +122,34 @@ def test_samples_that_are_not_finite(bad: float):
 @pytest.mark.parametrize("fs", [0.0, -1.0, np.nan, np.inf])
 def test_sampling_frequency(fs: float):
     refused("record 'lab': the sampling frequency is", fs=fs)
+
+
+def test_numbers_whose_squares_overflow_or_vanish():
+    for factor in (1e300, 1e-300):
+        refused("give it in a unit that brings it between 1e-100 and 1e+100", y=factor * Y)
+    refused("the sampling frequency is 1e-320 Hz; give one between", fs=1e-320)
+    refused("the sampling frequency is True; give a positive number", fs=True)
+
+
+def test_masked_samples_are_missing():
+    masked = np.ma.masked_array(Y, mask=Y > 3.5)
+    refused(f"output 'y' has {masked.mask.sum()} NaN, infinite or masked sample(s)", y=masked)
+    refused("masked sample(s)", u=[masked, masked])
+    refused("x0 is", start="given", x0=np.ma.masked_array([0.0], mask=[True]))
+    whole = np.ma.masked_array(Y)
+    assert np.array_equal(Record(U, whole).y[:, 0], Y)
+
+
+def test_what_is_no_array_of_real_numbers():
+    for given in ([[1.0, 2.0], [3.0]], torch.ones(10, device="meta")):
+        refused("input is no array of real numbers (", u=given)
+    for given in (np.arange(10).astype("datetime64[s]"), Y + 0j, [None] * 10, Y.astype(str)):
+        refused("give real numbers", u=given)
+
+
+def test_a_tensor_of_a_graph_is_a_signal():
+    y = torch.tensor(Y, requires_grad=True)
+    assert np.array_equal(Record(U, 2.0 * y).y[:, 0], 2.0 * Y)
 
 
 def test_unknown_start():

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.types import Integers
+from lfrtorch._support.types import Array, Integers
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -62,6 +62,24 @@ def band(given: Any) -> None:
     pair = isinstance(given, Sequence | np.ndarray) and len(given) == 2
     if not pair or not all(isinstance(f, Real) for f in given):
         raise InputError(f"band is {given}; give two numbers, the lowest and the highest in Hz.")
+
+
+def reals(name: str, given: ArrayLike) -> Array:
+    """Real numbers of any shape, NaN where they are masked; refuse all else with a ValueError."""
+    values: Any = given
+    try:
+        if hasattr(values, "detach"):  # a tensor, maybe one with a gradient or on a device
+            values = values.detach().cpu()
+        elif isinstance(values, list | tuple) and any(map(np.ma.is_masked, values)):
+            values = np.ma.stack(values)
+        array = np.asarray(values)
+    except (RuntimeError, TypeError, ValueError) as error:
+        reason = str(error).split(". ")[0].split("\n")[0].rstrip(".")
+        raise InputError(f"{name} is no array of real numbers ({reason}).") from None
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{name} has type {array.dtype}; give real numbers.")
+    array = array.astype(np.float64, copy=False)
+    return np.where(np.ma.getmaskarray(values), np.nan, array) if np.ma.is_masked(values) else array
 
 
 def dft_lines(given: ArrayLike, samples: int) -> Integers:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import engineering, number, quantity, table
 from lfrtorch._support.types import Array
@@ -82,7 +83,7 @@ def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) ->
     """
     cell, scaler = double(model.lfr.cell), model.scaler
     size = amplitudes(amplitude, len(model.inputs))
-    start = np.zeros(cell.nx) if x0 is None else np.asarray(x0, dtype=np.float64).ravel()
+    start = np.zeros(cell.nx) if x0 is None else reals("x0", x0).ravel()
     if len(start) != cell.nx or not np.isfinite(start).all():
         raise InputError(f"x0 is {x0!r}; the model has {cell.nx} states: give as many numbers.")
     reached = reach(cell, size / scaler.u_scale, start)
@@ -99,7 +100,7 @@ def amplitudes(given: ArrayLike, nu: int) -> Array:
         >>> amplitudes(0.5, nu=2)
         array([0.5, 0.5])
     """
-    found = np.atleast_1d(np.asarray(given, dtype=np.float64))
+    found = np.atleast_1d(reals("amplitude", given))
     if found.shape not in ((1,), (nu,)) or not (np.isfinite(found) & (found >= 0)).all():
         raise InputError(
             f"amplitude is {given!r}; the model has {nu} input(s): give one finite number for all, "

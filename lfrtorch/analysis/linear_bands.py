@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Complex128, Float
 from numpy.typing import ArrayLike
 
+from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.model import LinearModel
@@ -95,7 +96,7 @@ def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
         (2, 1, 1)
     """
     covariance = _covariance(model)
-    f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+    f = np.atleast_1d(reals("frequencies", frequencies))
     z = np.exp(2j * np.pi * f / model.fs)
     X, L = solve_resolvents(model.A, model.B, model.C, z)
     nu = len(model.inputs)

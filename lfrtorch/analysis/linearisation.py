@@ -7,6 +7,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import quantity
 from lfrtorch._support.types import Array
@@ -94,12 +95,7 @@ def vector(name: str, given: ArrayLike, size: int, expected: str) -> Array:
         >>> vector("u", 0.5, 1, "the model has {} input(s)").tolist()
         [0.5]
     """
-    if isinstance(given, Tensor):
-        given = given.detach().cpu().numpy()
-    try:
-        found = np.atleast_1d(np.asarray(given, dtype=np.float64))
-    except (TypeError, ValueError):
-        found = np.full((0, 0), np.nan)
+    found = np.atleast_1d(reals(name, given))
     if found.shape != (size,) or not np.isfinite(found).all():
         raise InputError(
             f"{name} is {given!r}; {expected.format(size)}: give as many finite numbers."

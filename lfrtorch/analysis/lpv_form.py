@@ -18,6 +18,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from torch.nn import Module
 
+from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import vector
@@ -155,7 +156,7 @@ class LPV:
             >>> np.allclose(form.simulate(record.u), model.simulate(record.u))
             True
         """
-        signal = np.asarray(u, dtype=np.float64)
+        signal = reals("u", u)
         signal = signal[:, None] if signal.ndim == 1 else signal
         if signal.ndim != 2 or signal.shape[1] != len(self.u0):
             raise InputError(

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from lfrtorch._support import checkpoint
+from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array, Complex
@@ -413,7 +414,7 @@ class LinearModel:
             ) from None
 
     def _z(self, frequencies: ArrayLike) -> Complex:
-        f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+        f = np.atleast_1d(reals("frequencies", frequencies))
         if f.ndim != 1:
             raise InputError(f"the frequencies have shape {f.shape}; give one dimension, in Hz.")
         return np.exp(2j * np.pi * f / self.fs)

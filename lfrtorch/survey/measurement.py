@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.periods import find_period
@@ -67,7 +68,7 @@ def survey_measurement(
         >>> found.outputs[0].samples, found.outputs[0].missing, found.whole
         (400, 0, slice(0, 400, None))
     """
-    u, y = _columns(u), _columns(y)
+    u, y = _columns("u", u), _columns("y", y)
     if len(u) != len(y):
         raise InputError(
             f"the inputs have {len(u)} samples and the outputs {len(y)}; "
@@ -90,8 +91,8 @@ def survey_measurement(
     return Survey(tuple(surveys[:nu]), tuple(surveys[nu:]), fs, whole)
 
 
-def _columns(signals: ArrayLike) -> Array:
-    array = np.asarray(signals, dtype=np.float64)
+def _columns(name: str, signals: ArrayLike) -> Array:
+    array = reals(name, signals)
     return array[:, None] if array.ndim == 1 else array
 
 
