@@ -200,7 +200,7 @@ def test_size_of_the_start_state(model: Model):
 
 def test_start_states_that_are_no_finite_numbers(model: Model):
     u = np.ones((9, 2))
-    for x0 in ([np.nan, 0.0, 0.0], np.ma.masked_array(np.zeros(3), mask=[1, 0, 0])):
+    for x0 in ([np.nan, 0.0, 0.0], np.ma.masked_array(np.zeros(3), mask=[True, False, False])):
         refused(model, "x0 has NaN, infinite or masked entries", u, x0=x0)
     for x0 in ([1j, 0.0, 0.0], "abc"):
         refused(model, "give real numbers", u, x0=x0)

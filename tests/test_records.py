@@ -149,7 +149,7 @@ def test_what_is_no_array_of_real_numbers():
 
 def test_a_tensor_of_a_graph_is_a_signal():
     y = torch.tensor(Y, requires_grad=True)
-    assert np.array_equal(Record(U, 2.0 * y).y[:, 0], 2.0 * Y)
+    assert np.array_equal(lab(y=2.0 * y).y[:, 0], 2.0 * Y)
 
 
 def test_unknown_start():

@@ -79,7 +79,7 @@ def reals(name: str, given: ArrayLike) -> Array:
     if array.dtype.kind not in "biuf":
         raise InputError(f"{name} has type {array.dtype}; give real numbers.")
     array = array.astype(np.float64, copy=False)
-    return np.where(np.ma.getmaskarray(values), np.nan, array) if np.ma.is_masked(values) else array
+    return np.where(np.ma.getmask(values), np.nan, array) if np.ma.is_masked(values) else array
 
 
 def dft_lines(given: ArrayLike, samples: int) -> Integers:

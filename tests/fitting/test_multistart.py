@@ -4,7 +4,7 @@ import math
 import threading
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -287,7 +287,7 @@ def test_bad_calls_are_refused():
     with pytest.raises(ValueError, match="no model to start from"):
         fit([], train)
     with pytest.raises(ValueError, match=r"models\[1\] is a str"):
-        fit([models[0], "model"], train)
+        fit(cast(Any, [models[0], "model"]), train)
     twice = [*models, replace(models[0], fitted_to="again")]
     with pytest.raises(ValueError, match=r"models\[2\] shares its weights with models\[0\]"):
         fit(twice, train)
