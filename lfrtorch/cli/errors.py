@@ -38,13 +38,17 @@ def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None
             raise failed.__cause__ from None
         group = re.search(r"^full_key: (.+)$", str(failed), re.MULTILINE)
         where = f"{group[1]}: " if group and failed.__cause__ else ""
-        show(f"{where}{failed.__cause__ or failed}")
+        show(f"{where}{_said(failed.__cause__ or failed)}")
     except TerminatedError as end:
         if rank == "0":
             print(end, file=sys.stderr)
         sys.exit(128 + end.number)
     except (LfrtorchError, OSError) as failed:
         show(str(failed))
+    except (MemoryError, RuntimeError) as failed:
+        if not _of_memory(failed):
+            raise
+        show(_said(failed))
     except KeyboardInterrupt:
         print("interrupted outside the fit: nothing to keep", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
@@ -55,4 +59,18 @@ def _of_the_user(cause: BaseException) -> bool:
     """Whether a call from the configuration failed because of what it was given."""
     if isinstance(cause, TypeError):
         return "unexpected keyword argument" in str(cause)
-    return isinstance(cause, LfrtorchError | OSError | ImportError)
+    return isinstance(cause, LfrtorchError | OSError | ImportError) or _of_memory(cause)
+
+
+def _of_memory(error: BaseException) -> bool:
+    """Whether there was not enough memory; torch says so with a RuntimeError."""
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and "memory" in str(error) and "alloc" in str(error)
+    )
+
+
+def _said(error: BaseException) -> str:
+    """The message of an error; those of memory have none, or one of the allocator."""
+    if _of_memory(error):
+        return "there is not enough memory; give smaller sizes or shorter records."
+    return str(error)

@@ -15,6 +15,7 @@ from torch.nn import Module, Parameter, ParameterList
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.memory import check_memory
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "tanh": torch.tanh,
@@ -23,6 +24,9 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "rbf": lambda v: torch.exp(-v.square()),
     "softplus": lambda v: torch.logaddexp(v, v.new_zeros(())),  # F.softplus cuts off at v = 20
 }
+
+BYTES = 1000
+"""What Python's lists take for a monomial of a polynomial, about."""
 
 
 class Network(Module):
@@ -150,7 +154,7 @@ class Polynomial(Module):
         constant is column 0.
 
     Raises:
-        ValueError: a degree below 1.
+        ValueError: a degree below 1, or more monomials than there is memory for.
 
     Example:
         >>> static = lfrtorch.Polynomial(nz=2, nw=1, degree=3)
@@ -169,6 +173,11 @@ class Polynomial(Module):
     ) -> None:
         super().__init__()
         integer("degree", degree, 1)
+        check_memory(
+            nw * math.comb(nz + degree, degree) * BYTES,
+            f"a polynomial with nz={nz}, nw={nw} and degree={degree}",
+            "give smaller ones",
+        )
         self.nz, self.degree = nz, degree
         monomials = [
             factors  # numbers of the z in the product

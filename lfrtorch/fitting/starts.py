@@ -24,6 +24,7 @@ from lfrtorch.fitting.driven_states import (
 )
 from lfrtorch.fitting.nonlinear_end import nonlinear_end
 from lfrtorch.least_squares.exact_integrators import integrating_states
+from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.modes import MINOR, without_slow_minor_modes
 from lfrtorch.model import Model
@@ -115,9 +116,10 @@ def initialise(
         dtype: of the weights.
 
     Raises:
-        ValueError: sizes below 1, a dtype that is no float32 or float64, an unknown method, a
-            static map of other sizes, modes and no errors above the band of the inputs, nothing
-            that z may see, or a linear model with feedthrough for a model without.
+        ValueError: sizes below 1, or so large that a fit takes more memory than there is, a dtype
+            that is no float32 or float64, an unknown method, a static map of other sizes, modes and
+            no errors above the band of the inputs, nothing that z may see, or a linear model with
+            feedthrough for a model without.
 
     References:
         Schoukens and Tóth, IFAC-PapersOnLine 53(2), 2020, section 4.2.
@@ -154,16 +156,19 @@ def initialise(
         bla.y_offset,
         rms_scale([r.y for r in data], bla.y_offset),
     )
+    sizes = len(bla.inputs), len(bla.outputs), len(bla.A)
     generator = torch.Generator().manual_seed(seed)
     if static is None:
         integer("nn", nn, 1)
         assert nn is not None
+        with torch.device("meta"):  # nothing is allocated
+            planned = Network(nz, nw, nn, activation, layers=layers, dtype=dtype)
+            check_fit_memory(LFRCell(*sizes, nz, nw, planned, dtype=dtype))
         static = Network(nz, nw, nn, activation, layers=layers, dtype=dtype)
         static.reset_parameters(generator)
     else:
         static = deepcopy(static).to(dtype)
         _check_sizes(static, nz, nw, dtype)
-    sizes = len(bla.inputs), len(bla.outputs), len(bla.A)
     linear, cell = LFRCell(*sizes, dtype=dtype), LFRCell(*sizes, nz, nw, static, dtype=dtype)
     for target in (linear, cell):
         bla.write(target, scaler)

@@ -23,6 +23,7 @@ from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, is_compiled
 from lfrtorch.least_squares.contracting import Contracting
 from lfrtorch.least_squares.exact_integrators import fixed_parameters, integrating_states
+from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.jacobian import Jacobian, Memory, Part
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
@@ -198,13 +199,14 @@ class SimulationProblem(LeastSquares):
             eliminate: whether initial states are eliminated if they outnumber the parameters; a
                 system without damping, or its factor, needs them all.
         """
+        states = self._initial_states.numel()
+        parts, P = [], len(theta) - states
+        eliminate = eliminate and states > P and self.ranks.world == 1
+        check_fit_memory(self.lfr.cell, 0 if eliminate else states)
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
         self.guesses = [t.x for t in trajectories]
         cell = self.lfr.cell
-        states = self._initial_states.numel()
-        parts, P = [], len(theta) - states
-        eliminate = eliminate and states > P and self.ranks.world == 1
         for group, trajectory in zip(self.groups, trajectories, strict=True):
             x0 = group.estimated if states else None
             if x0 is not None:

@@ -35,6 +35,15 @@ def test_errors_of_users_are_one_line(kind: Callable[[str], Exception], capsys):
     assert printed(capsys, lambda: instantiate({"a": target})["a"]) == f"error: a: {message}\n"
 
 
+def test_memory_that_there_is_not_is_one_line(capsys):
+    for call in (
+        lambda: fails(MemoryError, ""),
+        lambda: fails(RuntimeError, "DefaultCPUAllocator: can't allocate memory: 8 TB"),
+        lambda: instantiate({"_target_": fails, "kind": MemoryError, "message": ""}),
+    ):
+        assert "error: there is not enough memory; give smaller" in printed(capsys, call)
+
+
 def test_a_lost_process_is_one_line(capsys):
     err = printed(capsys, lambda: fails(ProcessLostError, "rank 1"))
     assert err == "error: a process was lost: rank 1\n"

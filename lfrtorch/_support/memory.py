@@ -1,0 +1,62 @@
+"""Memory that a computation takes, against what the machine has."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING
+
+from lfrtorch._support.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+_UNITS = ("kB", "MB", "GB", "TB", "PB", "EB")
+
+
+def check_memory(needed: float, what: str, remedy: str, device: torch.device | None = None) -> None:
+    """Refuse what takes more bytes than a device has with a ValueError, before it is asked for.
+
+    Args:
+        needed: bytes.
+        what: takes them, for the message.
+        remedy: what to do.
+        device: which one. Default: the CPU.
+
+    Example:
+        >>> from lfrtorch._support.memory import check_memory
+        >>> try:
+        ...     check_memory(8e18, "'x.h5', 1e18 samples,", "save a part of it")
+        ... except lfrtorch.InputError as error:
+        ...     print(str(error).split(",")[1])
+         1e18 samples
+    """
+    there = memory_of(device)
+    if needed > there:
+        raise InputError(
+            f"{what} takes {in_bytes(needed)} of memory, and there are {in_bytes(there)}; {remedy}."
+        )
+
+
+def memory_of(device: torch.device | None = None) -> float:
+    """Bytes of memory of a device, all of it; infinite if that is not known."""
+    if device is not None and device.type == "cuda":
+        import torch
+
+        return float(torch.cuda.get_device_properties(device).total_memory)
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):  # not on every system
+        return math.inf
+
+
+def in_bytes(count: float) -> str:
+    """Bytes with a unit.
+
+    Example:
+        >>> from lfrtorch._support.memory import in_bytes
+        >>> in_bytes(8.1e12)
+        '8.1 TB'
+    """
+    power = min(max(int(math.log10(max(count, 1.0)) // 3), 1), len(_UNITS))
+    return f"{count / 1000**power:.3g} {_UNITS[power - 1]}"

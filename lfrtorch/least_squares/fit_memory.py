@@ -1,0 +1,28 @@
+"""Memory that a fit takes, from the sizes of a model."""
+
+from __future__ import annotations
+
+from lfrtorch._support.memory import check_memory
+from lfrtorch.engine.cell import LFRCell
+
+SQUARES, TALL = 4, 3
+"""Matrices of P x P that a step holds at once (JᵀJ, the columns that it is of, damped, its factor),
+and of P x gauge directions."""
+
+
+def check_fit_memory(cell: LFRCell, states: int = 0) -> None:
+    """Refuse a model whose fit takes more memory than its device has with a ValueError.
+
+    Args:
+        cell: the model; its weights may be on torch's ``meta`` device, where they have none.
+        states: estimated start states, all entries together.
+    """
+    P = sum(p.numel() for p in cell.parameters() if p.requires_grad) + states
+    squares = [n**2 for n in (cell.nx, cell.nz, cell.nw)]  # coordinates of x, z and w
+    numbers = SQUARES * P**2 + TALL * P * sum(squares) + max(squares) ** 2
+    check_memory(
+        numbers * cell.A.element_size(),
+        f"a fit of {P} parameters with nx={cell.nx}, nz={cell.nz} and nw={cell.nw}",
+        "give smaller sizes",
+        cell.A.device,
+    )

@@ -1,0 +1,30 @@
+"""Sizes that take more memory to fit than a machine has."""
+
+import pytest
+import torch
+
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.least_squares.fit_memory import check_fit_memory
+
+
+def planned(nz: int, nn: int) -> LFRCell:
+    with torch.device("meta"):
+        return LFRCell(1, 1, 2, nz, 1, Network(nz, 1, nn))
+
+
+@pytest.mark.parametrize(("nz", "nn"), [(1, 10_000_000), (3000, 3), (1000, 100_000)])
+def test_sizes_beyond_any_machine(nz: int, nn: int):
+    with pytest.raises(ValueError, match=rf"nx=2, nz={nz} and nw=1 takes .*; give smaller sizes"):
+        check_fit_memory(planned(nz, nn))
+
+
+def test_start_states_count_as_parameters():
+    check_fit_memory(planned(2, 20))
+    with pytest.raises(ValueError, match="a fit of 100000099 parameters"):
+        check_fit_memory(planned(2, 20), states=100_000_000)
+
+
+def test_a_polynomial_of_too_many_terms():
+    with pytest.raises(ValueError, match="a polynomial with nz=60, nw=1 and degree=30 takes"):
+        Polynomial(60, 1, 30)
