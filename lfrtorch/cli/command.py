@@ -8,17 +8,21 @@ from importlib.metadata import version
 
 import hydra
 
-from lfrtorch.cli import CONF, preview_words
+from lfrtorch.cli import CONF, compare, preview_words
 
 COMMANDS = {
     "preview": "look at measurements before any fit",
     "linear": "frequency response and best linear approximation",
     "fit": "identify a nonlinear LFR model, from records to report",
+    "compare": "many runs in one table and one page",
     "evaluate": "score a saved model on a dataset",
     "simulate": "run a saved model on the inputs of files",
     "export": "write a saved model as C, CasADi, ONNX, MATLAB, Python or FMU",
 }
 """Modules of this room, in the order in which a user meets them, and what they do."""
+
+PARSERS = {"preview": preview_words.parser, "compare": compare.parser}
+"""What reads the words of commands that have no settings."""
 
 
 def main() -> None:
@@ -39,8 +43,8 @@ def start(command: str) -> None:
     """Start a command; its help comes without what computes, which takes seconds to import."""
     if {"--help", "-h"}.isdisjoint(sys.argv):
         import_module(f"lfrtorch.cli.{command}").launch()
-    elif command == "preview":
-        preview_words.parser().parse_args()
+    elif command in PARSERS:
+        PARSERS[command]().parse_args()
     else:
         name = "config" if command == "fit" else command
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(lambda _: None)()

@@ -28,6 +28,7 @@ from threadpoolctl import threadpool_limits
 from lfrtorch._support import tables
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT
+from lfrtorch.cli import compare
 from lfrtorch.cli.composition import SWEEPS, parsed
 from lfrtorch.cli.run_folder import SNAPSHOTS
 
@@ -245,6 +246,9 @@ class Report(Callback):
         runs = sorted(path.parents[1] for path in folder.rglob(".hydra/overrides.yaml"))
         failed = [run for run in runs if (run / FAILED).is_file()]
         ended = sum((run / "metrics.json").is_file() for run in runs if run not in failed)
+        if ended:
+            print()
+            compare.run([folder])
         print(f"\n{ended} of {len(runs)} runs in {folder} are done")
         if failed:
             rows = [

@@ -103,15 +103,9 @@ def render(
         residuals: of one record, if it has some; ``residuals`` among the images is theirs.
         config: of the run.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("lfrtorch.reporting"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["cell"] = cell
-    return environment.get_template("report.html").render(
+    return page(
+        "report.html",
+        images,
         name=dataset.name,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
         sizes=_sizes(metrics),
@@ -129,11 +123,30 @@ def render(
         parameters=_parameters(metrics, result),
         stability=_stability(metrics["stable_to"]),
         run=_run(metrics, result, bla, config),
-        images={
-            name: f"data:image/png;base64,{base64.b64encode(png).decode()}"
-            for name, png in images.items()
-        },
     )
+
+
+def page(template: str, images: Mapping[str, bytes], **values: Any) -> str:
+    """A page from a template of ours.
+
+    Args:
+        template: name of its file.
+        images: PNG by name, which the page has inside.
+        values: of the template's other variables.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("lfrtorch.reporting"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["cell"] = cell
+    inside = {
+        name: f"data:image/png;base64,{base64.b64encode(png).decode()}"
+        for name, png in images.items()
+    }
+    return environment.get_template(template).render(images=inside, **values)
 
 
 def comparisons(responses: Sequence[Response]) -> list[str]:

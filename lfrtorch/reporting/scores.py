@@ -326,7 +326,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     shown = [(line, s, of) for name, s in listed for line, of in lines(name, s, others)]
     tested = {line for line, s, _ in shown if s["use"] == "test"}
     factor, unit = tables.engineering(
-        [s[model] for _, s in listed for model in models], _unit(result), published_unit(others)
+        [s[model] for _, s in listed for model in models], unit_of(result), published_unit(others)
     )
     others = [p for p in others if tested & p.scores.keys()]
     head = ["record", "use", *["source"] * sources, "scored", *["linear", "NL-LFR"][: len(models)]]
@@ -387,8 +387,8 @@ def published_unit(published: Sequence[Published]) -> str:
     return next((p.unit for p in published if p.unit), "")
 
 
-def _unit(result: Mapping[str, Any]) -> str:
-    """The unit of all errors; none if there are several."""
+def unit_of(result: Mapping[str, Any]) -> str:
+    """The unit of all errors in what :func:`metrics` returns; none if there are several."""
     listed = [*result["scores"].values(), *result["validation"]["records"].values()]
     units = {s["unit"] for s in listed} - {""}
     return units.pop() if len(units) == 1 else ""
@@ -409,7 +409,7 @@ def starts_table(result: Mapping[str, Any]) -> str:
     """The starts of a fit that went to the end, the best first, and how many others there were."""
     ended, others = finalists(result)
     names = ("train", "validation", "selection")
-    factor, unit = tables.engineering([s[name] for s in ended for name in names], _unit(result))
+    factor, unit = tables.engineering([s[name] for s in ended for name in names], unit_of(result))
     head = ["seed", "iterations", "training", "validation", "selection", ""]
     rows = [
         [s["seed"], s["iterations"], *(tables.times(factor, s[n]) for n in names), s["reason"]]
