@@ -5,14 +5,16 @@ from __future__ import annotations
 import copy
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from time import monotonic
+from typing import Any
 
 from matplotlib.figure import Figure
 from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 
 from lfrtorch.engine.simulation import spectral_radius
 from lfrtorch.fitting.multistart import ROUNDS
@@ -108,6 +110,25 @@ class TensorBoard:
         """Add a text in a fixed-width font."""
         shown = "\n".join("    " + line for line in text.splitlines())
         self._from(step).add_text(name, shown, step)
+
+    def hyperparameters(
+        self, settings: Mapping[str, Any], found: Mapping[str, float | None], step: int
+    ) -> None:
+        """Add the run to the page HParams, where many runs are compared.
+
+        Args:
+            settings: numbers, truth values and texts among them are shown.
+            found: with them; numbers that are known.
+            step: of the iterations.
+        """
+        shown = {k: v for k, v in settings.items() if isinstance(v, bool | int | float | str)}
+        values = {f"found/{k}": v for k, v in found.items() if v is not None}
+        file = self._from(step).file_writer
+        assert file is not None
+        for summary in hparams(shown, values):
+            file.add_summary(summary)
+        for name, value in values.items():
+            self._from(step).add_scalar(name, value, step)
 
     def close(self) -> None:
         """Write what is pending."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 
 from lfrtorch._support.atomic import whole_file
 from lfrtorch.reporting import figures, html, plots, scores
 from lfrtorch.reporting.monitor import TensorBoard
+from lfrtorch.reporting.origin import origin
 from lfrtorch.reporting.run import Run
 
 
@@ -39,7 +41,7 @@ def write(
     result, dataset = run.fit, run.dataset
     run.model.save(folder / "model")
     run.linear.save(folder / "linear")
-    metrics = {**run.metrics, "command": command}
+    metrics = {**run.metrics, "command": command, **origin(dataset)}
     board = TensorBoard(folder) if board is None else board
     if not board.begun:
         for earlier in folder.glob("events.out.tfevents.*"):
@@ -54,6 +56,17 @@ def write(
     for name, text in texts.items():
         if text:
             board.text(name, text, result.iterations)
+    settings = {item.name: getattr(run.settings, item.name) for item in fields(run.settings)}
+    board.hyperparameters(
+        {**settings, **run.model.sizes},
+        {
+            "validation": metrics["validation"]["rmse"],
+            **{f"test_{name}": score["rmse"] for name, score in metrics["scores"].items()},
+            "parameters": metrics["parameters_net"],
+            "seconds": result.seconds,
+        },
+        result.iterations,
+    )
     if draw:
         drawn, views = figures.of_run(result, run.linear, dataset, run.simulations)
         if run.residuals is not None:

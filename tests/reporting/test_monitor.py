@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 import lfrtorch
 from lfrtorch.fitting.trainer import Progress
@@ -113,3 +114,15 @@ def test_checkpoint_holds_the_best_so_far_when_it_is_time(
         keep(model, Progress(iteration, 40, 1.0, 1.0, 0.0, best, {}, score))
         held.append(float(lfrtorch.load(tmp_path).lfr.cell.A.detach()))
     assert held == [0, 0, 0, 1, 1, 5]
+
+
+def test_tensorboard_has_the_run_among_others(tmp_path: Path):
+    board = TensorBoard(tmp_path)
+    board.hyperparameters({"nn": 4, "trainer": None}, {"validation": 0.5, "test": None}, 3)
+    board.close()
+    found = events(tmp_path)
+    data = found.summary_metadata
+    content = data["_hparams_/session_start_info"].plugin_data.content
+    assert HParamsPluginData.FromString(content).session_start_info.hparams.keys() == {"nn"}
+    assert found.Scalars("found/validation")[0].value == 0.5
+    assert "found/test" not in found.Tags()["scalars"]

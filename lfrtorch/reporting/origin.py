@@ -1,0 +1,81 @@
+"""What a run was made from and where: checksums of its records, the machine, the caller's code."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+import torch
+
+from lfrtorch.dataset import Dataset
+from lfrtorch.records import Record
+
+LONGEST = 10
+"""Seconds that git may take."""
+
+
+def origin(dataset: Dataset) -> dict[str, Any]:
+    """What ``metrics.json`` says of the origin of a run.
+
+    Args:
+        dataset: its records.
+
+    Returns:
+        ``machine``, ``git`` (None if the working directory is in no repository) and ``checksums``
+        of the records, by their names.
+
+    Example:
+        >>> from lfrtorch.reporting.origin import origin
+        >>> dataset = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[])
+        >>> sorted(origin(dataset))
+        ['checksums', 'git', 'machine']
+    """
+    records = (*dataset.train, *dataset.validation, *dataset.selection, *dataset.tests)
+    return {
+        "machine": {
+            "platform": platform.platform(),
+            "processor": platform.machine(),
+            "cpus": os.cpu_count(),
+            "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        },
+        "git": git_state(),
+        "checksums": {record.name: checksum(record) for record in records},
+    }
+
+
+def checksum(record: Record) -> str:
+    """SHA-256 of the samples of a record, its rate, and its inputs and outputs as float64.
+
+    Example:
+        >>> from lfrtorch.reporting.origin import checksum
+        >>> checksum(record) == checksum(record[:]), checksum(record) == checksum(record[1:])
+        (True, False)
+    """
+    found = sha256(f"{record.u.shape} {record.y.shape} {record.fs!r}".encode())
+    for signal in (record.u, record.y):
+        found.update(np.ascontiguousarray(signal, dtype="<f8").data)
+    return found.hexdigest()
+
+
+def git_state() -> dict[str, Any] | None:
+    """The commit of the working directory, and whether tracked files differ from it."""
+    commit = _git("rev-parse", "HEAD")
+    if commit is None:
+        return None
+    changes = _git("status", "--porcelain", "--untracked-files=no")
+    return {"commit": commit, "changed": None if changes is None else bool(changes)}
+
+
+def _git(*words: str) -> str | None:
+    """What git says, None if it cannot."""
+    try:
+        done = subprocess.run(
+            ["git", *words], capture_output=True, text=True, check=True, timeout=LONGEST
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
