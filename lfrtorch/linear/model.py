@@ -490,9 +490,6 @@ def _range(M: Array, limit: float) -> tuple[Array, int]:
 def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     """T and T⁻¹ to balanced coordinates by the square-root method (Laub et al. 1987).
 
-    The largest entry that a state has in the output equation is positive: else rounding errors
-    would choose the signs of the states, and with them what random weights do.
-
     Shape:
         A: (nx, nx), B: (nx, nu), C: (ny, nx) -> (nx, nx).
     """
@@ -500,11 +497,7 @@ def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     U, s, Vh = np.linalg.svd(Lq.T @ Lp)
     # A state that is almost uncontrollable or unobservable would be scaled by its rounding error.
     root = np.sqrt(np.maximum(s, s[0] * np.finfo(float).eps))
-    T, inverse = (U / root).T @ Lq.T, Lp @ (Vh.T / root)
-    seen = C @ inverse
-    largest = np.take_along_axis(seen, np.abs(seen).argmax(axis=0)[None], axis=0)[0]
-    sign = np.where(largest < 0.0, -1.0, 1.0)
-    return sign[:, None] * T, inverse * sign
+    return (U / root).T @ Lq.T, Lp @ (Vh.T / root)
 
 
 def _gramian(A: Array, Q: Array) -> Array:
