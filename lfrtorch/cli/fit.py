@@ -17,6 +17,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -185,7 +186,8 @@ def main(cfg: DictConfig) -> float:
     folder = Path(job.runtime.output_dir)
     if study.of_several(job):
         command = shlex.join(["lfrtorch", "fit", *job.overrides.task])
-        return study.job(lambda own: launched(own, folder, command), cfg, folder, hydra=job)
+        work = partial(launched, folder=folder, command=command)
+        return study.job(work, cfg, folder, hydra=job)
     command = shlex.join([*program("train.py"), *job.overrides.task])
     return launched(cfg, folder, command)
 

@@ -15,11 +15,11 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from hashlib import sha256
 from importlib.util import find_spec
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import torch
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -52,8 +52,13 @@ LAUNCHERS = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm":
 
 IN_SEQUENCE = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 
-FORKS = sys.platform == "linux"
-"""Whether a process may be copied safely: the libraries of other systems do not allow it."""
+PROCESSES = get_context("forkserver") if sys.platform == "linux" else get_context("spawn")
+"""Runs begin as copies of a process that has loaded what they need and has computed nothing: its
+threads are not copied, and a run would wait for them. Other systems' libraries allow no copies.
+"""
+
+LOADED = ("lfrtorch.cli.fit", "lfrtorch._public", "pandas", "scipy.signal")
+"""Modules that runs need, loaded before they begin: some take seconds."""
 
 
 def folder_name(varied: str) -> str:
@@ -131,7 +136,7 @@ def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, h
     Returns:
         The validation RMSE, nan if the run failed.
     """
-    with _alone(folder):
+    with _alone(folder) as lock:
         known = None if cfg.overwrite else done(folder, list(hydra.overrides.task))
         if known is not None:
             print(f"{folder.name}: done before", flush=True)
@@ -143,7 +148,7 @@ def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, h
         for old in (FAILED, LOG):
             (folder / old).unlink(missing_ok=True)
         begun = time.perf_counter()
-        value, end = _apart(work, cfg, folder / LOG)
+        value, end = _apart(work, cfg, folder / LOG, lock)
         if value is None:
             (folder / FAILED).write_text(f"{end}\n", encoding="utf-8")
             print(f"{folder.name}: failed: {end}", flush=True)
@@ -166,34 +171,29 @@ def done(folder: Path, words: Sequence[str]) -> float | None:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """No other process is at this run: one that is left of a study that was killed ends first."""
+def _alone(folder: Path) -> Iterator[Connection | None]:
+    """No other process is at this run: one that is left of a study that was killed ends first.
+
+    The open file is locked until all processes that have it close it. It is a connection, since
+    these may be handed to another process.
+    """
     try:
         import fcntl
     except ImportError:  # not on Windows
-        yield
+        yield None
         return
-    with (folder / LOCK).open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+    with Connection(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)) as lock:
+        fcntl.flock(lock.fileno(), fcntl.LOCK_EX)
+        yield lock
 
 
 def _apart(
-    work: Callable[[DictConfig], float], cfg: DictConfig, log: Path
+    work: Callable[[DictConfig], float], cfg: DictConfig, log: Path, lock: Connection | None
 ) -> tuple[float | None, str]:
     """The value of the work, None if it failed, and how it ended; what it prints is in a file."""
-    if not FORKS:
-        return _logged(work, cfg, log)
-    context = get_context("fork")
-    ours, theirs = context.Pipe(duplex=False)
-
-    def send() -> None:
-        with log.open("a") as file:
-            for number in (1, 2):
-                os.dup2(file.fileno(), number)  # of libraries that are not Python's, too
-        theirs.send(_logged(work, cfg, log))
-
-    process = context.Process(target=send)
+    PROCESSES.set_forkserver_preload([*LOADED])
+    ours, theirs = PROCESSES.Pipe(duplex=False)
+    process = PROCESSES.Process(target=_send, args=(theirs, work, cfg, log, lock))
     process.start()
     theirs.close()
     try:
@@ -207,6 +207,20 @@ def _apart(
     return None, f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
+def _send(
+    pipe: Connection,
+    work: Callable[[DictConfig], float],
+    cfg: DictConfig,
+    log: Path,
+    _lock: Connection | None,  # held until this process ends
+) -> None:
+    """In a process of its own: the value and how it ended."""
+    with log.open("a") as file:
+        for number in (1, 2):
+            os.dup2(file.fileno(), number)  # of libraries that are not Python's, too
+    pipe.send(_logged(work, cfg, log))
+
+
 def _logged(
     work: Callable[[DictConfig], float], cfg: DictConfig, log: Path
 ) -> tuple[float | None, str]:
@@ -217,7 +231,6 @@ def _logged(
         redirect_stderr(file),
         threadpool_limits(cfg.threads),
     ):
-        before = torch.get_num_threads()
         try:
             return work(cfg), "done"
         except SystemExit as end:
@@ -225,8 +238,6 @@ def _logged(
         except Exception:
             traceback.print_exc()
             error = "a bug"
-        finally:
-            torch.set_num_threads(before)
     lines = log.read_text(encoding="utf-8").splitlines()
     said = [line for line in lines if line.startswith("error: ")] or [x for x in lines if x.strip()]
     return None, said[-1].removeprefix("error: ") if said else error

@@ -10,10 +10,12 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import torch
 from command_line import ROOT, file_overrides, launched
 from omegaconf import DictConfig, OmegaConf
 
@@ -70,7 +72,14 @@ def broken(_: DictConfig) -> float:
     raise KeyError("a bug")
 
 
-@pytest.mark.skipif(not study.FORKS, reason="runs have no processes of their own here")
+def quarter(_: DictConfig) -> float:
+    return 0.25
+
+
+def threads_and_folder(cfg: DictConfig, folder: str) -> float:
+    return float(cfg.threads == 1 and cfg.resume == folder)
+
+
 @pytest.mark.parametrize(
     ("work", "why"), [(killed, "killed by SIGKILL"), (refused, "nn is 0."), (broken, "KeyError")]
 )
@@ -79,18 +88,33 @@ def test_a_run_that_fails_says_why_and_is_begun_again(
 ):
     assert study.job(work, settings(), tmp_path, hydra=HYDRA) != 0.25
     assert why in (tmp_path / study.FAILED).read_text()
-    assert study.job(lambda _: 0.25, settings(), tmp_path, hydra=HYDRA) == 0.25
+    assert study.job(quarter, settings(), tmp_path, hydra=HYDRA) == 0.25
     assert not (tmp_path / study.FAILED).exists()
+
+
+def by_two_threads(_: DictConfig) -> float:
+    torch.set_num_threads(2)
+    return torch.ones(400_000).exp().sum().item()
+
+
+def test_a_run_waits_for_no_threads_of_the_process_that_starts_it(tmp_path: Path):
+    before = torch.get_num_threads()
+    try:
+        value = by_two_threads(settings())
+    finally:
+        torch.set_num_threads(before)
+    found = study.job(by_two_threads, settings(), tmp_path, hydra=HYDRA)
+    assert found == pytest.approx(value)
 
 
 def test_a_run_that_is_done_is_not_begun_and_one_that_was_killed_goes_on(tmp_path: Path):
     (tmp_path / "resume").mkdir()
     asked = settings()
-    threads_and_folder = lambda cfg: float(cfg.threads == 1 and cfg.resume == str(tmp_path))  # noqa: E731
-    assert study.job(threads_and_folder, asked, tmp_path, hydra=HYDRA) == 1.0
+    work = partial(threads_and_folder, folder=str(tmp_path))
+    assert study.job(work, asked, tmp_path, hydra=HYDRA) == 1.0
     written(tmp_path)
     assert study.job(broken, settings(), tmp_path, hydra=HYDRA) == 0.5
-    assert study.job(lambda cfg: 2.0, settings(overwrite=True), tmp_path, hydra=HYDRA) == 2.0
+    assert study.job(quarter, settings(overwrite=True), tmp_path, hydra=HYDRA) == 0.25
 
 
 def test_a_folder_is_of_one_study(tmp_path: Path):
