@@ -40,7 +40,7 @@ def overwritten(texts: list[str]) -> str:
 @pytest.fixture(autouse=True)
 def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(shutil, "get_terminal_size", lambda: terminal_size((120, 24)))
+    monkeypatch.setattr(shutil, "get_terminal_size", lambda *_, **__: terminal_size((120, 24)))
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_a_file_gets_a_line_now_and_then_and_the_last(bla: lfrtorch.LinearModel)
 def test_a_terminal_gets_one_live_line_that_fits(
     width: int, bla: lfrtorch.LinearModel, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(shutil, "get_terminal_size", lambda: terminal_size((width, 24)))
+    monkeypatch.setattr(shutil, "get_terminal_size", lambda *_, **__: terminal_size((width, 24)))
     (model,), stream = models(bla, 1), Terminal()
     line = ProgressLine(stream=stream)
     line(model, step(10, gradient_norm=1e-9))  # a longer one
