@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import zipfile
 import zlib
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.memory import check_memory
 from lfrtorch._support.types import Array
 from lfrtorch.files.table import BLOCK, Clock, Table
 
@@ -33,6 +35,9 @@ _INTERVAL = re.compile(
     r"t_?s(amp|ampling|ample)?|d_?t|delta_?t|sampl(e|ing)[ _-]?(time|period|interval)",
     re.IGNORECASE,
 )
+
+_UNREADABLE = (OSError, EOFError, MemoryError, ValueError, zipfile.BadZipFile, zlib.error)
+"""What a damaged .npz file raises; its headers may declare more than there is memory for."""
 
 Stored = Callable[[Path], AbstractContextManager[Any]]
 """Opens a file: its arrays by name."""
@@ -146,6 +151,9 @@ class ArrayTable(Table):
             raise InputError(f"'{self.path}': {listed} samples; give arrays of one length.")
         T = next(iter(lengths.values()))
         clocks = {name: Clock() for name in lengths}
+        rows = min(samples, T)
+        for name in lengths:  # a block has all channels of an array
+            self.check_memory(rows * sum(own == name for own, _ in self._signals))
         with self._stored(self.path) as stored:
             for start in range(0, T, samples):
                 stop = min(start + samples, T)
@@ -198,6 +206,8 @@ def npz(path: Path) -> ArrayTable:
     found: dict[str, Signal | str] = {}
     try:
         with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+            check_memory(size, f"'{path}', unpacked,", "give a part of it")
             for member in archive.namelist():
                 name = member.removesuffix(".npy")
                 content = io.BytesIO(archive.read(member))
@@ -207,7 +217,9 @@ def npz(path: Path) -> ArrayTable:
                     if "Object arrays" not in str(error):
                         raise
                     found[name] = "is an array of objects; store an array of real numbers"
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+    except InputError:
+        raise
+    except _UNREADABLE as error:
         raise InputError(
             f"'{path}' is not a readable .npz file ({error}); write it again with numpy.savez, "
             "arrays of numbers only."
@@ -238,7 +250,11 @@ def mat(path: Path) -> ArrayTable:
     from scipy import io as scipy_io
 
     try:
+        numbers = sum(math.prod(shape) for _, shape, _ in scipy_io.whosmat(path))
+        check_memory(8.0 * numbers, f"'{path}', of {numbers:g} numbers,", "give a part of it")
         variables = scipy_io.loadmat(path, chars_as_strings=False)
+    except InputError:
+        raise
     except Exception as error:  # a damaged file raises any of a dozen kinds
         raise InputError(
             f"'{path}' is not a readable MATLAB file ({error}); write it again with save."

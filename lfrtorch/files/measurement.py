@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -87,7 +88,7 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
     if len(stamps) > 1:
         raise InputError(f"time is {wanted.time!r}, which is {len(stamps)} columns; name one.")
     columns = (*u, *y, *r, *stamps)
-    twice = [table.headers[i] for i in dict.fromkeys(columns) if columns.count(i) > 1]
+    twice = [table.headers[i] for i, count in Counter(columns).items() if count > 1]
     if twice:
         raise InputError(
             f"'{path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs, "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.memory import check_memory
 from lfrtorch._support.types import Array
 from lfrtorch.records import Channel
 
@@ -20,6 +22,9 @@ Columns = str | int | Sequence[str | int]
 
 BLOCK = 65536
 """Samples that are in memory at once."""
+
+COPIES = 3
+"""Times that the samples are in memory: as they were read, as a record, and normalised."""
 
 CLOSE = 0.75
 """Similarity of names from which on one may be meant for the other."""
@@ -93,10 +98,21 @@ class Table(ABC):
 
     def read(self, columns: Sequence[int]) -> Array:
         """All samples of some columns, (T, len(columns))."""
+        T = max((self.lengths[column] for column in columns), default=0) if self.lengths else 0
+        self.check_memory(T * len(columns))
         grown = bytearray()  # grows in place: a list of blocks would be twice in memory at its end
         for block in self.blocks(columns):
             grown += block.tobytes()
+            self.check_memory(len(grown) // 8)
         return np.frombuffer(grown, np.float64).reshape(-1, len(columns))
+
+    def check_memory(self, numbers: float) -> None:
+        """Refuse what has so many numbers that there is no memory for it with a ValueError."""
+        check_memory(
+            COPIES * 8.0 * numbers,
+            f"'{self.path}', of which {numbers:g} numbers are to be read,",
+            "give a part of it",
+        )
 
     def find(self, wanted: str | int | Sequence[str | int] | None, option: str) -> tuple[int, ...]:
         """Numbers of the columns that are wanted by name, by header or by number from 0.
@@ -204,9 +220,9 @@ def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel,
         Channel(header, units[header]) if units.get(header) else _channel(header)
         for header in headers
     ]
-    names = [channel.name for channel in found]
+    count = Counter(channel.name for channel in found)
     return tuple(
-        channel if names.count(channel.name) == 1 else Channel(header, units.get(header, ""))
+        channel if count[channel.name] == 1 else Channel(header, units.get(header, ""))
         for header, channel in zip(headers, found, strict=True)
     )
 

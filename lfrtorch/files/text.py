@@ -23,6 +23,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.files.table import BLOCK, Clock, Table, bracketed, is_unit
 
 _HEAD = 1 << 18  # characters that tell the layout
+_LONGEST = 1 << 25  # characters of a line
 _DELIMITERS = ("\t", ";", ",", "|", " ")  # " ": any blanks; the first of those that do as well
 _MARKS = "#%"  # of comment lines
 _COMMENT = re.compile(r"^[ \t]*[#%](?!N/?A\b|[A-Z]+/?0?[!?]).*(?:\n|$)", re.MULTILINE)  # no #N/A
@@ -196,8 +197,26 @@ class _Samples(io.TextIOBase):
         super().close()
 
 
+class _Text(io.TextIOWrapper):
+    """Text whose lines end: a packed file of nothing but blanks is one line of gigabytes."""
+
+    def __init__(self, path: Path, encoding: str) -> None:
+        super().__init__(_bytes(path), encoding, errors="replace")
+        self._path = path
+
+    def readline(self, size: int = -1) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The next line."""
+        line = super().readline(_LONGEST if size < 0 else size)
+        if len(line) == _LONGEST and not line.endswith("\n"):
+            raise InputError(
+                f"'{self._path}' has a line of more than {_LONGEST} characters; it is no table of "
+                "samples: give one line a sample."
+            )
+        return line
+
+
 def _opened(path: Path, encoding: str) -> IO[str]:
-    return io.TextIOWrapper(_bytes(path), encoding, errors="replace")
+    return _Text(path, encoding)
 
 
 def _bytes(path: Path) -> gzip.GzipFile | io.BufferedReader:
