@@ -14,7 +14,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -39,6 +38,9 @@ from lfrtorch.records import Record, Scaler, without_coordinates
 
 Window = tuple[int, int]
 """First sample, and the one after the last."""
+
+LOW = 12
+"""Highest order of the first subspaces; others are made when a scan comes there."""
 
 MOST_PARTS = 8
 """Initial states are unknowns: of more records this many are fitted, evenly spaced."""
@@ -90,12 +92,20 @@ class OrderFits:
             replace(problem.data, U=problem.data.U[:, :inputs]), known=problem.known
         )
         self._most = most
+        self._subspaces: dict[int, list[SpectralSubspace]] = {}
         self._found: dict[int, Matrices] = {}
         self._y_offset = scaler.y_offset
 
-    @cached_property
-    def _subspaces(self) -> list[SpectralSubspace]:
-        return spectral_subspaces(*self.problem.equal_noise(self.problem.data.Y), self._most)
+    def _subspaces_for(self, nx: int) -> list[SpectralSubspace]:
+        """Those that hold the order: small while it is low, as few scans come near the highest."""
+        most = LOW
+        while most < nx:
+            most *= 2
+        most = min(most, self._most)
+        if most not in self._subspaces:
+            problem = self.problem
+            self._subspaces[most] = spectral_subspaces(*problem.equal_noise(problem.data.Y), most)
+        return self._subspaces[most]
 
     @classmethod
     def of(cls, data: Sequence[Record] | FRF, most: int, options: Mapping[str, Any]) -> Self | None:
@@ -181,7 +191,7 @@ class OrderFits:
             found.append(self.problem.refined(search))
         best, model, _ = self._best(found, clock, self._y_offset)
         self._found[nx], self._y_offset = best.matrices, model.y_offset
-        subspace = self._subspaces[0]
+        subspace = self._subspaces_for(nx)[0]
         assert model.fit is not None
         values = tuple(map(float, subspace.singular_values / subspace.size))
         return replace(model, fit=replace(model.fit, singular_values=values))
@@ -224,7 +234,7 @@ class OrderFits:
             if below in self._found
             for pair in self._extended(self._found[below], nx - below)
         ]
-        estimates = [subspace.estimate(nx) for subspace in self._subspaces]
+        estimates = [subspace.estimate(nx) for subspace in self._subspaces_for(nx)]
         pairs += [(e.A, e.C) for e in estimates if e is not None and len(e.A) == nx]
         found = [self.problem.with_input_matrices(A, C) for A, C in pairs]
         ranked = sorted((each for each in found if np.isfinite(each[0])), key=lambda each: each[0])

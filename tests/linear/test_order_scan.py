@@ -2,17 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import reference
 from reference import System, random_system
 
-from lfrtorch.linear import order_scan
+from lfrtorch.linear import order_fits, order_scan
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.order_scan import FOLDS, PATIENCE, OrderScan, memory_of, scan_orders
+from lfrtorch.linear.subspace import SpectralSubspace
 from lfrtorch.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
@@ -62,6 +64,19 @@ def test_planted_order_is_chosen(validated: bool, scan: OrderScan, monkeypatch):
     # What is left at the true order is the noise, a tenth of the output.
     assert scan.scores[2] == pytest.approx(0.1, rel=0.1)
     assert scan.scores[0] > 2 * scan.scores[2]
+
+
+def test_work_grows_with_the_orders_that_are_tried_and_not_with_the_highest(monkeypatch):
+    asked, made = [], order_fits.spectral_subspaces
+
+    def noted(*spectra: Any) -> list[SpectralSubspace]:
+        asked.append(spectra[-1])
+        return made(*spectra)
+
+    monkeypatch.setattr(order_fits, "spectral_subspaces", noted)
+    few, many = (scan_orders(record_of(PLANTED, 0), range(1, most)) for most in (13, 1001))
+    assert few.scores == many.scores
+    assert max(asked) == order_fits.LOW
 
 
 def test_score_on_validation_is_the_relative_simulation_error(monkeypatch):
