@@ -56,8 +56,8 @@ def whole_folder(path: Path) -> Iterator[Path]:
 def put(fresh: Path, path: Path) -> None:
     """Let what is whole take its place, on the disk before its name is: power may fail."""
     full = 0o777 if fresh.is_dir() else 0o666
-    os.chmod(fresh, full & ~umask())  # what tempfile makes is its owner's alone
     flush(fresh)
+    os.chmod(fresh, full & ~umask())  # what tempfile makes is its owner's alone
     os.replace(fresh, path)
     flush(path.parent)
 
@@ -65,11 +65,20 @@ def put(fresh: Path, path: Path) -> None:
 def flush(path: Path) -> None:
     """Have the system write a file, or the names in a folder, to the disk."""
     with suppress(OSError) if path.is_dir() else nullcontext():  # some systems open no folder
-        handle = os.open(path, os.O_RDONLY)
+        handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
         try:
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what a killed program left unfinished in a folder where no other writes now."""
+    for path in list(folder.glob(f"{TEMPORARY}*")):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def umask() -> int:

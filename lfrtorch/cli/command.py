@@ -6,9 +6,8 @@ import sys
 from importlib import import_module
 from importlib.metadata import version
 
-import hydra
-
 from lfrtorch.cli import CONF, compare, preview_words
+from lfrtorch.cli.interrupts import at_once, handled
 
 COMMANDS = {
     "preview": "look at measurements before any fit",
@@ -34,7 +33,8 @@ def main() -> None:
         print(usage())
     elif word in COMMANDS:
         sys.argv[:2] = [f"lfrtorch {word}"]
-        start(word)
+        with handled(at_once):
+            start(word)
     else:
         sys.exit(f"error: there is no command '{word}'.\n{usage()}")
 
@@ -46,6 +46,8 @@ def start(command: str) -> None:
     elif command in PARSERS:
         PARSERS[command]().parse_args()
     else:
+        import hydra
+
         name = "config" if command == "fit" else command
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(lambda _: None)()
 

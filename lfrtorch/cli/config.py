@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,7 +14,7 @@ from torch.nn import Module
 
 import lfrtorch
 from lfrtorch._support import checkpoint
-from lfrtorch._support.checks import integer
+from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.words import translated
@@ -34,8 +35,8 @@ def configured(cfg: DictConfig) -> Settings:
             "nx, the number of states, is not set: add nx=2, for example, or nx=auto "
             "(+bench=boucwen sets it and all else for that benchmark)."
         )
-    if cfg.threads is not None:
-        integer("threads", cfg.threads, 1)
+    for name in ("figures", "overwrite"):
+        true_or_false(name, cfg[name])
     if cfg.dtype not in ("float32", "float64"):
         raise InputError(f"dtype is {cfg.dtype}; give float64 or float32.")
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
@@ -50,6 +51,13 @@ def configured(cfg: DictConfig) -> Settings:
         sizes_search=SizesSearch(**plain["sizes_search"]),
         dtype=getattr(torch, cfg.dtype),
     )
+
+
+def limit_threads(cfg: DictConfig) -> None:
+    """Compute on at most ``threads`` threads: more than there are cores cost time, up to hours."""
+    if cfg.threads is not None:
+        integer("threads", cfg.threads, 1)
+        torch.set_num_threads(min(cfg.threads, os.cpu_count() or 1))
 
 
 AS_THEY_ARE = (

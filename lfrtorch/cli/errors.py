@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from lfrtorch._support.errors import LfrtorchError
 from lfrtorch._support.tables import in_lines
-from lfrtorch.cli.interrupts import TerminatedError
+from lfrtorch.cli.interrupts import TerminatedError, as_error, handled
 from lfrtorch.cli.words import translated
 
 
@@ -31,7 +31,8 @@ def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None
         print(in_lines(f"{error}: {text}"), file=sys.stderr)
 
     try:
-        yield
+        with handled(as_error):
+            yield
         return
     except InstantiationException as failed:
         if failed.__cause__ and not _of_the_user(failed.__cause__):

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import cast
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -30,7 +29,7 @@ from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.reasons import Reason
 from lfrtorch.cli import CONF, study
 from lfrtorch.cli.composition import take_words
-from lfrtorch.cli.config import configured, loaded
+from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError, Termination
 from lfrtorch.cli.run_folder import (
@@ -77,8 +76,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
     ranks = Ranks() if ranks is None else ranks
     asked, cfg = cfg, chosen_before(cfg, folder)
     settings = configured(cfg)
-    if cfg.threads is not None:
-        torch.set_num_threads(cfg.threads)
+    limit_threads(cfg)
     dataset = loaded(cfg)
     if cfg.resume is None and ranks.rank == 0:
         for old in (SNAPSHOTS, STARTS):
@@ -115,10 +113,9 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
     best = f"the best model so far is in {folder / 'model'}; {go_on(folder)}"
     if reason == Reason.PROCESS_LOST:
         raise ProcessLostError(f"{found.fit.detail}; {best}")
-    if stop.asked == signal.SIGTERM and reason == Reason.INTERRUPTED:
-        raise TerminatedError(f"the fit was terminated; {best}")
     if reason == Reason.INTERRUPTED:
-        print(go_on(folder))
+        how = "terminated" if stop.asked == signal.SIGTERM else "interrupted"
+        raise TerminatedError(f"the fit was {how}; {best}", stop.asked or signal.SIGINT)
     judged = found.metrics["validation"]["rmse"]
     return found.fit.history[found.fit.chosen_iteration].train if judged is None else judged
 
@@ -216,6 +213,7 @@ def launch() -> None:
     if WORLD > 1 and os.environ["RANK"] != "0":
         sys.argv += WITHOUT_FILES
     if several:
-        study.went_on(main)
+        with user_errors():  # Ctrl-C and SIGTERM reach the runs
+            study.went_on(main)
     else:
         main()

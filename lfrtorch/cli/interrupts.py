@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Self
 
 from lfrtorch._support.errors import LfrtorchError
@@ -17,6 +20,34 @@ class TerminatedError(LfrtorchError):
         self.number = number
 
 
+@contextmanager
+def handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Inside, ``handler`` takes SIGTERM, and Ctrl-C unless it is ignored."""
+    numbers = [signal.SIGTERM]
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background job
+        numbers.append(signal.SIGINT)
+    usual = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, before in usual.items():
+            signal.signal(number, before)
+
+
+def at_once(number: int, _: Any = None) -> None:
+    """End the program while modules load: an import might take an exception for its own."""
+    how = "interrupted" if number == signal.SIGINT else "terminated"
+    os.write(2, f"{how} before it began: nothing to keep\n".encode())
+    os._exit(128 + number)
+
+
+def as_error(number: int, _: Any = None) -> None:
+    """End the program outside a fit, with no unfinished file left behind."""
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
+    raise TerminatedError("terminated outside the fit: nothing to keep")
+
+
 class Termination:
     """Ctrl-C and SIGTERM as a request that a fit asks for before each iteration, its ``stop``.
 
@@ -28,17 +59,14 @@ class Termination:
     def __init__(self) -> None:
         self.asked = 0
         self._fitting = False
-        self._signals = [signal.SIGTERM]
-        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background job
-            self._signals.append(signal.SIGINT)
 
     def __enter__(self) -> Self:
-        self._usual = [signal.signal(number, self._note) for number in self._signals]
+        self._handled = handled(self._note)
+        self._handled.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for each, usual in zip(self._signals, self._usual, strict=True):
-            signal.signal(each, usual)
+        self._handled.__exit__(None, None, None)
 
     def __call__(self) -> bool:
         """Whether the fit is to end."""
@@ -47,9 +75,7 @@ class Termination:
 
     def _note(self, number: int, _: Any) -> None:
         again, self.asked = self.asked == number, number
+        if not self._fitting or (again and number == signal.SIGINT):
+            as_error(number)
         if number == signal.SIGINT:
-            if again or not self._fitting:
-                raise KeyboardInterrupt
             print("\nending after this iteration; Ctrl-C again: at once", file=sys.stderr)
-        elif not self._fitting:
-            raise TerminatedError("terminated outside the fit: nothing to keep")

@@ -15,7 +15,6 @@ from typing import Any
 
 import hydra
 import numpy as np
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -29,9 +28,9 @@ from lfrtorch._support.types import Array
 from lfrtorch.analysis.poles import frequency_and_damping, remark
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
-from lfrtorch.cli.config import configured, loaded
+from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.run_folder import CONFIG, arguments, made, no_empty_folder, program
+from lfrtorch.cli.run_folder import CONFIG, arguments, no_empty_folder, program
 from lfrtorch.cli.words import Terminal
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
@@ -48,8 +47,7 @@ from lfrtorch.reporting.verdict import EXPLAINS_NOTHING
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     """One run, its files written into ``folder``."""
     settings = configured(cfg)
-    if cfg.threads is not None:
-        torch.set_num_threads(cfg.threads)
+    limit_threads(cfg)
     dataset = loaded(cfg)
     print(f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples")
     frf, notes = response(cfg, dataset.train)
@@ -78,7 +76,8 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     with whole_file(folder / CONFIG) as fresh:
         OmegaConf.save(cfg, fresh, resolve=True)
     for name, figure in figures(model, dataset, frf, scan).items():
-        figure.savefig(made(folder / "figures") / f"{name}.png", dpi=150)
+        with whole_file(folder / "figures" / f"{name}.png") as fresh:
+            figure.savefig(fresh, dpi=150)
     print(f"\nRun in {folder}")
 
 

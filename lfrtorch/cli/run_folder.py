@@ -30,7 +30,7 @@ def arguments(given: Sequence[str]) -> list[str]:
     """The command line with the settings of the run in ``resume=DIR``, if there is one, before it.
 
     Raises:
-        ValueError: no run there, or a folder given for a new run that holds another one.
+        ValueError: no run there.
     """
     values = dict(argument.split("=", 1) for argument in given if "=" in argument)
     folder = values.get("resume", "null")
@@ -55,13 +55,6 @@ def arguments(given: Sequence[str]) -> list[str]:
     for word in given:
         if now(word) != word:
             raise InputError(f"{word} is called {now(word)} now.")
-    folder = values.get("hydra.run.dir", "").strip("'\"")
-    taken = bool(folder) and (Path(folder) / CONFIG).exists()
-    if taken and values.get("overwrite", "").lower() != "true":
-        raise InputError(
-            f"hydra.run.dir is '{folder}', which holds a run; give another folder, "
-            f"resume={folder} to go on with that run, or overwrite=true to replace it."
-        )
     return list(given)
 
 
@@ -95,12 +88,6 @@ def common(folder: Path, ranks: Ranks) -> Path:
     """The first process's folder."""
     name = torch.tensor(list(str(folder).encode()), dtype=torch.uint8)
     return Path(bytes(ranks.first(name).tolist()).decode())
-
-
-def made(folder: Path) -> Path:
-    """The folder, made if it is missing."""
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 @contextmanager

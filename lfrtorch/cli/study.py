@@ -29,6 +29,7 @@ from lfrtorch._support import tables
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch.cli import compare
+from lfrtorch.cli.claim import tidy
 from lfrtorch.cli.composition import SWEEPS, parsed
 from lfrtorch.cli.run_folder import SNAPSHOTS
 
@@ -145,6 +146,7 @@ def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, h
             cfg.threads = hydra.launcher.get("cpus_per_task") or 1
         if not cfg.overwrite and cfg.resume is None and (folder / SNAPSHOTS).is_dir():
             cfg.resume = str(folder)
+        tidy(folder)
         for old in (FAILED, LOG):
             (folder / old).unlink(missing_ok=True)
         begun = time.perf_counter()

@@ -72,9 +72,9 @@ def write(
         if run.residuals is not None:
             drawn["residuals"] = run.residuals.plot()
         images = {name: plots.png(figure) for name, figure in drawn.items()}
-        (folder / "figures").mkdir(exist_ok=True)
         for name, image in images.items():
-            (folder / "figures" / f"{name}.png").write_bytes(image)
+            with whole_file(folder / "figures" / f"{name}.png") as fresh:
+                fresh.write_bytes(image)
             board.image(f"summary/{name}", image, result.iterations)
         page = html.render(
             metrics, result, run.linear, dataset, run.simulations, images, run.verdict,

@@ -1,5 +1,7 @@
 """The command ``lfrtorch``: its help, at once and of its own settings."""
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -7,7 +9,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from lfrtorch.cli import CONF, command
+from lfrtorch.cli import CONF, command, errors
 
 ALL_HELP = """
 import contextlib, sys
@@ -27,6 +29,39 @@ def test_help_comes_without_what_computes():
     text, loaded = done.stdout.rsplit("loaded", 1)
     assert text.count("data.path") >= len(command.COMMANDS) - 2  # but export and compare
     assert {"torch", "numba", "scipy", "numpy", "pandas", "matplotlib"}.isdisjoint(loaded.split())
+
+
+WHILE_MODULES_LOAD = """
+import os, sys
+from lfrtorch.cli import command
+def load(name):
+    os.kill(os.getpid(), {number})
+command.import_module = load
+sys.argv = ["lfrtorch", "fit"]
+command.main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")]
+)
+def test_a_signal_while_modules_load_ends_in_a_line(number: int, word: str):
+    done = subprocess.run(
+        [sys.executable, "-c", WHILE_MODULES_LOAD.format(number=int(number))],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert done.returncode == 128 + number
+    assert done.stderr == f"{word} before it began: nothing to keep\n"
+
+
+def test_sigterm_outside_a_fit_ends_in_a_line(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as end, errors.user_errors():
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert end.value.code == 128 + signal.SIGTERM
+    assert "terminated outside the fit: nothing to keep" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 import lfrtorch
 from lfrtorch import InputError
-from lfrtorch.cli import config, errors, evaluate, fit, interrupts, run_folder, words
+from lfrtorch.cli import claim, config, errors, evaluate, fit, interrupts, run_folder, words
 from lfrtorch.datasets import boucwen, official
 from lfrtorch.reporting import plots
 from lfrtorch.reporting.advice import Advice
@@ -307,8 +307,10 @@ def test_the_interrupt_key_keeps_the_best_model_and_its_scores(
     words = [*file_overrides(csv), "nx=1", "trainer._target_=cli.test_fit.Interrupted"]
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
-    launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words, "figures=false")
-    assert f"to go on: python train.py resume={tmp_path}" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as end:
+        launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words, "figures=false")
+    assert end.value.code == 128 + signal.SIGINT
+    assert f"to go on: python train.py resume={tmp_path}" in capsys.readouterr().err
     judged_when_interrupted(tmp_path)
 
 
@@ -333,7 +335,7 @@ def test_the_interrupt_key_reaches_the_program(csv: Path, tmp_path: Path):
         time.sleep(0.1)
         process.send_signal(signal.SIGINT)
         rest = process.stdout.read()
-        assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=60) == 128 + signal.SIGINT
     assert "interrupted" in rest
     judged_when_interrupted(tmp_path)
 
@@ -456,10 +458,10 @@ def test_the_mean_is_of_networks(csv: Path, tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_new_run_forgets_the_one_that_it_replaces(csv: Path, tmp_path: Path):
-    settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=2", "threads=3"]
+    settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=2", "threads=100000"]
     for seed in (0, 1):
         fit.run(configuration(*settings, f"seed={seed}"), tmp_path)
-    assert torch.get_num_threads() == 3
+    assert torch.get_num_threads() == os.cpu_count()
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["fit"]["iterations"] == 2
 
@@ -497,13 +499,64 @@ def test_resume_needs_a_run(tmp_path: Path):
     assert "hydra" not in str(refused.value)
 
 
-def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path: Path):
-    given = [f"hydra.run.dir='{tmp_path}'"]
-    assert run_folder.arguments(given) == given
+def refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str
+) -> str:
+    """What the command line says as it ends."""
+    with pytest.raises(SystemExit) as end:
+        launched(monkeypatch, *words)
+    assert end.value.code == 1
+    return capsys.readouterr().err
+
+
+def test_a_folder_with_a_run_is_replaced_only_where_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     (tmp_path / "config.yaml").touch()
-    with pytest.raises(ValueError, match="overwrite=true"):
-        run_folder.arguments(given)
-    assert run_folder.arguments([*given, "overwrite=true"]) == [*given, "overwrite=true"]
+    word = f"++hydra.run.dir={tmp_path.parent}/../{tmp_path.parent.name}/{tmp_path.name}"
+    assert "overwrite=true to replace it" in refused(monkeypatch, capsys, word)
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
+    assert "overwrite" not in refused(monkeypatch, capsys, word, "overwrite=true")
+
+
+def test_a_folder_where_a_run_is_at_work_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    fcntl = pytest.importorskip("fcntl", reason="this system has no such locks")
+    handle = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        said = refused(monkeypatch, capsys, f"hydra.run.dir={tmp_path}")
+    finally:
+        os.close(handle)
+    assert "where another run is at work; give another folder" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("below", ["", "/below"])
+def test_a_folder_that_is_a_file_is_one_message(
+    tmp_path: Path, below: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "file").touch()
+    said = refused(monkeypatch, capsys, f"hydra.run.dir={tmp_path}/file{below}")
+    assert "which cannot be written to" in said
+    assert len(said.splitlines()) < 4
+
+
+def test_what_a_killed_run_left_unfinished_goes(tmp_path: Path):
+    for name in (".lfrtorch-a.yaml", "model/.lfrtorch-b.safetensors", "mine/.lfrtorch-c"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / ".lfrtorch-model").mkdir()
+    (tmp_path / "config.yaml").touch()
+    claim.claim(tmp_path, configuration(f"resume={tmp_path}"))
+    left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))
+    assert left == ["config.yaml", "mine", "mine/.lfrtorch-c", "model"]
+
+
+def test_figures_are_true_or_false(csv: Path, tmp_path: Path):
+    with pytest.raises(InputError, match="figures is 'maybe'; give True or False"):
+        fit.run(configuration(*file_overrides(csv), "nx=1", "figures=maybe"), tmp_path)
 
 
 @pytest.mark.numeric

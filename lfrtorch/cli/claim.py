@@ -1,0 +1,95 @@
+"""The folder of a run is one's own, before anything is written into it."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+from lfrtorch._support.atomic import remove_leftovers
+from lfrtorch._support.errors import InputError
+from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.run_folder import CONFIG, SNAPSHOTS
+
+PARTS = ("model", "linear", "figures", SNAPSHOTS, f"{SNAPSHOTS}/begun")
+"""Folders in that of a run whose files are replaced."""
+
+_locks: dict[Path, int] = {}
+"""Open folders that are locked; the system unlocks them when the program ends, even if killed."""
+
+
+class Claim(Callback):
+    """Called by Hydra when it knows the folder of a run and has not made it yet.
+
+    Not of several runs: a study keeps each of its folders to one process itself.
+    """
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        """Claim ``hydra.run.dir``."""
+        if os.environ.get("RANK", "0") == "0":
+            with user_errors(cfg=config):
+                claim(Path(config.hydra.run.dir), config)
+
+
+def claim(folder: Path, cfg: DictConfig) -> None:
+    """Have a folder to oneself until the program ends.
+
+    Args:
+        folder: ``hydra.run.dir``, made if it is missing.
+        cfg: says whether a run may be replaced or goes on.
+
+    Raises:
+        ValueError: it cannot be written to, another run works there, or has ended there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"hydra.run.dir is '{folder}', which cannot be written to ({error.strerror}); "
+            "give another folder."
+        ) from None
+    if not locked(folder.resolve()):
+        raise InputError(
+            f"hydra.run.dir is '{folder}', where another run is at work; "
+            "give another folder, or wait."
+        )
+    if (folder / CONFIG).exists() and cfg.resume is None and cfg.overwrite is not True:
+        raise InputError(
+            f"hydra.run.dir is '{folder}', which holds a run; give another folder, resume={folder} "
+            "to go on with that run, or overwrite=true to replace it."
+        )
+    tidy(folder)
+
+
+def tidy(folder: Path) -> None:
+    """Remove what a run that was killed left unfinished in its folder."""
+    if (folder / CONFIG).exists() or (folder / SNAPSHOTS).exists():
+        for part in ("", *PARTS):
+            remove_leftovers(folder / part)
+
+
+def locked(folder: Path) -> bool:
+    """Whether the folder is this program's alone now; where the system has no locks, as if."""
+    try:
+        import fcntl
+    except ImportError:
+        return True
+    for other in list(_locks):
+        os.close(_locks.pop(other))
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        return False
+    except OSError:  # a file system without locks
+        os.close(handle)
+        return True
+    _locks[folder] = handle
+    return True
