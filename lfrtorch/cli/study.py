@@ -14,7 +14,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from hashlib import sha256
 from importlib.util import find_spec
-from multiprocessing import get_context
+from multiprocessing import (
+    get_all_start_methods,
+    get_context,
+    get_start_method,
+    set_start_method,
+)
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -31,6 +36,7 @@ from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch.cli import compare
 from lfrtorch.cli.claim import tidy
 from lfrtorch.cli.composition import SWEEPS, parsed
+from lfrtorch.cli.interrupts import TerminatedError
 from lfrtorch.cli.run_folder import SNAPSHOTS
 
 LOG, FAILED, LOCK = "log.txt", "failed.txt", ".lock"
@@ -193,6 +199,8 @@ def _apart(
     work: Callable[[DictConfig], float], cfg: DictConfig, log: Path, lock: Connection | None
 ) -> tuple[float | None, str]:
     """The value of the work, None if it failed, and how it ended; what it prints is in a file."""
+    if get_start_method() not in get_all_start_methods():  # joblib's, which our processes lack
+        set_start_method(PROCESSES.get_start_method(), force=True)
     PROCESSES.set_forkserver_preload([*LOADED])
     ours, theirs = PROCESSES.Pipe(duplex=False)
     process = PROCESSES.Process(target=_send, args=(theirs, work, cfg, log, lock))
@@ -201,6 +209,10 @@ def _apart(
     try:
         process.join()
     except KeyboardInterrupt:  # it was asked to end as well, and keeps what it found
+        process.join()
+        raise
+    except TerminatedError:
+        process.terminate()
         process.join()
         raise
     if process.exitcode == 0:
