@@ -7,8 +7,9 @@ import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
+from numbers import Real
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal, TypeGuard, cast, get_args
 
 from numpy.typing import ArrayLike
 
@@ -138,6 +139,7 @@ def load_records(
         period,
         None if skip == "auto" else skip,
         limits,
+        unseen=test if _is_fraction(test) else 0.0,
     )
     paths = listed_files(path, "path")
     left = reader.read(paths)
@@ -193,6 +195,8 @@ class _Reader:
         period: Period,
         skip: int | None,
         limits: Sequence[ArrayLike | None] | None,
+        *,
+        unseen: float,
     ) -> None:
         if start not in get_args(Start):
             raise InputError(f"start is {start!r}; use 'zero', 'estimated' or 'periodic'.")
@@ -201,7 +205,7 @@ class _Reader:
         if skip is not None:
             integer("skip", skip, 0)
         self.wanted, self.period, self.skip = wanted, period, skip
-        self.limits = limits
+        self.limits, self.unseen = limits, unseen
         self.start: Start = start
         self.all: list[_Whole] = []
         self._first: Measurement | None = None
@@ -281,9 +285,10 @@ class _Reader:
     ) -> tuple[Record, list[str]]:
         """The record of a stretch, and what was found of its period."""
         u, y, r, T = stretch.u, stretch.y, stretch.reference, len(stretch.u)
+        seen = y[: T - round(T * self.unseen)]  # outputs of the test choose nothing
         automatic = self.period == "auto"
         N = find_period(u if r is None else r) if automatic else cast("int | None", self.period)
-        settling = 0 if N is None or self.skip is not None else find_transient(y, N)
+        settling = 0 if N is None or self.skip is not None else find_transient(seen, N)
         start: Start = self.start
         if start == "periodic":
             if N is None:
@@ -320,8 +325,8 @@ class _Reader:
             elif (
                 start == "zero"
                 and self.skip is None
-                and not find_transient(y, N)
-                and not any(integrators(u, channel) for channel in y.T)
+                and not find_transient(seen, N)
+                and not any(integrators(u[: len(seen)], channel) for channel in seen.T)
             ):
                 said += "; the output is settled from the first sample on: use start='periodic'"
             notes.append(said)
@@ -403,6 +408,10 @@ def _some(names: Sequence[str]) -> str:
     return shown if len(names) <= 4 else f"{shown} and {len(names) - 4} more"
 
 
+def _is_fraction(use: Use) -> TypeGuard[float]:
+    return isinstance(use, Real) and 0 <= float(use) < 1
+
+
 def _taken(
     option: str, use: Use, wholes: list[_Whole], reader: _Reader
 ) -> tuple[list[Record], list[_Whole], float]:
@@ -412,7 +421,7 @@ def _taken(
     if isinstance(use, str | Path | Sequence):
         return *_named(option, [use] if isinstance(use, str | Path) else use, wholes, reader), 0.0
     number(option, use)
-    if use < 1:
+    if _is_fraction(use):
         return [], wholes, float(use)
     if use != int(use):
         raise InputError(

@@ -16,11 +16,14 @@ from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.files.formats import Table, open_table
-from lfrtorch.files.table import Columns
+from lfrtorch.files.table import BLOCK, Columns
 from lfrtorch.files.time_stamps import Sampling, UnevenError, in_seconds, is_time, sampling
 from lfrtorch.records import Channel
 
 Gaps = Literal["error", "split"]
+
+GLANCE = 1000
+"""Samples that show of most columns that they are no grid of time."""
 
 _SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
 
@@ -268,13 +271,26 @@ def find_rate(table: Table, used: Sequence[int]) -> Rate | None:
     )
 
 
-def _stamps(table: Table, column: int) -> Array:
-    """The first block of a column in seconds, what is missing between filled in."""
-    t = next(table.blocks([column]), np.empty((0, 1)))[:, 0]
+def _first(table: Table, columns: Sequence[int], samples: int) -> dict[int, Array]:
+    """The first samples of the columns that are numbers, read together as far as possible."""
+    if not columns:
+        return {}
+    try:
+        block = next(table.blocks(columns, samples), np.empty((0, len(columns))))
+    except ValueError:  # no numbers, in some of them
+        half = len(columns) // 2
+        return _first(table, columns[:half], samples) | (
+            _first(table, columns[half:], samples) if half else {}
+        )
+    return dict(zip(columns, block.T, strict=True))
+
+
+def _sampling(t: Array, channel: Channel) -> Sampling:
+    """The grid of stamps, what is missing between filled in."""
     known = np.flatnonzero(np.isfinite(t))
     if known.size:
         t = np.interp(np.arange(known[-1] + 1), known, t[known])
-    return in_seconds(t, table.columns[column])
+    return sampling(in_seconds(t, channel))
 
 
 def _beside(
@@ -287,18 +303,24 @@ def _beside(
         columns: what is measured.
         named: look only at columns that are named as time is.
     """
-    found, reasons = [], []
-    for column, channel in enumerate(table.columns):
-        long = table.lengths and table.lengths[column] != table.lengths[columns[0]]
-        if column in columns or long or (named and not is_time(channel)):
-            continue
-        try:
-            found.append((column, sampling(_stamps(table, column))))
-        except UnevenError as error:
-            reasons.append(f"the column {table.headers[column]!r} {error}")
-        except ValueError:  # no numbers
-            continue
-    return found, reasons
+    left = [
+        column
+        for column, channel in enumerate(table.columns)
+        if column not in columns
+        and not (table.lengths and table.lengths[column] != table.lengths[columns[0]])
+        and (is_time(channel) or not named)
+    ]
+    reasons: dict[int, str] = {}
+    grids: dict[int, Sampling] = {}
+    for samples in (BLOCK,) if named else (GLANCE, BLOCK):
+        grids.clear()
+        for column, t in _first(table, left, samples).items():
+            try:
+                grids[column] = _sampling(t, table.columns[column])
+            except UnevenError as error:
+                reasons[column] = f"the column {table.headers[column]!r} {error}"
+        left = list(grids)
+    return list(grids.items()), [reasons[column] for column in sorted(reasons)]
 
 
 def unusable_time(table: Table, used: Sequence[int]) -> str:

@@ -268,6 +268,8 @@ def _cells(text: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         # The unit in brackets belongs to the name before it.
         return [cell.strip('"') for cell in re.split(r"\s+(?![(\[])", text.strip())]
+    if len(text) > csv.field_size_limit() and delimiter not in text:  # csv takes no such cell
+        return [text]
     cells = next(csv.reader([text.strip(" ")], delimiter=delimiter, skipinitialspace=True), [])
     return [cell.strip() for cell in cells]
 

@@ -1,8 +1,9 @@
 """A user's own files as records by use: what is read, how it is split, and what is refused."""
 
+import csv
 from collections import UserList
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import openpyxl
@@ -13,6 +14,7 @@ import scipy.signal
 
 from lfrtorch import load_records
 from lfrtorch.excitation import multisine
+from lfrtorch.files.text import TextTable
 from lfrtorch.records import Channel
 
 SAMPLES = 200
@@ -496,6 +498,26 @@ def test_period_and_transient_are_found(tmp_path):
 
 
 @pytest.mark.numeric
+@pytest.mark.parametrize("count", [3, 5, 11])
+@pytest.mark.parametrize("start", ["zero", "periodic"])
+def test_outputs_of_the_test_part_move_nothing_before_it(
+    tmp_path, count: int, start: Literal["zero", "periodic"]
+):
+    table = periodic(tmp_path / "a.csv", count)
+    tests = max(1, round(0.2 * (count - 1))) * N if start == "periodic" else round(0.2 * len(table))
+    table[-tests:, 1] += np.random.default_rng(1).normal(size=tests) * 10.0
+    write(tmp_path / "b.csv", table, "u,y")
+    one, other = (
+        load_records(tmp_path / name, **PERIODIC, start=start, validation=0.2 * (count > 3))
+        for name in ("a.csv", "b.csv")
+    )
+    for a, b in zip(one.train + one.validation, other.train + other.validation, strict=True):
+        assert (a.skip, a.start, a.period) == (b.skip, b.start, b.period)
+        np.testing.assert_array_equal(a.y, b.y)
+    assert np.abs(one.tests[0].y - other.tests[0].y).max() > 1.0
+
+
+@pytest.mark.numeric
 def test_a_transient_of_several_periods(tmp_path):
     """A pole of 0.98 takes the response below noise of a thousandth in three to five periods."""
     table = periodic(tmp_path / "a.csv", 12)
@@ -668,3 +690,34 @@ def test_silverbox_in_matlab_and_text(tmp_path, benchmark_root):
     assert Path(path).stem == data.name
     assert np.array_equal(data.tests[0].y[:, 0], found["V2"])
     assert np.array_equal(text.tests[0].y, data.tests[0].y[:2000])
+
+
+def test_columns_that_are_not_used_are_looked_at_together(tmp_path, monkeypatch):
+    signals = np.random.default_rng(0).normal(size=(50, 200))
+    write(tmp_path / "a.csv", signals, ",".join(f"c{i}" for i in range(200)))
+    passes, blocks = [], TextTable.blocks
+
+    def counted(table: TextTable, *given: Any) -> Any:
+        passes.append(given)
+        return blocks(table, *given)
+
+    monkeypatch.setattr(TextTable, "blocks", counted)
+    with pytest.raises(ValueError, match="give fs=HZ"):
+        load_records(tmp_path / "a.csv", inputs="c0", outputs="c1")
+    assert len(passes) == 1
+
+
+def test_a_clock_among_columns_of_text_is_suggested(tmp_path):
+    lines = [f"a,{0.01 * i:.2f},b,{i % 7},{i % 5}" for i in range(50)]
+    (tmp_path / "a.csv").write_text("\n".join(["x,clock,z,u,y", *lines]))
+    with pytest.raises(ValueError, match=r"time='clock' \(100 Hz\)"):
+        load_records(tmp_path / "a.csv", inputs="u", outputs="y")
+
+
+def test_a_line_may_have_thousands_of_cells(tmp_path):
+    row = np.arange(14_000.0)
+    names = ",".join(f"signal {i}" for i in range(len(row)))
+    assert len(names) > csv.field_size_limit()
+    write(tmp_path / "a.csv", np.tile(row, (60, 1)) + np.arange(60)[:, None] % 3, names)
+    data = load_records(tmp_path / "a.csv", inputs="signal 0", outputs="signal 13999", fs=1.0)
+    assert data.train[0].y[2] == row[-1] + 2
