@@ -17,7 +17,7 @@ from torch.nn import Module
 
 from lfrtorch._support import checkpoint
 from lfrtorch._support.checks import integer, reals
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
 from lfrtorch.engine.beyond_linear import Beyond, base_of
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
@@ -618,5 +618,5 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         return Model(LFR(cell), scaler, fs, inputs, outputs, fitted_to, K)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise InputError(
-            f"'{folder}' is damaged: its description and weights do not fit ({error})."
+            f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."
         ) from None

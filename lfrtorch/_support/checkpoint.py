@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from lfrtorch._support.atomic import TEMPORARY, whole_file, whole_folder
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 
 FORMAT = "lfrtorch"
 VERSION = 1
@@ -85,7 +85,7 @@ def read(
         description = json.loads((folder / DESCRIPTION).read_text())
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
-            f"'{folder / DESCRIPTION}' is damaged or cut off ({error}); "
+            f"'{folder / DESCRIPTION}' is damaged or cut off ({brief(error)}); "
             "copy the checkpoint again from where it was saved, or train anew."
         ) from None
     if not isinstance(description, dict) or description.get("format") != FORMAT:
@@ -108,7 +108,7 @@ def read(
         weights = load_file(file)
     except (SafetensorError, OSError) as error:
         raise InputError(
-            f"'{file}' is damaged or missing ({error}); "
+            f"'{file}' is damaged or missing ({brief(error)}); "
             "copy the checkpoint again from where it was saved, or train anew."
         ) from None
     return description, weights

@@ -9,3 +9,19 @@ class LfrtorchError(Exception):
 
 class InputError(LfrtorchError, ValueError):
     """What was given cannot be used: the message says what was expected and what to do."""
+
+
+LONGEST = 160
+"""Characters of another library's message that are shown."""
+
+
+def brief(error: BaseException | str) -> str:
+    """The message of another library on one line, cut off if it is long.
+
+    Example:
+        >>> from lfrtorch._support.errors import brief
+        >>> brief("no such\\n    key")
+        'no such key'
+    """
+    text = " ".join(str(error)[: 4 * LONGEST].split())
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

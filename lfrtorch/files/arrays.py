@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import math
 import re
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,9 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.memory import check_memory
 from lfrtorch._support.types import Array
+from lfrtorch.files.matlab_elements import check_elements
 from lfrtorch.files.table import BLOCK, Clock, Table
 
 _REAL, _TIMES = "biuf", "M"
@@ -36,8 +39,20 @@ _INTERVAL = re.compile(
     re.IGNORECASE,
 )
 
-_UNREADABLE = (OSError, EOFError, MemoryError, ValueError, zipfile.BadZipFile, zlib.error)
-"""What a damaged .npz file raises; its headers may declare more than there is memory for."""
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    MemoryError,
+    ValueError,
+    LookupError,
+    RuntimeError,  # encrypted, or packed in an unknown way
+    OverflowError,
+    struct.error,
+    tokenize.TokenError,  # the header of an array
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What a damaged file of numpy raises; its headers may declare more than there is memory for."""
 
 Stored = Callable[[Path], AbstractContextManager[Any]]
 """Opens a file: its arrays by name."""
@@ -221,8 +236,8 @@ def npz(path: Path) -> ArrayTable:
         raise
     except _UNREADABLE as error:
         raise InputError(
-            f"'{path}' is not a readable .npz file ({error}); write it again with numpy.savez, "
-            "arrays of numbers only."
+            f"'{path}' is not a readable .npz file ({brief(error)}); write it again with "
+            "numpy.savez, arrays of numbers only."
         ) from error
     return _in_memory(path, found)
 
@@ -231,10 +246,10 @@ def npy(path: Path) -> ArrayTable:
     """The array that numpy.save wrote, by the file's name; it is read as it is needed."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, EOFError, ValueError) as error:
+    except _UNREADABLE as error:
         raise InputError(
-            f"'{path}' is not a readable .npy file ({error}); write it again with numpy.save, "
-            "an array of numbers."
+            f"'{path}' is not a readable .npy file ({brief(error)}); write it again with "
+            "numpy.save, an array of numbers."
         ) from error
     if not isinstance(array, np.ndarray):
         raise InputError(f"'{path}' holds several arrays; give it the extension .npz.")
@@ -250,6 +265,8 @@ def mat(path: Path) -> ArrayTable:
     from scipy import io as scipy_io
 
     try:
+        if scipy_io.matlab.matfile_version(path)[0] == 1:
+            check_elements(path)
         numbers = sum(math.prod(shape) for _, shape, _ in scipy_io.whosmat(path))
         check_memory(8.0 * numbers, f"'{path}', of {numbers:g} numbers,", "give a part of it")
         variables = scipy_io.loadmat(path, chars_as_strings=False)
@@ -257,7 +274,7 @@ def mat(path: Path) -> ArrayTable:
         raise
     except Exception as error:  # a damaged file raises any of a dozen kinds
         raise InputError(
-            f"'{path}' is not a readable MATLAB file ({error}); write it again with save."
+            f"'{path}' is not a readable MATLAB file ({brief(error)}); write it again with save."
         ) from error
     found: dict[str, Signal | str] = {}
     for name, value in variables.items():
@@ -378,4 +395,4 @@ def optional(package: str) -> ModuleType:
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:
-    return InputError(f"'{path}' is not a readable HDF5 file ({error}); write it again.")
+    return InputError(f"'{path}' is not a readable HDF5 file ({brief(error)}); write it again.")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
 from lfrtorch.files.arrays import optional
 from lfrtorch.files.table import BLOCK, Clock, Table
@@ -122,7 +122,8 @@ class ExcelTable(Table):
                 book = openpyxl.load_workbook(self._file, read_only=True, data_only=True)
         except Exception as error:  # a damaged file raises any of a dozen kinds
             raise InputError(
-                f"'{self._file}' is not a readable Excel file ({error}); save it again as .xlsx."
+                f"'{self._file}' is not a readable Excel file ({brief(error)}); save it "
+                "again as .xlsx."
             ) from error
         try:
             yield book

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
 from lfrtorch.files.arrays import optional
 from lfrtorch.files.table import BLOCK, Clock, Table
@@ -62,4 +62,4 @@ class ParquetTable(Table):
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:
-    return InputError(f"'{path}' is not a readable Parquet file ({error}); write it again.")
+    return InputError(f"'{path}' is not a readable Parquet file ({brief(error)}); write it again.")

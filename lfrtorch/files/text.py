@@ -18,7 +18,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
 from lfrtorch.files.table import BLOCK, Clock, Table, bracketed, is_unit
 
@@ -111,7 +111,7 @@ class TextTable(Table):
             if isinstance(error, ValueError):
                 self._explain(columns)
             raise InputError(
-                f"'{self.path}' is damaged or no text ({error}); write it again."
+                f"'{self.path}' is damaged or no text ({brief(error)}); write it again."
             ) from error
 
     def where(self, sample: int) -> str:
@@ -281,7 +281,7 @@ def _layout(path: Path) -> _Layout:
             head = stream.read(_HEAD)
             head += stream.readline()
     except _DAMAGED as error:
-        raise InputError(f"'{path}' is damaged ({error}); write it again.") from error
+        raise InputError(f"'{path}' is damaged ({brief(error)}); write it again.") from error
     text = head.splitlines()
     if not any(line.strip() for line in text):
         raise InputError(f"'{path}' is empty; give a file with data.")
@@ -291,7 +291,9 @@ def _layout(path: Path) -> _Layout:
             key=lambda split: _order(split[0], split[1]),
         )
     except csv.Error as error:
-        raise InputError(f"'{path}' is not a readable table ({error}); save it again.") from error
+        raise InputError(
+            f"'{path}' is not a readable table ({brief(error)}); save it again."
+        ) from error
     return layout_of(path, encoding, delimiter, lines)
 
 

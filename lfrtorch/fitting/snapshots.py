@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 
 from lfrtorch._support.atomic import whole_file
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.trainer import Fit, Keep, nothing
 from lfrtorch.model import Model, load
@@ -58,8 +58,8 @@ class Snapshots:
                 self._count, self.rounds = found["starts"], found["rounds"]
             except (ValueError, KeyError, TypeError) as error:
                 raise InputError(
-                    f"'{folder / ROUNDS}' is damaged ({error}); start from the best model of the "
-                    "run instead: init_from=DIR."
+                    f"'{folder / ROUNDS}' is damaged ({brief(error)}); start from the "
+                    "best model of the run instead: init_from=DIR."
                 ) from None
 
     @property

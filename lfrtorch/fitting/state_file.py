@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.checkpoint import write_tensors
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 
 State = TypeVar("State")
 Tensors = dict[str, Tensor]
@@ -44,8 +44,8 @@ def read(path: Path) -> tuple[Numbers, Tensors]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise InputError(
-            f"'{path}', where a fit stood, is damaged ({error}); start from the best model of the "
-            "run instead: init_from=DIR."
+            f"'{path}', where a fit stood, is damaged ({brief(error)}); start from the "
+            "best model of the run instead: init_from=DIR."
         ) from None
     if about.get("format") != FORMAT:
         raise InputError(

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from lfrtorch._support import checkpoint
 from lfrtorch._support.checks import reals
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
@@ -410,7 +410,7 @@ class LinearModel:
             return cls(**arrays, fs=fs, inputs=inputs, outputs=outputs, **optional, fit=fit)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
-                f"'{folder}' is damaged: its description and weights do not fit ({error})."
+                f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."
             ) from None
 
     def _z(self, frequencies: ArrayLike) -> Complex:
