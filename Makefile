@@ -6,7 +6,7 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all test-machines mutants coverage check bench first-try reproduce docs docs-links clean
+.PHONY: help setup run test test-all test-machines mutants coverage check bench first-try reproduce docs docs-links dist clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -55,6 +55,10 @@ docs: $(READY)  ## guide, notebooks and reference, in site/; a broken link in it
 
 docs-links: docs  ## links to other sites, too; needs the network
 	@$(BIN)/sphinx-build -qW --keep-going -d site/doctrees -b linkcheck docs site/links
+
+dist: $(READY)  ## wheel and sdist in dist/, the same bytes whenever they are built from a commit
+	@SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m build -q --no-isolation
+	@sha256sum dist/*
 
 clean:  ## remove caches and builds; .venv and runs stay
 	@rm -rf build dist site *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -53,6 +53,18 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     assert names == sources | settings | others
 
 
+@pytest.mark.slow
+def test_two_builds_are_the_same_bytes(wheel: Path, tmp_path: Path, monkeypatch):
+    assert wheel.is_file()  # the tools are there
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    for folder in ("one", "other"):
+        python("-m", "build", "--no-isolation", "--outdir", tmp_path / folder, ROOT)
+    built = sorted((tmp_path / "one").iterdir())
+    assert [path.suffix for path in built] == [".whl", ".gz"]
+    for path in built:
+        assert path.read_bytes() == (tmp_path / "other" / path.name).read_bytes()
+
+
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The bin folder of an environment that has the wheel and its dependencies, not the sources."""
