@@ -15,13 +15,13 @@ LONGEST = 160
 """Characters of another library's message that are shown."""
 
 
-def brief(error: BaseException | str) -> str:
-    """The message of another library on one line, cut off if it is long.
+def brief(error: BaseException | str, longest: int = LONGEST) -> str:
+    """The message of another library on one line, cut off if it is longer.
 
     Example:
         >>> from lfrtorch._support.errors import brief
         >>> brief("no such\\n    key")
         'no such key'
     """
-    text = " ".join(str(error)[: 4 * LONGEST].split())
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    text = " ".join(str(error)[: 4 * longest].split())
+    return text if len(text) <= longest else f"{text[:longest]}..."

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.memory import check_memory
 from lfrtorch._support.types import Array
 from lfrtorch.records import Channel
@@ -37,6 +37,9 @@ _BRACKETS = re.compile(r"(.*?)(\s*)[(\[]\s*([^()\[\]]{1,16}?)\s*[)\]]")
 
 
 _CHANNEL = re.compile(r"(.+)\[(\d+)\]")
+
+_ALL, _SOME = 24, 20  # columns: up to which a message names all, and of more
+_NAME = 60  # characters of a column's name in a list
 
 
 class NoColumnError(InputError):
@@ -192,11 +195,13 @@ class Table(ABC):
     def listed(self) -> str:
         """The columns by the names that a user may give, for messages."""
         if not self.columns:
-            why = "; ".join(f"{name!r} {reason}" for name, reason in self.refused.items())
+            refused = [*self.refused.items()][:_SOME]
+            why = "; ".join(f"{brief(repr(name), _NAME)} {reason}" for name, reason in refused)
             return f"no columns of numbers{f' ({why})' if why else ''}"
-        names = [repr(column.name) for column in self.columns]
-        shown = names if len(names) <= 24 else [*names[:20], "..."]
-        return f"{len(names)} column(s): {', '.join(shown)}"
+        count = len(self.columns)
+        names = [brief(repr(column.name), _NAME) for column in self.columns[:_ALL]]
+        shown = names if count <= _ALL else [*names[:_SOME], "..."]
+        return f"{count} column(s): {', '.join(shown)}"
 
 
 def is_unit(text: str) -> bool:

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from lfrtorch._support.errors import LONGEST, InputError
 from lfrtorch.files.load import load_records
 
+pytestmark = pytest.mark.filterwarnings("ignore:Reading `.npy` or `.npz`:UserWarning")  # numpy's
+
 SIGNALS = np.random.default_rng(0).normal(size=(40, 2)).round(3)
 LINES = "\n".join(["u,y", *(f"{u},{y}" for u, y in SIGNALS)]).encode()
 
@@ -99,6 +101,8 @@ def fuzzed(max_examples: int) -> Callable:
 @example(spots=[(70, 1, b"(")])  # .npy: its header had no end, and that was a TokenError
 @example(spots=[(128, 4, b"\x0f\x00\x00\x00")])  # .mat: packed, as it said
 @example(spots=[(176, 1, b"\x0a")])  # .mat: kinds of elements that there are not were a crash
+@example(spots=[(0, 50, b"\0\0\0\0"), (0, 50, b"\x01")])  # .mat: a name of 900 characters
+@example(spots=[(70, 0, b"\n")])  # .npy: numpy warns of Python 2
 @example(spots=[(27, 1, b"\x02")])  # .npz: a name of 517 bytes, which the message showed
 @fuzzed(30)
 def test_a_damaged_file(tmp_path: Path, name: str, spots: list[Change]):
