@@ -6,7 +6,7 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all test-machines mutants coverage check bench first-try reproduce docs docs-links dist clean
+.PHONY: help setup run test test-all test-machines test-min test-latest mutants coverage check bench first-try reproduce docs docs-links dist clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -25,6 +25,12 @@ test-all: $(READY)  ## all tests, the slow ones too
 
 test-machines: $(READY)  ## tests that compute, as on other processors (ARGS="oldest newest ...")
 	@$(BIN)/python tests/machines.py $(ARGS)
+
+test-min: $(READY)  ## fast tests with the oldest versions of what lfrtorch needs (ARGS="--keep torch")
+	@$(BIN)/python tests/versions.py min $(ARGS)
+
+test-latest: $(READY)  ## fast tests with the newest ones (ARGS="--keep torch")
+	@$(BIN)/python tests/versions.py latest $(ARGS)
 
 coverage: $(READY)  ## lines and branches of lfrtorch/ that the fast tests reach
 	@$(BIN)/python -m pytest $(PARALLEL) --cov=lfrtorch --cov-branch --cov-report=term:skip-covered $(ARGS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from importlib.metadata import version
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -29,7 +30,11 @@ _PAIR = re.compile(
     r"""('(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*"|[^,'"]+?)\s*(?:,|$)"""
 )
 
-OmegaConf.register_new_resolver(
+_RENAMED = tuple(map(int, version("omegaconf").split(".")[:2])) >= (2, 4)
+register_resolver = getattr(OmegaConf, f"register_{'' if _RENAMED else 'new_'}resolver")
+"""Gives a function a name in settings."""
+
+register_resolver(
     "table", lambda *pairs: dict(zip(pairs[::2], pairs[1::2], strict=True)), replace=True
 )
 

@@ -37,6 +37,7 @@ from lfrtorch.cli import compare
 from lfrtorch.cli.claim import tidy
 from lfrtorch.cli.composition import SWEEPS, parsed
 from lfrtorch.cli.interrupts import TerminatedError
+from lfrtorch.cli.quotes import register_resolver
 from lfrtorch.cli.run_folder import SNAPSHOTS
 
 LOG, FAILED, LOCK = "log.txt", "failed.txt", ".lock"
@@ -82,7 +83,7 @@ def folder_name(varied: str) -> str:
     return f"{name[: LONGEST - 9]}-{sha256(name.encode()).hexdigest()[:8]}"
 
 
-OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+register_resolver("folder_name", folder_name, replace=True)
 
 
 def study_words(given: Sequence[str]) -> list[str]:
