@@ -10,8 +10,9 @@ import re
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -76,35 +77,38 @@ class TextTable(Table):
         layout, beyond = self.layout, len(self.columns)
         dates = layout.dates.intersection(columns)
         clocks = {column: Clock() for column in dates}
+        # A line of one more missing value than there are columns, which is no sample, comes first:
+        # pandas takes the number of columns from there.
+        first = layout.delimiter.join(["nan"] * (beyond + 1)) + "\n"
         try:
-            with _Samples(self.path, layout) as stream:
-                reader = pd.read_csv(
-                    stream,
-                    sep=r"\s+" if layout.delimiter == " " else layout.delimiter,
-                    decimal="," if layout.comma else ".",
-                    header=None,
-                    names=range(beyond + 1),
-                    usecols=sorted({*columns, beyond}),
-                    index_col=False,
-                    dtype=dict.fromkeys(columns, np.float64) | dict.fromkeys((*dates, beyond), str),
-                    na_values=[
-                        *_MISSING,
-                        *map(str.upper, _MISSING),
-                        *map(str.capitalize, _MISSING),
-                    ],
-                    skipinitialspace=layout.delimiter != " ",
-                    chunksize=samples,
-                    **_exact(pd.__version__),
-                )
-                reader.get_chunk(1)  # the first line, which is no sample
-                while (part := _next(reader)) is not None:
-                    if part[beyond].notna().any():
-                        self._explain(columns)
-                    found = np.empty((len(part), len(columns)))
-                    for i, column in enumerate(columns):
-                        values = part[column]
-                        found[:, i] = clocks[column](_times(values)) if column in dates else values
-                    yield found
+            for text in _texts(self.path, layout, samples):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # a line of too many cells is refused below
+                    part = pd.read_csv(
+                        io.StringIO(first + text),
+                        sep=r"\s+" if layout.delimiter == " " else layout.delimiter,
+                        decimal="," if layout.comma else ".",
+                        header=None,
+                        names=range(beyond + 1),
+                        usecols=sorted({*columns, beyond}),
+                        index_col=False,
+                        dtype=dict.fromkeys(columns, np.float64)
+                        | dict.fromkeys((*dates, beyond), str),
+                        na_values=[
+                            *_MISSING,
+                            *map(str.upper, _MISSING),
+                            *map(str.capitalize, _MISSING),
+                        ],
+                        skipinitialspace=layout.delimiter != " ",
+                        **_exact(pd.__version__),
+                    )[1:]
+                if part[beyond].notna().any():
+                    self._explain(columns)
+                found = np.empty((len(part), len(columns)))
+                for i, column in enumerate(columns):
+                    values = part[column]
+                    found[:, i] = clocks[column](_times(values)) if column in dates else values
+                yield found
         except (ValueError, *_DAMAGED) as error:  # pandas says which cell, and not where
             if str(error).startswith(f"'{self.path}'"):
                 raise
@@ -154,47 +158,33 @@ class TextTable(Table):
         return _is_number(cell, self.layout.comma)
 
 
-def _next(reader: Any) -> Any:
-    """The next block; a line of more cells than names is no warning, but refused later."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return next(reader, None)
-
-
 def _exact(version: str) -> dict[str, Any]:
     """Options that make pandas read numbers to the last bit; from 3.1 on it needs none."""
     old = tuple(map(int, version.split(".")[:2])) < (3, 1)
     return {"float_precision": "round_trip"} if old else {}
 
 
-class _Samples(io.TextIOBase):
-    """The text from the first sample on, without comment lines.
-
-    One line of one more missing value than there are columns comes first: pandas takes the number
-    of columns from there.
-    """
-
-    def __init__(self, path: Path, layout: _Layout) -> None:
-        self._stream = _opened(path, layout.encoding)
+def _texts(path: Path, layout: _Layout, count: int) -> Iterator[str]:
+    """At most ``count`` lines at a time, from the first sample on, without comments."""
+    with _opened(path, layout.encoding) as stream:
         for _ in range(layout.first - 1):
-            self._stream.readline()
-        self._first = layout.delimiter.join(["nan"] * (len(layout.headers) + 1)) + "\n"
-
-    def read(self, size: int = -1) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """At least ``size`` characters, to the end of a line."""
-        if self._first:
-            text, self._first = self._first, ""
-            return text
-        while text := self._stream.read(size) + self._stream.readline():
+            stream.readline()
+        while block := list(_bounded(stream, count)):
+            text = "".join(block)
             if any(mark in text for mark in _MARKS):
                 text = _COMMENT.sub("", text)
-            if text:  # else there were only comments
-                break
-        return text
+            if text.strip(" \r\n"):
+                yield text
 
-    def close(self) -> None:
-        self._stream.close()
-        super().close()
+
+def _bounded(lines: Iterable[str], count: int) -> Iterator[str]:
+    """The next lines, no more than fit into memory."""
+    size = 0
+    for line in islice(lines, count):
+        yield line
+        size += len(line)
+        if size > _LONGEST:
+            return
 
 
 class _Text(io.TextIOWrapper):
