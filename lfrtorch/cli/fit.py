@@ -14,7 +14,7 @@ import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 from functools import partial
@@ -50,7 +50,7 @@ from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.observer import Watching
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.trainer import FitResult, StoppedError
+from lfrtorch.fitting.trainer import FitResult, Monitor, StoppedError
 from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -67,8 +67,19 @@ WITHOUT_FILES = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_loggi
 """Settings of Hydra for all processes but the first."""
 
 
-def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = None) -> float:
+def run(
+    cfg: DictConfig,
+    folder: Path,
+    command: str = "",
+    ranks: Ranks | None = None,
+    monitor: Callable[[], Monitor] | None = None,
+) -> float:
     """One run, its files written into ``folder`` by the first process; returns the validation RMSE.
+
+    Args:
+        cfg, folder, command: the settings, where the files go, and what the user typed.
+        ranks: the processes that share the fit.
+        monitor: makes what is called after each iteration, too, of a fit of one start.
 
     Raises:
         ProcessLostError, TerminatedError: the fit ended early, and what it had found is written.
@@ -83,7 +94,8 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             shutil.rmtree(folder / old, ignore_errors=True)
     kept = folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None
     snapshots = Snapshots(kept, writes=ranks.rank == 0)
-    files = _Folder(cfg, folder, least=snapshots.least) if ranks.rank == 0 else None
+    first = ranks.rank == 0
+    files = _Folder(cfg, folder, monitor, least=snapshots.least) if first else None
     with Termination() as stop:
         try:
             found = identify(
@@ -143,9 +155,16 @@ def in_words(found: Run, cfg: DictConfig) -> Run:
 class _Folder(Terminal):
     """The first process: prints, and keeps the folder of the run up to date during the fit."""
 
-    def __init__(self, cfg: DictConfig, folder: Path, *, least: float) -> None:
+    def __init__(
+        self,
+        cfg: DictConfig,
+        folder: Path,
+        monitor: Callable[[], Monitor] | None,
+        *,
+        least: float,
+    ) -> None:
         super().__init__(cfg)
-        self.folder, self._least = folder, least
+        self.folder, self._monitor, self._least = folder, monitor, least
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
@@ -162,7 +181,8 @@ class _Folder(Terminal):
         printing, watch = super().begin(dataset, settings, linear, models)
         if len(models) == 1:
             self._boards = []
-            return Watching([[*printing[0], self.board, keep]], watch)
+            own = [] if self._monitor is None else [self._monitor()]
+            return Watching([[*printing[0], self.board, keep, *own]], watch)
         self._boards = [
             TensorBoard(self.folder / STARTS / f"{i:02d}", finalist=True)
             for i in range(len(models))
@@ -189,7 +209,9 @@ def main(cfg: DictConfig) -> float:
     return launched(cfg, folder, command)
 
 
-def launched(cfg: DictConfig, folder: Path, command: str) -> float:
+def launched(
+    cfg: DictConfig, folder: Path, command: str, monitor: Callable[[], Monitor] | None = None
+) -> float:
     """One run, by all processes that torchrun started; errors of users end the program."""
     rank = os.environ.get("RANK", "0")
     with ExitStack() as stack:
@@ -199,7 +221,7 @@ def launched(cfg: DictConfig, folder: Path, command: str) -> float:
         ranks = stack.enter_context(connect(cfg.device, cfg.timeout))
         if ranks.rank > 0:
             stack.enter_context(redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
-        return run(cfg, common(folder, ranks), command, ranks)
+        return run(cfg, common(folder, ranks), command, ranks, monitor)
     raise AssertionError  # user_errors does not return
 
 

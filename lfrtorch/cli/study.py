@@ -43,6 +43,9 @@ from lfrtorch.cli.run_folder import SNAPSHOTS
 LOG, FAILED, LOCK = "log.txt", "failed.txt", ".lock"
 """In the folder of a run: what it printed, why it failed, and what says that a process is at it."""
 
+PRUNED = "pruned"
+"""How the reason begins if a search ended a run, which is no failure."""
+
 NOT_COMPARED = ("overwrite", "resume")
 """Words that are not about what a run computes."""
 
@@ -144,7 +147,7 @@ def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, h
     Returns:
         The validation RMSE, nan if the run failed.
     """
-    with _alone(folder) as lock:
+    with alone(folder) as lock:
         known = None if cfg.overwrite else done(folder, list(hydra.overrides.task))
         if known is not None:
             print(f"{folder.name}: done before", flush=True)
@@ -160,7 +163,8 @@ def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, h
         value, end = _apart(work, cfg, folder / LOG, lock)
         if value is None:
             (folder / FAILED).write_text(f"{end}\n", encoding="utf-8")
-            print(f"{folder.name}: failed: {end}", flush=True)
+            said = end if end.startswith(PRUNED) else f"failed: {end}"
+            print(f"{folder.name}: {said}", flush=True)
             return math.nan
         took = tables.quantity(time.perf_counter() - begun, "s")
         print(f"{folder.name}: error {tables.number(value)}, {took}", flush=True)
@@ -180,8 +184,12 @@ def done(folder: Path, words: Sequence[str]) -> float | None:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[Connection | None]:
+def alone(folder: Path, *, wait: bool = True) -> Iterator[Connection | None]:
     """No other process is at this run: one that is left of a study that was killed ends first.
+
+    Args:
+        folder: of the run.
+        wait: for that one; else a BlockingIOError.
 
     The open file is locked until all processes that have it close it. It is a connection, since
     these may be handed to another process.
@@ -192,7 +200,7 @@ def _alone(folder: Path) -> Iterator[Connection | None]:
         yield None
         return
     with Connection(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)) as lock:
-        fcntl.flock(lock.fileno(), fcntl.LOCK_EX)
+        fcntl.flock(lock.fileno(), fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         yield lock
 
 

@@ -37,6 +37,9 @@ BOXES = 30
 LONGEST = 40
 """Characters of a box's label."""
 
+WIDE = 50
+"""Ratio of the values of a word from which on their axis is logarithmic."""
+
 LEGEND = "*: no run with as few parameters has a smaller validation error."
 
 
@@ -160,6 +163,9 @@ class Comparison:
         drawn["time"] = self._against("seconds", "time of the fit (s)")
         if self.settings:
             drawn["seeds"] = self._boxes()
+        numbers = {name: found for name in self.varied if (found := self._numbers(name))}
+        if numbers:
+            drawn["words"] = self._over(numbers)
         return drawn
 
     def __str__(self) -> str:
@@ -208,6 +214,28 @@ class Comparison:
         ax.invert_yaxis()  # the best one above
         ax.set_xscale("log")
         _error_axis(ax.xaxis, unit)
+        return figure
+
+    def _numbers(self, name: str) -> list[float]:
+        """The values of a word, none if they are not all numbers or are two alone."""
+        try:
+            found = [float(run.words.get(name, "")) for run in self.runs]
+        except ValueError:
+            return []
+        return found if len(set(found)) > 2 else []
+
+    def _over(self, numbers: Mapping[str, Sequence[float]]) -> Figure:
+        """The errors against the value of each word."""
+        factor, unit = self._scale
+        figure = Figure(figsize=(7, 2.2 * -(-len(numbers) // 2)), layout="constrained")
+        grid = figure.subplots(-(-len(numbers) // 2), 2, sharey=True, squeeze=False)
+        for ax in grid.flat[len(numbers) :]:
+            ax.remove()
+        for ax, (name, values) in zip(grid.flat, numbers.items(), strict=False):
+            wide = min(values) > 0 and max(values) > WIDE * min(values)
+            ax.set(xlabel=name, xscale="log" if wide else "linear", yscale="log")
+            ax.plot(values, [factor * run.error for run in self.runs], ".", color=NL_LFR, alpha=0.6)
+            _error_axis(ax.yaxis, unit)
         return figure
 
 
