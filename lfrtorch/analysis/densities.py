@@ -60,8 +60,8 @@ def power_density(
     Example:
         >>> from lfrtorch.analysis.densities import power_density
         >>> f, density = power_density(record.y, record.fs)
-        >>> f[-1], np.allclose(density.sum() * f[1], record.y.var(), rtol=0.2)
-        (np.float64(50.0), True)
+        >>> float(f[-1]), np.allclose(density.sum() * f[1], record.y.var(), rtol=0.2)
+        (50.0, True)
     """
     T = len(signals)
     segment = min(SEGMENT, T, max(SHORTEST, T // 8))

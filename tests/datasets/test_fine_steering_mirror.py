@@ -1,6 +1,7 @@
 """Fine steering mirror: the split, the files, and scores as the board has them."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,16 +22,16 @@ def numbered(level: int, use: str) -> np.ndarray:
     return 1e6 * level + 1e5 * r + 1e4 * p + 1e3 * channel + k + (use == "test") * 1e9
 
 
-def write(root: Path, *uses: str, **changed: np.ndarray) -> Path:
+def write(root: Path, *uses: str, **changed: Any) -> Path:
     """A file of the official layout with some of its arrays; its root."""
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for use in uses:
         for level in LEVELS:
             arrays[f"u_{level}mV_{use}"] = numbered(level, use)
             arrays[f"y_{level}mV_{use}"] = -numbered(level, use)
     path = root / FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(path, allow_pickle=False, **(arrays | changed))
+    np.savez(path, **(arrays | changed))
     return root
 
 
