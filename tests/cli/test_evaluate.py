@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,6 +87,26 @@ def test_scores_are_those_of_the_model_from_the_start_of_each_record(
     assert rest.split()[1:6] == ["test", "simulated", "50", "of", "80"]
     assert rest.split()[-2:] == ["0.250", "0.125"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "scores.json"]
+
+
+def test_the_folder_of_a_run_that_is_at_work_is_a_place_like_others(
+    run_folder: Path, monkeypatch, capsys
+):
+    (run_folder / "config.yaml").touch()
+    monkeypatch.chdir(run_folder)
+    with run_folder_locked(run_folder):
+        run(monkeypatch, "checkpoint=.", DATA)
+    assert "Simulation RMSE (mm)" in capsys.readouterr().out
+
+
+@contextmanager
+def run_folder_locked(folder: Path) -> Iterator[None]:
+    """As a fit that writes into it has it."""
+    fcntl = pytest.importorskip("fcntl", reason="this system has no such locks")
+    handle = os.open(folder, os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    yield
+    os.close(handle)
 
 
 def test_the_model_folder_of_a_run_will_do(run_folder: Path, monkeypatch, capsys):
