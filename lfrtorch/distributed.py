@@ -1,4 +1,4 @@
-"""Several processes that share the records of one fit, by ``torch.distributed``.
+"""Several processes that share one fit, its records or its starts, by ``torch.distributed``.
 
     torchrun --nproc-per-node 2 script.py
 
@@ -57,6 +57,10 @@ class Ranks:
     def share(self, items: list[Shared]) -> list[Shared]:
         """The items that this process holds: every ``world``-th."""
         return items[self.rank :: self.world]
+
+    def enough_for(self, items: int) -> Ranks:
+        """These processes; this one alone, as each of them, if there are fewer items than they."""
+        return self if items >= self.world else Ranks()
 
     def sum(self, part: Tensor) -> Tensor:
         """The sum of all processes' parts, on each of them."""

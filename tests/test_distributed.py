@@ -1,4 +1,4 @@
-"""Processes that share the records of a fit: the fit of one process, and what is left of a loss."""
+"""Processes that share a fit, its records or starts: that of one, and what is left of a loss."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ from lfrtorch.cli.command import start as start_command
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.trainer import FitResult
+from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.trainer import FitResult, Progress
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
@@ -74,9 +75,11 @@ class Dying(LevenbergMarquardt):
     """Levenberg-Marquardt, killed on one of the processes."""
 
     rank: int = 1
+    at: int = 3
 
     def step(self, problem: Any, state: LMState) -> LMState:
-        if state.iteration == 3 and problem.ranks.rank == self.rank:
+        spared = "SPARED" in os.environ
+        if not spared and state.iteration == self.at and os.environ.get("RANK") == str(self.rank):
             os.kill(os.getpid(), signal.SIGKILL)
         return super().step(problem, state)
 
@@ -179,10 +182,45 @@ def averaged(ranks: Ranks) -> tuple[Tensor, int]:
     return theta(result.model), result.averaged
 
 
+def starts() -> tuple[list[Model], list[Record], Record]:
+    """Five starts, and one record, which two processes cannot share."""
+    truth = random_model(random_cell(1, 1, 2, 1, 1, 3, radius=0.7))
+    train = measure(truth, 120)
+    models = [random_model(random_cell(1, 1, 2, 1, 1, 3, radius=0.6)) for _ in range(5)]
+    for number, model in enumerate(models):
+        vector_to_parameters(
+            theta(model) * (1 + 0.2 * normal(len(theta(model)), seed=number)),
+            model.lfr.parameters(),
+        )
+    return models, [train], measure(truth, 60, seed=3)
+
+
+def spread(ranks: Ranks, folder: Path | None = None) -> FitResult:
+    """The fit from these starts, which two processes share."""
+    models, train, validation = starts()
+    trainer = LevenbergMarquardt(max_iter=40)
+    latest = [0] * len(models)
+
+    def watch(number: int) -> Callable[[Model, Progress], None]:
+        return lambda model, progress: latest.__setitem__(number, progress.iteration)
+
+    watching = [[watch(number)] for number in range(len(models))]
+    snapshots = Snapshots(folder, every=0.0, writes=ranks.rank == 0)
+    result = fit(
+        models, train, validation, validation[:50], trainer=trainer, average=2, ranks=ranks,
+        monitors=watching, snapshots=snapshots,
+    )  # fmt: skip
+    assert latest == [s.iterations for s in sorted(result.starts, key=lambda s: s.number)]
+    return result
+
+
 def everything(ranks: Ranks) -> None:
     """All that two processes do together, and at last one of them is lost."""
     found: dict[str, Any] = {name: fitted(name, ranks) for name in FITS}
     found["averaged"] = averaged(ranks)
+    found["spread"] = spread(ranks, Path("starts"))
+    found["stopped"] = stopped(ranks)
+    found["grown"] = grown(ranks)
     found["slope"] = slope(ranks)
     rows = normal(2 * ranks.rank, 3, seed=ranks.rank)
     found["stacked"] = ranks.stack(rows), ranks.first(normal(3 - ranks.rank, 2))
@@ -193,6 +231,26 @@ def everything(ranks: Ranks) -> None:
         found["refusal"] = str(error)
     torch.save(found, f"{ranks.rank}.pt")
     torch.save(losing(ranks), "left.pt")
+
+
+def stopped(ranks: Ranks) -> tuple[str, int]:
+    """How it ends if the second process alone is asked to stop."""
+    calls: list[int] = []
+
+    def stop() -> bool:
+        calls.append(0)
+        return ranks.rank == ranks.world - 1 and len(calls) > 20
+
+    models, train, validation = starts()
+    result = fit(models, train, validation, stop=stop, ranks=ranks, monitors=[[]] * 5)
+    return result.reason, len(result.starts)
+
+
+def grown(ranks: Ranks) -> Tensor:
+    """A fit whose first iterations are over windows."""
+    models, train, _ = starts()
+    trainer = LevenbergMarquardt(max_iter=3)
+    return theta(fit(models, train, horizon="grow", trainer=trainer, ranks=ranks).model)
 
 
 def losing(ranks: Ranks) -> Any:
@@ -228,6 +286,46 @@ def test_two_processes_take_one_mean(both: list[dict[str, Any]]):
     (first, count), (second, other) = (found["averaged"] for found in both)
     assert count == other == averaged(Ranks())[1] == 2
     assert torch.equal(first, second)
+
+
+@pytest.mark.numeric
+def test_starts_that_processes_share_end_as_on_one(both: list[dict[str, Any]], folder: Path):
+    alone = spread(Ranks())
+    for result in (found["spread"] for found in both):
+        np.testing.assert_allclose(theta(result.model), theta(alone.model), rtol=1e-9, atol=1e-12)
+        assert result.averaged == alone.averaged
+        for mine, theirs in zip(result.starts, alone.starts, strict=True):
+            assert (mine.number, mine.iterations, mine.reason) == (
+                theirs.number, theirs.iterations, theirs.reason
+            )  # fmt: skip
+            assert mine.selection == pytest.approx(theirs.selection, rel=1e-9)
+        assert len(result.history) == len(alone.history)
+    assert len(list((folder / "starts").glob("[0-9].safetensors"))) == len(alone.starts)
+
+
+@pytest.mark.numeric
+def test_a_longer_fit_of_shared_starts_goes_on_on_one(both: list[dict[str, Any]], folder: Path):
+    models, train, validation = starts()
+    result = fit(
+        models, train, validation, validation[:50], trainer=LevenbergMarquardt(max_iter=40),
+        average=2, snapshots=Snapshots(folder / "starts", writes=False),
+    )  # fmt: skip
+    before = both[0]["spread"]
+    np.testing.assert_allclose(theta(result.model), theta(before.model), rtol=1e-9, atol=1e-12)
+    assert [s.number for s in result.starts] == [s.number for s in before.starts]
+
+
+def test_one_process_that_stops_ends_all_starts(both: list[dict[str, Any]]):
+    (reason, count), other = (found["stopped"] for found in both)
+    assert other == (reason, count)
+    assert reason == Reason.INTERRUPTED
+    assert count == 5
+
+
+@pytest.mark.numeric
+def test_horizons_of_shared_starts_grow_as_on_one(both: list[dict[str, Any]]):
+    for found in both:
+        np.testing.assert_allclose(found["grown"], grown(Ranks()), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.numeric
@@ -308,13 +406,13 @@ SETTINGS = ["+data._target_=test_distributed.dataset", "name=several", "nx=2", "
 SETTINGS += ["figures=false"]
 
 
-def torchrun(*overrides: str, folder: Path) -> subprocess.CompletedProcess[str]:
+def torchrun(*words: str, folder: Path, **env: str) -> subprocess.CompletedProcess[str]:
     path = os.pathsep.join([str(TESTS), str(ROOT), os.environ.get("PYTHONPATH", "")])
     command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     return subprocess.run(
-        [sys.executable, *command, str(ROOT / "train.py"), *SETTINGS, *overrides],
+        [sys.executable, *command, str(ROOT / "train.py"), *words],
         capture_output=True, text=True, check=False, cwd=folder, timeout=100,
-        env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"} | env,
     )  # fmt: skip
 
 
@@ -335,7 +433,7 @@ def test_two_processes_make_one_run(folder: Path):
 
 @pytest.mark.slow
 def test_torchrun_makes_one_run(tmp_path: Path):
-    done = torchrun("trainer.max_iter=3", folder=tmp_path)
+    done = torchrun(*SETTINGS, "trainer.max_iter=3", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     one_run(tmp_path, done.stdout)
 
@@ -354,12 +452,33 @@ def one_run(folder: Path, printed: str):
 @pytest.mark.parametrize("rank", [0, 1])
 def test_a_killed_process_leaves_the_last_model(rank: int, tmp_path: Path):
     dying = ["trainer._target_=test_distributed.Dying", f"+trainer.rank={rank}"]
-    done = torchrun(*dying, folder=tmp_path)
+    done = torchrun(*SETTINGS, *dying, folder=tmp_path)
     assert done.returncode != 0
     folder = run_folder(tmp_path)
-    assert f"rank {1 - rank} of 2 has no answer from rank {rank} (" in done.stderr
-    assert f"the best model so far is in {folder / 'model'}; to go on: " in done.stderr
+    said = " ".join(done.stderr.split())  # lines are as long as a terminal's
+    assert f"rank {1 - rank} of 2 has no answer from rank {rank} (" in said
+    assert f"the best model so far is in {folder / 'model'}; to go on: " in said
     assert load(folder).sizes["nx"] == 2
     if rank == 1:  # the first process goes on to score what there is
         metrics = json.loads((folder / "metrics.json").read_text())
         assert metrics["fit"]["reason"].startswith(Reason.PROCESS_LOST)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_killed_process_of_shared_starts_costs_no_result(rank: int, tmp_path: Path):
+    dying = ["trainer._target_=test_distributed.Dying", f"+trainer.rank={rank}", "+trainer.at=17"]
+    shared = [*SETTINGS, "starts=4", "trainer.max_iter=40"]
+    once, broken = (tmp_path / name for name in ("once", "broken"))
+    for folder in (once, broken):
+        folder.mkdir()
+    assert torchrun(*shared, folder=once).returncode == 0
+    done = torchrun(*shared, *dying, folder=broken)
+    assert done.returncode != 0
+    (folder,) = (broken / "runs" / "several").iterdir()
+    said = " ".join(done.stderr.split())
+    assert f"rank {1 - rank} of 2 has no answer from rank {rank} (" in said
+    again = torchrun(f"resume={folder}", folder=broken, SPARED="1")
+    assert again.returncode == 0, again.stderr[:3000]
+    one, other = (theta(load(run)) for run in (run_folder(once), folder))
+    np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-12)

@@ -83,14 +83,15 @@ def distil(
             start = "periodic" if record.start == "periodic" else "estimated"
             made: dict[str, Any] = {"u": u, "y": y, "start": start, "reference": None}
             copies.append(replace(record, **made, skip=0, x0=None, limits=None, period=None))
+    records = [*train, *copies]
     return fit(
         deepcopy(result.members[0]),
-        [*train, *copies],
+        records,
         validation,
         trainer=trainer,
         ridge=ridge,
         monitors=None if monitor is None else [monitor],
-        ranks=ranks,
+        ranks=None if ranks is None else ranks.enough_for(len(records)),
         stop=stop,
     )
 

@@ -214,20 +214,22 @@ class StartsLine:
         rounds: bool = True,
     ) -> None:
         self.starts, self.unit, self.iterations, self.rounds = starts, unit, iterations, rounds
-        self._line, self._clock, self._count = LiveLine(stream), monotonic(), 0
+        self._line, self._clock = LiveLine(stream), monotonic()
+        self._iterations: dict[int, int] = {}
         self._best: Progress | None = None
 
     def __call__(self, model: Model, progress: Progress) -> None:
-        """Count an iteration of any of the starts."""
-        self._count += progress.iteration > 0
+        """Count the iterations of all starts."""
+        self._iterations[id(model)] = progress.iteration
+        count = sum(self._iterations.values())
         if self._best is None or progress.score < self._best.score:
             self._best = progress
         total = "" if self.iterations is None else f"/{self.iterations}"
-        parts = [f"{self._count}{total} iterations of {self.starts} starts"]
+        parts = [f"{count}{total} iterations of {self.starts} starts"]
         parts += errors(self._best.train, self._best.validation, self.unit)
-        if self.iterations is not None and 0 < self._count < self.iterations:
-            each = (monotonic() - self._clock) / self._count
-            parts.append(f"{duration(each * (self.iterations - self._count))} left")
+        if self.iterations is not None and 0 < count < self.iterations:
+            each = (monotonic() - self._clock) / count
+            parts.append(f"{duration(each * (self.iterations - count))} left")
         self._line.show("  ".join(parts))
 
     def round(self, ended: Round) -> None:

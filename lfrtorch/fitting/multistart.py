@@ -24,7 +24,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from math import ceil
-from threading import Event, Lock
+from threading import Event
 from typing import Any, cast
 
 import torch
@@ -32,13 +32,14 @@ import torch
 from lfrtorch._support.checks import integer, renamed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT, Reason, told
-from lfrtorch._support.threads import each_alone, spread_by_hand
+from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.growing_horizon import grow
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
+from lfrtorch.fitting.over_processes import OverProcesses, are_spread, same_weights
 from lfrtorch.fitting.prediction import (
     SIMULATION,
     Noise,
@@ -46,12 +47,12 @@ from lfrtorch.fitting.prediction import (
     shown_innovation_form,
     without_gain,
 )
+from lfrtorch.fitting.side_by_side import Together, any_of
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import (
     Fit,
     FitResult,
     Monitor,
-    Progress,
     RestartSummary,
     Round,
     StartDivergesError,
@@ -60,7 +61,6 @@ from lfrtorch.fitting.trainer import (
     Trainer,
 )
 from lfrtorch.fitting.windows import Horizon, check_horizon
-from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
 from lfrtorch.linear.score_window import settled
@@ -105,8 +105,11 @@ def fit(
     share the records is lost: ``reason`` then begins with "a process was lost".
 
     On a CPU each start is fitted on a thread of its own, as many at a time as torch has threads. On
-    another device all go in step, their simulations and Jacobians computed together. Processes that
-    share the records fit one start after another.
+    another device all go in step, their simulations and Jacobians computed together.
+
+    Several processes share the starts, if each has one up to the last round or there are fewer
+    records than processes; else they share the records, and fit one start after another. Starts
+    that are shared come to the same end as on one process.
 
     Args:
         models: where to start: a model, or several of which the best is kept. Their weights are
@@ -146,9 +149,10 @@ def fit(
             those that print or write files to the first alone. Default: a line on a terminal or in
             a notebook, and nothing elsewhere; ``[]`` for nothing at all.
         watch: called after each round.
-        ranks: the processes that share the training records, ``distributed.connect()``; each calls
-            this function with the same arguments, starts from the first one's weights and returns
-            the same fit.
+        ranks: the processes that share starts or training records, ``distributed.connect()``; each
+            calls this function with the same arguments, starts from the first one's weights and
+            returns the same fit. Of starts that others fit, monitors see the best and the last
+            iterate of a round.
         snapshots: where the starts are kept as far as they came. If some are, they go on from
             there, to the same end as if they had not been interrupted (on the same machine).
         stop: asked before each iteration; the fit ends there if it returns True, for example
@@ -160,8 +164,8 @@ def fit(
 
     Raises:
         ValueError: no model, none that is stable on the training records at the start, validation
-            records that all have too few samples, fewer records than processes, another number of
-            lists of monitors, or models to average that have no network.
+            records that all have too few samples, one start and fewer records than processes,
+            another number of lists of monitors, or models to average that have no network.
         ProcessLostError, StoppedError: before there was an iterate to keep.
 
     Example:
@@ -237,41 +241,27 @@ def _fitted(
     starts = [models] if alone else list(models)
     given = [monitors] if alone and monitors is not None else monitors
     watching = cast(Sequence[Sequence[Monitor]], given or ())
-    if not starts:
-        raise InputError("there is no model to start from; give one or more.")
-    if watching and len(watching) != len(starts):
-        raise InputError(
-            f"there are {len(starts)} models and {len(watching)} lists of monitors; give each "
-            "model its own."
-        )
-    integer("average", average, 1)
-    if average > 1 and any(model.lfr.cell.structure != "free" for model in starts):
-        raise InputError(
-            f"average is {average}, and a mean does not keep the structure of its models; give "
-            "average=1, or models whose structure is 'free'."
-        )
-    if average > 1 and not all(is_network(model.lfr.cell.static) for model in starts):
-        raise InputError(
-            f"average is {average}, and the mean is of models with a network as their static "
-            "nonlinearity; give average=1 for other maps."
-        )
+    _check(starts, watching, average)
     validation, selection = (_scored(starts[0], some, train) for some in (validation, selection))
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots
     halt = Event()
-    options: dict[str, Any] = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
+    search = LevenbergMarquardt() if trainer is None else trainer
+    planned = schedule(len(starts), search.limit, average)
+    ranks, train = Ranks() if ranks is None else ranks, as_records(train)
+    spread = are_spread(planned[-1][0], len(starts), len(train), ranks)
+    sharing = Ranks() if spread else ranks  # the processes that share the records of each start
+    options: dict[str, Any] = {"trainer": search, "ridge": ridge, "ranks": sharing}
     options["simulation"] = simulation
     options["horizon"] = None if horizon == "grow" else horizon
-    options["stop"] = any_of(halt, stop) if ranks is None or ranks.world == 1 else stop
+    options["stop"] = any_of(halt, stop) if sharing.world == 1 else stop
+    if spread:
+        same_weights(starts, ranks)
     if horizon == "grow":
-        grow(
-            starts,
-            as_records(train),
-            trainer=LevenbergMarquardt() if trainer is None else trainer,
-            ridge=ridge,
-            ranks=Ranks() if ranks is None else ranks,
-            stop=stop,
-        )
+        own = ranks.share(starts) if spread else starts
+        grow(own, train, trainer=search, ridge=ridge, ranks=sharing, stop=stop)
+        if spread:
+            same_weights(starts, ranks, owners=True)
     fits = [
         Fit(model, train, validation, **options, keep=snapshots.keeper(number))
         for number, model in enumerate(starts)
@@ -284,14 +274,21 @@ def _fitted(
         )
     snapshots.restore(fits)
     unseen = [r for some in (validation, selection) if some for r in as_records(some)]
-    judge = _Judge(fits, unseen if selection else [], unseen)
-    field, planned = fits, schedule(len(fits), fits[0].trainer.limit, average)
+    field = fits
     with ExitStack() as ending:
-        if monitors is None and fits[0].ranks.rank == 0:
+        if monitors is None and ranks.rank == 0:
             line = line_of(starts, planned)
             watching = [[line]] * len(starts)
             ending.callback(line.close)
-        together = Together(fits, watching or [()] * len(fits), halt)
+        watching = watching or [()] * len(fits)
+        if spread:
+            asked = any_of(halt, stop)
+            together: Together = OverProcesses(
+                fits, watching, halt, ranks=ranks, stop=asked, take=snapshots.take
+            )
+        else:
+            together = Together(fits, watching, halt)
+        judge = _Judge(fits, unseen if selection else [], unseen, together)
         for number, (_, until) in enumerate(planned, start=1):
             if number <= len(snapshots.rounds):
                 field = _drop_others(field, [fits[i] for i in snapshots.rounds[number - 1]])
@@ -321,6 +318,28 @@ def _fitted(
         if mean is not None:
             result = replace(result, model=mean, averaged=count, members=tuple(best[:count]))
     return replace(result, seconds=time.perf_counter() - clock)
+
+
+def _check(starts: Sequence[Model], watching: Sequence[Sequence[Monitor]], average: int) -> None:
+    """Refuse what cannot be fitted or averaged."""
+    if not starts:
+        raise InputError("there is no model to start from; give one or more.")
+    if watching and len(watching) != len(starts):
+        raise InputError(
+            f"there are {len(starts)} models and {len(watching)} lists of monitors; give each "
+            "model its own."
+        )
+    integer("average", average, 1)
+    if average > 1 and any(model.lfr.cell.structure != "free" for model in starts):
+        raise InputError(
+            f"average is {average}, and a mean does not keep the structure of its models; give "
+            "average=1, or models whose structure is 'free'."
+        )
+    if average > 1 and not all(is_network(model.lfr.cell.static) for model in starts):
+        raise InputError(
+            f"average is {average}, and the mean is of models with a network as their static "
+            "nonlinearity; give average=1 for other maps."
+        )
 
 
 def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]:
@@ -382,12 +401,17 @@ class _Judge:
         fits: of all starts.
         records: that they are judged on. If empty, the fits' own validation or training records.
         unseen: the records that none of them is fitted to.
+        together: has the processes that must judge alike.
     """
 
     def __init__(
-        self, fits: Sequence[Fit], records: Sequence[Record], unseen: Sequence[Record]
+        self,
+        fits: Sequence[Fit],
+        records: Sequence[Record],
+        unseen: Sequence[Record],
+        together: Together,
     ) -> None:
-        self.fits, self._unseen = fits, unseen
+        self.fits, self._unseen, self._together = fits, unseen, together
         self._errors = [
             SimulationProblem.judge(fit.model, records) if records else None for fit in fits
         ]
@@ -423,7 +447,7 @@ class _Judge:
         reach = torch.tensor(
             [largest_stable_amplitude(model, train) for model in models], dtype=torch.float64
         )
-        reach = self.fits[0].ranks.first(reach).tolist()
+        reach = self._together.ranks.first(reach).tolist()
         return [model for model, to in zip(models, reach, strict=True) if to >= max(LOUDER)]
 
     def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
@@ -439,7 +463,7 @@ class _Judge:
         for mean in means:
             error = SimulationProblem.judge(mean, self._unseen)
             scores.append(error.cost(error.residual(error.theta)))
-        scores = self.fits[0].ranks.first(torch.tensor(scores, dtype=torch.float64))
+        scores = self._together.ranks.first(torch.tensor(scores, dtype=torch.float64))
         count = 1 + int((scores <= AS_GOOD**2 * scores.nan_to_num(math.inf).min()).nonzero().max())
         return (means[count - 2], count) if count > 1 else (None, 1)
 
@@ -450,87 +474,12 @@ class _Judge:
         if error is None:
             return fit.best
         score = error.cost(error.residual(error.theta))
-        score = float(fit.ranks.first(torch.tensor(score, dtype=torch.float64)))
+        score = float(self._together.ranks.first(torch.tensor(score, dtype=torch.float64)))
         return score if math.isfinite(score) else math.inf
 
     def number(self, fit: Fit) -> int:
         """The place of a fit among all."""
         return next(number for number, other in enumerate(self.fits) if other is fit)
-
-
-def any_of(halt: Event, stop: Stop | None) -> Stop:
-    """Stop if one of the two says so."""
-    return lambda: halt.is_set() or (stop is not None and stop())
-
-
-class Together:
-    """Fits side by side, and who watches them; ``halt`` is set if Ctrl-C ends one thread."""
-
-    def __init__(
-        self, fits: Sequence[Fit], monitors: Sequence[Sequence[Monitor]], halt: Event
-    ) -> None:
-        self._halt, self._one = halt, Lock()
-        self._monitors = {
-            id(fit): [self._in_turn(monitor) for monitor in own]
-            for fit, own in zip(fits, monitors, strict=True)
-        }
-
-    def advance(self, fits: Sequence[Fit], until: int) -> None:
-        """Go on with some of them to an iteration."""
-        first = fits[0]
-        in_step = isinstance(first.trainer, LevenbergMarquardt) and first.ranks.world == 1
-        in_step &= len({tuple(fit.model.sizes.items()) for fit in fits}) == 1
-        try:
-            if len(fits) > 1 and in_step and first.problem.theta.device.type != "cpu":
-                advance_in_step(fits, until, [self._monitors[id(fit)] for fit in fits])
-            elif len(fits) > 1 and first.ranks.world == 1:
-                each_alone(lambda fit: self._advance_one(fit, until), fits, self._halt.set)
-            else:
-                for fit in fits:
-                    self._advance_one(fit, until)
-        except KeyboardInterrupt:
-            if not any(fit.history for fit in fits):
-                raise
-            for fit in fits:
-                fit.note_end(Reason.INTERRUPTED)
-
-    def _advance_one(self, fit: Fit, until: int) -> None:
-        if fit.history or not fit.stopped():
-            fit.advance(until, self._monitors[id(fit)])
-
-    def _in_turn(self, monitor: Monitor) -> Monitor:
-        def call(model: Model, progress: Progress) -> None:
-            with self._one:
-                monitor(model, progress)
-
-        return call
-
-
-@spread_by_hand()
-def advance_in_step(
-    fits: Sequence[Fit], until: int, monitors: Sequence[Sequence[Monitor]] = ()
-) -> None:
-    """Go on with several fits by Levenberg-Marquardt to an iteration, evaluated together.
-
-    Raises:
-        KeyboardInterrupt: by Ctrl-C.
-    """
-    watching = dict(zip(map(id, fits), monitors or [()] * len(fits), strict=True))
-    trainer = fits[0].trainer
-    assert isinstance(trainer, LevenbergMarquardt)
-    for fit in fits:
-        if not fit.history:
-            fit.begin(watching[id(fit)])
-    try:
-        while live := [f for f in fits if _unfinished(f, until)]:
-            clock = time.perf_counter()
-            after = trainer.steps(JointProblem([f.problem for f in live]), [f.state for f in live])
-            each = (time.perf_counter() - clock) / len(live)
-            for fit, state in zip(live, after, strict=True):
-                fit.take(state, each, watching[id(fit)])
-    finally:
-        for fit in fits:
-            fit.pause()
 
 
 def _drop_others(field: list[Fit], kept: list[Fit]) -> list[Fit]:
@@ -539,7 +488,3 @@ def _drop_others(field: list[Fit], kept: list[Fit]) -> list[Fit]:
         if not (fit.diverges or any(fit is other for other in kept)):
             fit.note_end(Reason.OTHERS_BETTER)
     return kept
-
-
-def _unfinished(fit: Fit, until: int) -> bool:
-    return not fit.over and fit.state.iteration < until and not fit.stopped()

@@ -79,9 +79,12 @@ def refit(
     chosen = result.chosen_iteration if iterations is None else iterations
     limit = min(ceil(chosen * new / seen), base.limit)
     models = [deepcopy(model) for model in result.members or (result.model,)]
+    records = all_records(train, held_out)
+    if ranks is not None and len(models) == 1:
+        ranks = ranks.enough_for(len(records))
     return fit(
         models,
-        all_records(train, held_out),
+        records,
         trainer=replace(base, max_iter=limit),
         ridge=ridge,
         noise=noise,

@@ -42,9 +42,10 @@ from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting.folds import Fold
 from lfrtorch.fitting.folds import folds as folds_of
 from lfrtorch.fitting.live_line import StartsLine
-from lfrtorch.fitting.multistart import Together, any_of, iterations_of
+from lfrtorch.fitting.multistart import iterations_of
 from lfrtorch.fitting.prediction import SIMULATION, Noise, predicting
 from lfrtorch.fitting.refit import all_records
+from lfrtorch.fitting.side_by_side import Together, any_of
 from lfrtorch.fitting.trainer import Fit, FitResult, Monitor, Stop, StoppedError, Trainer
 from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt

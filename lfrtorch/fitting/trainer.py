@@ -455,6 +455,12 @@ class Fit:
         self._show(progress, monitors)
         self.keep(self, False)
 
+    def show_last(self, monitors: Sequence[Monitor]) -> None:
+        """Call monitors with the latest iterate; the best is in the model again after that."""
+        self.problem.write(self.state.theta)
+        self._show(self.history[-1], monitors)
+        self.problem.write(self._theta_best)
+
     def result(self) -> FitResult:
         """What was found."""
         usual = self._durations[1:] or self._durations

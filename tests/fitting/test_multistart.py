@@ -16,7 +16,8 @@ from lfrtorch._support.reasons import Reason
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.multistart import Round, advance_in_step, fit
+from lfrtorch.fitting.multistart import Round, fit
+from lfrtorch.fitting.side_by_side import advance_in_step
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import Fit, Progress
 from lfrtorch.least_squares.adam import Adam

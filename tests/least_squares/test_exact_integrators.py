@@ -9,7 +9,8 @@ import torch
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.multistart import advance_in_step, fit
+from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.side_by_side import advance_in_step
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import Fit
 from lfrtorch.least_squares.adam import Adam

@@ -1,0 +1,180 @@
+"""Starts of one fit that several processes share: each fits some of them to all records.
+
+A round is cut into legs. At the end of each the processes meet: if one is asked to stop, all do,
+and the first one gets the state of every start, for its snapshots. At the end of a round each takes
+over the starts of the others, to the same bits, so that all judge and choose alike. If a process is
+lost, the others go back to what it had at the end of the leg before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event
+
+import torch
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from lfrtorch._support.reasons import Reason
+from lfrtorch.distributed import ProcessLostError, Ranks
+from lfrtorch.fitting.side_by_side import Together
+from lfrtorch.fitting.trainer import Fit, Monitor, Stop
+from lfrtorch.model import Model
+
+SHORT, LONG = 10.0, 60.0
+"""Seconds of a leg: shorter ones get twice the iterations, longer ones half of them. A process that
+waits for the others longer than its timeout takes them for lost."""
+
+Take = Callable[[int, bytes], None]
+"""Called with the number of a start and the state of its fit, as ``Fit.save`` writes it."""
+
+
+def are_spread(finalists: int, starts: int, records: int, ranks: Ranks) -> bool:
+    """Whether processes share the starts of a fit, and not its records.
+
+    They do if each has a start up to the end, or if the records do not go round.
+
+    Args:
+        finalists: starts of the last round.
+        starts, records: of the whole fit.
+        ranks: the processes.
+
+    Example:
+        >>> from lfrtorch.fitting.over_processes import are_spread
+        >>> are_spread(4, 16, 20, lfrtorch.distributed.Ranks())
+        False
+    """
+    return ranks.world > 1 and starts > 1 and (finalists >= ranks.world or records < ranks.world)
+
+
+def same_weights(models: Sequence[Model], ranks: Ranks, owners: bool = False) -> None:
+    """Give all processes the weights of the first one's models, or those of each model's owner."""
+    for number, model in enumerate(models):
+        weights = parameters_to_vector(model.lfr.parameters()).detach()
+        if owners:
+            mine = number % ranks.world == ranks.rank
+            weights = ranks.sum(weights if mine else torch.zeros_like(weights))
+        else:
+            weights = ranks.first(weights)
+        vector_to_parameters(weights, model.lfr.parameters())
+
+
+class OverProcesses(Together):
+    """Fits of which each process has a share; after ``advance`` each has all of them.
+
+    Args:
+        fits: of all starts, the same on each process.
+        monitors: of each fit. They are called after each iteration of this process's own, and, at
+            the end of a round, with the best and the last iterate of the others'.
+        halt: set if Ctrl-C ends one thread.
+        ranks: the processes.
+        stop: asked at the end of a leg, as well as by the fits.
+        take: called at the end of a leg with the others' fits.
+    """
+
+    def __init__(
+        self,
+        fits: Sequence[Fit],
+        monitors: Sequence[Sequence[Monitor]],
+        halt: Event,
+        *,
+        ranks: Ranks,
+        stop: Stop,
+        take: Take,
+    ) -> None:
+        super().__init__(fits, monitors, halt)
+        self.ranks, self._stop, self._take = ranks, stop, take
+        self._numbers = {id(fit): number for number, fit in enumerate(fits)}
+        self._stride = 1
+        self._states: dict[int, bytes] = {}
+
+    def advance(self, fits: Sequence[Fit], until: int) -> None:
+        """Go on with some of them to an iteration, each process with its share.
+
+        Raises:
+            ProcessLostError: before there was an iterate to keep.
+        """
+        own = self.ranks.share(list(fits))
+        others = [fit for fit in fits if not any(fit is mine for mine in own)]
+        self._states = {}
+        try:
+            asked = self._legs(own, until, self._first_iteration(fits))
+        except ProcessLostError as lost:
+            self.ranks = Ranks()
+            self._take_over(others)
+            if not any(fit.history for fit in fits):
+                raise
+            for fit in fits:
+                fit.note_end(Reason.PROCESS_LOST, lost.detail)
+            return
+        self._take_over(others)
+        if asked:
+            for fit in fits:
+                fit.note_end(Reason.INTERRUPTED)
+
+    def _legs(self, own: Sequence[Fit], until: int, at: int) -> bool:
+        """Go on with a share of them, and meet the others; whether one is asked to stop."""
+        while at < until:
+            at, clock = min(until, at + self._stride), time.perf_counter()
+            if own:
+                super().advance(own, at)
+            stopped = self._stop() or any(fit.reason == Reason.INTERRUPTED for fit in own)
+            row = [float(stopped), time.perf_counter() - clock]
+            met = self.ranks.stack(torch.tensor([row], dtype=torch.float64))
+            self._hand_on(own)
+            asked, longest = met.amax(0).tolist()
+            if asked:
+                return True
+            if longest < SHORT:
+                self._stride *= 2
+            elif longest > LONG:
+                self._stride = max(1, self._stride // 2)
+        return False
+
+    def _first_iteration(self, fits: Sequence[Fit]) -> int:
+        """The iteration that they go on from: the first one's, if files were read meanwhile."""
+        least = min((fit.state.iteration for fit in fits if fit.state is not None), default=0)
+        return int(self.ranks.first(torch.tensor(least)))
+
+    def _hand_on(self, own: Sequence[Fit]) -> None:
+        """All processes get the states of each one's fits."""
+        mine = {self._numbers[id(fit)]: state_of(fit) for fit in own if fit.state is not None}
+        sizes = [[number, len(state)] for number, state in mine.items()]
+        listed = self.ranks.stack(torch.tensor(sizes, dtype=torch.int64).reshape(-1, 2))
+        if not len(listed):
+            return
+        together = bytearray(b"".join(mine.values()))
+        sent = torch.frombuffer(together, dtype=torch.uint8) if together else torch.empty(0)
+        everything = self.ranks.stack(sent.to(torch.uint8)).numpy().tobytes()
+        begin = 0
+        for number, size in listed.tolist():
+            if number not in mine:
+                self._states[number] = everything[begin : begin + size]
+                self._take(number, self._states[number])
+            begin += size
+
+    def _take_over(self, others: Sequence[Fit]) -> None:
+        """Go on from the last known states of the others' fits, and show them."""
+        for fit in others:
+            state = self._states.pop(self._numbers[id(fit)], None)
+            if state is None:
+                continue
+            with TemporaryDirectory() as folder:
+                path = Path(folder) / "fit"
+                path.write_bytes(state)
+                fit.restore(path)
+            monitors = self._monitors[id(fit)]
+            for monitor in monitors:
+                monitor(fit.model, fit.kept)
+            if monitors and fit.history[-1] is not fit.kept:
+                fit.show_last(monitors)
+
+
+def state_of(fit: Fit) -> bytes:
+    """As ``Fit.save`` writes it."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "fit"
+        fit.save(path)
+        return path.read_bytes()
