@@ -26,31 +26,49 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     """A path beside ``path`` to write to, of the same extension; it takes the place of ``path``.
 
     If the block raises, nothing is left, and what was at ``path`` stays as it was.
+
+    Raises:
+        OSError: names the folder.
     """
     path = Path(path).resolve()  # a link's target is replaced, not the link
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=TEMPORARY, suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    fresh = Path(name)
+    with writing_to(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=TEMPORARY, suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        fresh = Path(name)
+        try:
+            yield fresh
+            put(fresh, path)
+        finally:
+            fresh.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Errors of the system inside say which folder cannot be written to."""
     try:
-        yield fresh
-        put(fresh, path)
-    finally:
-        fresh.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        named = folder if error.filename is None else Path(os.fsdecode(error.filename)).resolve()
+        ours = folder == named or folder in named.parents or named in folder.parents
+        if error.strerror is None or not ours:  # it says more, or is of another file
+            raise
+        raise OSError(f"'{folder}' cannot be written to: {error.strerror}") from error
 
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """A folder beside ``path`` to write files to; it becomes ``path``, which is new or empty."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=path.parent))
-    try:
-        yield fresh
-        for file in fresh.iterdir():
-            flush(file)
-        put(fresh, path)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
+    with writing_to(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=path.parent))
+        try:
+            yield fresh
+            for file in fresh.iterdir():
+                flush(file)
+            put(fresh, path)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
 
 
 def put(fresh: Path, path: Path) -> None:

@@ -43,6 +43,7 @@ from lfrtorch.cli.run_folder import (
     go_on,
     no_empty_folder,
     program,
+    resumable,
 )
 from lfrtorch.cli.words import Terminal, translated
 from lfrtorch.dataset import Dataset
@@ -55,7 +56,7 @@ from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
+from lfrtorch.reporting.monitor import Checkpoint, TensorBoard, quiet_writers
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.run_files import write
 from lfrtorch.reporting.verdict import LINEAR_MODEL
@@ -96,7 +97,7 @@ def run(
     snapshots = Snapshots(kept, writes=ranks.rank == 0)
     first = ranks.rank == 0
     files = _Folder(cfg, folder, monitor, least=snapshots.least) if first else None
-    with Termination() as stop:
+    with Termination() as stop, resumable(folder):
         try:
             found = identify(
                 dataset, settings, observer=files, snapshots=snapshots, ranks=ranks, stop=stop
@@ -175,7 +176,10 @@ class _Folder(Terminal):
             OmegaConf.save(self.cfg, fresh, resolve=True)
         shown = (dataset.validation or dataset.train)[0]
         self.board = TensorBoard(
-            self.folder, shown if self.cfg.figures else None, linear.simulate(shown)
+            self.folder,
+            shown if self.cfg.figures else None,
+            linear.simulate(shown),
+            say=self.note,
         )
         keep = Checkpoint(self.folder / "model", least=self._least)
         printing, watch = super().begin(dataset, settings, linear, models)
@@ -184,11 +188,14 @@ class _Folder(Terminal):
             own = [] if self._monitor is None else [self._monitor()]
             return Watching([[*printing[0], self.board, keep, *own]], watch)
         self._boards = [
-            TensorBoard(self.folder / STARTS / f"{i:02d}", finalist=True)
+            TensorBoard(self.folder / STARTS / f"{i:02d}", finalist=True, say=self.note)
             for i in range(len(models))
         ]
         own = zip(printing, self._boards, strict=True)
         return Watching([[*lines, board, keep] for lines, board in own], watch)
+
+    def note(self, text: str) -> None:
+        self.say(f"note: {text}")
 
     def end(self, result: FitResult) -> None:
         super().end(result)
@@ -216,6 +223,7 @@ def launched(
     rank = os.environ.get("RANK", "0")
     with ExitStack() as stack:
         stack.enter_context(user_errors(rank, cfg))
+        stack.enter_context(quiet_writers())
         if rank == "0":
             stack.enter_context(no_empty_folder(folder))
         ranks = stack.enter_context(connect(cfg.device, cfg.timeout))

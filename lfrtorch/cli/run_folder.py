@@ -84,6 +84,17 @@ def go_on(folder: Path) -> str:
     return f"to go on: {shlex.join(program('train.py'))} resume={folder}"
 
 
+@contextmanager
+def resumable(folder: Path) -> Iterator[None]:
+    """If a disk fails inside, the message says how to go on."""
+    try:
+        yield
+    except OSError as error:
+        if not (folder / SNAPSHOTS).is_dir():
+            raise
+        raise OSError(f"{error}; {go_on(folder)}") from error
+
+
 def common(folder: Path, ranks: Ranks) -> Path:
     """The first process's folder."""
     name = torch.tensor(list(str(folder).encode()), dtype=torch.uint8)

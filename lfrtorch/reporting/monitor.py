@@ -5,7 +5,10 @@ from __future__ import annotations
 import copy
 import io
 import math
-from collections.abc import Mapping, Sequence
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -13,7 +16,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary
-from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard import FileWriter, SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from lfrtorch.engine.simulation import spectral_radius
@@ -38,6 +41,8 @@ class TensorBoard:
         every: iterations between figures; they cost about half a second.
         finalist: whether nothing is written before the last round of a fit from several starts, so
             that starts that others end leave no run.
+        say: told once if the file cannot be written, for example because the disk is full. The fit
+            goes on without it. Default: a warning.
 
     Example:
         >>> from lfrtorch.reporting.monitor import TensorBoard
@@ -54,10 +59,12 @@ class TensorBoard:
         every: int = 50,
         *,
         finalist: bool = False,
+        say: Callable[[str], None] = warnings.warn,
     ) -> None:
-        self.folder, self.finalist = Path(folder), finalist
+        self.folder, self.finalist, self._say = Path(folder), finalist, say
         self.record, self.y_linear, self.every = record, y_linear, every
         self._writer: SummaryWriter | None = None
+        self._failed = False
         self._waiting: list[tuple[Progress, float]] = []
 
     @property
@@ -68,12 +75,7 @@ class TensorBoard:
     def history(self, history: Sequence[Progress]) -> None:
         """Log iterations of the past."""
         for progress in history:
-            writer, step = self._from(progress.iteration), progress.iteration
-            writer.add_scalar("rmse/train", progress.train, step)
-            if not math.isnan(progress.validation):
-                writer.add_scalar("rmse/validation", progress.validation, step)
-            for name, value in progress.report.items():
-                writer.add_scalar(f"search/{name}", value, step)
+            self._write(progress.iteration, lambda writer, one=progress: _add(writer, one))
 
     def __call__(self, model: Model, progress: Progress) -> None:
         """Log one iteration."""
@@ -83,7 +85,7 @@ class TensorBoard:
             return
         for one, radius in self._waiting:
             self.history([one])
-            self._from(step).add_scalar("stability/spectral_radius_A", radius, one.iteration)
+            self._scalar("stability/spectral_radius_A", radius, one.iteration)
         self._waiting = []
         if self.record is not None and self.y_linear is not None and step % self.every == 0:
             y_hat, signals = model.simulate(self.record), model.signals(self.record)
@@ -102,14 +104,12 @@ class TensorBoard:
             encoded_image_string=png, width=width, height=height, colorspace=len("RGB")
         )
         summary = Summary(value=[Summary.Value(tag=name, image=image)])
-        file = self._from(step).file_writer
-        assert file is not None
-        file.add_summary(summary, step)
+        self._write(step, lambda writer: _file(writer).add_summary(summary, step))
 
     def text(self, name: str, text: str, step: int = 0) -> None:
         """Add a text in a fixed-width font."""
         shown = "\n".join("    " + line for line in text.splitlines())
-        self._from(step).add_text(name, shown, step)
+        self._write(step, lambda writer: writer.add_text(name, shown, step))
 
     def hyperparameters(
         self, settings: Mapping[str, Any], found: Mapping[str, float | None], step: int
@@ -123,23 +123,65 @@ class TensorBoard:
         """
         shown = {k: v for k, v in settings.items() if isinstance(v, bool | int | float | str)}
         values = {f"found/{k}": v for k, v in found.items() if v is not None}
-        file = self._from(step).file_writer
-        assert file is not None
         for summary in hparams(shown, values):
-            file.add_summary(summary)
+            self._write(step, lambda writer, one=summary: _file(writer).add_summary(one))
         for name, value in values.items():
-            self._from(step).add_scalar(name, value, step)
+            self._scalar(name, value, step)
 
     def close(self) -> None:
         """Write what is pending."""
-        if self._writer is not None:
-            self._writer.close()
+        if self.begun:
+            self._write(0, lambda writer: writer.close())
 
-    def _from(self, step: int) -> SummaryWriter:
-        """The writer, made at the first step."""
-        if self._writer is None:
-            self._writer = SummaryWriter(str(self.folder), purge_step=step)
-        return self._writer
+    def _scalar(self, name: str, value: float, step: int) -> None:
+        self._write(step, lambda writer: writer.add_scalar(name, value, step))
+
+    def _write(self, step: int, write: Callable[[SummaryWriter], None]) -> None:
+        """Write with the writer, made at the first step, as long as that works."""
+        if self._failed:
+            return
+        try:
+            if self._writer is None:
+                self._writer = SummaryWriter(str(self.folder), purge_step=step)
+            write(self._writer)
+        except OSError as error:
+            self._failed = True
+            self._say(
+                f"TensorBoard's file in '{self.folder}' cannot be written "
+                f"({error.strerror or error}); the fit goes on without it"
+            )
+
+
+def _add(writer: SummaryWriter, progress: Progress) -> None:
+    """The scalars of an iteration."""
+    step = progress.iteration
+    writer.add_scalar("rmse/train", progress.train, step)
+    if not math.isnan(progress.validation):
+        writer.add_scalar("rmse/validation", progress.validation, step)
+    for name, value in progress.report.items():
+        writer.add_scalar(f"search/{name}", value, step)
+
+
+def _file(writer: SummaryWriter) -> FileWriter:
+    """What takes summaries that are made already."""
+    assert writer.file_writer is not None
+    return writer.file_writer
+
+
+@contextmanager
+def quiet_writers() -> Iterator[None]:
+    """Inside, TensorBoard's thread prints no traceback of a full disk, which ``say`` tells."""
+    usual = threading.excepthook
+
+    def hook(failed: threading.ExceptHookArgs) -> None:
+        if not (issubclass(failed.exc_type, OSError) and "AsyncWriter" in repr(failed.thread)):
+            usual(failed)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = usual
 
 
 class Checkpoint:

@@ -71,6 +71,20 @@ def test_tensorboard_holds_scalars_figures_and_texts(
     assert min(groups) == "rmse"  # the first in TensorBoard
 
 
+def test_a_fit_goes_on_if_tensorboard_cannot_write(model: lfrtorch.Model, tmp_path: Path):
+    said: list[str] = []
+    (tmp_path / "file").touch()
+    board = TensorBoard(tmp_path / "file" / "inside", say=said.append)
+    for iteration in range(3):
+        board(model, step(iteration))
+    board.text("scores", "a", 2)
+    board.close()
+    assert len(said) == 1
+    assert "inside' cannot be written (" in said[0]
+    with pytest.warns(UserWarning, match="the fit goes on without it"):
+        TensorBoard(tmp_path / "file" / "inside")(model, step(0))
+
+
 def test_tensorboard_has_a_run_of_finalists_alone(model: lfrtorch.Model, tmp_path: Path):
     boards = [TensorBoard(tmp_path / name, finalist=True) for name in ("early", "late")]
     for board, last in zip(boards, (5, 6), strict=True):  # an eighth of 40 iterations, and more

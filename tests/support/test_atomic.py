@@ -32,6 +32,26 @@ def test_an_error_leaves_what_was_there(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_an_error_of_the_system_names_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file' cannot be written to: "):
+        fill(tmp_path / "file" / "x.csv", "")
+    with pytest.raises(OSError, match="' cannot be written to: No space left"):
+        fill(tmp_path / "x.csv", OSError(28, "No space left on device"))
+    with pytest.raises(FileNotFoundError, match=r"No such file or directory: '/nowhere/x\.csv'"):
+        fill(
+            tmp_path / "x.csv", FileNotFoundError(2, "No such file or directory", "/nowhere/x.csv")
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def fill(path: Path, text: str | OSError) -> None:
+    with whole_file(path) as fresh:
+        if isinstance(text, OSError):
+            raise text
+        fresh.write_text(text)
+
+
 def test_permissions_are_the_usual_ones(tmp_path: Path) -> None:
     usual, path = tmp_path / "usual", tmp_path / "x"
     usual.touch()
