@@ -294,11 +294,12 @@ def _fitted(
                 field = _drop_others(field, [fits[i] for i in snapshots.rounds[number - 1]])
                 continue
             together.advance(field, until)
+            # Also of a start that was to begin when the fit was asked to end.
+            cut = next((fit for fit in field if fit.reason in CUT_SHORT), None)
             field = judge.ranked(field)
             if not field:
                 raise StoppedError("stopped before the first iterate of the fit")
             watch(Round(number, len(planned), judge.summaries(field), time.perf_counter() - clock))
-            cut = next((fit for fit in field if fit.reason in CUT_SHORT), None)
             if cut is not None:
                 for one in field:
                     if not one.reason:  # it reached the end of the round

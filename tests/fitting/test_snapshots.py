@@ -1,8 +1,9 @@
 """A fit that was interrupted ends as if it had not been, to the last bit."""
 
 import copy
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -85,10 +86,11 @@ def run(
     data: tuple[list[Record], Record],
     folder: Path | None = None,
     stop: int = 0,
+    own_stop: Callable[[], bool] | None = None,
     **options: Any,
 ) -> FitResult:
-    monitors = [[Stop(stop)] if stop else [] for _ in models]
-    return fit(models, *data, monitors=monitors, snapshots=Snapshots(folder, 0.0), **options)
+    options |= {"snapshots": Snapshots(folder, 0.0), "stop": own_stop}
+    return fit(models, *data, monitors=[[Stop(stop)] if stop else [] for _ in models], **options)
 
 
 # --- one start ------------------------------------------------------------------------------
@@ -179,6 +181,21 @@ def test_several_starts_end_as_without_interruption(tmp_path: Path):
         assert len(Snapshots(folder).rounds) == (stop == 5)
         resumed = run(starts(3), data, folder, trainer=optimiser)
         assert outcome(resumed) == outcome(whole)
+
+
+def test_a_start_that_had_not_begun_takes_part_after_that(tmp_path: Path):
+    data, optimiser = records(["zero"]), LevenbergMarquardt(max_iter=8)
+    whole = run(starts(3), data, trainer=optimiser)
+    for after in range(2, 9):
+        folder, calls = tmp_path / str(after), itertools.count()
+        folder.mkdir()
+
+        def stop(calls: Iterator[int] = calls, after: int = after) -> bool:
+            return next(calls) >= after
+
+        cut = run(starts(3), data, folder, trainer=optimiser, own_stop=stop)
+        assert cut.reason == Reason.INTERRUPTED
+        assert outcome(run(starts(3), data, folder, trainer=optimiser)) == outcome(whole)
 
 
 def test_more_iterations_than_were_asked_for(tmp_path: Path):
