@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Self
@@ -20,16 +21,36 @@ class TerminatedError(LfrtorchError):
         self.number = number
 
 
+AGAIN = 0.05
+"""Seconds after which a signal comes again that a library took for an error of its own."""
+
+
 @contextmanager
 def handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Inside, ``handler`` takes SIGTERM, and Ctrl-C unless it is ignored."""
+    """Inside, ``handler`` takes SIGTERM, and Ctrl-C unless it is ignored.
+
+    What it raises while compiled code calls Python, as numba's compiler does, is lost there.
+    """
+    hook = sys.unraisablehook
+
+    def lost(failed: sys.UnraisableHookArgs) -> None:
+        number = getattr(failed.exc_value, "number", signal.SIGINT)
+        if not isinstance(failed.exc_value, TerminatedError | KeyboardInterrupt):
+            hook(failed)
+        elif handler is as_error:
+            again = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+
     numbers = [signal.SIGTERM]
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background job
         numbers.append(signal.SIGINT)
     usual = {number: signal.signal(number, handler) for number in numbers}
+    sys.unraisablehook = lost
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         for number, before in usual.items():
             signal.signal(number, before)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from hydra.utils import instantiate
 
 from lfrtorch import InputError, LfrtorchError
 from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.interrupts import TerminatedError
+from lfrtorch.cli.interrupts import TerminatedError, as_error, handled
 from lfrtorch.distributed import ProcessLostError
 
 
@@ -33,6 +34,24 @@ def test_errors_of_users_are_one_line(kind: Callable[[str], Exception], capsys):
     target = {"_target_": fails, "kind": kind, "message": "nx is 0"}
     assert printed(capsys, lambda: instantiate(target)) == f"error: {message}\n"
     assert printed(capsys, lambda: instantiate({"a": target})["a"]) == f"error: a: {message}\n"
+
+
+class Swallows:
+    """Loses what is raised in it, as a library does where compiled code calls Python."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_signal_that_a_library_loses_comes_again(capsys):
+    def end() -> None:
+        with handled(as_error):
+            Swallows()
+            time.sleep(60)
+
+    with pytest.raises(TerminatedError, match="terminated"):
+        end()
+    assert not capsys.readouterr().err
 
 
 def test_memory_that_there_is_not_is_one_line(capsys):
