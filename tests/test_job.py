@@ -382,6 +382,7 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
         ({"nz": "many"}, "nz is 'many'"),
         ({"degree": "auto"}, "degree is auto, and this static map has none; give nn='auto'"),
         ({"static": "spline"}, "static is 'spline'"),
+        ({"static": -1}, "static is -1"),
         ({"static": torch.nn.Linear, "nz": "auto"}, "is not searched; give numbers"),
         ({"init": "magic"}, "init is 'magic'"),
         ({"minor": -1.0}, "minor is -1"),

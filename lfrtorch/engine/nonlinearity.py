@@ -68,7 +68,7 @@ class Network(Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        if activation not in ACTIVATIONS:
+        if not (isinstance(activation, str) and activation in ACTIVATIONS):
             raise InputError(
                 f"activation is {activation!r}; use one of {', '.join(sorted(ACTIVATIONS))}."
             )

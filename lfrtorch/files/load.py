@@ -133,6 +133,10 @@ def load_records(
         >>> [len(records) for records in (data.train, data.validation, data.tests)]
         [1, 1, 1]
     """
+    if not isinstance(units or {}, Mapping):
+        raise InputError(
+            f"units is {units!r}; give that of each channel by its name: {{'force': 'N'}}."
+        )
     reader = _Reader(
         Wanted(inputs, outputs, fs, time, dict(units or {}), gaps, reference),
         start,
@@ -446,6 +450,11 @@ def _named(
     left, records = list(wholes), []
     known = list(reader.all)
     for name in names:
+        if not isinstance(name, str | Path):
+            raise InputError(
+                f"{option} is {list(names)!r}; give a fraction, a number of records, or a list of "
+                "names of records and files."
+            )
         found = [whole for whole in known if str(name) in (whole.record.name, whole.stem)]
         if not found:
             path = Path(name).expanduser()

@@ -277,7 +277,8 @@ class Settings:
             )
         for name in ("nx", "nz", "nw", "nn", "degree"):
             integer(name, getattr(self, name), 1, word="auto")
-        if isinstance(self.static, str) and self.static not in LAST_SIZE:
+        known = isinstance(self.static, str) and self.static in LAST_SIZE
+        if not (known or callable(self.static)):
             raise InputError(
                 f"static is {self.static!r}; use 'network', 'polynomial', or a module's class."
             )

@@ -32,6 +32,9 @@ from lfrtorch.least_squares.stable_states import StableSystem, fading, largest_m
 from lfrtorch.model import Model
 from lfrtorch.records import NormalisedRecord, Record, as_records
 
+LARGEST_RIDGE = 1e100
+"""Its square is still a number; 1 holds parameters where they are already."""
+
 Ridge = float | Mapping[str, float]
 
 
@@ -348,7 +351,10 @@ class SimulationProblem(LeastSquares):
             sizes.append(self._initial_states.numel())
         weights = [0.0] * len(names)
         for group, value in groups.items():
-            number(f"ridge of '{group}'" if group else "ridge", value)
+            name = f"ridge of '{group}'" if group else "ridge"
+            number(name, value)
+            if value > LARGEST_RIDGE:
+                raise InputError(f"{name} is {value}; give {LARGEST_RIDGE} at most.")
             own = [i for i, name in enumerate(names) if _belongs(name, group)]
             if not own:
                 raise InputError(

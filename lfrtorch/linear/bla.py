@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from lfrtorch._support.checks import integer
+from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import radius
 from lfrtorch._support.threads import spread_by_hand
@@ -173,6 +173,7 @@ def estimate_bla(
         data = [without_coordinates(record) for record in as_records(data)]
         check_signals(data)
         refine = refine or ("frequency" if of_response(data) else "simulation")
+    true_or_false("feedthrough", feedthrough)
     if refine != "frequency" and weight is not None:
         raise InputError("weight is that of a response: use refine='frequency'.")
     settings = _Settings(refine, weight, offset, feedthrough, coordinates, max_iter)

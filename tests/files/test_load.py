@@ -721,3 +721,13 @@ def test_a_line_may_have_thousands_of_cells(tmp_path):
     write(tmp_path / "a.csv", np.tile(row, (60, 1)) + np.arange(60)[:, None] % 3, names)
     data = load_records(tmp_path / "a.csv", inputs="signal 0", outputs="signal 13999", fs=1.0)
     assert data.train[0].y[2] == row[-1] + 2
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("units", "N"), ("units", -1), ("validation", [1, 2]), ("test", [1, 2])]
+)
+def test_settings_of_other_types(option: str, value: object, tmp_path: Path):
+    np.savetxt(tmp_path / "x.csv", np.ones((20, 2)), delimiter=",", header="u,y", comments="")
+    given: dict[str, Any] = {option: value}
+    with pytest.raises(ValueError, match=f"{option} is .*; give "):
+        load_records(tmp_path / "x.csv", inputs="u", outputs="y", fs=1.0, **given)
