@@ -72,15 +72,16 @@ def theta(model: Model) -> Tensor:
 
 @dataclass(frozen=True)
 class Dying(LevenbergMarquardt):
-    """Levenberg-Marquardt, killed on one of the processes."""
+    """Levenberg-Marquardt, killed or stopped on one of the processes."""
 
     rank: int = 1
     at: int = 3
+    by: str = "SIGKILL"
 
     def step(self, problem: Any, state: LMState) -> LMState:
         spared = "SPARED" in os.environ
         if not spared and state.iteration == self.at and os.environ.get("RANK") == str(self.rank):
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.Signals[self.by])
         return super().step(problem, state)
 
 
@@ -462,6 +463,18 @@ def test_a_killed_process_leaves_the_last_model(rank: int, tmp_path: Path):
     if rank == 1:  # the first process goes on to score what there is
         metrics = json.loads((folder / "metrics.json").read_text())
         assert metrics["fit"]["reason"].startswith(Reason.PROCESS_LOST)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("starts", [1, 4])
+def test_a_stuck_process_is_taken_for_lost(starts: int, tmp_path: Path):
+    stuck = ["trainer._target_=test_distributed.Dying", "+trainer.by=SIGSTOP", "timeout=5"]
+    done = torchrun(*SETTINGS, *stuck, f"starts={starts}", folder=tmp_path)
+    assert done.returncode != 0
+    said = " ".join(done.stderr.split())
+    assert "rank 0 of 2 has no answer from rank 1 (" in said
+    assert "to go on: torchrun --nproc-per-node 2 train.py resume=" in said
+    assert load(run_folder(tmp_path)).sizes["nx"] == 2
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import math
 import shlex
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -45,6 +46,7 @@ Words are those of lfrtorch fit; those with several values are searched:
 and of the search itself:
 
   trials=N      runs in all. Default: 40
+  minutes=X     after which no run begins. Default: no limit
   workers=N     of them at once, on one machine. Default: 1
   objective=    error (of validation, the default) or front: of error against number of parameters
   out=DIR       folder. Default: runs/search. The same command goes on there, also from several
@@ -56,7 +58,13 @@ front). The folder has each run, and comparison.html of them all.
 
 NAME = "search"  # of the study in its journal
 JOURNAL, FAILED = "journal.log", "failed"
-OWN = {"trials": "40", "workers": "1", "objective": "error", "out": "runs/search"}
+OWN = {
+    "trials": "40",
+    "minutes": "inf",
+    "workers": "1",
+    "objective": "error",
+    "out": "runs/search",
+}
 OBJECTIVES = ("error", "front")
 BEGINS = 60.0  # seconds within which a worker that has a trial is at it
 TRIED = 5  # runs that come to their end before any is pruned
@@ -73,12 +81,13 @@ class Plan(NamedTuple):
     Args:
         fixed: words of all runs.
         space: where each of the others is searched, by its name.
-        trials, workers, objective, folder: see ``ABOUT``.
+        trials, minutes, workers, objective, folder: see ``ABOUT``.
     """
 
     fixed: list[str]
     space: dict[str, BaseDistribution]
     trials: int
+    minutes: float
     workers: int
     objective: str
     folder: Path
@@ -120,9 +129,9 @@ WORKER = f"import sys; from {__name__} import plan, work; work(plan(sys.argv[1:]
 
 def work(found: Plan) -> None:
     """Try settings; other processes may do the same."""
-    study = opened(found)
+    study, end = opened(found), time.monotonic() + 60.0 * found.minutes
     try_again(found, study)
-    while begun(study) < found.trials:
+    while begun(study) < found.trials and time.monotonic() < end:
         trial = study.ask(found.space)
         study.tell(trial, **tried(found, trial))
 
@@ -187,14 +196,27 @@ def plan(words: Sequence[str]) -> Plan:
     for name in ("trials", "workers"):
         if not own[name].isdecimal() or int(own[name]) < 1:
             raise InputError(f"{name} is {own[name]}; give a whole number of at least 1.")
+    try:
+        minutes = float(own["minutes"])
+    except ValueError:
+        minutes = math.nan
+    if not minutes > 0:
+        raise InputError(f"minutes is {own['minutes']}; give a number above 0.")
     check_words("config", ["-m", *rest])
     read = [parsed(word) for word in rest]
     space = {w.get_key_element(): distribution(w) for w in read if w.is_sweep_override()}
     if not space:
         raise InputError("no word has several values to search: nn=5,10,15 or 'nn=range(4,31)'.")
     fixed = [quoted(str(word.input_line)) for word in read if not word.is_sweep_override()]
-    counts = int(own["trials"]), int(own["workers"])
-    return Plan(fixed, space, *counts, own["objective"], Path(own["out"]))
+    return Plan(
+        fixed,
+        space,
+        trials=int(own["trials"]),
+        minutes=minutes,
+        workers=int(own["workers"]),
+        objective=own["objective"],
+        folder=Path(own["out"]),
+    )
 
 
 def distribution(word: Any) -> BaseDistribution:

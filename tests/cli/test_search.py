@@ -48,6 +48,7 @@ def test_values_of_a_word_are_a_distribution(word: str, expected: Any):
         (["nx=1"], "no word has several values"),
         (["nx=1,2", "trials=none"], "trials is none; give a whole number"),
         (["nx=1,2", "workers=0"], "workers is 0"),
+        (["nx=1,2", "minutes=-1"], "minutes is -1; give a number above 0"),
         (["nx=1,2", "objective=time"], "objective is time; give error or front"),
         (["nm=1,2"], "there is no setting 'nm'"),
     ],
