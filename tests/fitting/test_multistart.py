@@ -205,16 +205,19 @@ def test_selection_chooses_among_starts_and_not_among_iterates():
 
 
 class Sharing(Ranks):
-    """Claims to be one of two processes, which have the same records."""
+    """Claims to be one of three processes, which have the same records."""
 
-    world = 2
+    world = 3
 
     def share(self, items: list) -> list:
         return items
 
 
-def test_processes_fit_one_start_after_another():
+def test_processes_that_share_records_fit_one_start_after_another():
+    torch.set_num_threads(2)
     models, train, validation = several(2)
+    train.append(validation)
+    assert len(train) >= Sharing.world
     threads = set()
     monitors: Any = [[lambda *_: threads.add(threading.get_ident())]] * 2
     options: Any = {"trainer": LevenbergMarquardt(max_iter=2), "monitors": monitors}
