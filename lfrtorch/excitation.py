@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lfrtorch._support import checks
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import dft_lines, integer, number, reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Integers
@@ -53,6 +54,7 @@ class Multisine:
         return between[between % 2 == parity]
 
 
+@typed()
 def multisine(
     samples: int,
     *,
@@ -114,6 +116,8 @@ def multisine(
         weakly nonlinear MIMO systems", Automatica 43, 2007.
     """
     integer("samples", samples, 3)
+    if not isinstance(seed, np.random.Generator):
+        integer("seed", seed, 0)
     integer("nu", nu, 1)
     integer("realisations", realisations, 1)
     integer("group", group, 2)
@@ -152,8 +156,8 @@ def _candidates(
             f"fs / 2 = {fs / 2:g} Hz."
         )
     # A frequency that is a line up to rounding belongs to the band.
-    first = max(1, int(np.ceil(low * samples / fs * (1 - 1e-12))))
-    found = np.arange(first, min(last, int(high * samples / fs * (1 + 1e-12))) + 1)
+    first = max(1, int(np.ceil(low / fs * samples * (1 - 1e-12))))
+    found = np.arange(first, min(last, int(high / fs * samples * (1 + 1e-12))) + 1)
     if not found.size:
         raise InputError(
             f"the band {low:g} to {high:g} Hz holds no line of a period of {samples} samples, "
@@ -163,8 +167,6 @@ def _candidates(
 
 
 def _on_grid(lines: Integers, grid: Any, group: int, generator: np.random.Generator) -> Integers:
-    if grid not in get_args(Grid):
-        raise InputError(f"grid is {grid!r}; use 'full', 'odd' or 'random_odd'.")
     if grid == "full":
         return lines
     odd = lines[lines % 2 == 1]

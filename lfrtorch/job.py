@@ -12,6 +12,7 @@ from typing import Any, cast
 
 import torch
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import each_alone
@@ -52,6 +53,7 @@ SLOW_SAMPLES = 5000
 """Training samples from which a static map that is not compiled is worth a note."""
 
 
+@typed("dataset")
 def identify(
     dataset: Dataset,
     settings: Settings,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.records import Record
@@ -16,6 +17,7 @@ def rms(signal: ArrayLike, axis: int | None = None) -> Array:
         return np.sqrt(np.mean(np.square(signal), axis=axis))
 
 
+@typed()
 def rmse(record: Record, y_hat: Array) -> float:
     """Root mean squared simulation error over scored samples and outputs, in the output's unit.
 
@@ -34,6 +36,7 @@ def rmse(record: Record, y_hat: Array) -> float:
     return float(rms(record.y[record.skip :] - y_hat[record.skip :]))
 
 
+@typed()
 def nrmse(record: Record, y_hat: Array) -> float:
     """RMSE over the standard deviation of the measured output, both over the scored samples.
 

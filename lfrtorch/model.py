@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from lfrtorch._support import checkpoint
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, reals
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
@@ -197,6 +198,7 @@ class Model:
             gauge += cell.nz * cell.nw
         return self.parameter_count - gauge
 
+    @typed()
     def simulate(
         self, data: Record | ArrayLike, *, start: Start | None = None, x0: ArrayLike | None = None
     ) -> Array:
@@ -264,6 +266,7 @@ class Model:
             trajectory = self.lfr.trajectory(v, state, start)
         return Trajectory(*(signal.cpu() for signal in trajectory))
 
+    @typed()
     def predict(self, record: Record, *, horizon: int = 1) -> Array:
         """Output (T, ny) predicted so many samples ahead, in physical units.
 
@@ -313,6 +316,7 @@ class Model:
         P0: ArrayLike = 1.0,
     ) -> ExtendedKalmanFilter: ...
 
+    @typed()
     def observer(
         self,
         *,
@@ -471,6 +475,7 @@ class Model:
         return checkpoint.write(folder, description, weights)
 
 
+@typed()
 def simulate_blocks(
     model: Model, blocks: Iterable[ArrayLike], *, x0: ArrayLike | None = None
 ) -> Iterator[Array]:
@@ -544,6 +549,7 @@ def _made(
     return own
 
 
+@typed()
 def load(folder: str | Path, *, static: Module | None = None) -> Model:
     """The model in a checkpoint folder, or in the ``model/`` folder of a run's folder.
 

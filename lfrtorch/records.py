@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._support.checks import integer, number, reals
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
 
 Start = Literal["zero", "given", "estimated", "periodic"]
@@ -511,7 +511,7 @@ class Scaler:
 
 def check_start(start: str, what: str) -> None:
     """Refuse an unknown kind of start with a ValueError."""
-    if start not in get_args(Start):
+    if not isinstance(start, str) or start not in get_args(Start):
         raise InputError(
             f"{what}: start is {start!r}; use 'zero', 'given', 'estimated' or 'periodic'."
         )
@@ -529,13 +529,14 @@ def _side(
     """Channels and samples of the inputs or the outputs of a record."""
     array = reals(what, signal)
     width = array.shape[1] if array.ndim == 2 else 1
+    given = _channels(given, what)
     if given and len(given) != width:
         raise InputError(
             f"{letter} has {width} column(s) but {len(given)} channel name(s) were given; "
             "name every column once."
         )
     default = (Channel(letter if width == 1 else f"{letter}{i + 1}") for i in range(width))
-    channels = tuple(Channel(*c) for c in given) or tuple(default)
+    channels = given or tuple(default)
     array = as_signal(array, channels, what)
     largest = np.abs(array).max(axis=0)
     odd = np.flatnonzero((largest > _LARGEST) | ((largest > 0) & (largest < _SMALLEST)))
@@ -545,6 +546,21 @@ def _side(
             f"that brings it between {_SMALLEST:g} and {_LARGEST:g}."
         )
     return channels, array
+
+
+def _channels(given: Any, what: str) -> tuple[Channel, ...]:
+    """Channels, also of names alone."""
+    listed = isinstance(given, list | tuple)
+    pairs = [(c,) if isinstance(c, str) else c for c in given] if listed else []
+    known = [
+        isinstance(c, list | tuple) and all(isinstance(text, str) for text in c) for c in pairs
+    ]
+    if not listed or not all(known) or any(len(pair) not in (1, 2) for pair in pairs):
+        raise InputError(
+            f"{what}: the channels are {brief(repr(given), 80)}; give a name for each column, or a "
+            "name and a unit: [('force', 'N')]."
+        )
+    return tuple(Channel(*pair) for pair in pairs)
 
 
 def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: int = 0) -> Array:

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import wraps
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
-from types import CodeType
+from types import CodeType, FunctionType
 from typing import Any
 
 from beartype import beartype
@@ -27,7 +27,7 @@ calls: Counter[str] = Counter()
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     """Check the shapes of the first calls in each test."""
-    strict, name = jaxtyped(function, typechecker=beartype), function.__qualname__
+    strict, name = jaxtyped(_shapes_alone(function), typechecker=beartype), function.__qualname__
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -69,16 +69,26 @@ class _Loader(SourceFileLoader):
 def _decorate(function: ast.FunctionDef) -> None:
     """Check the shapes of a function, if it has any, and nothing else of it."""
     arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
-    for argument in arguments:
-        if not _has_shape(argument.annotation):
-            argument.annotation = None
-    if not _has_shape(function.returns):
-        function.returns = None
-    if function.returns or any(argument.annotation for argument in arguments):
+    if any(map(_has_shape, [function.returns, *(argument.annotation for argument in arguments)])):
         decorator = ast.parse("__import__('shapes').checked", mode="eval").body
         for node in ast.walk(decorator):
             ast.copy_location(node, function)
         function.decorator_list.append(decorator)
+
+
+def _shapes_alone(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function, annotated with its shapes and nothing else."""
+    assert isinstance(function, FunctionType)
+    code, names = function.__code__, function.__globals__
+    bare = FunctionType(code, names, function.__name__, function.__defaults__, function.__closure__)
+    bare.__kwdefaults__, bare.__qualname__ = function.__kwdefaults__, function.__qualname__
+    bare.__module__ = function.__module__
+    bare.__annotations__ = {
+        name: text
+        for name, text in function.__annotations__.items()
+        if _has_shape(ast.parse(text, mode="eval").body)
+    }
+    return bare
 
 
 def _has_shape(annotation: ast.expr | None) -> bool:

@@ -154,7 +154,7 @@ def test_same_seed_same_bits():
         ({"fs": np.inf}, "fs is inf; give a positive number"),
         ({"band": (0.3, 0.6)}, "between 0 and fs / 2 = 0.5 Hz"),
         ({"band": (0.1, 0.1)}, "the band 0.1 to 0.1 Hz holds no line of a period of 64 samples"),
-        ({"grid": "even"}, "grid is 'even'; use 'full', 'odd' or 'random_odd'"),
+        ({"grid": "even"}, "grid is 'even'; give 'full', 'odd' or 'random_odd'"),
         ({"grid": "odd", "lines": [2, 4]}, "grid 'odd' needs 1 odd line(s) and there are 0"),
         ({"grid": "random_odd", "lines": [1, 3, 5]}, "needs 4 odd line(s) and there are 3"),
         ({"amplitude": np.ones(31)}, "amplitude has shape (31,); a period of 64 samples has 33"),

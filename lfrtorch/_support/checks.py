@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from functools import wraps
 from numbers import Integral, Real
@@ -44,9 +45,12 @@ def renamed(**new: str) -> Callable[[Function], Function]:
 
 def integer(name: str, value: Any, least: int, *, word: str = "") -> None:
     """Refuse what is not a whole number of at least ``least``, nor a word, with a ValueError."""
-    if word and value == word:
+    if word and isinstance(value, str) and value == word:
         return
-    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < least:
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if whole and abs(int(value)) > sys.maxsize:
+        raise InputError(f"{name} has more than 64 bits; give a smaller whole number.")
+    if not whole or int(value) < least:
         other = f", or {word}" if word else ""
         raise InputError(f"{name} is {value!r}; give a whole number of at least {least}{other}.")
 

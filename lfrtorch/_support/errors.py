@@ -7,12 +7,24 @@ class LfrtorchError(Exception):
     """An error that the package raises with a message for its user; any other is a bug."""
 
 
-class InputError(LfrtorchError, ValueError):
-    """What was given cannot be used: the message says what was expected and what to do."""
-
-
 LONGEST = 160
 """Characters of another library's message that are shown."""
+
+LONGEST_INPUT_ERROR = 1000
+"""Characters of a message, which may hold a value that was given."""
+
+
+class InputError(LfrtorchError, ValueError):
+    """What was given cannot be used: the message says what was expected and what to do.
+
+    The middle of a long one, which holds what was given, is left out.
+    """
+
+    def __init__(self, message: str) -> None:
+        if len(message) > LONGEST_INPUT_ERROR:
+            half = LONGEST_INPUT_ERROR // 2 - len(" ... ")
+            message = " ... ".join(" ".join(p.split()) for p in (message[:half], message[-half:]))
+        super().__init__(message)
 
 
 def brief(error: BaseException | str, longest: int = LONGEST) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from lfrtorch._support.arguments import typed
 from lfrtorch.analysis.block_structure import Structure, structure
 from lfrtorch.analysis.bounds import Bound, bound
 from lfrtorch.analysis.canonical_form import Canonical, canonical
@@ -46,6 +47,7 @@ __all__ = [
 ]
 
 
+@typed()
 def plot(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
     """Figure of a model: frequency responses, poles, and the nonlinearity of its static map.
 

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.tables import percent
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.canonical_form import MOST_SAMPLES, canonical
@@ -83,6 +84,7 @@ class Structure:
         )
 
 
+@typed()
 def structure(model: Model, records: Record | Sequence[Record]) -> Structure:
     """Is a model Wiener, Hammerstein, Wiener-Hammerstein, parallel, or a feedback loop?
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import engineering, number, quantity, table
@@ -56,6 +57,7 @@ class Bound:
         )
 
 
+@typed()
 def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) -> Bound:
     """What the states and outputs of a model stay within, whatever the input of an amplitude.
 

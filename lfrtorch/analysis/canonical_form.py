@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Complex128, Float
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.beyond_linear import Beyond
@@ -69,6 +70,7 @@ class Canonical:
     Z: Float[Array, "nz nz"]
 
 
+@typed()
 def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     """A model in its canonical form: the same for all weights that are the same model.
 

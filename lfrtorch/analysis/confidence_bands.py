@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.autograd.functional import jacobian
 from torch.func import functional_call
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import number as check_number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines, number, percent, quantities, table
@@ -270,6 +271,7 @@ class Uncertainty:
         return "\n".join([*map(in_lines, [*self.doubts, *lines]), "", table(head, rows)])
 
 
+@typed()
 def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty:
     """How far the parameters of a model are known from the records that it was fitted to.
 
@@ -301,8 +303,6 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
         18 parameters vary, 3 are held without loss; the data tell 18 directions of them
         ...
     """
-    if not isinstance(model, Model):
-        raise InputError(f"model is of type {type(model).__name__}; give a Model.")
     if model.K is not None:
         raise InputError(
             "this model has K: it was fitted to predictions, and bands are of fits to simulations; "
@@ -524,6 +524,7 @@ def _derivative_at_rest(model: Model, u: Float[Array, " nu"]) -> Float[Array, "n
     return torch.cat([part.flatten(1) for part in found], dim=1).numpy()
 
 
+@typed()
 def spread(models: Sequence[Model], data: Record | ArrayLike) -> Band:
     """The mean output of several models, and how far they differ.
 

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array
@@ -91,6 +92,7 @@ class Contraction:
         return "\n".join(lines)
 
 
+@typed()
 def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction:
     """A proof that a model contracts, with its rate and gain, or why there is none.
 

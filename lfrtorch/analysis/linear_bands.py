@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Complex128, Float
 from numpy.typing import ArrayLike
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
@@ -81,6 +82,7 @@ class PoleBand:
     damping_std: float
 
 
+@typed()
 def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
     """Frequency response with its covariance.
 
@@ -96,6 +98,7 @@ def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
         (2, 1, 1)
     """
     covariance = _covariance(model)
+    response = model.frf(frequencies)
     f = np.atleast_1d(reals("frequencies", frequencies))
     z = np.exp(2j * np.pi * f / model.fs)
     X, L = solve_resolvents(model.A, model.B, model.C, z)
@@ -103,9 +106,10 @@ def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
     J = response_jacobian(X, L, np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu)))
     parts = np.stack([J.real, J.imag], axis=-2)
     of = np.einsum("...ip,pq,...jq->...ij", parts, covariance, parts, optimize=True)
-    return ResponseBand(f, model.frf(f), of)
+    return ResponseBand(f, response, of)
 
 
+@typed()
 def pole_bands(model: LinearModel) -> tuple[PoleBand, ...]:
     """Poles with their standard deviations, by frequency; a conjugate pair counts once.
 

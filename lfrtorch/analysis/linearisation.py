@@ -7,6 +7,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import quantity
@@ -18,6 +19,7 @@ from lfrtorch.model import Model
 from lfrtorch.records import Channel
 
 
+@typed()
 def linearise(
     model: Model, u: ArrayLike | None = None, *, x: ArrayLike | None = None
 ) -> LinearModel:

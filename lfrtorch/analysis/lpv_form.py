@@ -18,6 +18,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from torch.nn import Module
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
@@ -169,6 +170,7 @@ class LPV:
         return y
 
 
+@typed()
 def lpv(
     model: Model,
     u: ArrayLike | None = None,

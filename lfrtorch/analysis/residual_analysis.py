@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines, number, quantity, table
 from lfrtorch._support.types import Array
@@ -156,6 +157,7 @@ class Residuals:
         return residual_figure(self.of(self.worst if record is None else record))
 
 
+@typed()
 def residuals(
     model: Model | LinearModel, records: Record | Sequence[Record], *, lags: int | None = None
 ) -> Residuals:
@@ -186,8 +188,6 @@ def residuals(
         >>> print(lfrtorch.analysis.residuals(bla, record))  # the record saturates
         record    output      samples  fit (%)  rms ...
     """
-    if not isinstance(model, Model | LinearModel):
-        raise InputError(f"model is of type {type(model).__name__}; give a Model or a LinearModel.")
     listed = as_records(records)
     return Residuals(
         tuple(

@@ -59,13 +59,15 @@ class LFRCell(nn.Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
+        for name, size in (("nu", nu), ("ny", ny), ("nx", nx)):
+            integer(name, size, 1)
+        for name, size in (("nz", nz), ("nw", nw)):
+            integer(name, size, 0)
         if (static is None) != (nw == 0) or (nz == 0) != (nw == 0):
             raise InputError(
                 f"nz={nz}, nw={nw} with static={static}: a static nonlinearity needs nz >= 1 and "
                 "nw >= 1, and a linear model has neither."
             )
-        for name, size in (("nu", nu), ("ny", ny), ("nx", nx)):
-            integer(name, size, 1)
         self.nu, self.ny, self.nx, self.nz, self.nw = nu, ny, nx, nz, nw
 
         def matrix(rows: int, columns: int) -> nn.Parameter:

@@ -72,7 +72,8 @@ class Network(Module):
             raise InputError(
                 f"activation is {activation!r}; use one of {', '.join(sorted(ACTIVATIONS))}."
             )
-        integer("layers", layers, 1)
+        for name, size in (("nz", nz), ("nw", nw), ("nn", nn), ("layers", layers)):
+            integer(name, size, 1)
         self.activation, self.layers = activation, layers
         self.Wz = Parameter(torch.empty(nn, nz, device=device, dtype=dtype))
         self.bz = Parameter(torch.empty(nn, device=device, dtype=dtype))
@@ -172,7 +173,8 @@ class Polynomial(Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        integer("degree", degree, 1)
+        for name, size in (("nz", nz), ("nw", nw), ("degree", degree)):
+            integer(name, size, 1)
         check_memory(
             nw * math.comb(nz + degree, degree) * BYTES,
             f"a polynomial with nz={nz}, nw={nw} and degree={degree}",

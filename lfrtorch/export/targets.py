@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lfrtorch._support import checkpoint
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
@@ -100,6 +101,7 @@ TARGETS = {
 """All kinds of export."""
 
 
+@typed()
 def write(
     model: Model | LinearModel,
     to: str,

@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 from numbers import Real
 from pathlib import Path
-from typing import Literal, TypeGuard, cast, get_args
+from typing import Any, Literal, TypeGuard, cast
 
 from numpy.typing import ArrayLike
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, number
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch.dataset import Dataset
 from lfrtorch.files.excel import workbook
 from lfrtorch.files.formats import similar
@@ -58,6 +59,7 @@ class _Whole:
     stretch: bool
 
 
+@typed("path", "inputs", "outputs", "reference")
 def load_records(
     path: Paths,
     *,
@@ -133,10 +135,6 @@ def load_records(
         >>> [len(records) for records in (data.train, data.validation, data.tests)]
         [1, 1, 1]
     """
-    if not isinstance(units or {}, Mapping):
-        raise InputError(
-            f"units is {units!r}; give that of each channel by its name: {{'force': 'N'}}."
-        )
     reader = _Reader(
         Wanted(inputs, outputs, fs, time, dict(units or {}), gaps, reference),
         start,
@@ -202,8 +200,6 @@ class _Reader:
         *,
         unseen: float,
     ) -> None:
-        if start not in get_args(Start):
-            raise InputError(f"start is {start!r}; use 'zero', 'estimated' or 'periodic'.")
         if period not in (None, "auto"):
             integer("period", period, 1)
         if skip is not None:
@@ -352,13 +348,14 @@ class _Reader:
         return record, notes
 
 
-def listed_files(given: Paths | None, option: str) -> list[Path]:
+def listed_files(given: Any, option: str) -> list[Path]:
     """The files of paths and patterns, those of a pattern in the order of people's counting."""
-    listed = [given] if isinstance(given, str | Path) else list(given or [])
+    several = isinstance(given, Iterable) and not isinstance(given, str | Path)
+    listed: list[Any] = [*given] if several else [given]
     if not listed or not all(isinstance(path, str | Path) for path in listed):
         raise InputError(
-            f"{option} is {given!r}; give the path of a file, a pattern as 'runs/*.csv', or a list "
-            "of these."
+            f"{option} is {brief(repr(given))}; give the path of a file, a pattern as "
+            "'runs/*.csv', or a list of these."
         )
     found: list[Path] = []
     for entry in listed:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +43,6 @@ class Wanted:
     def __post_init__(self) -> None:
         if self.fs is not None:
             number("fs", self.fs, positive=True)
-        if self.gaps not in get_args(Gaps):
-            raise InputError(f"gaps is {self.gaps!r}; use 'error' or 'split'.")
 
 
 class Stretch(NamedTuple):

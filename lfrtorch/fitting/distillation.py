@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from lfrtorch._support.arguments import typed
+from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
@@ -35,6 +37,7 @@ PASSES = 30
 """Passes that give a shuffled input the spectrum of the data's."""
 
 
+@typed()
 def distil(
     result: FitResult,
     train: Record | Sequence[Record],
@@ -71,6 +74,7 @@ def distil(
         >>> lfrtorch.distil(mean, record, trainer=trainer).model.sizes
         {'nx': 1, 'nz': 1, 'nw': 1, 'nn': 4}
     """
+    integer("seed", seed, 0)
     if not result.members:
         raise InputError("the model is no mean of several; fit several starts with average=4.")
     train, rng = as_records(train), np.random.default_rng(seed)

@@ -40,6 +40,7 @@ import torch
 from torch import Tensor
 from torch.nn import Module
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex, Integers
@@ -318,6 +319,7 @@ def _least_squares(M: Array, b: Array) -> Array:
     return scipy.linalg.cho_solve(factor, right / scale) / scale
 
 
+@typed("dtype")
 def infer(
     bla: LinearModel,
     records: Record | Sequence[Record],

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
@@ -16,6 +17,7 @@ from lfrtorch.engine.nonlinearity import Network, is_network
 from lfrtorch.model import Model
 
 
+@typed()
 def mean_model(models: Sequence[Model]) -> Model:
     """The model whose output is the mean of the outputs of several models.
 

@@ -29,6 +29,7 @@ from typing import Any, cast
 
 import torch
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, renamed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT, Reason, told
@@ -80,6 +81,7 @@ starts is so by luck, too, on the records that chose it."""
 
 
 @renamed(optimiser="trainer", model="models")
+@typed("models")
 @spread_by_hand()
 def fit(
     models: Model | Sequence[Model],
@@ -199,9 +201,9 @@ def fit(
     return replace(result, model=result.model.innovation_form(), members=members)
 
 
-def _different(models: Sequence[Model]) -> list[Model]:
+def _different(models: Any) -> list[Model]:
     """The models as a list; refuse one that is none, or has its weights in common with another."""
-    starts = list(models)
+    starts = list(models) if isinstance(models, list | tuple) else [models]
     for number, model in enumerate(starts):
         if not isinstance(model, Model):
             raise InputError(

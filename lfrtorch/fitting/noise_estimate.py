@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import scipy
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.types import Array
 from lfrtorch.extended_kalman_filter import ExtendedKalmanFilter, NoiseCovariance, inside_limits
 from lfrtorch.model import Model
@@ -23,6 +24,7 @@ DIFFERENCE = 1e-4
 """Of the logarithm of a variance, for the gradient."""
 
 
+@typed()
 def estimate_noise(model: Model, records: Record | Sequence[Record]) -> NoiseCovariance:
     """The noise that an extended Kalman filter of a model needs, from records.
 

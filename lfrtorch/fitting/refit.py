@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from lfrtorch._support.arguments import typed
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.prediction import Noise
@@ -26,6 +27,7 @@ from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.records import Record, as_records
 
 
+@typed()
 def refit(
     result: FitResult,
     train: Record | Sequence[Record],

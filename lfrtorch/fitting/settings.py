@@ -10,7 +10,8 @@ from typing import Any, Literal
 import torch
 from torch.nn import Module
 
-from lfrtorch._support.checks import integer, number, true_or_false
+from lfrtorch._support.arguments import typed
+from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import check_dtype
 from lfrtorch.engine.nonlinearity import Polynomial
@@ -32,6 +33,7 @@ SEED_STEP = 1000
 """Distance of the seeds of several starts."""
 
 
+@typed("method")
 @dataclass(frozen=True, kw_only=True)
 class SizesSearch:
     """What is tried for the sizes that are ``"auto"``, see :func:`lfrtorch.search_sizes`.
@@ -66,7 +68,7 @@ class SizesSearch:
     folds: int = 0
 
     def __post_init__(self) -> None:
-        if self.method not in ("race", "group_lasso"):
+        if str(self.method) not in ("race", "group_lasso"):
             raise InputError(
                 f"sizes_search.method is {self.method!r}; use 'race' or 'group_lasso'."
             )
@@ -81,6 +83,7 @@ class SizesSearch:
         number("sizes_search.iterations", self.iterations, positive=True)
 
 
+@typed("init_from", "trainer", "nx", "nz", "nw", "nn", "degree")
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """How a model is identified; see :func:`lfrtorch.identify`.
@@ -201,18 +204,12 @@ class Settings:
                     f"distil is for noise='output', and noise is {self.noise!r}; give one of them."
                 )
         integer("seed", self.seed, 0)
-        for name in ("distil", "refit", "z_feedthrough", "feedthrough"):
-            true_or_false(name, getattr(self, name))
         if not self.feedthrough:
             object.__setattr__(self, "linear", {**self.linear, "feedthrough": False})
         known = [*signature(estimate_bla).parameters][2:]
         for name in self.linear:
             if name not in known:
                 raise InputError(f"linear has no option '{name}'; there are {', '.join(known)}.")
-        if self.init not in ("zero_output", "paper", "inference"):
-            raise InputError(
-                f"init is {self.init!r}; use 'zero_output', 'paper' or 'inference' (periodic data)."
-            )
         if self.minor is not None:
             number("minor", self.minor)
         number("first_part", self.first_part, positive=True)

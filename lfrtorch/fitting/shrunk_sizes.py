@@ -24,6 +24,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lfrtorch._support.arguments import typed
+from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
@@ -43,6 +45,7 @@ from lfrtorch.fitting.size_search import (
     Judge,
     Sizes,
     SizeSearch,
+    begun,
     check_whole,
     sizes_to_try,
 )
@@ -75,6 +78,7 @@ WORSE = 1.5
 """Ratio of errors on validation at which larger penalties are not tried."""
 
 
+@typed()
 @spread_by_hand()
 def shrink_sizes(
     start: Callable[[Sizes, int], Model],
@@ -134,15 +138,17 @@ def shrink_sizes(
     tried = {name: sizes_to_try(name, values) for name, values in given.items()}
     searched = [name for name, values in tried.items() if len(values) > 1]
     for name, several in (("seeds", seeds), ("weights", weights)):
-        if not several:
+        if not len(several):
             raise InputError(f"{name} is empty; give one at least.")
+    for weight in weights:
+        number("each of the weights", weight)
     if not validation:
         raise InputError(
             "there are no validation records, on which sizes are chosen; give some, or set "
             f"{', '.join(tried)} to numbers."
         )
     largest = {name: values[-1] for name, values in tried.items()}
-    models = [replace(start(largest, seed), K=None) for seed in seeds]
+    models = [replace(begun(start, largest, seed), K=None) for seed in seeds]
     _check_cell(models[0].lfr.cell, searched)
     if any(map(is_open, as_records(validation))):  # the same samples for all sizes
         model = models[0] if linear is None else linear.to_model()

@@ -32,8 +32,9 @@ import numpy as np
 import torch
 
 from lfrtorch._support import tables
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, renamed
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import spread_by_hand
@@ -255,6 +256,7 @@ def _known(error: float | None) -> bool:
 
 
 @renamed(optimiser="trainer")
+@typed()
 @spread_by_hand()
 def search_sizes(
     start: Callable[[Sizes, int], Model],
@@ -326,7 +328,7 @@ def search_sizes(
     tried = {name: sizes_to_try(name, values) for name, values in given.items()}
     integer("finalists", finalists, 1)
     integer("folds", folds, 0)
-    if not seeds:
+    if not len(seeds):
         raise InputError("seeds is empty; give one for each start, for example (0, 1000).")
     if not validation:
         raise InputError(
@@ -342,7 +344,7 @@ def search_sizes(
     trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer
     if any(map(is_open, as_records(validation))):  # the same samples for all sizes
         first = {name: values[0] for name, values in tried.items()}
-        model = start(first, seeds[0]) if linear is None else linear.to_model()
+        model = begun(start, first, seeds[0]) if linear is None else linear.to_model()
         validation, _ = settled(model, as_records(validation), as_records(train))
     scale = Scaler.of(as_records(validation)).y_scale
     judge, clock = Judge(as_records(validation), linear, ranks, scale), time.perf_counter()
@@ -354,7 +356,7 @@ def search_sizes(
     options["simulation"], options["horizon"] = SIMULATION.get(noise, 0.0), horizon
     options["stop"] = any_of(halt, stop) if ranks.world == 1 else stop
     field = [
-        _Runner(sizes, seed, Fit(start(sizes, seed), train, validation, **options))
+        _Runner(sizes, seed, Fit(begun(start, sizes, seed), train, validation, **options))
         for sizes, seed in drawn
     ]
     left: list[Candidate] = []
@@ -381,7 +383,7 @@ def search_sizes(
             judges = [Judge(part.left_out, linear, ranks, scale) for part in parts]
             fits = [
                 [
-                    Fit(start(r.sizes, r.seed), part.train, part.left_out, **options)
+                    Fit(begun(start, r.sizes, r.seed), part.train, part.left_out, **options)
                     for part in parts
                 ]
                 for r in field
@@ -517,6 +519,14 @@ def _ratio(error: float, linear: Array, counts: Integers) -> float:
         return nan
     least = _relative(linear, counts)[0]
     return error / least if least else nan
+
+
+def begun(start: Callable[[Sizes, int], Model], sizes: Sizes, seed: int) -> Model:
+    """A model of some sizes to start from."""
+    model = start(sizes, seed)
+    if not isinstance(model, Model):
+        raise InputError(f"start({sizes}, {seed}) returned {brief(repr(model))}; return a Model.")
+    return model
 
 
 def sizes_to_try(name: str, given: int | Sequence[int]) -> list[int]:

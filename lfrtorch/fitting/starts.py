@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import Module
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
@@ -37,6 +38,7 @@ OUTPUT_WEIGHTS: dict[type[Module], tuple[str, ...]] = {Network: ("Ww", "bw"), Po
 """The weights of a static map that make its output vanish."""
 
 
+@typed("dtype")
 def initialise(
     bla: LinearModel,
     records: Record | Sequence[Record],
@@ -139,8 +141,6 @@ def initialise(
     integer("relaxations", relaxations, 0)
     integer("modes", modes, 0)
     check_dtype(dtype)
-    if method not in ("zero_output", "paper"):
-        raise InputError(f"init method is {method!r}; use 'zero_output' or 'paper'.")
     if structure != "free":
         _check_structure(structure, nz, nw, nn, layers, static, relaxations + modes, z_feedthrough)
     if not feedthrough:
@@ -157,7 +157,7 @@ def initialise(
         rms_scale([r.y for r in data], bla.y_offset),
     )
     sizes = len(bla.inputs), len(bla.outputs), len(bla.A)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(int(seed))
     if static is None:
         integer("nn", nn, 1)
         assert nn is not None

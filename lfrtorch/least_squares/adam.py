@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._support.checks import integer, number, renamed, true_or_false
+from lfrtorch._support.arguments import typed
+from lfrtorch._support.checks import integer, number, renamed
 from lfrtorch._support.reasons import Reason
 
 
@@ -45,6 +46,7 @@ class AdamState:
 
 
 @renamed(epochs="max_iter")
+@typed()
 @dataclass(frozen=True)
 class Adam:
     """Options of ``torch.optim.Adam``; ``init`` and ``step`` run it.
@@ -73,8 +75,6 @@ class Adam:
     def __post_init__(self) -> None:
         number("learning_rate", self.learning_rate, positive=True)
         integer("max_iter", self.max_iter, 0)
-        true_or_false("stable", self.stable)
-        true_or_false("contracting", self.contracting)
 
     @property
     def limit(self) -> int:

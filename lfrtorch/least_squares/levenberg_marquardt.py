@@ -23,7 +23,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._support.checks import integer, number, true_or_false
+from lfrtorch._support.arguments import typed
+from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import Reason
 from lfrtorch.least_squares.linear_systems import SVDSystem, System
@@ -179,6 +180,7 @@ class _Trial(NamedTuple):
     gain_ratio: float
 
 
+@typed()
 @dataclass(frozen=True)
 class LevenbergMarquardt:
     """Options of the search; ``init`` and ``step`` run it.
@@ -232,8 +234,6 @@ class LevenbergMarquardt:
             number(name, getattr(self, name))
         integer("max_iter", self.max_iter, 0)
         integer("patience", self.patience, 1)
-        true_or_false("stable", self.stable)
-        true_or_false("contracting", self.contracting)
 
     @property
     def limit(self) -> int:

@@ -11,10 +11,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import radius
@@ -76,6 +77,7 @@ BETTER = 0.25
 """The data come from an unstable system if its cost is below this part of a stable model's."""
 
 
+@typed()
 @spread_by_hand()
 def estimate_bla(
     data: Record | Sequence[Record] | FRF,
@@ -154,12 +156,6 @@ def estimate_bla(
     clock = time.perf_counter()
     integer("nx", nx, 1)
     integer("max_iter", max_iter, 0)
-    if coordinates not in ("balanced", "given"):
-        raise InputError(f"coordinates is {coordinates!r}; use 'balanced' or 'given'.")
-    if refine not in (None, *get_args(Criterion)):
-        raise InputError(f"refine is {refine!r}; use 'simulation', 'prediction' or 'frequency'.")
-    if integrators not in (0, 1, 2):
-        raise InputError(f"integrators is {integrators!r}; use 0, 1 or 2, for each output.")
     if integrators and refine == "prediction":
         raise InputError(
             "integrators are for refine='simulation' or 'frequency'; a prediction finds poles near "

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Complex128, Float
 from numpy.typing import ArrayLike
 
 from lfrtorch._support import checks
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import dft_lines, integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import spread_by_hand
@@ -196,6 +197,7 @@ class FRF:
         )
 
 
+@typed()
 @spread_by_hand()
 def estimate_frf(
     records: Record | Sequence[Record],
@@ -268,10 +270,6 @@ def estimate_frf(
         and 7 (local polynomial method).
     """
     data = as_records(records)
-    if method not in get_args(Method):
-        raise InputError(
-            f"method is {method!r}; use 'auto', 'robust', 'fast' or 'local_polynomial'."
-        )
     integer("order", order, 0)
     if degrees_of_freedom is not None:
         integer("degrees_of_freedom", degrees_of_freedom, 1)

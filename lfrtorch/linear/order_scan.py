@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lfrtorch._support import tables
+from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import number, quantity
@@ -118,6 +119,7 @@ class OrderScan:
         return tables.table(head, rows, digits=4)
 
 
+@typed("validation")
 def scan_orders(
     data: Record | Sequence[Record] | FRF,
     orders: Sequence[int] = ORDERS,
@@ -152,7 +154,8 @@ def scan_orders(
     """
     outputs = data.outputs if isinstance(data, FRF) else as_records(data)[0].outputs
     orders = _rising(orders, options.get("integrators", 0) * len(outputs))
-    judges = as_records(validation) if validation else []
+    none = isinstance(validation, list | tuple) and not validation
+    judges = [] if none else as_records(validation)
     records = [] if isinstance(data, FRF) else [without_coordinates(r) for r in as_records(data)]
     if records:
         check_signals(records)

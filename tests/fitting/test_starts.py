@@ -169,7 +169,7 @@ def test_size_below_one(bla: LinearModel, size: str):
 
 
 def test_unknown_method(bla: LinearModel):
-    with pytest.raises(ValueError, match="method is 'random'; use 'zero_output' or 'paper'"):
+    with pytest.raises(ValueError, match="method is 'random'; give 'zero_output' or 'paper'"):
         initialise(bla, RECORDS, **SIZES, method="random")  # pyright: ignore[reportArgumentType]
 
 

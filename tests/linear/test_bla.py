@@ -256,7 +256,7 @@ def test_order(nx: int):
 
 def test_coordinates():
     refused(
-        "coordinates is 'modal'; use 'balanced' or 'given'.",
+        "coordinates is 'modal'; give 'balanced' or 'given'.",
         record_of(random_system(1), "zero"),
         1,
         coordinates="modal",
@@ -576,7 +576,7 @@ def test_fewer_lines_than_unknowns():
 
 def test_error_and_data_must_go_together():
     record = record_of(random_system(1), "periodic")
-    refused("refine is 'output'; use 'simulation', 'prediction' or", record, refine="output")
+    refused("refine is 'output'; give 'simulation', 'prediction'", record, refine="output")
     refused("weight is that of a response: use refine='frequency'.", record, weight="noise")
     with pytest.raises(ValueError, match="refine is 'simulation', an error of records"):
         estimate_bla(estimate_frf(record), 1, refine="simulation")

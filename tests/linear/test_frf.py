@@ -386,7 +386,7 @@ def twice(u: Array) -> Array:
     ("records", "options", "message"),
     [
         ([], {}, "no record given"),
-        (lab(FULL.u[0]), {"method": "etfe"}, "method is 'etfe'; use 'auto', 'robust', 'fast' or"),
+        (lab(FULL.u[0]), {"method": "etfe"}, "method is 'etfe'; give 'auto', 'robust', 'fast' or"),
         (lab(FULL.u[0]), {"order": -1}, "order is -1; give a whole number of at least 0"),
         (lab(FULL.u[0]), {"degrees_of_freedom": 0}, "degrees_of_freedom is 0; give a whole"),
         (

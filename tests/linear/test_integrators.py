@@ -153,7 +153,7 @@ def test_orders_below_the_integrators(tmp_path):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"integrators": 3}, "use 0, 1 or 2"),
+        ({"integrators": 3}, "give 0, 1 or 2"),
         ({"integrators": 2, "nx": 1}, "raise nx"),
         ({"integrators": 1, "refine": "prediction"}, "integrators are for refine"),
     ],

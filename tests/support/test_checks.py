@@ -20,6 +20,12 @@ def test_anything_else_is_named(value):
         integer("nx", value, 3)
 
 
+@pytest.mark.parametrize("value", [2**63, 10**20, 10**5000, -(10**5000)], ids=int.bit_length)
+def test_whole_numbers_of_more_than_64_bits_are_refused(value):
+    with pytest.raises(ValueError, match="seed has more than 64 bits; give a smaller whole number"):
+        integer("seed", value, 0)
+
+
 @pytest.mark.parametrize("value", [0, 0.5, np.float64(2), 7])
 def test_numbers_pass(value):
     number("ridge", value)

@@ -1,0 +1,156 @@
+"""Arguments of public functions are of the types that their hints name, or a message says so."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, wraps
+from numbers import Integral, Real
+from types import NoneType, SimpleNamespace, UnionType
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lfrtorch._support.errors import InputError, brief
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+LONGEST = 80
+"""Characters of a value that a message shows."""
+
+NUMBERS = {int: Integral, float: Real}
+UNIONS = (Union, UnionType)
+NAMES: dict[Any, str] = {
+    NoneType: "None", bool: "True or False", int: "a whole number", float: "a number",
+    str: "a text", Mapping: "a dict", Callable: "a function", np.ndarray: "an array",
+}  # fmt: skip
+
+
+def typed(*own: str) -> Callable[[Function], Function]:
+    """Let a function or class refuse arguments of other types than its hints name.
+
+    Numbers and arrays alone are left to the function, which knows more about them.
+
+    Args:
+        own: arguments that the function looks at itself.
+
+    Raises:
+        InputError: by the function, with the argument's name, its value and what to give.
+
+    Example:
+        >>> from typing import Literal
+        >>> from lfrtorch._support.arguments import typed
+        >>> @typed()
+        ... def drawn(kind: Literal["line", "bar"], grid: bool = True): ...
+        >>> drawn("bars")
+        Traceback (most recent call last):
+        ...
+        lfrtorch._support.errors.InputError: kind is 'bars'; give 'line' or 'bar'.
+    """
+
+    def decorate(function: Function) -> Function:
+        inner = function.__init__ if isinstance(function, type) else function
+        signature = inspect.signature(inner)
+        starred = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        several = {name for name, given in signature.parameters.items() if given.kind in starred}
+
+        @cache
+        def hints() -> dict[str, Any]:
+            left = {"return", *several, *own}
+            texts = {name: t for name, t in inner.__annotations__.items() if name not in left}
+            names = inspect.unwrap(inner).__globals__
+            found = get_type_hints(SimpleNamespace(__annotations__=texts), names)
+            return {name: hint for name, hint in found.items() if hint not in NUMBERS}
+
+        @wraps(inner)
+        def checked(*args: Any, **kwargs: Any) -> Any:
+            given = signature.bind(*args, **kwargs).arguments
+            for name, hint in hints().items():
+                if name in given and not is_of(given[name], hint):
+                    raise InputError(
+                        f"{name} is {brief(repr(given[name]), LONGEST)}; give {wanted(hint)}."
+                    )
+            return inner(*args, **kwargs)
+
+        if not isinstance(function, type):
+            return cast(Function, checked)
+        function.__init__ = checked
+        return cast(Function, function)
+
+    return decorate
+
+
+def is_of(value: Any, hint: Any) -> bool:
+    """Whether a value is of the type of a hint; True if the hint is not looked at.
+
+    Example:
+        >>> from collections.abc import Sequence
+        >>> from lfrtorch._support.arguments import is_of
+        >>> is_of([1, 2], int | Sequence[int]), is_of([1, "x"], int | Sequence[int])
+        (True, False)
+    """
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in UNIONS:
+        return any(is_of(value, one) for one in inner)
+    if origin is Literal:
+        plain = value.item() if isinstance(value, np.generic) else value
+        return any((type(plain), plain) == (type(one), one) for one in inner)
+    if origin is Sequence:
+        arrays = isinstance(value, np.ndarray) and inner[0] in NUMBERS
+        several = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+        return (several or arrays) and all(is_of(one, inner[0]) for one in value)
+    if origin is Iterable:
+        return isinstance(value, Iterable) and not isinstance(value, str | bytes)
+    if origin is Mapping:
+        return isinstance(value, Mapping)
+    if origin is Callable:
+        return callable(value)
+    if hint is bool:
+        return isinstance(value, bool | np.bool_)
+    if hint in NUMBERS:
+        return isinstance(value, NUMBERS[hint]) and not isinstance(value, bool)
+    if getattr(hint, "_is_protocol", False):
+        return all(hasattr(value, name) for name in vars(hint) if not name.startswith("_"))
+    return (
+        hint is Any or origin is not None or not isinstance(hint, type) or isinstance(value, hint)
+    )
+
+
+def wanted(hint: Any) -> str:
+    """What a hint asks for.
+
+    Example:
+        >>> from collections.abc import Sequence
+        >>> from typing import Literal
+        >>> from lfrtorch._support.arguments import wanted
+        >>> wanted(int | Sequence[int] | Literal["auto"])
+        "a whole number, several of them or 'auto'"
+    """
+    *others, last = _choices(hint)
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _choices(hint: Any) -> list[str]:
+    """What a hint asks for, one text for each kind."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in UNIONS:
+        arrays = get_args(ArrayLike)
+        if not set(arrays) <= set(inner):
+            return [text for one in inner for text in _several(one, inner) or _choices(one)]
+        return ["an array", *(text for one in inner if one not in arrays for text in _choices(one))]
+    if origin is Literal:
+        return [repr(one) for one in inner]
+    if origin in (Sequence, Iterable):
+        return [f"a list of: {wanted(inner[0])}"]
+    kind = origin or hint
+    name = getattr(kind, "__name__", str(kind))
+    return [NAMES.get(kind) or f"{'an' if name[0] in 'AEIO' or name.isupper() else 'a'} {name}"]
+
+
+def _several(hint: Any, others: tuple[Any, ...]) -> list[str]:
+    """That several of another kind can be given, too, if they can."""
+    alike = get_origin(hint) is Sequence and set(_choices(get_args(hint)[0])) <= {
+        text for one in others if one is not hint for text in _choices(one)
+    }
+    return ["several of them"] if alike else []
