@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig
@@ -35,15 +36,15 @@ def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None
             yield
         return
     except InstantiationException as failed:
+        if isinstance(failed.__cause__, TerminatedError):
+            _end(failed.__cause__, rank)
         if failed.__cause__ and not _of_the_user(failed.__cause__):
             raise failed.__cause__ from None
         group = re.search(r"^full_key: (.+)$", str(failed), re.MULTILINE)
         where = f"{group[1]}: " if group and failed.__cause__ else ""
         show(f"{where}{_said(failed.__cause__ or failed)}")
     except TerminatedError as end:
-        if rank == "0":
-            print(end, file=sys.stderr)
-        sys.exit(128 + end.number)
+        _end(end, rank)
     except (LfrtorchError, OSError) as failed:
         show(str(failed))
     except (MemoryError, RuntimeError) as failed:
@@ -54,6 +55,13 @@ def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None
         print("interrupted outside the fit: nothing to keep", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
     sys.exit(1)
+
+
+def _end(end: TerminatedError, rank: str) -> NoReturn:
+    """Exit as a program does that a signal ended."""
+    if rank == "0":
+        print(end, file=sys.stderr)
+    sys.exit(128 + end.number)
 
 
 def _of_the_user(cause: BaseException) -> bool:

@@ -276,7 +276,7 @@ def _fitted(
         )
     snapshots.restore(fits)
     unseen = [r for some in (validation, selection) if some for r in as_records(some)]
-    field = fits
+    field, cut = fits, None
     with ExitStack() as ending:
         if monitors is None and ranks.rank == 0:
             line = line_of(starts, planned)
@@ -313,6 +313,8 @@ def _fitted(
                 field = _drop_others(field, field[:kept])
     ranked = judge.ranked(fits)
     result = ranked[0].result()
+    if cut is not None:  # the best start may have come to its end, but not all of those beside it
+        result = replace(result, reason=cut.reason, detail=cut.detail)
     if not alone:
         result = replace(result, starts=judge.summaries(ranked))
     if average > 1:

@@ -36,6 +36,14 @@ def test_errors_of_users_are_one_line(kind: Callable[[str], Exception], capsys):
     assert printed(capsys, lambda: instantiate({"a": target})["a"]) == f"error: a: {message}\n"
 
 
+def test_a_signal_while_hydra_builds_an_object_ends_the_program(capsys):
+    target = {"_target_": signal.raise_signal, "_args_": [signal.SIGTERM]}
+    with pytest.raises(SystemExit) as ended, user_errors():
+        instantiate({"data": target})
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "terminated outside the fit: nothing to keep\n"
+
+
 class Swallows:
     """Loses what is raised in it, as a library does where compiled code calls Python."""
 

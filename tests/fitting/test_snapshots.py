@@ -198,6 +198,26 @@ def test_a_start_that_had_not_begun_takes_part_after_that(tmp_path: Path):
         assert outcome(run(starts(3), data, folder, trainer=optimiser)) == outcome(whole)
 
 
+def test_a_fit_is_cut_short_if_a_start_beside_the_best_is(tmp_path: Path):
+    data, optimiser = records(["zero"]), LevenbergMarquardt(max_iter=4)
+    whole = run(starts(3), data, trainer=optimiser)
+    ends = 0
+    for after in range(9, 16):
+        folder, calls = tmp_path / str(after), itertools.count()
+        folder.mkdir()
+
+        def stop(calls: Iterator[int] = calls, after: int = after) -> bool:
+            return next(calls) >= after
+
+        cut = run(starts(3), data, folder, trainer=optimiser, own_stop=stop)
+        if cut.reason != Reason.INTERRUPTED:
+            assert outcome(cut) == outcome(whole)
+            break
+        ends += any(start.reason == Reason.ALL_ITERATIONS for start in cut.starts)
+        assert outcome(run(starts(3), data, folder, trainer=optimiser)) == outcome(whole)
+    assert ends
+
+
 def test_more_iterations_than_were_asked_for(tmp_path: Path):
     data = records()
     for limit in (3, 9):
