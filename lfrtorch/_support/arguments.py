@@ -142,7 +142,7 @@ def _choices(hint: Any) -> list[str]:
     if origin is Literal:
         return [repr(one) for one in inner]
     if origin in (Sequence, Iterable):
-        return [f"a list of: {wanted(inner[0])}"]
+        return [f"a list (each: {wanted(inner[0])})"]
     kind = origin or hint
     name = getattr(kind, "__name__", str(kind))
     return [NAMES.get(kind) or f"{'an' if name[0] in 'AEIO' or name.isupper() else 'a'} {name}"]

@@ -33,7 +33,6 @@ SEED_STEP = 1000
 """Distance of the seeds of several starts."""
 
 
-@typed("method")
 @dataclass(frozen=True, kw_only=True)
 class SizesSearch:
     """What is tried for the sizes that are ``"auto"``, see :func:`lfrtorch.search_sizes`.
@@ -68,7 +67,7 @@ class SizesSearch:
     folds: int = 0
 
     def __post_init__(self) -> None:
-        if str(self.method) not in ("race", "group_lasso"):
+        if self.method not in ("race", "group_lasso"):
             raise InputError(
                 f"sizes_search.method is {self.method!r}; use 'race' or 'group_lasso'."
             )
@@ -83,7 +82,7 @@ class SizesSearch:
         number("sizes_search.iterations", self.iterations, positive=True)
 
 
-@typed("init_from", "trainer", "nx", "nz", "nw", "nn", "degree")
+@typed("init_from", "trainer", "static", "nx", "nz", "nw", "nn", "degree")
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """How a model is identified; see :func:`lfrtorch.identify`.

@@ -54,7 +54,7 @@ def test_values_of_the_hint_pass_alone(hint: Any, good: list[Any], bad: list[Any
         (ArrayLike | None, "an array or None"),
         (str | Path | Sequence[str | Path], "a text, a Path or several of them"),
         (lfrtorch.FRF, "an FRF"),
-        (Sequence[lfrtorch.Model], "a list of: a Model"),
+        (Sequence[lfrtorch.Model], "a list (each: a Model)"),
     ],
 )
 def test_what_to_give_is_said(hint: Any, said: str):
