@@ -6,7 +6,7 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all test-machines test-min test-latest mutants coverage check bench first-try reproduce docs docs-links dist clean
+.PHONY: help setup run test test-all test-machines test-min test-latest torture mutants coverage check bench first-try reproduce docs docs-links dist clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -38,6 +38,9 @@ coverage: $(READY)  ## lines and branches of lfrtorch/ that the fast tests reach
 mutants: $(READY)  ## faults put into the numerical core: does a test notice? (up to an hour)
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[mutants]'
 	@$(BIN)/python tests/mutants.py $(ARGS)
+
+torture: $(READY)  ## kills, signals, full disks and nonsense: the page docs/measured/torture.md (an hour)
+	@PYTHONPATH=tests $(BIN)/python tests/torture.py $(ARGS)
 
 check: $(READY)  ## format, lint, types, import order
 	@$(BIN)/ruff format --check .
