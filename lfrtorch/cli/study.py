@@ -55,11 +55,19 @@ LONGEST = 120
 ATTEMPTS = 3
 """How often the runs that are left are begun if processes are killed that many runs share."""
 
-KILLED = {"BrokenProcessPool", "UncompletedJobError"}
-"""Errors of joblib and submitit if one of their processes is."""
+KILLED = {"BrokenProcessPool", "UncompletedJobError", "WorkerCrashedError", "NodeDiedError"}
+"""Errors of joblib, submitit and Ray if one of their processes is."""
 
-LAUNCHERS = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit"}
-"""What starts several runs at once, and the plugin of Hydra that has it."""
+LAUNCHERS = {
+    "joblib": "hydra_plugins.hydra_joblib_launcher",
+    "submitit_local": "hydra_plugins.hydra_submitit_launcher",
+    "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
+    "ray": "ray",
+}
+"""What starts several runs at once, and the package that it needs."""
+
+REQUESTS = 1.0
+"""Seconds after which a worker of Ray looks whether its run is to end: no signal wakes it."""
 
 IN_SEQUENCE = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 
@@ -101,8 +109,8 @@ def study_words(given: Sequence[str]) -> list[str]:
         )
     words = [parsed(word) for word in given if not word.startswith("-")]
     for word in words:
-        plugin = word.key_or_group == "hydra/launcher" and LAUNCHERS.get(str(word.value()))
-        if plugin and find_spec(f"hydra_plugins.hydra_{plugin}_launcher") is None:
+        package = word.key_or_group == "hydra/launcher" and LAUNCHERS.get(str(word.value()))
+        if package and find_spec(package) is None:
             raise InputError(f"{word.input_line} needs: pip install 'lfrtorch[sweep]'.")
     common = [word for word in words if not (word.is_sweep_override() or word.is_hydra_override())]
     for word in words:
@@ -216,7 +224,8 @@ def _apart(
     process.start()
     theirs.close()
     try:
-        process.join()
+        while process.exitcode is None:
+            process.join(REQUESTS)
     except KeyboardInterrupt:  # it was asked to end as well, and keeps what it found
         process.join()
         raise
@@ -303,9 +312,11 @@ def went_on(launched: Callable[[], Any]) -> None:
     for _ in range(ATTEMPTS):
         try:
             return launched()
-        except KeyboardInterrupt:
-            print("interrupted: the same command with that folder goes on", file=sys.stderr)
-            sys.exit(128 + signal.SIGINT)
+        except (KeyboardInterrupt, TerminatedError) as end:
+            number = getattr(end, "number", signal.SIGINT)
+            how = "interrupted" if number == signal.SIGINT else "terminated"
+            print(f"{how}: the same command with that folder goes on", file=sys.stderr)
+            sys.exit(128 + number)
         except Exception as error:
             if not {kind.__name__ for kind in type(error).__mro__} & KILLED:
                 raise

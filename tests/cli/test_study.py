@@ -25,6 +25,7 @@ HYDRA = OmegaConf.create({
     "overrides": {"task": ["nn=2", "seed=0"]},
     "launcher": {"_target_": "joblib"},
 })  # fmt: skip
+CORES = {"joblib": ["hydra.launcher.n_jobs=2"], "ray": ["hydra.launcher.num_cpus=2"]}
 SHORT = ["nx=1", "trainer.max_iter=2", "bla.max_iter=1", "figures=false"]
 
 
@@ -176,14 +177,14 @@ def test_runs_follow_each_other(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
 def test_runs_at_once_survive_a_process_that_is_killed(csv: Path, tmp_path: Path, launcher: str):
-    plugin = f"hydra_plugins.hydra_{study.LAUNCHERS[launcher]}_launcher"
-    if find_spec(plugin) is None:
-        pytest.skip(f"needs {plugin}: pip install 'lfrtorch[sweep]'")
+    package = study.LAUNCHERS[launcher]
+    if find_spec(package) is None:
+        pytest.skip(f"needs {package}: pip install 'lfrtorch[sweep]'")
     words = ["-m", *file_overrides(csv), *SHORT, "nn=2,3", "seed=0,1"]
     words += [f"hydra.sweep.dir={tmp_path}", f"hydra/launcher={launcher}"]
-    words += ["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
+    words += CORES.get(launcher, [])
     process = subprocess.Popen(
         [sys.executable, "-m", "lfrtorch.cli", "fit", *words],
         cwd=ROOT,
@@ -191,15 +192,62 @@ def test_runs_at_once_survive_a_process_that_is_killed(csv: Path, tmp_path: Path
         stderr=subprocess.STDOUT,
         text=True,
     )
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while not (workers := [pid for pid in below(process.pid) if works(pid)]):
         assert time.monotonic() < deadline
         time.sleep(0.05)
     os.kill(workers[0], signal.SIGKILL)
     said, _ = process.communicate(timeout=300)
-    assert "a process was killed: going on" in said
+    assert "a process was killed: going on" in said or launcher == "ray"  # which goes on itself
     assert "4 of 4 runs" in said
     assert process.returncode == 0, said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_tasks_of_ray_keep_what_they_found_if_the_study_is_ended(
+    csv: Path, tmp_path: Path, number: signal.Signals
+):
+    pytest.importorskip("ray", reason="needs ray: pip install 'lfrtorch[sweep]'")
+    words = ["-m", *file_overrides(csv), "nx=1", "trainer.max_iter=100000", "figures=false"]
+    words += ["trainer.tolerance=0", "nn=2", "seed=0,1", f"hydra.sweep.dir={tmp_path}"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lfrtorch.cli", "fit", *words, "hydra/launcher=ray", *CORES["ray"]],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    deadline = time.monotonic() + 300
+    while not (begun := [*tmp_path.glob("*/resume/*.safetensors")]):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    process.send_signal(number)
+    said, _ = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, said
+    assert "the same command with that folder goes on" in said
+    assert (begun[0].parents[1] / "model").is_dir()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [("address=auto", "Ray did not start"), ("cpus_per_task=99", "no run could begin")],
+)
+def test_a_cluster_that_cannot_be_is_refused(csv: Path, tmp_path: Path, word: str, message: str):
+    pytest.importorskip("ray", reason="needs ray: pip install 'lfrtorch[sweep]'")
+    words = ["-m", *file_overrides(csv), *SHORT, f"hydra.sweep.dir={tmp_path}"]
+    words += ["hydra/launcher=ray", f"hydra.launcher.{word}"]
+    ended = subprocess.run(
+        [sys.executable, "-m", "lfrtorch.cli", "fit", *words],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 1
+    assert message in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 def below(pid: int) -> list[int]:
@@ -213,9 +261,9 @@ def below(pid: int) -> list[int]:
 
 
 def works(pid: int) -> bool:
-    """Whether it is a process of joblib or submitit that runs share."""
+    """Whether it is a process of joblib, submitit or Ray that runs share."""
     try:
         command = Path(f"/proc/{pid}/cmdline").read_text()
     except OSError:
         return False
-    return "popen_loky" in command or "submitit.core._submit" in command
+    return any(name in command for name in ("popen_loky", "submitit.core._submit", "ray::_run"))
