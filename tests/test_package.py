@@ -46,7 +46,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     names = {name for name in ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "lfrtorch").rglob("*.py")}
+    rooms = ("lfrtorch", "hydra_plugins")
+    sources = {
+        str(path.relative_to(ROOT)) for room in rooms for path in (ROOT / room).rglob("*.py")
+    }
     settings = {f"lfrtorch/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
     templates = (ROOT / "lfrtorch").rglob("templates/*")
     others = {"lfrtorch/py.typed", *(str(path.relative_to(ROOT)) for path in templates)}
