@@ -50,6 +50,7 @@ def find_period(u: Array) -> int | None:
         u: (T, nu) or (T,).
     """
     u = u.reshape(len(u), -1)
+    u = np.ldexp(u, -np.frexp(np.max(np.abs(u), axis=0, initial=0))[1])  # squares are finite
     deviation = np.std(u, axis=0)
     moving = deviation > 1e-12 * np.max(np.abs(u), axis=0, initial=0)
     if not moving.any() or len(u) < 4:

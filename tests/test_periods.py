@@ -36,6 +36,12 @@ def test_period_in_noise(T, seed):
     assert find_period(u + noise(T, seed=seed, size=0.1 * float(np.std(u)))) == N
 
 
+@pytest.mark.parametrize("scale", [2.0**1000, 2.0**-1040, 1.0])
+def test_period_of_signals_whose_squares_are_no_numbers(scale: float):
+    u = np.tile(np.random.default_rng(0).normal(size=50), 4)
+    assert find_period(scale * u) == 50
+
+
 def test_period_of_a_slow_signal_in_noise():
     k = np.arange(100_000)
     u = np.sin(2 * np.pi * k / 12_345) + noise(len(k), seed=0, size=0.05)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lfrtorch._support.errors import InputError
@@ -39,14 +40,60 @@ def check_memory(needed: float, what: str, remedy: str, device: torch.device | N
 
 
 def memory_of(device: torch.device | None = None) -> float:
-    """Bytes of memory of a device, all of it; infinite if that is not known."""
+    """Bytes of memory of a device, or what a container may take; infinite if that is not known."""
     if device is not None and device.type == "cuda":
         import torch
 
         return float(torch.cuda.get_device_properties(device).total_memory)
     try:
-        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+        machine = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):  # not on every system
+        machine = math.inf
+    return min(machine, limit_of(Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")))
+
+
+def limit_of(listed: Path, mounted: Path) -> float:
+    """Bytes that the control groups of a process leave it, as those of containers and batch jobs.
+
+    Args:
+        listed: file of the groups, a line each.
+        mounted: folder of what the groups may take; groups above limit those in them.
+
+    Returns:
+        The smallest limit, infinite if there is none.
+
+    References:
+        Linux kernel documentation, "Control Group v2", and its v1 with "memory.limit_in_bytes".
+
+    Example:
+        >>> from lfrtorch._support.memory import limit_of
+        >>> limit_of(Path("none"), Path("none"))
+        inf
+    """
+    try:
+        groups = [line.split(":", 2)[1:] for line in listed.read_text().splitlines()]
+    except OSError:
+        return math.inf
+    limits = [math.inf]
+    for controllers, path in groups:
+        if not controllers:
+            root, name = mounted, "memory.max"
+        elif "memory" in controllers.split(","):
+            root, name = mounted / "memory", "memory.limit_in_bytes"
+        else:
+            continue
+        own = root / path.lstrip("/")
+        for folder in (own, *own.parents):
+            if folder.is_relative_to(root):
+                limits.append(_number(folder / name))
+    return min(limits)
+
+
+def _number(file: Path) -> float:
+    """What the file says, infinite if that is "max" or nothing."""
+    try:
+        return float(int(file.read_text()))
+    except (OSError, ValueError):
         return math.inf
 
 
