@@ -93,7 +93,9 @@ def blocked_mean(sums: Array, counts: Integers) -> tuple[Array, Array]:
     B, samples = len(counts), counts.sum()
     mean = sums.sum(axis=-1) / samples
     rest = sums - mean[..., None] * counts
-    return mean, np.sqrt(B / (B - 1.0) * (rest**2).sum(axis=-1)) / samples
+    largest = np.abs(rest).max(axis=-1)
+    parts = rest / np.where(largest > 0.0, largest, 1.0)[..., None]  # whose squares are numbers
+    return mean, largest * np.sqrt(B / (B - 1.0) * (parts**2).sum(axis=-1)) / samples
 
 
 def squares_in_blocks(errors: Sequence[Array]) -> Array:

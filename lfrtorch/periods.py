@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
+from lfrtorch._support.powers import near_one
 from lfrtorch._support.types import Array
 
 _ALIKE = 0.02
@@ -50,7 +51,7 @@ def find_period(u: Array) -> int | None:
         u: (T, nu) or (T,).
     """
     u = u.reshape(len(u), -1)
-    u = np.ldexp(u, -np.frexp(np.max(np.abs(u), axis=0, initial=0))[1])  # squares are finite
+    u = near_one(u, axis=0)
     deviation = np.std(u, axis=0)
     moving = deviation > 1e-12 * np.max(np.abs(u), axis=0, initial=0)
     if not moving.any() or len(u) < 4:

@@ -89,3 +89,10 @@ def test_errors_that_are_not_finite_are_infinite_and_no_model_is_as_good():
     assert np.isinf(lost).all()
     counts = np.array([len(block) for block in in_blocks([e[:, 0] for e in errors])])
     assert as_good([lost, sums], counts).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("scale", [2.0**-660, 2.0**660])
+def test_units_do_not_change_which_model_is_as_good(scale: float):
+    squares, counts = np.random.default_rng(0).uniform(1.0, 1.1, (5, 12)), np.full(12, 50)
+    expected = standard_errors_above(squares, counts)
+    assert np.array_equal(standard_errors_above(squares * scale, counts), expected)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int64
 from scipy.stats import chi2, norm
 
 from lfrtorch._support.checks import integer
+from lfrtorch._support.powers import near_one
 from lfrtorch._support.types import Array, Integers
 
 LAGS, LEAST = 25, 5
@@ -128,7 +129,7 @@ def cross_correlation(
         (3, True)
     """
     K = lags_for(len(e), lags)
-    return white_cross_correlation(whitened(e), whitened(x), K)
+    return white_cross_correlation(whitened(near_one(e)), whitened(near_one(x)), K)
 
 
 def white_cross_correlation(e: Float[Array, " S"], x: Float[Array, " T"], lags: int) -> Correlation:
@@ -191,6 +192,7 @@ def _correlated(
     a: Float[Array, " T"], b: Float[Array, " T"], lags: range
 ) -> tuple[Float[Array, " K"], Float[Array, " K"], Float[Array, " K"]]:
     """Correlations of a(t) and b(t-k), their bounds, and their ratios to a standard deviation."""
+    a, b = near_one(a), near_one(b)
     T, a2, b2 = len(a), a**2, b**2
     sums, variances = np.zeros((2, len(lags)))
     for i, k in enumerate(lags):

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.powers import near_one
 from lfrtorch._support.tables import in_lines, number, quantity, table
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.correlation import (
@@ -217,8 +218,8 @@ def of_simulation(
         )
     errors = y - y_hat[record.skip :]
     K = lags_for(len(y), lags)
-    linear = [whitened(channel) for channel in u.T]
-    squares = [whitened(channel) for channel in ((u - u.mean(axis=0)) ** 2).T]
+    linear = [whitened(near_one(channel)) for channel in u.T]
+    squares = [whitened(near_one(channel) ** 2) for channel in (u - u.mean(axis=0)).T]
     deviation = np.std(y, axis=0)
     f, of_y = power_density(y, record.fs)
     noise, of_noise = noise_of_periods([record]), noise_density(record)
@@ -230,8 +231,9 @@ def of_simulation(
         simulated, tested = y_hat[record.skip :, i], error
         if exact or not finite:
             simulated, tested = np.zeros((2, len(y)))
-        tested = tested - tested.mean()
-        e, ey = whitened(tested), whitened(tested * (simulated - simulated.mean()))
+        tested = near_one(tested - tested.mean())
+        product = tested * near_one(simulated - simulated.mean())
+        e, ey = whitened(tested), whitened(product)
         spread = float(deviation[i])
         fit = 100.0 * (1.0 - size / spread) if spread > 0 else math.nan
         found.append(

@@ -495,6 +495,8 @@ def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     """
     Lp, Lq = _square_root(_gramian(A, B @ B.T)), _square_root(_gramian(A.T, C.T @ C))
     U, s, Vh = np.linalg.svd(Lq.T @ Lp)
+    if not s.any():  # no input reaches an output: all coordinates are balanced
+        return np.eye(len(A)), np.eye(len(A))
     # A state that is almost uncontrollable or unobservable would be scaled by its rounding error.
     root = np.sqrt(np.maximum(s, s[0] * np.finfo(float).eps))
     return (U / root).T @ Lq.T, Lp @ (Vh.T / root)

@@ -253,3 +253,20 @@ def test_lags_are_those_asked_for_and_units_have_prefixes():
     assert found.parts[0].whiteness.lags.tolist() == list(range(1, 31))
     assert found.parts[0].linear[0].lags.tolist() == list(range(-30, 31))
     assert "µm" in str(found)
+
+
+def test_units_do_not_change_what_is_found():
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal((2, 300, 1))
+    one, other = (
+        of_simulation(Record(a * u, b * y, fs=1.0), 0.5 * b * y + 0.1 * b * np.roll(u, 1, axis=0))[
+            0
+        ]
+        for a, b in ((1.0, 1.0), (2.0**320, 2.0**-320))
+    )
+    for name in ("linear", "even", "odd"):
+        (a,), (b,) = getattr(one, name), getattr(other, name)
+        assert np.array_equal(a.values, b.values)
+        assert np.array_equal(a.bounds, b.bounds)
+        assert a.p == b.p
+    assert np.array_equal(one.whiteness.values, other.whiteness.values)

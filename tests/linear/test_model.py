@@ -375,6 +375,12 @@ def test_balancing_close_to_the_unit_circle():
     np.testing.assert_allclose(G, expected, rtol=0, atol=1e-7)
 
 
+def test_balancing_states_that_no_input_reaches_changes_nothing():
+    A, C = np.diag([0.5, 0.2]), np.ones((1, 2))
+    for matrix in balancing(A, np.zeros((2, 1)), C):
+        assert np.array_equal(matrix, np.eye(2))
+
+
 def test_balancing_a_state_that_nothing_reaches_or_sees():
     A, B, C = np.diag([0.5, 0.3, 0.8]), np.array([[1.0], [0.0], [1.0]]), np.array([[1.0, 1.0, 0.0]])
     T, inverse = balancing(A, B, C)
