@@ -48,7 +48,7 @@ def origin(dataset: Dataset) -> dict[str, Any]:
 
 
 def checksum(record: Record) -> str:
-    """SHA-256 of the samples of a record, its rate, and its inputs and outputs as float64.
+    """SHA-256 of a record: its shapes and rate, and all its signals as float64.
 
     Example:
         >>> from lfrtorch.reporting.origin import checksum
@@ -56,7 +56,10 @@ def checksum(record: Record) -> str:
         (True, False)
     """
     found = sha256(f"{record.u.shape} {record.y.shape} {record.fs!r}".encode())
-    for signal in (record.u, record.y):
+    signals = [record.u, record.y]
+    if record.reference is not None:
+        signals.append(record.reference)
+    for signal in signals:
         found.update(np.ascontiguousarray(signal, dtype="<f8").data)
     return found.hexdigest()
 

@@ -18,7 +18,8 @@ def test_checksum_is_of_samples_and_rate():
     record = Record(U, 2 * U, 10.0)
     assert checksum(record) == checksum(Record(U.copy(), 2 * U, 10.0, skip=5))
     others = [Record(U, 3 * U, 10.0), Record(2 * U, 2 * U, 10.0), Record(U, 2 * U, 20.0)]
-    assert len({checksum(one) for one in (record, *others)}) == 4
+    others += [Record(U, 2 * U, 10.0, reference=r) for r in (U, 4 * U)]
+    assert len({checksum(one) for one in (record, *others)}) == 6
 
 
 def test_git_state_of_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
