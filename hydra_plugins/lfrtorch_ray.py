@@ -79,6 +79,10 @@ class RayLauncher(Launcher):
         """All runs, each with words of its own; what they say is printed as they end."""
         import ray
 
+        if self._each < 1:
+            raise InputError(
+                f"hydra.launcher.cpus_per_task is {self._each}; give a whole number of at least 1."
+            )
         setup_globals()
         with self._cluster():
             task = ray.remote(num_cpus=self._each, max_retries=RETRIES)(_run)
@@ -95,7 +99,8 @@ class RayLauncher(Launcher):
             except BaseException as error:
                 for left in waiting:
                     ray.cancel(left)
-                ray.wait(waiting, num_returns=len(waiting), timeout=GRACE)
+                if waiting:
+                    ray.wait(waiting, num_returns=len(waiting), timeout=GRACE)
                 if isinstance(error, SystemError) and error.__cause__:  # of SIGTERM's handler
                     raise error.__cause__ from None
                 raise

@@ -232,7 +232,11 @@ def test_tasks_of_ray_keep_what_they_found_if_the_study_is_ended(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("word", "message"),
-    [("address=auto", "Ray did not start"), ("cpus_per_task=99", "no run could begin")],
+    [
+        ("address=auto", "Ray did not start"),
+        ("cpus_per_task=99", "no run could begin"),
+        ("cpus_per_task=0", "at least 1"),
+    ],
 )
 def test_a_cluster_that_cannot_be_is_refused(csv: Path, tmp_path: Path, word: str, message: str):
     pytest.importorskip("ray", reason="needs ray: pip install 'lfrtorch[sweep]'")
