@@ -66,6 +66,7 @@ def limit_of(listed: Path, mounted: Path) -> float:
         Linux kernel documentation, "Control Group v2", and its v1 with "memory.limit_in_bytes".
 
     Example:
+        >>> from pathlib import Path
         >>> from lfrtorch._support.memory import limit_of
         >>> limit_of(Path("none"), Path("none"))
         inf

@@ -17,6 +17,6 @@ def near_one(x: Array, axis: int | None = None) -> Array:
     Example:
         >>> from lfrtorch._support.powers import near_one
         >>> near_one(np.array([3e200, -6e200])).round(3).tolist()
-        [0.29, -0.581]
+        [0.49, -0.98]
     """
     return np.ldexp(x, -np.frexp(np.max(np.abs(x), axis=axis, keepdims=True, initial=0.0))[1])
