@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep, time
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -142,6 +142,7 @@ class TensorBoard:
             return
         try:
             if self._writer is None:
+                _wait_for_a_later_name(self.folder)
                 self._writer = SummaryWriter(str(self.folder), purge_step=step)
             write(self._writer)
         except OSError as error:
@@ -150,6 +151,17 @@ class TensorBoard:
                 f"TensorBoard's file in '{self.folder}' cannot be written "
                 f"({error.strerror or error}); the fit goes on without it"
             )
+
+
+def _wait_for_a_later_name(folder: Path) -> None:
+    """Let the second pass in which the last file was made.
+
+    TensorBoard reads the files of a folder in the order of their names, which begin with the
+    second. Within one, file 10 of a process comes before its file 9.
+    """
+    end = monotonic() + 1.5  # whatever the clock does
+    while monotonic() < end and any(folder.glob(f"events.out.tfevents.{int(time())}.*")):
+        sleep(0.02)
 
 
 def _add(writer: SummaryWriter, progress: Progress) -> None:

@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+from tensorboard.summary.writer import event_file_writer
 
 import lfrtorch
 from lfrtorch.fitting.trainer import Progress
@@ -95,7 +96,11 @@ def test_tensorboard_has_a_run_of_finalists_alone(model: lfrtorch.Model, tmp_pat
     assert [e.step for e in events(tmp_path / "late").Scalars("rmse/train")] == list(range(7))
 
 
-def test_iterations_that_are_done_again_are_shown_once(model: lfrtorch.Model, tmp_path: Path):
+def test_iterations_that_are_done_again_are_shown_once(
+    model: lfrtorch.Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    files = event_file_writer.AtomicCounter(9)  # number 10 sorts before number 9
+    monkeypatch.setattr(event_file_writer, "_global_uid", files)
     for first, last in ((0, 5), (3, 8)):  # a run that ended, and went on from a snapshot
         board = TensorBoard(tmp_path)
         for iteration in range(first, last):
