@@ -37,7 +37,7 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
 from lfrtorch.linear.requirements import check_excitation, excited_directions
 from lfrtorch.linear.score_window import with_score_windows
-from lfrtorch.model import Model
+from lfrtorch.model import Model, check_channels
 from lfrtorch.records import Record
 from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import evidence
@@ -464,20 +464,3 @@ def linear_models_of_tests(dataset: Dataset, settings: Settings) -> dict[str, Li
     models = each_alone(estimate, [[records[name] for name in names] for names in of])
     by_records = dict(zip(of, models, strict=True))
     return {test: by_records[names] for test, names in dataset.linear.items()}
-
-
-def check_channels(model: Model, record: Record) -> None:
-    """Refuse data of other channels than the model's with a ValueError; a unit may be unknown."""
-    for side, channels, found in (
-        ("inputs", model.inputs, record.inputs),
-        ("outputs", model.outputs, record.outputs),
-    ):
-        alike = [
-            own.name == other.name and (own.unit == other.unit or not (own.unit and other.unit))
-            for own, other in zip(channels, found, strict=False)
-        ]
-        if len(channels) != len(found) or not all(alike):
-            raise InputError(
-                f"the model has the {side} {', '.join(map(str, channels))} and the data "
-                f"{', '.join(map(str, found))}; give data of the same channels."
-            )

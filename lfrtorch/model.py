@@ -626,3 +626,20 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         raise InputError(
             f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."
         ) from None
+
+
+def check_channels(model: Model, record: Record) -> None:
+    """Refuse data of other channels than the model's with a ValueError; a unit may be unknown."""
+    for side, channels, found in (
+        ("inputs", model.inputs, record.inputs),
+        ("outputs", model.outputs, record.outputs),
+    ):
+        alike = [
+            own.name == other.name and (own.unit == other.unit or not (own.unit and other.unit))
+            for own, other in zip(channels, found, strict=False)
+        ]
+        if len(channels) != len(found) or not all(alike):
+            raise InputError(
+                f"the model has the {side} {', '.join(map(str, channels))} and the data "
+                f"{', '.join(map(str, found))}; give data of the same channels."
+            )

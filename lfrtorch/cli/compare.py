@@ -1,7 +1,7 @@
 """Runs side by side: one table, and one page with figures.
 
 lfrtorch compare runs/study
-lfrtorch compare runs/boucwen/* out=boucwen
+lfrtorch compare runs/boucwen/* +bench=boucwen out=boucwen
 """
 
 from __future__ import annotations
@@ -9,19 +9,30 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, LfrtorchError
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from lfrtorch.records import Record
 
 ABOUT = """Compare runs: a table on the terminal, and comparison.html, .md and .csv.
 
     lfrtorch compare runs/study
     lfrtorch compare runs/study runs/boucwen/DATE out=compared
+    lfrtorch compare runs/study +bench=boucwen
+    lfrtorch compare runs/run data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750
 
 All runs in the folders, and in those below them, that came to their end are read. Runs of different
 data have tables of their own.
 
   out=DIR   folder of the files. Default: the one that all folders that are given lie in
+  +bench=NAME or data=file data.path=FILE ..   as in lfrtorch evaluate: the page shows the first
+            validation record, or the first test if there is none, simulated by the best models
 """
 
 
@@ -30,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(
         prog=sys.argv[0], description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    found.add_argument("words", nargs="+", metavar="FOLDER", help="of runs, or out=DIR")
+    found.add_argument("words", nargs="+", metavar="FOLDER", help="of runs, or NAME=VALUE")
     return found
 
 
@@ -41,11 +52,44 @@ def launch() -> None:
     words = parser().parse_args().words
     outs = [word.removeprefix("out=") for word in words if word.startswith("out=")]
     with user_errors():
-        run([Path(word) for word in words if not word.startswith("out=")], *outs[-1:])
+        settings = [word for word in words if is_setting(word) and not word.startswith("out=")]
+        folders = [Path(word) for word in words if not is_setting(word)]
+        run(folders, *outs[-1:], record=chosen(settings) if settings else None)
 
 
-def run(folders: list[Path], out: str | Path | None = None) -> None:
-    """Print the tables, and write the files."""
+def is_setting(word: str) -> bool:
+    """Whether it is NAME=VALUE, and no folder: those of a study have such names."""
+    return "=" in word and not Path(word).is_dir()
+
+
+def chosen(words: Sequence[str]) -> Record | None:
+    """The record of the data that words choose, as those of ``lfrtorch evaluate``."""
+    from lfrtorch.cli.composition import check_words, composed
+    from lfrtorch.cli.config import one_record
+    from lfrtorch.cli.quotes import quoted
+
+    check_words("evaluate", words)
+    return one_record(composed("evaluate", [quoted(word) for word in words]))
+
+
+def of_study(cfg: DictConfig) -> Record | None:
+    """The record of the data that the runs share; None if these cannot be read any more."""
+    from lfrtorch.cli.config import one_record
+
+    try:
+        return one_record(cfg)
+    except (LfrtorchError, OSError):
+        return None
+
+
+def run(folders: list[Path], out: str | Path | None = None, record: Record | None = None) -> None:
+    """Print the tables, and write the files.
+
+    Args:
+        folders: of the runs, or with runs in them.
+        out: of the files. Default: the folder that all lie in.
+        record: that the best models simulate on the page.
+    """
     from lfrtorch.reporting import comparison
 
     for folder in folders:
@@ -55,6 +99,6 @@ def run(folders: list[Path], out: str | Path | None = None) -> None:
         raise InputError("no folder is given; give those of runs.")
     found = comparison.compare(folders)
     target = Path(os.path.commonpath([path.resolve() for path in folders]) if out is None else out)
-    comparison.write(found, target)
+    comparison.write(found, target, record)
     print("\n\n".join(map(str, found)))
     print(f"\nFigures and all runs: {target / 'comparison.html'}, comparison.md and comparison.csv")

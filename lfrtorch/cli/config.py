@@ -20,6 +20,7 @@ from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.words import translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings, SizesSearch
+from lfrtorch.records import Record
 from lfrtorch.survey.notes import notes_on
 
 
@@ -106,6 +107,13 @@ def loaded(cfg: DictConfig) -> Dataset:
     for note in notes:
         print(in_lines(f"note: {note}"))
     return replace(dataset, notes=notes)
+
+
+def one_record(cfg: DictConfig) -> Record | None:
+    """A record for several models to simulate: the first of validation, or else of the tests."""
+    require_data(cfg)
+    dataset: Dataset = instantiate(cfg.data)
+    return next(iter((*dataset.validation, *dataset.tests)), None)
 
 
 def require_data(cfg: DictConfig) -> None:

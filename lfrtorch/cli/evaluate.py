@@ -27,7 +27,8 @@ from lfrtorch.cli.run_folder import CONFIG, program
 from lfrtorch.cli.simulate import opened
 from lfrtorch.cli.words import Terminal
 from lfrtorch.files.load import EVERYTHING, listed_files
-from lfrtorch.job import check_channels, windowed
+from lfrtorch.job import windowed
+from lfrtorch.model import check_channels
 from lfrtorch.reporting import scores as report
 
 FILES = "lfrtorch.load_records"

@@ -48,7 +48,8 @@ and of the search itself:
   trials=N      runs in all. Default: 40
   minutes=X     after which no run begins. Default: no limit
   workers=N     of them at once, on one machine. Default: 1
-  objective=    error (of validation, the default) or front: of error against number of parameters
+  objective=    error (of validation, the default); front: of error against number of parameters;
+                front_time: of error against seconds of the fit
   out=DIR       folder. Default: runs/search. The same command goes on there, also from several
                 machines at once if they share the folder
 
@@ -65,7 +66,12 @@ OWN = {
     "objective": "error",
     "out": "runs/search",
 }
-OBJECTIVES = ("error", "front")
+FRONTS = {
+    "front": lambda metrics: metrics["parameters_net"],
+    "front_time": lambda metrics: metrics["fit"]["seconds"],
+}
+"""What a front has beside the error, in the ``metrics.json`` of a run."""
+OBJECTIVES = ("error", *FRONTS)
 BEGINS = 60.0  # seconds within which a worker that has a trial is at it
 TRIED = 5  # runs that come to their end before any is pruned
 JUDGED = 8  # and this part of the iterations: the first eighth tells little
@@ -192,7 +198,7 @@ def plan(words: Sequence[str]) -> Plan:
         else:
             rest.append(word)
     if own["objective"] not in OBJECTIVES:
-        raise InputError(f"objective is {own['objective']}; give {' or '.join(OBJECTIVES)}.")
+        raise InputError(f"objective is {own['objective']}; give {', '.join(OBJECTIVES)}.")
     for name in ("trials", "workers"):
         if not own[name].isdecimal() or int(own[name]) < 1:
             raise InputError(f"{name} is {own[name]}; give a whole number of at least 1.")
@@ -262,7 +268,7 @@ def opened(found: Plan) -> Study:
     study = optuna.create_study(
         storage=journal(found.folder),
         study_name=NAME,
-        directions=[StudyDirection.MINIMIZE] * (1 + (found.objective == "front")),
+        directions=[StudyDirection.MINIMIZE] * (1 + (found.objective in FRONTS)),
         sampler=optuna.samplers.TPESampler(constant_liar=True),
         load_if_exists=True,
     )
@@ -310,7 +316,7 @@ def tried(found: Plan, trial: Trial) -> dict[str, Any]:
     if found.objective == "error":
         return {"values": error}
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    return {"values": [error, metrics["parameters_net"]]}
+    return {"values": [error, FRONTS[found.objective](metrics)]}
 
 
 def report(folder: Path, number: int, least: int) -> Monitor:
@@ -341,11 +347,13 @@ def report(folder: Path, number: int, least: int) -> Monitor:
 def show(found: Plan, study: Study) -> None:
     """Print the runs and the best one, or those of the front."""
     from lfrtorch.cli import compare
+    from lfrtorch.cli.composition import composed
 
     states = Counter(trial.state.name for trial in study.trials)
     if states["COMPLETE"]:
         print()
-        compare.run([found.folder])
+        record = compare.of_study(composed("config", found.fixed))
+        compare.run([found.folder], record=record)
     failed = sum(FAILED in trial.user_attrs for trial in study.trials)
     print(f"\n{states['COMPLETE']} runs, {states['PRUNED']} pruned, {failed} failed")
     for trial in study.best_trials:

@@ -291,7 +291,7 @@ class Report(Callback):
         ended = sum((run / "metrics.json").is_file() for run in runs if run not in failed)
         if ended:
             print()
-            compare.run([folder])
+            compare.run([folder], record=compare.of_study(config))
         print(f"\n{ended} of {len(runs)} runs in {folder} are done")
         if failed:
             rows = [

@@ -22,8 +22,13 @@ from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.drawing import NL_LFR, OUTPUT, plain_ticks
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import Cell, cell, engineering, table, times
+from lfrtorch._support.types import Array
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import check_channels, load
+from lfrtorch.records import Record
 from lfrtorch.reporting import html, plots
 from lfrtorch.reporting.scores import unit_of
+from lfrtorch.reporting.several_models import COLOURS, side_by_side
 
 SEEDS = ("seed", "data.seed")
 """Words that differ between repetitions of one setting."""
@@ -35,10 +40,19 @@ BOXES = 30
 """Most settings whose boxes are drawn, the best by their median."""
 
 LONGEST = 40
-"""Characters of a box's label."""
+"""Characters of a setting in a figure."""
 
 WIDE = 50
 """Ratio of the values of a word from which on their axis is logarithmic."""
+
+CAPTIONS = {
+    "parameters": "Validation error by parameters",
+    "time": "Validation error by time",
+    "seeds": "Validation error over seeds",
+    "words": "Validation error by words",
+    "simulations": "Best models on one record: about the largest error, and spectra of the errors",
+}
+"""Of the figures."""
 
 LEGEND = "*: no run with as few parameters has a smaller validation error."
 
@@ -157,8 +171,38 @@ class Comparison:
         ]
         return head, rows
 
-    def figures(self) -> dict[str, Figure]:
-        """Errors against parameters and time, and boxes of each setting, by name."""
+    def simulations(self, record: Record) -> Figure | None:
+        """A record, simulated by the best runs, one of each setting; None if no model fits to it.
+
+        Args:
+            record: of the same channels as the models; others are left out.
+        """
+        best = {label: runs[0] for label, runs in self.settings.items()}
+        ranked = sorted(
+            best.items() if best else ((run.folder.name, run) for run in self.runs),
+            key=lambda one: (math.isnan(one[1].error), one[1].error),
+        )
+        found: dict[str, Array] = {}
+        y_linear = None
+        for label, run in ranked:
+            if len(found) == len(COLOURS):
+                break
+            try:
+                model = load(run.folder)
+                check_channels(model, record)
+                found[_short(label)] = model.simulate(record)
+            except (InputError, FileNotFoundError):
+                continue
+            if y_linear is None and (run.folder / "linear").is_dir():
+                y_linear = LinearModel.load(run.folder).simulate(record)
+        return side_by_side(record, found, y_linear) if found else None
+
+    def figures(self, record: Record | None = None) -> dict[str, Figure]:
+        """Errors against parameters and time, and boxes of each setting, by name.
+
+        Args:
+            record: that the best models simulate. Default: none.
+        """
         drawn = {"parameters": self._against("parameters", "parameters", front=True)}
         drawn["time"] = self._against("seconds", "time of the fit (s)")
         if self.settings:
@@ -166,6 +210,8 @@ class Comparison:
         numbers = {name: found for name in self.varied if (found := self._numbers(name))}
         if numbers:
             drawn["words"] = self._over(numbers)
+        if record is not None and (figure := self.simulations(record)):
+            drawn["simulations"] = figure
         return drawn
 
     def __str__(self) -> str:
@@ -209,8 +255,7 @@ class Comparison:
         ]
         figure = Figure(figsize=(7, 1 + 0.3 * len(labels)), layout="constrained")
         ax = figure.subplots()
-        names = [label if len(label) <= LONGEST else f"{label[:LONGEST]}…" for label in labels]
-        ax.boxplot(errors, tick_labels=names, orientation="horizontal", sym=".")
+        ax.boxplot(errors, tick_labels=[*map(_short, labels)], orientation="horizontal", sym=".")
         ax.invert_yaxis()  # the best one above
         ax.set_xscale("log")
         _error_axis(ax.xaxis, unit)
@@ -276,12 +321,15 @@ def compare(folders: Sequence[str | Path]) -> list[Comparison]:
     ]
 
 
-def write(comparisons: Sequence[Comparison], folder: str | Path) -> None:
+def write(
+    comparisons: Sequence[Comparison], folder: str | Path, record: Record | None = None
+) -> None:
     """Write ``comparison.html``, ``comparison.md`` and ``comparison.csv`` with all runs.
 
     Args:
         comparisons: see :func:`compare`.
         folder: of the files; those of an earlier comparison are replaced.
+        record: that the page shows, simulated by the best models. Default: none.
 
     Example:
         >>> from lfrtorch.reporting import comparison
@@ -289,18 +337,18 @@ def write(comparisons: Sequence[Comparison], folder: str | Path) -> None:
         >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=1)
         >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(nx=1, nz=1, nn=4, trainer=trainer))
         >>> lfrtorch.reporting.write(run, "study/one", draw=False)
-        >>> comparison.write(comparison.compare(["study"]), "study")
+        >>> comparison.write(comparison.compare(["study"]), "study", record[200:])
     """
     images, parts = {}, []
     for number, one in enumerate(comparisons):
-        drawn = {f"{number}_{name}": plots.png(f) for name, f in one.figures().items()}
+        drawn = {f"{number}_{name}": plots.png(f) for name, f in one.figures(record).items()}
         images |= drawn
         parts.append(
             {
                 "name": one.name,
                 "runs": one.rows(),
                 "settings": one.summary() if one.settings else None,
-                "figures": list(drawn),
+                "figures": [(name, CAPTIONS[name.partition("_")[2]]) for name in drawn],
             }
         )
     texts = {
@@ -333,6 +381,10 @@ def _read(path: Path) -> Compared:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"'{path}' is not of a run: {error!r}.") from None
+
+
+def _short(label: str) -> str:
+    return label if len(label) <= LONGEST else f"{label[:LONGEST]}…"
 
 
 def _float(value: float | None) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -49,7 +50,7 @@ def test_values_of_a_word_are_a_distribution(word: str, expected: Any):
         (["nx=1,2", "trials=none"], "trials is none; give a whole number"),
         (["nx=1,2", "workers=0"], "workers is 0"),
         (["nx=1,2", "minutes=-1"], "minutes is -1; give a number above 0"),
-        (["nx=1,2", "objective=time"], "objective is time; give error or front"),
+        (["nx=1,2", "objective=time"], "objective is time; give error, front, front_time"),
         (["nm=1,2"], "there is no setting 'nm'"),
     ],
 )
@@ -69,7 +70,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return math.nan if cfg.nn == 3 else 1.0 + abs(cfg.nn - 7)
 
     monkeypatch.setattr(study, "job", job)
-    monkeypatch.setattr(compare, "run", lambda folders: None)
+    monkeypatch.setattr(compare, "run", lambda folders, record: None)
     return made
 
 
@@ -124,6 +125,22 @@ def test_a_run_that_others_leave_behind_is_pruned(tmp_path: Path):
         told(None, each)
     with pytest.raises(search.PrunedError, match="pruned after 3 iterations"):
         told(None, progress[3])
+
+
+def test_a_front_is_of_errors_beside_what_they_cost(tmp_path: Path, runs: list[str]):
+    for objective, cost in (("front", 5), ("front_time", 0.5)):
+        folder = tmp_path / objective
+        for nn in range(2, 12):
+            run = folder / f"nn={nn}"
+            run.mkdir(parents=True)
+            metrics = {"parameters_net": 5, "fit": {"seconds": 0.5}}
+            (run / "metrics.json").write_text(json.dumps(metrics))
+        words = ["nx=1", "nn=range(2,12)", f"out={folder}", f"objective={objective}"]
+        found = search.plan([*words, "trials=4"])
+        search.work(found)
+        whole = [t.values for t in search.opened(found).trials if t.state == TrialState.COMPLETE]
+        assert whole
+        assert all(value[1] == cost for value in whole)
 
 
 @pytest.mark.slow

@@ -68,8 +68,28 @@ def test_command_writes_page_and_tables(
     assert (study / "out" / "comparison.html").read_text().count("data:image/png") == 6
 
 
+def test_data_words_choose_the_record_that_is_simulated(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (study / "x.csv").write_text("u,y\n" + "".join(f"{k % 7},{k % 5}\n" for k in range(60)))
+    data = f"data=file data.path={study / 'x.csv'} data.inputs=[u] data.outputs=[y] data.fs=10"
+    chosen = []
+    monkeypatch.setattr(command, "run", lambda *_, record: chosen.append(record))
+    in_a_study = study / "nn=5,seed=0"  # a folder with the look of a setting
+    for words in ([], data.split()):
+        monkeypatch.setattr(sys, "argv", ["lfrtorch compare", str(in_a_study), *words])
+        command.launch()
+    assert chosen[0] is None
+    assert chosen[1].name == "validation"
+
+
 @pytest.mark.parametrize(
-    ("words", "said"), [(["none"], "no folder"), (["."], "no run came to its end")]
+    ("words", "said"),
+    [
+        (["none"], "no folder"),
+        (["."], "no run came to its end"),
+        ([".", "nm=3"], "no setting 'nm'"),
+    ],
 )
 def test_folders_without_runs_are_refused(
     words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
