@@ -21,10 +21,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 
 import lfrtorch
+from lfrtorch.cli.composition import composed
+from lfrtorch.cli.hydra_versions import instantiate
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 
@@ -67,8 +67,7 @@ def fitted(job: dict) -> dict:
         f"seed={job['seed']}",
         f"data.seed={job['seed']}",
     ]
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        cfg = compose("config", settings)
+    cfg = composed("config", settings)
     data = instantiate(cfg.data)
     bla = instantiate(cfg.bla, data.train)
     model = instantiate(cfg.init, bla, data.train, nn=cfg.nn, activation=cfg.activation)

@@ -28,14 +28,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra import compose, initialize_config_dir
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 
 import lfrtorch
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.tables import number
-from lfrtorch.cli import CONF
+from lfrtorch.cli.composition import composed
+from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.dataset import Dataset
 from lfrtorch.reporting import leaderboard
 from lfrtorch.reporting import scores as report
@@ -132,15 +130,11 @@ def main() -> int:
 
 def case(name: str, words: list[str], out: Path, seeds: int, *, start: bool) -> Case:
     """The runs of a benchmark; those that are not there yet are started, if ``start``."""
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        cfg = compose("config", words)
+    cfg = composed("config", words)
     try:
         dataset: Dataset = instantiate(cfg.data)
-    except (FileNotFoundError, InstantiationException) as error:
-        cause = error.__cause__ or error
-        if not isinstance(cause, FileNotFoundError):
-            raise
-        print(f"{name}: no data. {cause}", flush=True)
+    except FileNotFoundError as error:
+        print(f"{name}: no data. {error}", flush=True)
         return Case(name, None, missing="no data at hand")
     if not dataset.tests:
         return Case(name, None, missing="no test records at hand")

@@ -8,10 +8,10 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from lfrtorch.cli import fit
+from lfrtorch.cli.composition import composed
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
@@ -39,16 +39,15 @@ GROUPS = ("+bench", "data", "bla", "static", "init", "trainer")
 
 
 @cache
-def composed(*groups: str) -> DictConfig:
+def usual(*groups: str) -> DictConfig:
     """By Hydra, which takes a tenth of a second; without figures, which take seconds."""
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        return compose("config", ["figures=false", *groups])
+    return composed("config", ["figures=false", *groups])
 
 
 def configuration(*overrides: str) -> DictConfig:
     """Of a run without figures, unless they are asked for."""
     groups = [word for word in overrides if word.split("=")[0] in GROUPS]
-    cfg = copy.deepcopy(composed(*groups))
+    cfg = copy.deepcopy(usual(*groups))
     cfg.merge_with_dotlist([word for word in overrides if word not in groups])
     return cfg
 

@@ -6,12 +6,10 @@ from pathlib import Path
 
 import matplotlib
 import pytest
-from hydra import compose, initialize_config_dir
 from matplotlib import pyplot
 
 import lfrtorch
-from lfrtorch.cli import CONF
-from lfrtorch.cli.composition import first_run, parsed
+from lfrtorch.cli.composition import composed, first_run, parsed
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -66,8 +64,7 @@ def test_command_of_the_guide_has_settings_that_exist(name: str, words: str):
     if "-m" in words.split():
         read = [parsed(word) for word in overrides]
         overrides = [first_run(word) for word in read if not word.is_hydra_override()]
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        compose("config" if name == "fit" else name, overrides)
+    composed("config" if name == "fit" else name, overrides)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

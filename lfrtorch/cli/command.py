@@ -49,8 +49,10 @@ def start(command: str) -> None:
     else:
         import hydra
 
+        from lfrtorch.cli.hydra_versions import MAIN
+
         name = "config" if command == "fit" else command
-        hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(lambda _: None)()
+        hydra.main(**MAIN, config_path=str(CONF), config_name=name)(lambda _: None)()
 
 
 def usage() -> str:

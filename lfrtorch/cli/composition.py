@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.cli import CONF
+from lfrtorch.cli.hydra_versions import COMPOSED
 from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.words import GROUPS
 
@@ -116,7 +117,7 @@ def first_run(word: Override) -> str:
 def composed(command: str, words: Sequence[str] = ()) -> DictConfig:
     """The configuration; where Hydra cannot make one, the first line of its reason."""
     try:
-        with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        with initialize_config_dir(**COMPOSED, config_dir=str(CONF)):
             return compose(command, list(words))
     except (HydraException, OmegaConfBaseException) as failed:
         raise InputError(str(failed).splitlines()[0]) from None

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch.nn import Module
 
@@ -17,6 +16,7 @@ from lfrtorch._support import checkpoint
 from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
+from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.words import translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.settings import Settings, SizesSearch

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import sys
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from omegaconf import DictConfig
 
 from lfrtorch._support.errors import LfrtorchError
 from lfrtorch._support.tables import in_lines
+from lfrtorch.cli.hydra_versions import NODE, notes_of
 from lfrtorch.cli.interrupts import TerminatedError, as_error, handled
 from lfrtorch.cli.words import translated
 
@@ -35,22 +35,14 @@ def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None
         with handled(as_error):
             yield
         return
-    except InstantiationException as failed:
-        if isinstance(failed.__cause__, TerminatedError):
-            _end(failed.__cause__, rank)
-        if failed.__cause__ and not _of_the_user(failed.__cause__):
-            raise failed.__cause__ from None
-        group = re.search(r"^full_key: (.+)$", str(failed), re.MULTILINE)
-        where = f"{group[1]}: " if group and failed.__cause__ else ""
-        show(f"{where}{_said(failed.__cause__ or failed)}")
     except TerminatedError as end:
         _end(end, rank)
-    except (LfrtorchError, OSError) as failed:
-        show(str(failed))
-    except (MemoryError, RuntimeError) as failed:
-        if not _of_memory(failed):
+    except (LfrtorchError, OSError, InstantiationException) as failed:
+        show(f"{_where(failed)}{failed}")
+    except (MemoryError, RuntimeError, ImportError, TypeError) as failed:
+        if not (_of_memory(failed) or _of_the_settings(failed)):
             raise
-        show(_said(failed))
+        show(f"{_where(failed)}{_said(failed)}")
     except KeyboardInterrupt:
         print("interrupted outside the fit: nothing to keep", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
@@ -64,11 +56,17 @@ def _end(end: TerminatedError, rank: str) -> NoReturn:
     sys.exit(128 + end.number)
 
 
-def _of_the_user(cause: BaseException) -> bool:
+def _where(error: BaseException) -> str:
+    """The group of the configuration that the call was made from, for the message."""
+    nodes = [note.removeprefix(NODE) for note in notes_of(error) if note.startswith(NODE)]
+    return f"{nodes[0]}: " if nodes and nodes[0] else ""
+
+
+def _of_the_settings(error: BaseException) -> bool:
     """Whether a call from the configuration failed because of what it was given."""
-    if isinstance(cause, TypeError):
-        return "unexpected keyword argument" in str(cause)
-    return isinstance(cause, LfrtorchError | OSError | ImportError) or _of_memory(cause)
+    called = any(note.startswith(NODE) for note in notes_of(error))
+    wrong = "unexpected keyword argument" in str(error)
+    return called and (isinstance(error, ImportError) or (isinstance(error, TypeError) and wrong))
 
 
 def _of_memory(error: BaseException) -> bool:

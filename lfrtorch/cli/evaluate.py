@@ -23,6 +23,7 @@ from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import loaded, require_data
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.hydra_versions import MAIN
 from lfrtorch.cli.run_folder import CONFIG, program
 from lfrtorch.cli.simulate import opened
 from lfrtorch.cli.words import Terminal
@@ -120,7 +121,7 @@ def linear_beside(checkpoint: str) -> lfrtorch.LinearModel | None:
     return None if found is None else lfrtorch.LinearModel.load(found)
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF), config_name="evaluate")
+@hydra.main(**MAIN, config_path=str(CONF), config_name="evaluate")
 def main(cfg: DictConfig) -> None:
     """The command line."""
     command = shlex.join([*program("scripts/evaluate.py"), *HydraConfig.get().overrides.task])

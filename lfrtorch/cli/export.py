@@ -14,6 +14,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.hydra_versions import MAIN
 from lfrtorch.cli.simulate import introduced, opened
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 
@@ -46,7 +47,7 @@ def observer_of(cfg: DictConfig) -> bool | NoiseCovariance:
     return NoiseCovariance(np.array(Q, dtype=float), np.array(R, dtype=float))
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF), config_name="export")
+@hydra.main(**MAIN, config_path=str(CONF), config_name="export")
 def main(cfg: DictConfig) -> None:
     """The command line."""
     with user_errors(cfg=cfg):

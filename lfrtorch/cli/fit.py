@@ -31,6 +31,7 @@ from lfrtorch.cli import CONF, study
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.hydra_versions import MAIN
 from lfrtorch.cli.interrupts import TerminatedError, Termination
 from lfrtorch.cli.run_folder import (
     CONFIG,
@@ -203,7 +204,7 @@ class _Folder(Terminal):
             board.close()
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
+@hydra.main(**MAIN, config_path=str(CONF), config_name="config")
 def main(cfg: DictConfig) -> float:
     """The command line."""
     job = HydraConfig.get()

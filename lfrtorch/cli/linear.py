@@ -16,13 +16,12 @@ from typing import Any
 import hydra
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines, in_percent, percent
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.poles import frequency_and_damping, remark
@@ -30,6 +29,7 @@ from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.hydra_versions import MAIN, instantiate
 from lfrtorch.cli.run_folder import CONFIG, arguments, no_empty_folder, program
 from lfrtorch.cli.words import Terminal
 from lfrtorch.dataset import Dataset
@@ -88,10 +88,10 @@ def response(
     asked_for = cfg.frf.method != "auto" or wants_response(cfg, records)
     try:
         frf: lfrtorch.FRF = instantiate(cfg.frf, records)
-    except InstantiationException as failed:
-        if asked_for or not isinstance(failed.__cause__, ValueError):
+    except InputError as failed:
+        if asked_for:
             raise
-        return None, [f"no measured frequency response: {failed.__cause__}"]
+        return None, [f"no measured frequency response: {failed}"]
     return frf, list(frf.notes)
 
 
@@ -315,7 +315,7 @@ def finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF), config_name="linear")
+@hydra.main(**MAIN, config_path=str(CONF), config_name="linear")
 def main(cfg: DictConfig) -> None:
     """The command line."""
     run = HydraConfig.get()

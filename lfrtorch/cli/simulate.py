@@ -25,6 +25,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.hydra_versions import MAIN
 from lfrtorch.cli.linear import finite
 from lfrtorch.cli.words import translated
 from lfrtorch.files.load import listed_files
@@ -335,7 +336,7 @@ def about(path: Path) -> Iterator[None]:
         raise InputError(f"'{path}': {error}") from error
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF), config_name="simulate")
+@hydra.main(**MAIN, config_path=str(CONF), config_name="simulate")
 def main(cfg: DictConfig) -> None:
     """The command line."""
     with user_errors(cfg=cfg):

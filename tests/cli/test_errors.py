@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import builtins
 import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from hydra.utils import instantiate
 
 from lfrtorch import InputError, LfrtorchError
 from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.interrupts import TerminatedError, as_error, handled
 from lfrtorch.distributed import ProcessLostError
 
 
 def fails(kind: Callable[[str], Exception], message: str) -> None:
     raise kind(message)
+
+
+def fails_by_name(kind: str, message: str) -> None:
+    named = {"InputError": InputError, "LfrtorchError": LfrtorchError, **vars(builtins)}
+    fails(named[kind], message)
+
+
+def failing(kind: Any, message: str) -> dict[str, Any]:
+    """A node of settings whose target raises an error."""
+    return {"_target_": fails_by_name, "kind": kind.__name__, "message": message}
 
 
 def printed(capsys: pytest.CaptureFixture[str], call: Callable[[], object]) -> str:
@@ -31,7 +43,7 @@ def printed(capsys: pytest.CaptureFixture[str], call: Callable[[], object]) -> s
 def test_errors_of_users_are_one_line(kind: Callable[[str], Exception], capsys):
     message = str(kind("nx is 0"))
     assert printed(capsys, lambda: fails(kind, "nx is 0")) == f"error: {message}\n"
-    target = {"_target_": fails, "kind": kind, "message": "nx is 0"}
+    target = failing(kind, "nx is 0")
     assert printed(capsys, lambda: instantiate(target)) == f"error: {message}\n"
     assert printed(capsys, lambda: instantiate({"a": target})["a"]) == f"error: a: {message}\n"
 
@@ -66,7 +78,7 @@ def test_memory_that_there_is_not_is_one_line(capsys):
     for call in (
         lambda: fails(MemoryError, ""),
         lambda: fails(RuntimeError, "DefaultCPUAllocator: can't allocate memory: 8 TB"),
-        lambda: instantiate({"_target_": fails, "kind": MemoryError, "message": ""}),
+        lambda: instantiate(failing(MemoryError, "")),
     ):
         assert "error: there is not enough memory; give smaller" in printed(capsys, call)
 
@@ -82,7 +94,7 @@ def test_bugs_are_raised_as_they_are(kind: Callable[[str], Exception]):
         fails(kind, "bug")
     assert found.traceback[-1].name == "fails"
     with pytest.raises(kind, match="bug") as found, user_errors():  # pyright: ignore
-        instantiate({"_target_": fails, "kind": kind, "message": "bug"})
+        instantiate(failing(kind, "bug"))
     assert found.traceback[-1].name == "fails"
 
 

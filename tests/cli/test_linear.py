@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import scipy.signal
 from command_line import configuration
-from hydra import compose, initialize_config_dir
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
 from lfrtorch.cli import errors, fit, linear
+from lfrtorch.cli.composition import composed
 from lfrtorch.dataset import Dataset
 from lfrtorch.records import Record
 
@@ -224,9 +224,8 @@ def test_user_errors_are_one_message(
 
 
 @cache
-def composed() -> DictConfig:
-    with initialize_config_dir(version_base="1.3", config_dir=str(ROOT / "conf")):
-        return compose("linear", ["data=file"])
+def usual() -> DictConfig:
+    return composed("linear", ["data=file"])
 
 
 @pytest.mark.parametrize(
@@ -249,7 +248,7 @@ def composed() -> DictConfig:
 def test_settings_that_cannot_be_are_one_message(
     inputs: str, more: list[str], message: str, csv: Path, tmp_path: Path, capsys
 ):
-    cfg = copy.deepcopy(composed())
+    cfg = copy.deepcopy(usual())
     OmegaConf.set_struct(cfg, False)  # as + does on the command line
     cfg.merge_with_dotlist(overrides(csv, inputs, "x", *more)[1:])
     with pytest.raises(SystemExit) as stop, errors.user_errors(cfg=cfg):

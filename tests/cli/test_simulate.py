@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from reference import random_cell, random_model
 
 import lfrtorch
 from lfrtorch._support.types import Array
 from lfrtorch.cli import simulate
+from lfrtorch.cli.composition import composed
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.stream import Block, FileStream
 
@@ -54,14 +54,13 @@ def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
 
 
 @cache
-def composed() -> DictConfig:
-    with initialize_config_dir(version_base="1.3", config_dir=str(simulate.CONF)):
-        return compose("simulate")
+def usual() -> DictConfig:
+    return composed("simulate")
 
 
 def direct() -> None:
     """The command line without the start of Hydra, which takes a quarter of a second."""
-    cfg = copy.deepcopy(composed())
+    cfg = copy.deepcopy(usual())
     cfg.merge_with_dotlist(sys.argv[1:])
     with simulate.user_errors(cfg=cfg):
         simulate.simulate(cfg)

@@ -8,11 +8,11 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from scipy.io import savemat
 from scipy.signal import cont2discrete, lfilter
 
 from lfrtorch.cli import fit
+from lfrtorch.cli.composition import composed
 from lfrtorch.datasets import ced
 
 FILE = "CED/DATAUNIF.MAT"
@@ -143,9 +143,8 @@ def test_drives_are_identified(tmp_path):
     """
     (u11, z11), (u12, z12) = drives(0.5, 1.5, 0), drives(1.0, 2.5, 1)
     write(tmp_path, u11=u11, z11=z11, u12=u12, z12=z12)
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        words = ["+bench=ced", f"data.root='{tmp_path}'", "figures=false", "starts=4"]
-        cfg = compose("config", [*words, "trainer.max_iter=80"])
+    words = ["+bench=ced", f"data.root='{tmp_path}'", "figures=false", "starts=4"]
+    cfg = composed("config", [*words, "trainer.max_iter=80"])
     fit.run(cfg, tmp_path)
     scores = json.loads((tmp_path / "metrics.json").read_text())["scores"]
     for level in ("low", "high"):

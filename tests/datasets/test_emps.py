@@ -10,11 +10,11 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from scipy.io import savemat
 
 import lfrtorch
 from lfrtorch.cli import fit
+from lfrtorch.cli.composition import composed
 from lfrtorch.datasets import emps
 
 ESTIMATION, TEST = FILES = ("EMPS/DATA_EMPS.mat", "EMPS/DATA_EMPS_PULSES.mat")
@@ -181,9 +181,8 @@ def simulated(tmp_path):
 
 def scores(root: Path, *words: str) -> dict[str, dict[str, float]]:
     """Of a run on the files below ``root``."""
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        given = ["+bench=emps", f"data.root='{root}'", "figures=false", "starts=1"]
-        cfg = compose("config", [*given, *words])
+    given = ["+bench=emps", f"data.root='{root}'", "figures=false", "starts=1"]
+    cfg = composed("config", [*given, *words])
     fit.run(cfg, root)
     metrics = json.loads((root / "metrics.json").read_text())
     return metrics["scores"] | {"validation": metrics["validation"]}

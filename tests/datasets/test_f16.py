@@ -9,12 +9,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from scipy.io import savemat
 from scipy.signal import lfilter
 
 from lfrtorch import metrics, multisine
 from lfrtorch.cli import fit
+from lfrtorch.cli.composition import composed
 from lfrtorch.datasets import f16
 
 FOLDER = "F16/F16GVT_Files/BenchmarkData"
@@ -277,8 +277,7 @@ def test_run(shaken, tmp_path, capsys):
     sizes = "nx=4 nn=5 starts=1 data.levels=[7]"
     shorter = "trainer.max_iter=2 figures=false"
     overrides = ["+bench=f16", f"data.root='{shaken}'", *sizes.split(), *shorter.split()]
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        cfg = compose("config", overrides)
+    cfg = composed("config", overrides)
     fit.run(cfg, tmp_path)
     result = json.loads((tmp_path / "metrics.json").read_text())
     names = [f"{kind}_{level}" for kind in ("multisine", "sweep") for level in (2, 4, 6)]

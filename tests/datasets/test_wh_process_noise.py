@@ -8,11 +8,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from scipy.io import savemat
 from scipy.signal import butter, lfilter
 
 from lfrtorch.cli import fit
+from lfrtorch.cli.composition import composed
 from lfrtorch.datasets import wh_process_noise
 
 FOLDER = "WienHammer/WienerHammersteinFiles"
@@ -159,8 +159,7 @@ def test_run(tmp_path):
     write(tmp_path, TEST, u=tests, y=outputs(tests, 0.0))
     sizes = "nx=2 nn=5 starts=1 data.validation=1 trainer.max_iter=2 bla.max_iter=5 figures=false"
     overrides = ["+bench=wh_process_noise", f"data.root='{tmp_path}'", *sizes.split()]
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        cfg = compose("config", overrides)
+    cfg = composed("config", overrides)
     fit.run(cfg, tmp_path / "run")
     result = json.loads((tmp_path / "run" / "metrics.json").read_text())
 

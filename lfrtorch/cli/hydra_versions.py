@@ -1,0 +1,52 @@
+"""What Hydra 1.4 asks for and Hydra 1.3 does not know."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Any
+
+import hydra.utils
+from hydra.errors import InstantiationException
+
+IS_1_3 = version("hydra-core").startswith("1.3")
+
+NODE = "full_key: "
+"""How the note on an error begins that says which node of the settings it is from."""
+
+COMPOSED: dict[str, Any] = {"version_base": "1.3"} if IS_1_3 else {}
+"""How ``initialize_config_dir`` reads the settings."""
+
+_TRUSTED = None if IS_1_3 else getattr(hydra.utils, "UNSAFE_DISABLE_EXECUTION_CHECKS", None)
+# Targets come from the settings in conf/ and from the user's command line, never from data or a
+# checkpoint; a static map of the user's own may be of any module.
+
+MAIN: dict[str, Any] = COMPOSED if _TRUSTED is None else {"execution_whitelist": _TRUSTED}
+"""How ``hydra.main`` does, and that it may make what they name."""
+
+
+def instantiate(node: Any, *args: Any, **options: Any) -> Any:
+    """What a node of the settings describes.
+
+    What its target raises comes with a note that says which node it was, ``full_key: data``.
+
+    Args:
+        node: with a ``_target_``.
+        args, options: of the target, beside those of the node.
+    """
+    if _TRUSTED is not None:
+        options["_execution_whitelist_"] = _TRUSTED
+    try:
+        return hydra.utils.instantiate(node, *args, **options)
+    except Exception as failed:
+        wraps = isinstance(failed, InstantiationException) and failed.__cause__
+        error: BaseException = failed.__cause__ if wraps and failed.__cause__ else failed
+        lines = [*notes_of(failed), *str(failed).splitlines()]
+        note = next((line for line in lines if line.startswith(NODE)), NODE)
+        if note not in notes_of(error):
+            error.add_note(note)
+        raise error from error.__cause__
+
+
+def notes_of(error: BaseException) -> list[str]:
+    """What was added to an error."""
+    return getattr(error, "__notes__", [])
