@@ -38,10 +38,20 @@ class Board(NamedTuple):
 SIZES = ["nz=1,2,3", "nw=1,2,3", "nn=range(5,26)"]
 BOARDS = {
     "silverbox": Board(["trainer.max_iter=60"], ["nx=range(1,13)", *SIZES]),
-    "f16": Board(["trainer.max_iter=12"], ["nx=range(1,21)", *SIZES]),
+    "f16": Board(
+        [
+            *("data.train=[multisine_3,multisine_7]", "data.validation=[multisine_5]"),
+            *("first_part=1", "modes=0", "nx_max=12", "trainer.max_iter=20"),
+        ],
+        ["nx=range(1,13)", *SIZES],
+    ),
     "fine_steering_mirror": Board(
-        ["trainer.max_iter=8", "data.levels=[200]"],
-        ["nx=range(1,33)", "nz=4,8,12", "nw=4,8", "nn=range(20,31)"],
+        [
+            *("data.levels=[200]", "relaxations=0", "nx_max=12"),
+            *("sizes_search.nz=[2,4,8]", "sizes_search.nw=[2,4]", "sizes_search.nn=[10,20]"),
+            *("first_iterations=10", "trainer.max_iter=8"),
+        ],
+        ["nx=range(1,13)", "nz=2,4,8", "nw=2,4", "nn=range(10,21)"],
     ),
 }
 COMMON = ["threads=1", "figures=false", "refit=false", "average=1"]
