@@ -6,7 +6,7 @@ PARTIAL := $(VENV)/.partial
 PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-all test-machines test-min test-latest torture mutants coverage check bench first-try reproduce docs docs-links dist clean
+.PHONY: help setup run test test-all test-machines test-min test-latest torture mutants coverage check bench first-try reproduce docs docs-links audit dist clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -64,6 +64,10 @@ docs: $(READY)  ## guide, notebooks and reference, in site/; a broken link in it
 
 docs-links: docs  ## links to other sites, too; needs the network
 	@$(BIN)/sphinx-build -qW --keep-going -d site/doctrees -b linkcheck docs site/links
+
+audit:  ## known faults of the versions in constraints.txt; asks pypi.org
+	@$(PYTHON) -m venv .venv-audit && .venv-audit/bin/python -m pip install -qq --disable-pip-version-check pip-audit
+	@.venv-audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip --strict
 
 dist: $(READY)  ## wheel and sdist in dist/, the same bytes whenever they are built from a commit
 	@SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m build -q --no-isolation
