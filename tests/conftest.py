@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import settings
 from shapes import calls, install
+from threadpoolctl import threadpool_limits
 
 install()
 
@@ -19,6 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 THREADS = int(os.environ["LFRTORCH_TEST_THREADS"])
 torch.set_num_threads(THREADS)
+# jaxtyping's plugin of pytest has imported numpy before the variable above was set.
+threadpool_limits(THREADS, user_api="blas")
 
 # Same examples in every run, none kept on disk; compilation may take its time.
 settings.register_profile("lfrtorch", deadline=None, derandomize=True, database=None)
