@@ -133,7 +133,7 @@ def test_every_module_of_an_installed_wheel_imports(installed: Path, tmp_path: P
     assert Path(found.stdout.strip()).is_relative_to(installed.parent)
 
 
-HEAVY = ("hydra", "matplotlib", "pandas", "jinja2", "scipy.signal", "scipy.io")
+HEAVY = ("hydra", "matplotlib", "pandas", "jinja2", "scipy.signal", "scipy.io", "scipy.stats")
 """What some functions alone need; together they take more than a second to import."""
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.stats import norm
+from scipy.special import ndtri
 from torch import Tensor
 from torch.autograd.functional import jacobian
 from torch.func import functional_call
@@ -102,7 +102,7 @@ class Band:
         if not 0 < level < 1:
             raise InputError(f"level is {level}; give a probability between 0 and 1, as 0.95.")
         std = np.hypot(self.std, self.noise) if noise else self.std
-        half = float(norm.ppf((1 + level) / 2)) * std
+        half = float(ndtri((1 + level) / 2)) * std
         return self.y - half, self.y + half
 
 

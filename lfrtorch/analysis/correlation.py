@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtr, ndtri
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.powers import near_one
@@ -98,7 +98,7 @@ def autocorrelation(e: Float[Array, " T"], lags: int | None = None) -> Correlati
     e = e - e.mean()
     K = lags_for(len(e), lags)
     values, bounds, scores = _correlated(e, e, range(1, K + 1))
-    return Correlation(np.arange(1, K + 1), values, bounds, float(chi2.sf(np.sum(scores**2), K)))
+    return Correlation(np.arange(1, K + 1), values, bounds, float(chdtrc(K, np.sum(scores**2))))
 
 
 def cross_correlation(
@@ -144,7 +144,7 @@ def white_cross_correlation(e: Float[Array, " S"], x: Float[Array, " T"], lags: 
     T = min(len(e), len(x))
     every = range(-lags, lags + 1)
     values, bounds, scores = _correlated(e[-T:], x[-T:], every)
-    one = 2.0 * norm.sf(np.max(np.abs(scores[lags:])))
+    one = 2.0 * ndtr(-np.max(np.abs(scores[lags:])))
     p = -math.expm1((lags + 1) * math.log1p(-min(float(one), 1.0 - 1e-16)))
     return Correlation(np.arange(-lags, lags + 1), values, bounds, p)
 
@@ -202,7 +202,7 @@ def _correlated(
     if not size > 0:
         return np.zeros(len(lags)), np.zeros(len(lags)), np.zeros(len(lags))
     scores = np.divide(sums, deviations, out=np.zeros(len(lags)), where=deviations > 0)
-    z = float(norm.isf((1.0 - BOUND) / 2))
+    z = -float(ndtri((1.0 - BOUND) / 2))
     return sums / size, z * deviations / size, scores
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import f
+from scipy.special import fdtrc
 
 from lfrtorch._support.reasons import SPENT, Reason
 from lfrtorch._support.types import Array
@@ -378,7 +378,7 @@ def chance_of_ratio(here: Sequence[Array], there: Sequence[Array]) -> float:
         spread = max(spread, counts.sum() * float(error / power) ** 2)  # of one sample
     high, low = np.argsort(powers)[::-1]
     freedom = 2.0 * np.array(samples) / max(spread, np.finfo(float).tiny)
-    one_side = f.sf(powers[high] / powers[low], freedom[high], freedom[low])
+    one_side = fdtrc(freedom[high], freedom[low], powers[high] / powers[low])
     return min(1.0, 2.0 * float(one_side))
 
 

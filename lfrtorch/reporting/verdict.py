@@ -17,7 +17,7 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import stdtrit
 
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.tables import number, percent
@@ -295,7 +295,7 @@ def _compared(errors: Sequence[_Errors], among: int = 1) -> Compared:
         ratio=ratio,
         ratio_std=ratio_std,
         deviations=math.log(ratio) * ratio / ratio_std if ratio_std > 0 else 0.0,
-        clear=float(t.ppf(1.0 - (1.0 - CONFIDENCE) / max(1, among), len(counts) - 1)),
+        clear=float(stdtrit(len(counts) - 1, 1.0 - (1.0 - CONFIDENCE) / max(1, among))),
         nrmse=math.sqrt(sum(e.squares.sum() for e in errors) / power),
         linear_nrmse=math.sqrt(sum(e.linear.sum() for e in errors) / power),
     )
