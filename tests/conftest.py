@@ -1,3 +1,4 @@
+import gc
 import os
 
 # Small matrices: more threads cost more than they give. Emulated machines may have two.
@@ -14,6 +15,7 @@ from hypothesis import settings
 from shapes import calls, install
 from threadpoolctl import threadpool_limits
 
+gc.disable()  # until all is imported: there is much of it, and nothing in it is garbage
 install()
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -26,6 +28,12 @@ threadpool_limits(THREADS, user_api="blas")
 # Same examples in every run, none kept on disk; compilation may take its time.
 settings.register_profile("lfrtorch", deadline=None, derandomize=True, database=None)
 settings.load_profile("lfrtorch")
+
+
+def pytest_collection_finish() -> None:
+    """From now on garbage is collected, except in what has been imported: it is looked at once."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)
