@@ -52,10 +52,12 @@ def measured(kind: Start, seed: int, **sizes: Any) -> Record:
     return replace(late[20:], start=kind, x0=[0.3, -0.2] if kind == "given" else None)
 
 
-def records(kinds: Sequence[Start] = STARTS, **sizes: Any) -> tuple[list[Record], Record]:
+def records(
+    kinds: Sequence[Start] = STARTS, validation: Start = "estimated", **sizes: Any
+) -> tuple[list[Record], Record]:
     """One record of each kind of start, and one for validation."""
     train = [measured(kind, seed, **sizes) for seed, kind in enumerate(kinds)]
-    return train, measured("estimated", 9, **sizes)
+    return train, measured(validation, 9, **sizes)
 
 
 def starts(count: int, **sizes: Any) -> list[Model]:
@@ -184,7 +186,7 @@ def test_several_starts_end_as_without_interruption(tmp_path: Path):
 
 
 def test_a_start_that_had_not_begun_takes_part_after_that(tmp_path: Path):
-    data, optimiser = records(["zero"]), LevenbergMarquardt(max_iter=8)
+    data, optimiser = records(["zero"], "zero"), LevenbergMarquardt(max_iter=8)
     whole = run(starts(3), data, trainer=optimiser)
     for after in range(2, 9):
         folder, calls = tmp_path / str(after), itertools.count()
@@ -199,7 +201,7 @@ def test_a_start_that_had_not_begun_takes_part_after_that(tmp_path: Path):
 
 
 def test_a_fit_is_cut_short_if_a_start_beside_the_best_is(tmp_path: Path):
-    data, optimiser = records(["zero"]), LevenbergMarquardt(max_iter=4)
+    data, optimiser = records(["zero"], "zero"), LevenbergMarquardt(max_iter=4)
     whole = run(starts(3), data, trainer=optimiser)
     ends = 0
     for after in range(9, 16):
