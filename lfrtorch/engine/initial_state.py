@@ -153,7 +153,11 @@ def _fitted_start(
         seen = SEEN * weight.abs().amax()
         step = -(torch.linalg.pinv(rows, atol=seen, rtol=SEEN) @ errors).squeeze(-1)
         before = cost
-        waiting = usable.clone()
+        # A step that should lower the cost by less than its rounding is not worth a trial.
+        promised = (rows @ step.unsqueeze(-1)).square().sum(dim=(1, 2))
+        waiting = usable & (promised > torch.finfo(cost.dtype).eps * cost)
+        if not waiting.any():
+            break
         for _ in range(HALVINGS):
             trial = simulate(cell, u, x0 + step)
             trial_cost = squares(trial, x0 + step)
