@@ -329,13 +329,13 @@ class LevenbergMarquardt:
         relative = first if damping is None else damping / state.scale
         system, gradient = jacobian.system(relative, self.truncation)
         scale = system.scale
-        if not scale > 0:
+        if not 0.0 < scale < math.inf:
             return replace(state, reason=Reason.JACOBIAN_VANISHES)
         if damping is None:  # to be lowered within this step
             damping, least = self.damping * scale, self.least_damping * scale
         growth, trials, gain_ratio = state.growth, 0, float("nan")
         best: _Trial | None = None
-        while damping <= self.max_damping * scale:
+        while damping / scale <= self.max_damping:
             trials += 1
             trial = yield from self._trial(cost_of, state, jacobian, system, gradient, damping)
             gain_ratio, decrease = trial.gain_ratio, state.cost - trial.cost

@@ -252,15 +252,18 @@ class Flat(Problem):
         return torch.full((2, 2), self.entry, dtype=theta.dtype)
 
 
-def test_search_gives_up_after_trials_in_vain():
+@pytest.mark.parametrize(("entry", "trials"), [(1.0, 10), (1e149, 9)])
+def test_search_gives_up_after_trials_in_vain(entry: float, trials: int):
     start = tensor(1, 1)
     problem = Flat(lambda x: x if torch.equal(x, start) else x * torch.nan)
+    problem.entry = entry
     (_, end) = search(problem, start, LevenbergMarquardt())
     assert end.reason == "converged: no step lowers the cost"
     assert torch.equal(end.theta, start)
     assert end.iteration == 1
-    # λ grows by 2, 4, 8, ... from 1e-2: nine times 2^45 = 3.5e13, the next is beyond 1e12.
-    assert end.trials == 10
+    # λ grows by 2, 4, 8, ... from 1e-2: nine times 2^45 = 3.5e13, the next is beyond 1e12. That
+    # part of the square of 2e149 is no number.
+    assert end.trials == trials
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -269,8 +272,9 @@ def test_start_that_is_not_finite_is_refused(bad: float):
         LevenbergMarquardt().init(Problem(lambda x: x * bad), tensor(1, 1))
 
 
-@pytest.mark.parametrize("entry", [0.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("entry", [0.0, float("nan"), float("inf"), 1e200])
 def test_jacobian_that_vanishes_or_is_not_finite_ends_the_search(entry: float):
+    """So does one whose squares are not: no damping is above infinity."""
     problem = Flat(lambda x: x + 1)
     problem.entry = entry
     (_, end) = search(problem, tensor(1, 1), LevenbergMarquardt())
