@@ -135,9 +135,9 @@ class ModalJacobian:
         inverse = system.inverse.numpy()
         if known:
             return Q @ (inverse / 2) @ Q.T
-        scores = (self._scores(self._errors) @ Z).real
+        root = (self._scores(self._errors) @ Z).real @ inverse @ Q.T
         M, K = 2 * self._errors.size, Q.shape[1]
-        return Q @ (inverse @ (scores.T @ scores) @ inverse * (M / max(1, M - K))) @ Q.T
+        return root.T @ root * (M / max(1, M - K))
 
     def _products(self) -> Complex:
         """JᴴJ with λ, b, c and the free entries of D, (Kc, Kc)."""

@@ -368,8 +368,9 @@ class ResponseJacobian:
         J = self._J.reshape(len(self._J), -1, self._J.shape[-1])
         r = self._errors.reshape(J.shape[:2])
         scores = np.einsum("fek,fe->fk", J.conj(), r).real @ self._reduced.expand.numpy()
+        root = scores @ inverse  # whose squares are positive, whatever the rounding
         M, K = 2 * self._errors.size, self._rows.shape[1]
-        return inverse @ (scores.T @ scores) @ inverse * (M / max(1, M - K))
+        return root.T @ root * (M / max(1, M - K))
 
 
 def _real(errors: Complex) -> Tensor:

@@ -188,7 +188,7 @@ class SignalFit:
         if self._prediction or problem.size * len(theta) > LARGEST_ROWS:
             return inverse * (cost / spare)
         rows, errors = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
-        meat, first = np.zeros_like(inverse), 0
+        found, first = np.zeros_like(inverse), 0
         for group in problem.groups:
             shape = group.residual_shape
             last = first + shape.numel()
@@ -201,10 +201,10 @@ class SignalFit:
                 scores[:, 0] /= 2.0
                 if shape[1] % 2 == 0:
                     scores[:, -1] /= 2.0
-            flat = scores.reshape(-1, scores.shape[-1])
-            meat += flat.T @ flat
+            root = scores.reshape(-1, scores.shape[-1]) @ inverse
+            found += root.T @ root
             first = last
-        return inverse @ meat @ inverse * (problem.size / spare)
+        return found * (problem.size / spare)
 
     def _with_all_inputs(self, each: NormalisedRecord) -> NormalisedRecord:
         """The record with the inputs of the cell: u, then y for a prediction, then the constant."""
