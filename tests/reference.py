@@ -205,6 +205,48 @@ def measure(model: Model, T: int, *, seed: int = 0, start: Start = "zero", skip:
     )  # fmt: skip
 
 
+# --- special cases --------------------------------------------------------------------------
+
+MATRICES = ["normal", "zero", "repeated", "rank 1", "graded", "sparse"]
+"""What ``special_matrix`` makes."""
+
+
+def special_matrix(kind: str, rows: int, columns: int, rng: np.random.Generator) -> Array:
+    """Normal numbers; or with zeros, dependent columns, or columns of 1e-9 to 1e9."""
+    M = rng.normal(size=(rows, columns))
+    if kind == "zero":
+        M *= 0.0
+    if kind == "repeated":
+        M[:, -1] = M[:, 0]
+    if kind == "rank 1":
+        M = M[:, :1] * rng.normal(size=columns)
+    if kind == "graded":
+        M *= 10.0 ** rng.uniform(-9.0, 9.0, columns)
+    if kind == "sparse":
+        M[rng.random(M.shape) < 0.5] = 0.0
+    return M
+
+
+POLES = ["normal", "repeated", "near", "defective", "nilpotent", "zero", "slow"]
+"""What ``special_poles`` makes."""
+
+
+def special_poles(kind: str, nx: int, rng: np.random.Generator) -> Array:
+    """A with |poles| < 1, which may be equal, almost equal, without eigenvectors, 0 or near 1."""
+    turn = np.linalg.qr(rng.normal(size=(nx, nx)))[0]
+    if kind == "normal":
+        A = rng.normal(size=(nx, nx))
+        return 0.9 * A / np.abs(np.linalg.eigvals(A)).max()
+    poles = {
+        "repeated": np.full(nx, 0.5),
+        "near": 0.5 + 10.0 ** rng.uniform(-16.0, -2.0) * np.arange(nx),
+        "slow": 1.0 - 10.0 ** rng.uniform(-6.0, -2.0, nx),
+        "defective": np.full(nx, 0.5),
+    }.get(kind, np.zeros(nx))
+    A = np.diag(poles) + np.eye(nx, k=1) * (kind in ("defective", "nilpotent"))
+    return turn @ A @ turn.T if rng.random() < 0.5 else A
+
+
 # --- linear systems -------------------------------------------------------------------------
 
 System = tuple[Array, Array, Array, Array]  # A, B, C, D

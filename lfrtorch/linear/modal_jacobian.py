@@ -22,8 +22,10 @@ from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.pole_limits import Excess
 from lfrtorch.linear.spectral_data import SpectralData
 
-DEFECTIVE = 1e5
-"""Modes are not used if the condition number of the eigenvectors is above this."""
+DEFECTIVE = 1e6
+"""Modes are not used if sᵢ sⱼ / |λᵢ - λⱼ| of two poles is above this, s being how far a pole moves
+with A. The derivatives of modes grow with it and cancel in those of the response: JᵀJ then has four
+digits left."""
 
 SMALLEST = 1e-14
 """Eigenvalues of JᵀJ below this part of the largest are rounding errors."""
@@ -58,8 +60,11 @@ class Modes(NamedTuple):
             W = np.asarray(np.linalg.inv(V), dtype=np.complex128)
         except np.linalg.LinAlgError:
             return None
-        if not np.linalg.norm(V) * np.linalg.norm(W) < DEFECTIVE:
-            return None
+        with np.errstate(over="ignore"):
+            s = np.linalg.norm(V, axis=0) * np.linalg.norm(W, axis=1)
+            apart = np.abs(poles - poles[:, None]) + np.diag(np.full(len(poles), np.inf))
+            if not (np.outer(s, s) < DEFECTIVE * apart).all():
+                return None
         return cls(poles, V, W, W @ B, C @ V, D)
 
     def response(self, z: Complex128[Complex, " F"]) -> Complex128[Complex, "F ny nu"]:
@@ -336,17 +341,18 @@ def _change(m: Modes, free: NDArray[np.bool_]) -> Complex:
 
 def _without_scaling(m: Modes, change: Complex) -> Float[Array, "K P"]:
     """Real rows that span the same directions: of one pole of a pair, and with the largest entry of
-    each cᵢ constant, as bᵢ and cᵢ have a common factor."""
+    each bᵢ and cᵢ constant, as they have a common factor."""
     (ny, n), nu = m.c.shape, m.b.shape[1]
     poles, b, c, D = np.split(change, np.cumsum([n, n * nu, n * ny]))
-    b, c = b.reshape(n, nu, -1), c.reshape(n, ny, -1)
-    largest = np.abs(m.c).argmax(axis=0)
-    at = np.arange(n)
-    relative = c[at, largest] / m.c[largest, at][:, None]  # (n, P)
-    b = b + m.b[:, :, None] * relative[:, None]
-    c = c - m.c.T[:, :, None] * relative[:, None]
-    c = c[np.arange(ny) != largest[:, None]].reshape(n, ny - 1, change.shape[1])
-    whole = np.concatenate([poles[:, None], b, c], axis=1)
+    both = np.concatenate([b.reshape(n, nu, -1), c.reshape(n, ny, -1)], axis=1)
+    # A factor on bᵢ that cᵢ is divided by moves them along these.
+    along = np.concatenate([m.b, -m.c.T], axis=1)
+    largest, at = np.abs(along).argmax(axis=1), np.arange(n)
+    size = along[at, largest]  # 0 of a mode that no input moves and no output shows
+    factor = both[at, largest] / np.where(size == 0, 1.0, size)[:, None]  # (n, P)
+    both = both - along[:, :, None] * factor[:, None]
+    both = both[np.arange(nu + ny) != largest[:, None]].reshape(n, -1, change.shape[1])
+    whole = np.concatenate([poles[:, None], both], axis=1)
     upper, pair = whole[m.poles.imag >= 0], whole[m.poles.imag > 0]
     parts = [part.reshape(-1, change.shape[1]) for part in (upper.real, pair.imag)]
     return np.concatenate([*parts, D.real])

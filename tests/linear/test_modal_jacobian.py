@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import reference
 import torch
-from reference import random_system
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from reference import POLES, random_system, special_poles
 
 from lfrtorch import Record, estimate_bla
 from lfrtorch.linear.modal_jacobian import ModalJacobian, Modes, with_best_inputs
@@ -124,3 +126,60 @@ def test_one_input_and_output_are_fitted_by_modes_as_well(monkeypatch: pytest.Mo
     assert found.fit is not None
     assert expected.fit is not None
     assert found.fit.rmse == pytest.approx(expected.fit.rmse, rel=1e-4)
+
+
+cases = given(
+    kind=st.sampled_from(POLES),
+    sizes=st.tuples(st.integers(1, 4), st.integers(1, 2), st.integers(1, 2)),
+    hidden=st.sampled_from(["", "input", "output", "both"]),
+    seed=st.integers(0, 1000),
+)
+
+
+def check_modes(kind: str, sizes: tuple[int, int, int], hidden: str, seed: int):
+    """Poles of all kinds, and states that no input moves or no output shows."""
+    (nx, nu, ny), rng = sizes, np.random.default_rng(seed)
+    A = special_poles(kind, nx, rng)
+    B, C, D = (rng.normal(size=shape) for shape in ((nx, nu), (ny, nx), (ny, nu)))
+    if hidden in ("input", "both"):
+        B[0] = 0.0
+    if hidden in ("output", "both"):
+        C[:, 0] = 0.0
+    theta = torch.as_tensor(np.concatenate([m.ravel() for m in (A, B, C, D)]))
+    z = np.exp(1j * np.linspace(1.0, 2.0, 20))
+    U, Y = (rng.normal(size=(20, n, 2)) + 1j * rng.normal(size=(20, n, 2)) for n in (nu, ny))
+    modal, general = (
+        ResponseProblem(SpectralData(z, U, Y), nx, by_modes=by_modes) for by_modes in (True, False)
+    )
+    d = torch.as_tensor(rng.normal(size=len(theta)))
+    ours, theirs = modal.linearise(theta), general.linearise(theta)
+    expected = theirs.tangent(d)
+    size = float(expected.norm())
+    np.testing.assert_allclose(ours.tangent(d), expected, rtol=0, atol=1e-6 * size)
+    (system, gradient), (same, _) = (j.system(1.0, 1e-12) for j in (ours, theirs))
+    assert system.scale == pytest.approx(same.scale, rel=1e-3)
+    step, expected = (each.solve(gradient, 1e-2 * same.scale) for each in (system, same))
+    # JᵀJ has four digits of the largest left, and a hundredth of that is its damping.
+    assert float((step - expected).norm()) <= 1e-2 * float(expected.norm())
+    for problem in (modal, general):
+        assert (np.diag(problem.covariance(theta, known=False)) >= 0.0).all()
+
+
+@cases
+@example(kind="repeated", sizes=(2, 1, 1), hidden="", seed=0)  # divided by 0
+@example(kind="near", sizes=(4, 2, 2), hidden="", seed=3)  # JᵀJ was wrong by 1e7
+@example(kind="defective", sizes=(3, 1, 1), hidden="", seed=0)  # warned of an overflow
+@example(kind="slow", sizes=(4, 1, 2), hidden="output", seed=0)  # was NaN
+@example(kind="slow", sizes=(2, 1, 1), hidden="both", seed=1)  # variances were negative
+@settings(max_examples=40)
+def test_modes_are_used_where_they_are_the_general_path(
+    kind: str, sizes: tuple[int, int, int], hidden: str, seed: int
+):
+    check_modes(kind, sizes, hidden, seed)
+
+
+@pytest.mark.slow
+@cases
+@settings(max_examples=2000)
+def test_modes_of_many_systems(kind: str, sizes: tuple[int, int, int], hidden: str, seed: int):
+    check_modes(kind, sizes, hidden, seed)
