@@ -29,6 +29,10 @@ SINGULAR = 1e-12
 """Singular values below this, relative to the size of the system, count as zero when zeros at
 infinity are taken out."""
 
+TWICE = 2
+"""Times that outputs and inputs are scaled for it: the first time, an input in tiny units makes D
+the largest part of its output, and that output then is next to nothing beside the input."""
+
 
 @dataclass(frozen=True)
 class LinearFit:
@@ -451,10 +455,11 @@ def _zeros(A: Array, B: Array, C: Array, D: Array) -> Complex:
         Emami-Naeini and Van Dooren, "Computation of zeros of linear multivariable systems",
         Automatica 18, 1982.
     """
-    by_y = np.linalg.norm(np.hstack([C, D]), axis=1)
-    C, D = (M / np.where(by_y > 0, by_y, 1.0)[:, None] for M in (C, D))
-    by_u = np.linalg.norm(np.vstack([B, D]), axis=0)
-    B, D = (M / np.where(by_u > 0, by_u, 1.0) for M in (B, D))
+    for _ in range(TWICE):
+        by_y = np.linalg.norm(np.hstack([C, D]), axis=1)
+        C, D = (M / np.where(by_y > 0, by_y, 1.0)[:, None] for M in (C, D))
+        by_u = np.linalg.norm(np.vstack([B, D]), axis=0)
+        B, D = (M / np.where(by_u > 0, by_u, 1.0) for M in (B, D))
     limit = SINGULAR * float(np.linalg.norm(np.block([[A, B], [C, D]]), 2))
     A, B, C, D = _outputs_reduced(A, B, C, D, limit)
     A, C, B, D = (M.T for M in _outputs_reduced(A.T, C.T, B.T, D.T, limit))
