@@ -46,7 +46,9 @@ def nrmse(record: Record, y_hat: Array) -> float:
         >>> lfrtorch.nrmse(record, bla.simulate(record)) < 0.3
         True
     """
-    deviation = float(np.sqrt(np.mean(np.var(record.y[record.skip :], axis=0))))
+    y = record.y[record.skip :]
+    # About the first sample, so that those of a constant are 0: its mean has rounding errors.
+    deviation = float(np.sqrt(np.mean(np.var(y - y[0], axis=0))))
     return rmse(record, y_hat) / deviation if deviation > 0 else float("nan")
 
 
@@ -74,8 +76,13 @@ class BlockScores:
         left_out = min(self._skip, len(y))
         self._skip -= left_out
         y, y_hat = y[left_out:], y_hat[left_out:]
+        if not len(y):
+            return
         there = np.isfinite(y)
         added = there.sum(axis=0)
+        first = (self.samples == 0) & (added > 0)
+        # Samples of a constant are then 0 about the mean so far.
+        self._mean[first] = y[there.argmax(axis=0), np.arange(len(first))][first]
         whole = np.maximum(self.samples + added, 1)
         y = np.where(there, y, self._mean)
         # About the mean so far, by the update of Chan, Golub and LeVeque (1983): exact, and

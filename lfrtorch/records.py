@@ -486,8 +486,9 @@ class Scaler:
         us, ys = [r.u for r in records], [r.y for r in records]
 
         def centre(signals: list[Array]) -> Array:
-            mean = np.concatenate(signals).mean(axis=0)
-            return mean if offset else np.zeros_like(mean)
+            together = np.concatenate(signals)
+            first = together[0]  # the mean of a constant is that, without rounding errors
+            return first + (together - first).mean(axis=0) if offset else np.zeros_like(first)
 
         u_offset, y_offset = centre(us), centre(ys)
         return cls(u_offset, rms_scale(us, u_offset), y_offset, rms_scale(ys, y_offset))

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
-from lfrtorch.metrics import nrmse, rms, rmse
-from lfrtorch.records import Record
+from lfrtorch.metrics import BlockScores, nrmse, rms, rmse
+from lfrtorch.records import Record, Scaler
 
 pytestmark = pytest.mark.numeric
 
@@ -49,3 +51,46 @@ def test_root_mean_square_of_all_values_or_along_an_axis():
     assert rms(signal, axis=0) == pytest.approx([3.0, np.sqrt(8.0)])
     assert float(rms(signal)) == pytest.approx(np.sqrt(34.0 / 4.0))
     assert rms([[1e200], [1.0]], axis=0).tolist() == [np.inf]  # no warning
+
+
+def test_constant_output_has_no_nrmse_and_unit_scale():
+    """Whose mean has rounding errors."""
+    y = np.column_stack([np.full(1000, 837769.8956), np.full(1000, 0.1)])
+    record = Record(np.arange(1000.0), y)
+    assert np.isnan(nrmse(record, y + 1.0))
+    assert Scaler.of([record]).y_scale.tolist() == [1.0, 1.0]
+
+
+@given(
+    blocks=st.lists(st.integers(0, 9), min_size=1, max_size=5),
+    skip=st.integers(0, 12),
+    missing=st.sampled_from([0.0, 0.3, 1.0]),
+    offset=st.sampled_from([0.0, 0.1, -837769.8956, 1e6]),
+    spread=st.sampled_from([0.0, 1e-3, 1.0, 1e12]),
+    seed=st.integers(0, 1000),
+)
+@example(blocks=[9, 9], skip=0, missing=0.0, offset=0.1, spread=0.0, seed=0)  # nrmse was 1e16
+@settings(max_examples=60)
+def test_scores_of_blocks_are_those_of_all_samples(
+    blocks: list[int], skip: int, missing: float, offset: float, spread: float, seed: int
+):
+    rng, scores = np.random.default_rng(seed), BlockScores(2, skip)
+    y = offset + spread * rng.normal(size=(sum(blocks), 2))
+    y_hat = y + rng.normal(size=y.shape)
+    y[rng.random(y.shape) < missing] = np.nan
+    for end, n in zip(np.cumsum(blocks), blocks, strict=True):
+        scores.add(y[end - n : end], y_hat[end - n : end])
+    for channel in range(2):
+        there = np.isfinite(y[skip:, channel])
+        measured, error = y[skip:, channel][there], (y_hat - y)[skip:, channel][there]
+        assert scores.samples[channel] == len(measured)
+        if not len(measured):
+            assert np.isnan([scores.rmse[channel], scores.nrmse[channel]]).all()
+            continue
+        expected = np.sqrt(np.mean(error**2))
+        assert scores.rmse[channel] == pytest.approx(expected, rel=1e-12)
+        if np.ptp(measured) == 0.0:
+            assert np.isnan(scores.nrmse[channel])
+        else:  # of 1e6 a deviation of 1e-3 has six digits
+            expected /= np.std(measured - measured[0])
+            assert scores.nrmse[channel] == pytest.approx(expected, rel=1e-5)
