@@ -85,11 +85,16 @@ def candidates(problem: LinearLeastSquares, nx: int) -> list[Candidate]:
         if np.isfinite(cost):
             found.append(Candidate(cost, estimate, matrices))
     if not found:
-        raise InputError(
-            f"no stable linear model of order {nx} could be started from these data; "
-            "try a lower nx or a longer record."
-        )
+        raise no_start(nx)
     return sorted(found, key=lambda each: each.cost)
+
+
+def no_start(nx: int) -> InputError:
+    """No candidate has a finite cost."""
+    return InputError(
+        f"no stable linear model of order {nx} could be started from these data; "
+        "try a lower nx or a longer record."
+    )
 
 
 def best_minimum(

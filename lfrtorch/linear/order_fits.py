@@ -22,7 +22,7 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
 from lfrtorch.linear.bla import physical
 from lfrtorch.linear.frf import FRF, estimate_frf
-from lfrtorch.linear.minima import ALIKE, scaled, transformation
+from lfrtorch.linear.minima import ALIKE, no_start, scaled, transformation
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Matrices, Refined, Search
 from lfrtorch.linear.requirements import check_spectral_data, of_response
@@ -244,6 +244,8 @@ class OrderFits:
             for (cost, matrices), last in zip(ranked, costs, strict=False)
             if cost > ALIKE * last
         ]
+        if not ranked:
+            raise no_start(nx)
         return (apart or [matrices for _, matrices in ranked])[:STARTS]
 
     def _extended(self, below: Matrices, more: int) -> list[tuple[Array, Array]]:

@@ -120,7 +120,10 @@ class SpectralSubspace(NamedTuple):
     ny: int
 
     def estimate(self, nx: int) -> SubspaceEstimate | None:
-        """The estimate of an order, ``None`` if the map of the axis has no inverse there."""
+        """The estimate of an order; ``None`` if there are fewer directions, or the map of the axis
+        has no inverse there."""
+        if nx > len(self.directions):
+            return None
         observability = _main(self.directions, self.singular_values, nx)
         A_axis, C = _shift(self.whiten @ observability, self.ny)
         a, eye = self.warp, np.eye(nx)

@@ -9,6 +9,7 @@ import pytest
 import reference
 from reference import System, random_system
 
+from lfrtorch._support.errors import InputError
 from lfrtorch.linear import order_fits, order_scan
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
@@ -308,3 +309,14 @@ def test_the_memory_is_that_of_the_response_and_not_of_its_slowest_pole():
     assert memory_of(model([0.95, 0.9999], [1.0, 1e-4]), 2000) == pytest.approx(alone, rel=0.1)
     assert memory_of(model([0.95, 0.9999], [1.0, 1.0]), 2000) > 20 * alone
     assert memory_of(model([0.0], [1.0]), 2000) == 1.0
+
+
+def test_an_order_beyond_the_block_rows_of_the_lines_cannot_be_started():
+    """Six lines make 72 equations for the 71 unknowns of order 13, and four block rows."""
+    system, u = random_system(3, 2, 3), np.random.default_rng(0).normal(size=(2, 14, 2))
+    records = [
+        Record(x, reference.periodic_response(system, x), start="periodic", name=f"r{r}")
+        for r, x in enumerate(u)
+    ]
+    with pytest.raises(InputError, match="no stable linear model of order 13"):
+        scan_orders(estimate_frf(records), [13])

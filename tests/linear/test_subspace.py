@@ -17,6 +17,7 @@ from lfrtorch.linear.subspace import (
     from_signals,
     from_spectra,
     shortest,
+    spectral_subspaces,
     suffice,
 )
 
@@ -126,6 +127,14 @@ def test_singular_values_fall_off_behind_the_order():
 def test_too_few_lines_give_no_start():
     lines = lines_of(random_system(6), BANDS["all"], 3)
     assert from_spectra(lines.z, lines.U, lines.Y, 6) == []
+
+
+def test_orders_beyond_the_directions_have_no_estimate():
+    """As many lines as order 13 of three outputs has unknowns, and four block rows."""
+    lines = lines_of(random_system(3, 2, 3), BANDS["all"], 12)
+    for found in spectral_subspaces(lines.z, lines.U, lines.Y, 13):
+        assert found.estimate(len(found.directions)) is not None
+        assert found.estimate(len(found.directions) + 1) is None
 
 
 # --- from signals ---------------------------------------------------------------------------
