@@ -67,10 +67,10 @@ class SVDSystem:
         self.scale, self.rank = float("nan"), 0
         if torch.isfinite(R).all():
             _, s, Vh = torch.linalg.svd(R, full_matrices=False)
-            kept = s > truncation * s[0]
+            kept = s > truncation * s[:1]  # of no rows there is none
             # A parameter that R does not see stays as it is, to the last bit.
             self._squares, self._Vh = s[kept].square(), Vh[kept].masked_fill((R == 0).all(0), 0.0)
-            self.scale, self.rank = float(s[0].square()), len(self._squares)
+            self.scale, self.rank = float(s[:1].square().sum()), len(self._squares)
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient, without its part along the directions that are left out."""
@@ -305,4 +305,5 @@ def product(left: Float[Tensor, "m k"], right: Float[Tensor, "k n"]) -> Float[Te
     """left @ right, by numpy on the CPU: faster if k is large, and one triangle of a square."""
     if left.device.type != "cpu":
         return left @ right
-    return torch.from_numpy(left.numpy() @ right.numpy())
+    with np.errstate(over="ignore", invalid="ignore"):  # such a system has no scale
+        return torch.from_numpy(left.numpy() @ right.numpy())

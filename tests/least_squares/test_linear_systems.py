@@ -2,9 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
-from reference import normal
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from reference import MATRICES, normal, special_matrix
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -150,3 +153,43 @@ def test_the_largest_eigenvalue_of_many_parameters(spread: float):
     expected = float(torch.linalg.eigvalsh(G)[-1])
     assert CholeskySystem(G, len(G)).scale == pytest.approx(expected, rel=1e-9)
     assert CholeskySystem(torch.zeros_like(G), 0).scale == 0.0
+
+
+@given(
+    rows=st.lists(st.sampled_from([0, 1, 2, 7, 90]), min_size=1, max_size=4),
+    columns=st.integers(1, 7),
+    kind=st.sampled_from(MATRICES),
+    unit=st.floats(-12.0, 12.0),
+    damping=st.sampled_from([1e-6, 1.0, 1e3]),
+    seed=st.integers(0, 1000),
+)
+@example(rows=[0], columns=3, kind="normal", unit=0.0, damping=1.0, seed=0)  # had no singular value
+@settings(max_examples=60)
+def test_steps_of_any_rows_are_those_of_dense_least_squares(
+    rows: list[int], columns: int, kind: str, unit: float, damping: float, seed: int
+):
+    """In blocks of any height, of no rank or little, and in any unit."""
+    rng = np.random.default_rng(seed)
+    J = 10.0**unit * special_matrix(kind, sum(rows), columns, rng)
+    r = rng.normal(size=len(J))
+    R, G, gradient = QRAccumulator(), GramAccumulator(), torch.as_tensor(J.T @ r)
+    for block in torch.as_tensor(J).split(rows):
+        R.fold(block)
+        G.fold(block)
+    systems = SVDSystem(R.R, 1e-12), CholeskySystem(G.G, columns)
+    size = float(np.linalg.norm(J, 2)) if J.any() else 0.0
+    damping *= max(size**2, 1e-300)
+    whole = np.vstack([J, math.sqrt(damping) * np.eye(columns)])
+    expected = np.linalg.lstsq(whole, np.concatenate([-r, np.zeros(columns)]), rcond=None)[0]
+    # eps of the gradient |J| |r|, and in JᵀJ eps of its square, over the damping.
+    atol = 1e-13 * (1.0 + size**2 / damping) * size * float(np.linalg.norm(r)) / damping
+    for system in systems:
+        assert system.scale == pytest.approx(size**2, rel=1e-12)
+        step = system.solve(gradient, damping).numpy()
+        np.testing.assert_allclose(step, expected, rtol=0, atol=atol)
+
+
+def test_squares_beyond_single_precision_have_no_scale_and_give_no_warning():
+    G = GramAccumulator()
+    G.fold(torch.full((3, 2), 1e20))
+    assert not math.isfinite(CholeskySystem(G.G, 2).scale)
