@@ -132,5 +132,5 @@ def _steady(record: Record, N: int) -> bool:
         return True
     periods = record.y[record.samples - count * N :].reshape(count, N, -1)
     power = np.diff(periods, axis=0).reshape((count - 1) * N, -1) ** 2
-    parts = np.array([part.mean(axis=0) for part in np.array_split(power, PARTS)])
+    parts = np.array([part.mean(axis=0) for part in np.array_split(power, min(PARTS, len(power)))])
     return bool(np.all(parts.max(axis=0) <= STEADY * np.median(parts, axis=0)))
