@@ -49,7 +49,7 @@ class Canonical:
     Args:
         model: the same model; x = X x_before, z = Z z_before.
         shares: part of the power that the nonlinearity adds to the normalised output, by w, if all
-            w had the mean of their spectra.
+            w had the mean of their spectra; 0 if it adds nothing.
         bends: part of the mean squared change of the map's slope, by z; w counts by its share.
         X, Z: from the coordinates before to these.
 
@@ -154,7 +154,8 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     }  # fmt: skip
     K = None if model.K is None else torch.as_tensor(X) @ model.K.double().cpu()
     same = replace(model, lfr=LFR(_cell(cell, made, slope, _inverse(Z), W)), K=K)
-    return Canonical(same, power / power.sum(), bends / max(bends.sum(), 1e-300), X, Z)
+    shares, bends = (part / max(part.sum(), 1e-300) for part in (power, bends))
+    return Canonical(same, shares, bends, X, Z)
 
 
 def _cell(cell: LFRCell, made: dict[str, Array], slope: Array, into: Array, out: Array) -> LFRCell:

@@ -153,3 +153,16 @@ def test_what_has_no_nonlinearity_is_refused():
         model.lfr.cell.static.get_parameter("Ww").zero_()  # type: ignore[union-attr]
     with pytest.raises(lfrtorch.InputError, match="nothing of it is nonlinear"):
         canonical(model, measure(model, 50))
+
+
+def test_a_map_that_no_output_shows_has_no_shares():
+    model = strong()
+    cell = model.lfr.cell
+    with torch.no_grad():
+        cell.Bw.zero_()
+        cell.Dyw.zero_()
+    record = measure(model, 100)
+    found = canonical(model, record)
+    assert not found.shares.any()
+    assert not found.bends.any()
+    np.testing.assert_allclose(found.model.simulate(record), record.y, rtol=0, atol=1e-9)
