@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import lfrtorch
 from lfrtorch.excitation import Multisine, multisine
@@ -167,3 +169,36 @@ def test_door(options: dict, message: str):
     settings: dict[str, Any] = {"samples": 64} | options
     with pytest.raises(ValueError, match=re.escape(message)):
         multisine(**settings)
+
+
+@given(
+    samples=st.integers(3, 60),
+    nu=st.integers(1, 3),
+    grid=st.sampled_from(["full", "odd", "random_odd"]),
+    ends=st.tuples(st.integers(1, 29), st.integers(1, 29)),
+    fs=st.floats(-6.0, 6.0),
+    rms=st.lists(st.floats(-12.0, 12.0), min_size=3, max_size=3),
+)
+@settings(max_examples=40)
+def test_any_design_has_its_rms_at_its_lines(
+    samples: int, nu: int, grid: Any, ends: tuple[int, int], fs: float, rms: list[float]
+):
+    """Or its band has no lines; one that ends at two of them has them, whatever their rounding."""
+    first, last = min(ends), max(ends)
+    rate, wanted = 10.0**fs, 10.0 ** np.array(rms[:nu])
+    band = first * rate / samples, last * rate / samples
+    try:
+        design = multisine(samples, fs=rate, band=band, grid=grid, nu=nu, rms=wanted)
+    except lfrtorch.InputError:
+        between = np.arange(first, min(last, (samples - 1) // 2) + 1)
+        assert 2 * last > samples or (grid != "full" and (between % 2).sum() < 4)
+        return
+    found = np.sqrt(np.mean(design.u**2, axis=1))
+    np.testing.assert_allclose(found, np.tile(wanted, (nu, 1)), rtol=1e-9)
+    assert (np.abs(np.delete(spectra(design), design.lines, axis=1)) < 1e-12 * wanted).all()
+    if grid == "full":
+        assert design.lines.tolist() == list(range(first, design.lines[-1] + 1))
+        assert design.lines[-1] == min(last, (samples - 1) // 2)
+    for U in spectra(design)[:, design.lines].swapaxes(0, 1):  # (experiment, input)
+        size = np.linalg.norm(U, axis=0)
+        assert np.abs((U / size).conj().T @ (U / size) - np.eye(nu)).max() < 1e-9

@@ -18,11 +18,22 @@ from exported import (
     measured_with_gaps,
     some_noise,
 )
-from reference import normal, random_cell, random_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import (
+    MATRICES,
+    POLES,
+    normal,
+    random_cell,
+    random_model,
+    special_matrix,
+    special_poles,
+)
 
 import lfrtorch
 from lfrtorch import NoiseCovariance
 from lfrtorch._support.types import Array
+from lfrtorch.engine.kalman_kernel import correct, propagate
 from lfrtorch.model import Model
 
 pytestmark = pytest.mark.numeric
@@ -201,3 +212,52 @@ def test_an_infinite_output_is_refused():
     observer.predict([0.0, 0.0])
     with pytest.raises(lfrtorch.InputError, match="NaN for a missing output"):
         observer.update([np.inf, 0.0])
+
+
+@given(
+    poles=st.sampled_from(POLES),
+    kind=st.sampled_from(MATRICES),
+    sizes=st.tuples(st.integers(1, 3), st.integers(1, 3)),
+    noise=st.sampled_from([0.0, 1e-12, 1.0, 1e6]),
+    gain=st.sampled_from([0.0, 1e-3, 1.0]),
+    missing=st.sampled_from([0.0, 0.5, 1.0]),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=40)
+def test_roots_of_any_covariances_are_those_of_the_textbook(
+    poles: str,
+    kind: str,
+    sizes: tuple[int, int],
+    noise: float,
+    gain: float,
+    missing: float,
+    seed: int,
+):
+    """P singular or 0, states without noise, outputs that show nothing or are missing."""
+    (nx, ny), rng = sizes, np.random.default_rng(seed)
+    F, H = special_poles(poles, nx, rng), gain * special_matrix(kind, ny, nx, rng)
+    H /= max(1.0, float(np.abs(H).max()))
+    U = special_matrix(kind, nx, nx, rng)
+    U /= max(1.0, float(np.abs(U).max()))
+    G = np.tril(rng.normal(size=(ny + nx, ny + nx)))
+    G[:ny, :ny] = np.eye(ny)
+    G[ny:] *= np.sqrt(noise)
+    joint, P, e = G @ G.T, U @ U.T, rng.normal(size=ny)
+    e[rng.random(ny) < missing] = np.nan
+    known = np.isfinite(e)
+    x, w = np.zeros(nx), np.zeros(nx)
+    M, count, log_p = correct(e.copy(), H, G, x, U, w)
+    H, R = H[known], joint[:ny, :ny][known][:, known]
+    Q, S, V = joint[ny:, ny:], joint[ny:, :ny][:, known], H @ P @ H.T + R
+    L, W = P @ H.T @ np.linalg.inv(V), S @ np.linalg.inv(V)
+    # The condition of V is at most 1 + |H|² |P|: 30.
+    size = 1e-12 * (1.0 + np.abs(S).max(initial=0.0))
+    np.testing.assert_allclose(x, L @ e[known], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(w, W @ e[known], rtol=0, atol=size)
+    expected = -0.5 * (e[known] @ np.linalg.inv(V) @ e[known] + np.linalg.slogdet(2 * np.pi * V)[1])
+    assert log_p == pytest.approx(expected, rel=1e-12, abs=1e-12)
+    propagate(F, M, count, U)
+    across = F @ L @ S.T
+    after = F @ (P - L @ V @ L.T) @ F.T + Q - W @ S.T - across - across.T
+    limit = 1e-11 * (1.0 + np.abs(Q).max() + np.abs(F).max() ** 2)
+    np.testing.assert_allclose(U @ U.T, after, rtol=0, atol=limit)

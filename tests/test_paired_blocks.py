@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from lfrtorch.paired_blocks import (
@@ -96,3 +98,36 @@ def test_units_do_not_change_which_model_is_as_good(scale: float):
     squares, counts = np.random.default_rng(0).uniform(1.0, 1.1, (5, 12)), np.full(12, 50)
     expected = standard_errors_above(squares, counts)
     assert np.array_equal(standard_errors_above(squares * scale, counts), expected)
+
+
+@given(
+    lengths=st.lists(st.integers(1, 40), min_size=1, max_size=4),
+    powers=st.lists(st.sampled_from([-300, -150, 0, 0, 150, 160]), min_size=1, max_size=4),
+    equal=st.booleans(),
+    bad=st.sampled_from([None, math.nan, math.inf]),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=40)
+def test_the_best_of_any_models_is_as_good_and_nothing_is_nan(
+    lengths: list[int], powers: list[int], equal: bool, bad: float | None, seed: int
+):
+    if sum(lengths) < BLOCKS:
+        return
+    rng, errors = np.random.default_rng(seed), []
+    for power in powers:
+        errors.append([10.0**power * rng.normal(size=(T, 2)) for T in lengths])
+    if equal:
+        errors.append(errors[0])
+    if bad is not None:
+        errors.append([np.full((T, 2), bad) for T in lengths])
+    counts = np.array([len(block) for block in in_blocks([e[:, 0] for e in errors[0]])])
+    assert counts.sum() == sum(lengths)
+    assert counts.min() >= 1
+    squares = np.array([squares_in_blocks(each) for each in errors])
+    above, good = standard_errors_above(squares, counts), as_good(squares, counts)
+    assert (above >= 0.0).all()  # False for NaN
+    if np.isfinite(squares).all(axis=1).any():
+        best = np.argmin(squares.sum(axis=1))
+        assert above[best] == 0.0
+        assert good[best]
+        assert not good[~np.isfinite(squares).all(axis=1)].any()

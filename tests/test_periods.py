@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lfrtorch.excitation import multisine
 from lfrtorch.periods import find_period, find_transient
@@ -173,3 +175,20 @@ def test_one_period_shows_no_transient():
     assert find_transient(settling(1, 0.1), N) == 0
     assert find_transient(np.resize(multi(), 2 * N - 1), N) == 0
     assert find_transient(np.zeros(4 * N), N) == 0
+
+
+@given(
+    N=st.integers(4, 40),
+    periods=st.integers(2, 5),
+    channels=st.integers(1, 2),
+    unit=st.floats(-12.0, 12.0),
+    offset=st.sampled_from([0.0, 1.0, 1e6]),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=40)
+def test_whole_periods_are_found_in_any_unit(
+    N: int, periods: int, channels: int, unit: float, offset: float, seed: int
+):
+    u = np.random.default_rng(seed).normal(size=(N, channels))
+    assert find_period(10.0**unit * (offset + np.tile(u, (periods, 1)))) == N
+    assert find_transient(10.0**unit * (offset + np.tile(u, (periods, 1))), N) == 0

@@ -1,11 +1,14 @@
 """Initial states that are estimated from the output: known ones, hidden ones, faded ones."""
 
+import numpy as np
 import pytest
 import torch
-from reference import normal, random_cell
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import POLES, normal, random_cell, special_poles
 from torch.testing import assert_close
 
-from lfrtorch.engine.initial_state import simulate_estimated
+from lfrtorch.engine.initial_state import simulate_estimated, simulate_from_beginning
 from lfrtorch.engine.simulation import simulate
 
 pytestmark = pytest.mark.numeric
@@ -103,3 +106,43 @@ def test_estimated_initial_state_whose_response_overflows_stays():
     y = simulate(cell, u, u.new_zeros(1, 2)).y + 0.1
     found = simulate_estimated(cell, u, y, torch.ones_like(y))
     assert torch.equal(found.x[:, 0], u.new_zeros(1, 2))
+
+
+@given(
+    poles=st.sampled_from(POLES),
+    sizes=st.tuples(st.integers(1, 2), st.integers(1, 2), st.integers(1, 3)),
+    T=st.sampled_from([1, 2, 3, 20]),
+    driven=st.sampled_from([0.0, 1.0]),
+    shown=st.sampled_from([0.0, 1.0, 1.0]),
+    unit=st.sampled_from([1e-6, 1.0, 1e6]),
+    counted=st.sampled_from([0.0, 0.5, 1.0]),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=30)
+def test_estimated_initial_state_fits_as_well_as_rest(
+    poles: str,
+    sizes: tuple[int, int, int],
+    T: int,
+    driven: float,
+    shown: float,
+    unit: float,
+    counted: float,
+    seed: int,
+):
+    """Of one sample as of many, of poles of all kinds, and where nothing is driven or shown."""
+    (nu, ny, nx), rng = sizes, np.random.default_rng(seed)
+    cell, u = random_cell(nu, ny, nx, 0, 0, seed=seed), driven * normal(1, T, nu, seed=seed)
+    with torch.no_grad():
+        cell.A.copy_(torch.as_tensor(special_poles(poles, nx, rng)))
+        cell.Cy.mul_(shown)
+    y = simulate(cell, u, normal(1, nx, seed=seed)).y + 0.1 * normal(1, T, ny, seed=seed + 1)
+    weight = unit * torch.as_tensor((rng.random((1, T, ny)) < counted) * 1.0)
+
+    def cost(y_hat: torch.Tensor) -> float:
+        return float((weight * (y_hat - y)).square().sum())
+
+    rest = cost(simulate(cell, u, u.new_zeros(1, nx)).y)
+    for way in (simulate_estimated, simulate_from_beginning):
+        found = way(cell, u, y, weight)
+        assert found.finite
+        assert cost(found.y) <= (1.0 + 1e-6) * rest  # rounding

@@ -5,7 +5,9 @@ import pytest
 import reference
 import scipy.linalg
 import torch
-from reference import System, random_system
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import MATRICES, POLES, System, random_system, special_matrix, special_poles
 from torch import Tensor
 
 from lfrtorch._support.types import Complex
@@ -181,3 +183,28 @@ def test_states_under_all_inputs_together(nx: int, nu: int, ny: int):
     np.testing.assert_allclose(S, X @ U, rtol=0, atol=1e-12 * np.abs(X @ U).max())
     J = response_jacobian(X, L, U)
     np.testing.assert_allclose(driven_jacobian(S, L, U), J, rtol=0, atol=1e-12 * np.abs(J).max())
+
+
+@given(
+    poles=st.sampled_from(POLES),
+    kind=st.sampled_from(MATRICES),
+    sizes=st.tuples(st.integers(1, 5), st.integers(1, 3), st.integers(1, 3)),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=40)
+def test_response_of_any_poles_is_its_formula(
+    poles: str, kind: str, sizes: tuple[int, int, int], seed: int
+):
+    (nx, nu, ny), rng = sizes, np.random.default_rng(seed)
+    A, B = special_poles(poles, nx, rng), special_matrix(kind, nx, nu, rng)
+    C, D = special_matrix(kind, ny, nx, rng), special_matrix(kind, ny, nu, rng)
+    X, L = solve_resolvents(A, B, C, Z)
+    for k, z in enumerate(Z):
+        inverse = np.linalg.inv(z * np.eye(nx) - A)
+        # eps of A, which the inverse multiplies on either side.
+        limit = 1e-12 * (1.0 + np.linalg.norm(A)) * np.linalg.norm(inverse) ** 2
+        assert np.abs(X[k] - inverse @ B).max() <= limit * np.linalg.norm(B)
+        assert np.abs(L[k] - C @ inverse).max() <= limit * np.linalg.norm(C)
+    G = frequency_response(A, B, C, D, Z)
+    limit = 1e-13 * (np.abs(C).max() * np.abs(X).max() * nx + np.abs(D).max())
+    assert np.abs(G - (C @ X + D)).max() <= limit
