@@ -29,10 +29,9 @@ from collections.abc import Sequence
 from math import ceil, inf
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.types import Array, Integers
+from lfrtorch._support.types import Array, Booleans, Integers
 
 MARGIN = 0.01
 """A model does as well as the best if its rms error exceeds that one's by at most this part."""
@@ -44,7 +43,7 @@ BLOCKS = 10
 """Least number of blocks of time, over all records."""
 
 
-def as_good(squares: Sequence[Array] | Array, counts: Integers) -> NDArray[np.bool_]:
+def as_good(squares: Sequence[Array] | Array, counts: Integers) -> Booleans:
     """Which models are within one standard error of the best, or ``MARGIN``; at most ``CEILING``.
 
     Args:

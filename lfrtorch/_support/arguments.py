@@ -90,9 +90,11 @@ def is_of(value: Any, hint: Any) -> bool:
         >>> is_of([1, 2], int | Sequence[int]), is_of([1, "x"], int | Sequence[int])
         (True, False)
     """
+    first, *others = members(hint)
+    if others:
+        return any(is_of(value, one) for one in (first, *others))
+    hint = first
     origin, inner = get_origin(hint), get_args(hint)
-    if origin in UNIONS:
-        return any(is_of(value, one) for one in inner)
     if origin is Literal:
         plain = value.item() if isinstance(value, np.generic) else value
         return any((type(plain), plain) == (type(one), one) for one in inner)
@@ -111,10 +113,25 @@ def is_of(value: Any, hint: Any) -> bool:
     if hint in NUMBERS:
         return isinstance(value, NUMBERS[hint]) and not isinstance(value, bool)
     if getattr(hint, "_is_protocol", False):
-        return all(hasattr(value, name) for name in vars(hint) if not name.startswith("_"))
+        names = (name for name in vars(hint) if not name.startswith("_"))
+        return not isinstance(value, type) and all(hasattr(value, name) for name in names)
     return (
         hint is Any or origin is not None or not isinstance(hint, type) or isinstance(value, hint)
     )
+
+
+def members(hint: Any) -> tuple[Any, ...]:
+    """The hints that a union is of, and those of its aliases; of another hint itself alone.
+
+    Example:
+        >>> from lfrtorch._support.arguments import members
+        >>> [one.__name__ for one in members(int | None)]
+        ['int', 'NoneType']
+    """
+    hint = getattr(hint, "__value__", hint)  # of numpy's ArrayLike from numpy 2.5 on
+    if get_origin(hint) not in UNIONS:
+        return (hint,)
+    return tuple(one for each in get_args(hint) for one in members(each))
 
 
 def wanted(hint: Any) -> str:
@@ -133,12 +150,12 @@ def wanted(hint: Any) -> str:
 
 def _choices(hint: Any) -> list[str]:
     """What a hint asks for, one text for each kind."""
+    kinds, arrays = members(hint), members(ArrayLike)
+    if len(kinds) > 1:
+        if not set(arrays) <= set(kinds):
+            return [text for one in kinds for text in _several(one, kinds) or _choices(one)]
+        return ["an array", *(text for one in kinds if one not in arrays for text in _choices(one))]
     origin, inner = get_origin(hint), get_args(hint)
-    if origin in UNIONS:
-        arrays = get_args(ArrayLike)
-        if not set(arrays) <= set(inner):
-            return [text for one in inner for text in _several(one, inner) or _choices(one)]
-        return ["an array", *(text for one in inner if one not in arrays for text in _choices(one))]
     if origin is Literal:
         return [repr(one) for one in inner]
     if origin in (Sequence, Iterable):

@@ -15,9 +15,12 @@ M      residuals, or rows
 =====  =====================================  =====  =====================================
 """
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Integers = NDArray[np.int64]
+import numpy as np
+
+# Not numpy's NDArray: from numpy 2.5 on it is an alias that jaxtyping cannot look into.
+Array = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
+Complex = np.ndarray[tuple[Any, ...], np.dtype[np.complex128]]
+Integers = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
+Booleans = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]

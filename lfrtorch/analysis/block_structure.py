@@ -18,11 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.tables import percent
-from lfrtorch._support.types import Array
+from lfrtorch._support.types import Array, Booleans
 from lfrtorch.analysis.canonical_form import MOST_SAMPLES, canonical
 from lfrtorch.engine.linearised import of_static, spectral_radius
 from lfrtorch.engine.operating_point import double
@@ -165,7 +164,7 @@ def _left(signal: Float[Array, "T n"], regressors: Float[Array, "T m"]) -> float
 
 
 def _slopes(
-    model: Model, z: Float[Array, "T n"], bent: Bool[NDArray[np.bool_], " nz"]
+    model: Model, z: Float[Array, "T n"], bent: Bool[Booleans, " nz"]
 ) -> Float[Array, "S nw n"]:
     """dw/dz of the canonical map at some samples, by the z that bend it."""
     cell = model.lfr.cell

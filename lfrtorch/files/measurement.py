@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.types import Array, Integers
+from lfrtorch._support.types import Array, Booleans, Integers
 from lfrtorch.files.formats import Table, open_table
 from lfrtorch.files.table import BLOCK, Columns
 from lfrtorch.files.time_stamps import Sampling, UnevenError, in_seconds, is_time, sampling
@@ -163,7 +163,7 @@ def _channels(
     return tuple(found)
 
 
-def _stretches(missing: NDArray[np.bool_], gaps: Integers) -> list[tuple[int, int]]:
+def _stretches(missing: Booleans, gaps: Integers) -> list[tuple[int, int]]:
     """First and last sample + 1 of the stretches without a missing value or a gap between."""
     edges = np.flatnonzero(np.diff(np.concatenate([[True], missing, [True]]).astype(np.int8)))
     edges = np.union1d(edges, gaps)

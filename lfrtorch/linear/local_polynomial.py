@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Complex128, Int64
-from numpy.typing import NDArray
 
-from lfrtorch._support.types import Complex, Integers
+from lfrtorch._support.types import Booleans, Complex, Integers
 from lfrtorch.linear.regression import DEPENDENT, covariance, divided, outer, regress
 
 CHUNK = 2**21
@@ -39,7 +38,7 @@ def fit_local_polynomials(
 ) -> tuple[
     Complex128[Complex, "F ny nu"],
     Complex128[Complex, "F ny*nu ny*nu"],
-    Bool[NDArray[np.bool_], " F"],
+    Bool[Booleans, " F"],
 ]:
     """Frequency response at lines of spectra that hold transients, and its covariance.
 

@@ -15,10 +15,9 @@ import numpy as np
 import scipy
 import torch
 from jaxtyping import Complex128, Float
-from numpy.typing import NDArray
 from torch import Tensor
 
-from lfrtorch._support.types import Array, Complex
+from lfrtorch._support.types import Array, Booleans, Complex
 from lfrtorch.linear.pole_limits import Excess
 from lfrtorch.linear.spectral_data import SpectralData
 
@@ -90,7 +89,7 @@ class ModalJacobian:
         data: SpectralData,
         errors: Complex128[Complex, "F ny m"],
         *,
-        free: NDArray[np.bool_],
+        free: Booleans,
         excess: tuple[Float[Array, " nx"], Float[Array, "nx P"]],
     ) -> None:
         self._modes, self._data, self._errors = modes, data, errors
@@ -258,7 +257,7 @@ def _products(functions: Complex, data: SpectralData, left: Complex, right: Comp
 
 
 def with_best_inputs(
-    A: Array, C: Array, data: SpectralData, free: NDArray[np.bool_]
+    A: Array, C: Array, data: SpectralData, free: Booleans
 ) -> tuple[Array, Array] | None:
     """B and D of least errors for A and C; ``None`` if the modes cannot be told apart.
 
@@ -312,7 +311,7 @@ def _constants(m: Modes, nu: int) -> tuple[Complex, Complex]:
     return np.hstack(left), np.concatenate(right, axis=2).reshape((2 * n + 1) * nu, -1)
 
 
-def _change(m: Modes, free: NDArray[np.bool_]) -> Complex:
+def _change(m: Modes, free: Booleans) -> Complex:
     """Derivative of λ, b (by modes), c (by modes) and the free D with A, B, C, D, (Kc, P)."""
     n, nu, ny = len(m.poles), m.b.shape[1], len(m.c)
     apart = m.poles - m.poles[:, None]

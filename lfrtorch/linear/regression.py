@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex128
-from numpy.typing import NDArray
 
-from lfrtorch._support.types import Complex
+from lfrtorch._support.types import Booleans, Complex
 
 DEPENDENT = 1e-10
 """A column depends on those before it if its part orthogonal to them is relatively below this."""
@@ -27,7 +26,7 @@ class Regression(NamedTuple):
     G: Complex128[Complex, "F ny nu"]
     weights: Complex128[Complex, "F nu R"]
     residual: Complex128[Complex, "F R ny"]
-    determined: Bool[NDArray[np.bool_], " F"]
+    determined: Bool[Booleans, " F"]
 
 
 def regress(

@@ -8,12 +8,9 @@ dG = [L I] [dA dB; dC dD] [X; I], a product without any further inverse.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy
 from jaxtyping import Complex128, Float, Integer
-from numpy.typing import NDArray
 
 from lfrtorch._support.types import Array, Complex, Integers
 
@@ -77,7 +74,7 @@ def response_jacobian(
     X: Complex128[Complex, "F nx nu"],
     L: Complex128[Complex, "F ny nx"],
     U: Complex128[Complex, "F nu m"],
-    columns: Integer[NDArray[Any], " K"] | None = None,
+    columns: Integer[np.ndarray, " K"] | None = None,
 ) -> Complex128[Complex, "F ny m K"]:
     """Derivative of G U with the entries of A, B, C, D, row by row, one matrix after another.
 
@@ -93,7 +90,7 @@ def driven_jacobian(
     S: Complex128[Complex, "F nx m"],
     L: Complex128[Complex, "F ny nx"],
     U: Complex128[Complex, "F nu m"],
-    columns: Integer[NDArray[Any], " K"] | None = None,
+    columns: Integer[np.ndarray, " K"] | None = None,
 ) -> Complex128[Complex, "F ny m K"]:
     """The same from the states S = X U."""
     F, ny, nx = L.shape

@@ -15,10 +15,9 @@ import numpy as np
 import scipy
 import torch
 from jaxtyping import Complex128, Float
-from numpy.typing import NDArray
 from torch import Tensor
 
-from lfrtorch._support.types import Array, Complex
+from lfrtorch._support.types import Array, Booleans, Complex
 from lfrtorch.least_squares.gauge import Reduction, reduction
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
 from lfrtorch.least_squares.linear_systems import SVDSystem
@@ -136,7 +135,7 @@ class ResponseFit:
         return Search(problem, theta, COARSE if self.many(len(matrices[0])) else TOLERANCE)
 
     @property
-    def _free_feedthrough(self) -> NDArray[np.bool_]:
+    def _free_feedthrough(self) -> Booleans:
         """Which entries of D (ny, nu) are parameters."""
         nu, ny = self.data.U.shape[1], self.data.Y.shape[1]
         free = np.full((ny, nu), self.feedthrough)
@@ -181,7 +180,7 @@ class ResponseProblem(LeastSquares):
         nx: int,
         largest_pole: float = np.inf,
         *,
-        free_feedthrough: NDArray[np.bool_] | None = None,
+        free_feedthrough: Booleans | None = None,
         together: bool = False,
         by_modes: bool = False,
         limits: PoleLimits | None = None,

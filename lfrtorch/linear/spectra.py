@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex128, Float, Int64
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lfrtorch._support.checks import dft_lines
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.types import Array, Complex, Integers
+from lfrtorch._support.types import Array, Booleans, Complex, Integers
 from lfrtorch.linear.regression import outer
 from lfrtorch.records import Record
 
@@ -294,7 +294,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     return lines
 
 
-def carrying(power: Array) -> NDArray[np.bool_]:
+def carrying(power: Array) -> Booleans:
     """Which lines the input is meant to excite, of their power (F,).
 
     Sorted by power, they end where the next one has less than the part GAP: a measured input has
@@ -330,7 +330,7 @@ def smoothed(power: Array, width: int) -> Array:
 
 def without_noise(
     power: Complex128[Complex, "F nu nu"], noise: Complex128[Complex, "F nu nu"]
-) -> tuple[Complex128[Complex, "F nu nu"] | None, Bool[NDArray[np.bool_], " F"]]:
+) -> tuple[Complex128[Complex, "F nu nu"] | None, Bool[Booleans, " F"]]:
     """UᴴU of inputs without the part of their noise, and at which lines that is most of it.
 
     Elsewhere it is the unit matrix. It is ``None`` if the inputs have no noise.

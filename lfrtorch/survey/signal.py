@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from lfrtorch._support.types import Array, Integers
+from lfrtorch._support.types import Array, Booleans, Integers
 from lfrtorch.periods import find_transient
 from lfrtorch.records import Channel
 
@@ -139,7 +138,7 @@ def survey_signal(
     )
 
 
-def longest_run(holds: NDArray[np.bool_]) -> tuple[int, int]:
+def longest_run(holds: Booleans) -> tuple[int, int]:
     """First sample and length of the longest run of samples for which a condition (T,) holds."""
     ends = np.flatnonzero(np.diff(holds.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     if not len(ends):

@@ -36,7 +36,7 @@ FUNCTIONS = [
         (Iterable[Any], [iter([1]), [1]], [1, "text"]),
         (Mapping[str, int], [{}, {"a": 1}], [[], "a"]),
         (Callable[[], int], [lambda: 1, int], [1, "f"]),
-        (Trainer, [lfrtorch.Adam(), lfrtorch.LevenbergMarquardt()], ["adam", None]),
+        (Trainer, [lfrtorch.Adam(), lfrtorch.LevenbergMarquardt()], ["adam", None, lfrtorch.Adam]),
         (Any, [1, None], []),
         (ArrayLike, [1, [1.0], np.zeros(3)], []),
     ],
