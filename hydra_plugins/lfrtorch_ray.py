@@ -10,13 +10,13 @@ References:
 import logging
 import os
 import signal
+import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
 from hydra.core.utils import JobReturn, run_job, setup_globals
@@ -34,6 +34,10 @@ SURROUNDINGS = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
 
 RETRIES = 3
 """How often a run begins again whose worker or machine was lost."""
+
+REACHED = 10.0
+"""Seconds in which the machine of an address answers. Ray alone would try for a quarter of an hour.
+"""
 
 GRACE = 60.0
 """Seconds in which runs may end their iteration and write what they found."""
@@ -54,11 +58,6 @@ class RayLauncherConf:
     address: str | None = None
     num_cpus: int | None = None
     cpus_per_task: int = 1
-
-
-ConfigStore.instance().store(
-    group="hydra/launcher", name="ray", node=RayLauncherConf, provider="lfrtorch"
-)
 
 
 class RayLauncher(Launcher):
@@ -111,6 +110,8 @@ class RayLauncher(Launcher):
         """Connected to the cluster inside."""
         import ray
 
+        if self._address is not None and ":" in self._address:
+            _reach(self._address)
         for name, value in SURROUNDINGS.items():
             os.environ.setdefault(name, value)
         own = {**LOCAL, "num_cpus": self._cores} if self._address is None else {}
@@ -134,6 +135,18 @@ class RayLauncher(Launcher):
             yield
         finally:
             ray.shutdown()
+
+
+def _reach(address: str) -> None:
+    """Refuse an address where nothing answers."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), REACHED).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(
+            f"hydra.launcher.address is {address}, where no cluster of Ray answers "
+            f"({brief(error)}); give HOST:PORT of its head, or auto for this machine's."
+        ) from None
 
 
 def _run(

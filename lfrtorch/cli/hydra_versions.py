@@ -21,7 +21,7 @@ _TRUSTED = None if IS_1_3 else getattr(hydra.utils, "UNSAFE_DISABLE_EXECUTION_CH
 # checkpoint; a static map of the user's own may be of any module.
 
 MAIN: dict[str, Any] = COMPOSED if _TRUSTED is None else {"execution_whitelist": _TRUSTED}
-"""How ``hydra.main`` does, and that it may make what they name."""
+"""How ``hydra.main`` reads the settings, and which targets in them it may call: all."""
 
 
 def instantiate(node: Any, *args: Any, **options: Any) -> Any:

@@ -25,17 +25,20 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from hydra.core.config_store import ConfigStore
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from threadpoolctl import threadpool_limits
 
+from hydra_plugins.lfrtorch_ray import RayLauncherConf
 from lfrtorch._support import tables
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch.cli import compare
 from lfrtorch.cli.claim import tidy
 from lfrtorch.cli.composition import SWEEPS, parsed
+from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.interrupts import TerminatedError
 from lfrtorch.cli.quotes import register_resolver
 from lfrtorch.cli.run_folder import SNAPSHOTS
@@ -95,6 +98,9 @@ def folder_name(varied: str) -> str:
 
 
 register_resolver("folder_name", folder_name, replace=True)
+ConfigStore.instance().store(
+    group="hydra/launcher", name="ray", node=RayLauncherConf, provider="lfrtorch"
+)  # here, not in its module, which Hydra imports in every program of this environment
 
 
 def study_words(given: Sequence[str]) -> list[str]:
@@ -289,17 +295,19 @@ class Report(Callback):
         runs = sorted(path.parents[1] for path in folder.rglob(".hydra/overrides.yaml"))
         failed = [run for run in runs if (run / FAILED).is_file()]
         ended = sum((run / "metrics.json").is_file() for run in runs if run not in failed)
-        if ended:
-            print()
-            compare.run([folder], record=compare.of_study(config))
-        print(f"\n{ended} of {len(runs)} runs in {folder} are done")
-        if failed:
-            rows = [
-                [str(run.relative_to(folder)), (run / FAILED).read_text(encoding="utf-8").strip()]
-                for run in failed
-            ]
-            print(f"\n{tables.table(['failed', 'why'], rows)}")
-            sys.exit(1)
+        try:
+            if ended:
+                print()
+                with user_errors():
+                    compare.run([folder], record=compare.of_study(config))
+        finally:  # Hydra would make a warning of an error, and exit with 0
+            print(f"\n{ended} of {len(runs)} runs in {folder} are done")
+            if failed:
+                why = [(run / FAILED).read_text(encoding="utf-8").strip() for run in failed]
+                names = [str(run.relative_to(folder)) for run in failed]
+                rows = [list(pair) for pair in zip(names, why, strict=True)]
+                print(f"\n{tables.table(['failed', 'why'], rows)}")
+                sys.exit(1)
 
 
 def went_on(launched: Callable[[], Any]) -> None:

@@ -13,6 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -229,10 +230,28 @@ def test_tasks_of_ray_keep_what_they_found_if_the_study_is_ended(
     assert (begun[0].parents[1] / "model").is_dir()
 
 
+def test_a_study_whose_runs_failed_says_so_also_if_they_cannot_be_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    for name, file in (("nn=2", "metrics.json"), ("nn=3", study.FAILED)):
+        (tmp_path / name / ".hydra").mkdir(parents=True)
+        (tmp_path / name / ".hydra" / "overrides.yaml").write_text("[]")
+        (tmp_path / name / file).write_text("{}" if file == "metrics.json" else "nn is 3")
+    report: Any = study.Report()
+    with pytest.raises(SystemExit) as ended:
+        report.on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}}))
+    assert ended.value.code == 1
+    said = capsys.readouterr()
+    assert "is not of a run" in said.err
+    assert "1 of 2 runs" in said.out
+    assert "nn is 3" in said.out
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("word", "message"),
     [
+        ("address=127.0.0.1:9", "no cluster of Ray answers"),
         ("address=auto", "Ray did not start"),
         ("cpus_per_task=99", "no run could begin"),
         ("cpus_per_task=0", "at least 1"),
