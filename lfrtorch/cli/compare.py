@@ -31,7 +31,7 @@ All runs in the folders, and in those below them, that came to their end are rea
 data have tables of their own.
 
   out=DIR   folder of the files. Default: the one that all folders that are given lie in
-  +bench=NAME or data=file data.path=FILE ..   as in lfrtorch evaluate: the page shows the first
+  +bench=NAME or data=file data.path=FILE ..   as in lfrtorch fit: the page shows the first
             validation record, or the first test if there is none, simulated by the best models
 """
 
@@ -58,12 +58,13 @@ def launch() -> None:
 
 
 def is_setting(word: str) -> bool:
-    """Whether it is NAME=VALUE, and no folder: those of a study have such names."""
-    return "=" in word and not Path(word).is_dir()
+    """Whether it is NAME=VALUE, and no folder: those of a study have such names, as a/nn=5."""
+    name, given, _ = word.partition("=")
+    return bool(given) and "/" not in name and not Path(word).is_dir()
 
 
 def chosen(words: Sequence[str]) -> Record | None:
-    """The record of the data that words choose, as those of ``lfrtorch evaluate``."""
+    """The record of the data that words choose, as those of ``lfrtorch fit``."""
     from lfrtorch.cli.composition import check_words, composed
     from lfrtorch.cli.config import one_record
     from lfrtorch.cli.quotes import quoted

@@ -24,11 +24,12 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import Cell, cell, engineering, table, times
 from lfrtorch._support.types import Array
 from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.score_window import is_open, settled
 from lfrtorch.model import check_channels, load
 from lfrtorch.records import Record
 from lfrtorch.reporting import html, plots
 from lfrtorch.reporting.scores import unit_of
-from lfrtorch.reporting.several_models import COLOURS, side_by_side
+from lfrtorch.reporting.several_models import COLOURS, short, side_by_side
 
 SEEDS = ("seed", "data.seed")
 """Words that differ between repetitions of one setting."""
@@ -38,9 +39,6 @@ SHOWN = 20
 
 BOXES = 30
 """Most settings whose boxes are drawn, the best by their median."""
-
-LONGEST = 40
-"""Characters of a setting in a figure."""
 
 WIDE = 50
 """Ratio of the values of a word from which on their axis is logarithmic."""
@@ -136,12 +134,11 @@ class Comparison:
         tests = list(dict.fromkeys(name for run in self.runs for name in run.tests))
         factor, unit = self._scale
         shown = f" ({unit})" if unit else ""
-        root = Path(os.path.commonpath([run.folder.parent for run in self.runs]))
         head = ["run", "", "parameters", f"validation{shown}"]
         head += [f"{name}{shown}" for name in tests] + ["time (s)", "outcome"]
         rows: list[list[Cell]] = [
             [
-                str(run.folder.relative_to(root)),
+                self._name(run),
                 "*" if run in self.front else "",
                 run.parameters,
                 times(factor, run.error),
@@ -178,23 +175,22 @@ class Comparison:
             record: of the same channels as the models; others are left out.
         """
         best = {label: runs[0] for label, runs in self.settings.items()}
-        ranked = sorted(
-            best.items() if best else ((run.folder.name, run) for run in self.runs),
-            key=lambda one: (math.isnan(one[1].error), one[1].error),
-        )
+        best = best or {self._name(run): run for run in self.runs}
         found: dict[str, Array] = {}
         y_linear = None
-        for label, run in ranked:
+        for label, run in sorted(best.items(), key=lambda one: _worst_last(one[1].error)):
             if len(found) == len(COLOURS):
                 break
             try:
                 model = load(run.folder)
                 check_channels(model, record)
-                found[_short(label)] = model.simulate(record)
-            except (InputError, FileNotFoundError):
+                if not found and is_open(record):
+                    record = settled(model, [record], [])[0][0]
+                found[label] = model.simulate(record)
+                if y_linear is None and (run.folder / "linear").is_dir():
+                    y_linear = LinearModel.load(run.folder).simulate(record)
+            except (InputError, OSError, IndexError):
                 continue
-            if y_linear is None and (run.folder / "linear").is_dir():
-                y_linear = LinearModel.load(run.folder).simulate(record)
         return side_by_side(record, found, y_linear) if found else None
 
     def figures(self, record: Record | None = None) -> dict[str, Figure]:
@@ -223,6 +219,14 @@ class Comparison:
         more = len(rows) - SHOWN
         parts.append(LEGEND + f" {more} more runs are in the files." * (more > 0))
         return "\n\n".join(parts)
+
+    @cached_property
+    def _root(self) -> Path:
+        return Path(os.path.commonpath([run.folder.parent for run in self.runs]))
+
+    def _name(self, run: Compared) -> str:
+        """The folder of a run below the one that all are in."""
+        return str(run.folder.relative_to(self._root))
 
     @property
     def _scale(self) -> tuple[float, str]:
@@ -255,7 +259,7 @@ class Comparison:
         ]
         figure = Figure(figsize=(7, 1 + 0.3 * len(labels)), layout="constrained")
         ax = figure.subplots()
-        ax.boxplot(errors, tick_labels=[*map(_short, labels)], orientation="horizontal", sym=".")
+        ax.boxplot(errors, tick_labels=[*map(short, labels)], orientation="horizontal", sym=".")
         ax.invert_yaxis()  # the best one above
         ax.set_xscale("log")
         _error_axis(ax.xaxis, unit)
@@ -316,7 +320,7 @@ def compare(folders: Sequence[str | Path]) -> list[Comparison]:
         run = _read(path)
         groups.setdefault(run.dataset, []).append(run)
     return [
-        Comparison(name, sorted(runs, key=lambda run: (math.isnan(run.error), run.error)))
+        Comparison(name, sorted(runs, key=lambda run: _worst_last(run.error)))
         for name, runs in groups.items()
     ]
 
@@ -383,8 +387,9 @@ def _read(path: Path) -> Compared:
         raise InputError(f"'{path}' is not of a run: {error!r}.") from None
 
 
-def _short(label: str) -> str:
-    return label if len(label) <= LONGEST else f"{label[:LONGEST]}…"
+def _worst_last(error: float) -> tuple[bool, float]:
+    """By which runs are sorted; those that diverged are the worst."""
+    return math.isnan(error), error
 
 
 def _float(value: float | None) -> float:

@@ -22,11 +22,27 @@ SIZE = (11.0, 3.6)
 """Width of the figure, and height of an output in it, in inches."""
 
 
+LONGEST = 40
+"""Characters of a setting in a figure."""
+
+
+def short(label: str) -> str:
+    """A setting as a figure has room for it, its beginning and its end.
+
+    Example:
+        >>> from lfrtorch.reporting import several_models
+        >>> several_models.short("trainer.max_iter=100 trainer.tolerance=1e-9 nn=5")
+        'trainer.max_iter=100…r.tolerance=1e-9 nn=5'
+    """
+    half = LONGEST // 2
+    return label if len(label) <= LONGEST else f"{label[:half]}…{label[-half:]}"
+
+
 def side_by_side(
     record: Record, simulated: Mapping[str, Array], y_linear: Array | None = None
 ) -> Figure:
     """Each output about the largest error of the first model, and power spectral densities of the
-    errors. The legend has the fit of each model to the whole record, 100 % - NRMSE.
+    errors. The legend has the fit of each model to all scored samples, 100 % - NRMSE.
 
     Args:
         record: the measurement.
@@ -74,7 +90,9 @@ def _in_time(ax: Axes, record: Record, models: list[_Model], i: int, near: slice
     ax.plot(t, y[near], lw=1.6, color=OUTPUT, label="measured")
     for name, simulated, colour, style in models:
         own = simulated[record.skip :, i]
-        ax.plot(t, own[near], style, lw=1.0, color=colour, label=f"{name}, {fit_text(y, own)}")
+        ax.plot(
+            t, own[near], style, lw=1.0, color=colour, label=f"{short(name)}, {fit_text(y, own)}"
+        )
     span = float(np.ptp(y)) or 1.0
     low, high = ax.get_ylim()
     limits = max(low, y.min() - BEYOND * span), min(high, y.max() + BEYOND * span)
@@ -95,7 +113,7 @@ def _spectrum(ax: Axes, record: Record, models: list[_Model], i: int) -> None:
             continue
         f, power = power_density(signal[:, None], record.fs)
         level = 10.0 * np.log10(np.maximum(power[1:, 0], np.finfo(float).tiny))
-        ax.plot(f[1:], level, style, lw=1.0, color=colour, label=name)
+        ax.plot(f[1:], level, style, lw=1.0, color=colour, label=short(name))
     per = f"{unit}²/Hz" if record.fs != 1.0 else f"{unit}²"
     ax.set(ylabel=f"output and errors (dB, re 1 {per})", xlim=(0, record.fs / 2))
     ax.grid(True, alpha=0.2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -63,3 +65,27 @@ def test_models_of_other_channels_are_left_out(runs: Path):
     (found,) = comparison.compare([runs])
     assert found.simulations(RECORD) is None
     assert "simulations" not in found.figures(RECORD)
+
+
+def test_settings_that_are_alike_in_their_first_letters_stay_apart(runs: Path, tmp_path: Path):
+    for source in runs.iterdir():
+        nn, seed = source.name.split()
+        copy = shutil.copytree(source, tmp_path / source.name)
+        metrics = json.loads((copy / "metrics.json").read_text())
+        metrics["command"] = f"lfrtorch fit trainer.tolerance={'1' * 40}{nn} seed={seed}"
+        (copy / "metrics.json").write_text(json.dumps(metrics))
+    (found,) = comparison.compare([tmp_path])
+    record = Record(U[150:], np.tanh(U[150:]), 10.0, outputs=(Channel("b", "m"),))
+    in_time, _ = shown(found.simulations(record))
+    assert len(in_time) == 2 + len(found.settings) == 4
+
+
+def test_a_damaged_linear_model_costs_no_page(runs: Path, tmp_path: Path):
+    copy = shutil.copytree(runs, tmp_path / "runs")
+    for linear in copy.glob("*/linear/model.json"):
+        linear.write_text("{")
+    (found,) = comparison.compare([copy])
+    record = Record(U[150:], np.tanh(U[150:]), 10.0, outputs=(Channel("b", "m"),))
+    in_time, _ = shown(found.simulations(record))
+    assert in_time[0] == "measured"
+    assert not any(label.startswith("linear") for label in in_time)
