@@ -274,7 +274,9 @@ def _fitted(
             f"{which} on the training records at the start; start from a stable model, or use "
             "the linear model alone (lfrtorch linear)."
         )
+    here = sum(fit.seconds for fit in fits)
     snapshots.restore(fits)
+    clock -= sum(fit.seconds for fit in fits) - here
     unseen = [r for some in (validation, selection) if some for r in as_records(some)]
     field, cut = fits, None
     with ExitStack() as ending:

@@ -187,7 +187,8 @@ class FitResult:
         model: the fitted model, the object that was given.
         history: one entry an iteration, the start first.
         chosen_iteration: the iterate that ``model`` holds.
-        seconds: duration of the whole fit.
+        seconds: duration of the whole fit. If it went on from snapshots, those that its starts had
+            taken before are added.
         seconds_per_iteration: median over the accepted iterations but the first, which may compile.
         reason: why the search ended, a :class:`lfrtorch.Reason`.
         detail: what else is known of a process that was lost.
@@ -319,6 +320,11 @@ class Fit:
             self.history.append(
                 Progress(0, self.trainer.limit, math.inf, math.nan, 0.0, False, {}, math.inf)
             )
+
+    @property
+    def seconds(self) -> float:
+        """That its iterations took, those before it went on included."""
+        return self._seconds
 
     @property
     def diverges(self) -> bool:

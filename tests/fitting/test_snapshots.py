@@ -172,6 +172,14 @@ def test_ends_as_without_interruption(tmp_path: Path):
     assert outcome(resumed) == outcome(whole)
 
 
+def test_seconds_before_an_interruption_count(tmp_path: Path):
+    data, optimiser = records(["zero"], "zero"), LevenbergMarquardt(max_iter=6)
+    first = run(starts(1), data, tmp_path, stop=4, trainer=optimiser)
+    last = run(starts(1), data, tmp_path, trainer=optimiser)
+    assert last.iterations > first.iterations
+    assert last.seconds > last.history[-1].seconds - last.history[0].seconds
+
+
 def test_several_starts_end_as_without_interruption(tmp_path: Path):
     data, optimiser = records(["zero", "periodic"]), LevenbergMarquardt(max_iter=8)
     whole = run(starts(3), data, trainer=optimiser)
