@@ -14,6 +14,7 @@ import argparse
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -85,6 +86,7 @@ def compared(name: str, seed: int, root: Path, out: Path) -> None:
     seconds = timed("fit", *words, *AUTO, f"hydra.run.dir={folder}", "overwrite=true")
     both = {"auto": ended(folder) | {"seconds": seconds}}
     folder = out / f"search_{seed}"
+    shutil.rmtree(folder, ignore_errors=True)  # what an interrupted one left
     limits = ["trials=1000", f"minutes={seconds / 60}", f"out={folder}"]
     seconds = timed("search", *words, *BOARDS[name].space, *limits)
     runs = [ended(path.parent) for path in folder.glob("*/metrics.json")]

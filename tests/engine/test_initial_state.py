@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from reference import POLES, normal, random_cell, special_poles
 from torch.testing import assert_close
 
+from lfrtorch.engine import initial_state
 from lfrtorch.engine.initial_state import simulate_estimated, simulate_from_beginning
 from lfrtorch.engine.simulation import simulate
 
@@ -20,6 +21,21 @@ def test_estimated_initial_state_is_the_one_that_made_the_output():
     found = simulate_estimated(cell, u, made.y, torch.ones_like(made.y))
     assert_close(found.x[:, 0], x0, rtol=0, atol=1e-8)
     assert_close(found.y, made.y, rtol=0, atol=1e-9)
+
+
+def test_a_linear_model_is_not_simulated_from_states_that_cannot_be_better(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 60, 1)
+    y = simulate(cell, u, normal(1, 2, seed=1)).y + 0.1 * normal(1, 60, 1, seed=2)
+    tried = []
+    monkeypatch.setattr(
+        initial_state, "simulate", lambda *given: tried.append(1) or simulate(*given)
+    )
+    simulate_estimated(cell, u, y, torch.ones_like(y))
+    # From rest, one step, and one of its rounding errors at most; a few in each further pass.
+    # Before it was looked whether a step promises anything, six halvings of each followed.
+    assert len(tried) <= 3 * (1 + initial_state.PASSES)
 
 
 def test_estimated_initial_state_counts_what_is_weighted_only():
