@@ -40,7 +40,10 @@ def check_memory(needed: float, what: str, remedy: str, device: torch.device | N
 
 
 def memory_of(device: torch.device | None = None) -> float:
-    """Bytes of memory of a device, or what a container may take; infinite if that is not known."""
+    """Bytes of memory of a device, or what a container or a process may take.
+
+    Infinite if that is not known.
+    """
     if device is not None and device.type == "cuda":
         import torch
 
@@ -49,7 +52,18 @@ def memory_of(device: torch.device | None = None) -> float:
         machine = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):  # not on every system
         machine = math.inf
-    return min(machine, limit_of(Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")))
+    grouped = limit_of(Path("/proc/self/cgroup"), Path("/sys/fs/cgroup"))
+    return min(machine, grouped, _own_limit())
+
+
+def _own_limit() -> float:
+    """What ``ulimit -v`` leaves this process, as batch systems set it."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return math.inf
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return math.inf if limit == resource.RLIM_INFINITY else float(limit)
 
 
 def limit_of(listed: Path, mounted: Path) -> float:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -41,3 +43,11 @@ def test_groups_above_limit_those_in_them(tmp_path: Path):
 
 def test_this_machine_has_memory():
     assert memory_of() > 1e8
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems set no such limit")
+def test_a_limit_of_the_process_counts():
+    told = "from lfrtorch._support.memory import memory_of; print(memory_of())"
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_AS, (2**31, 2**31)); {told}"
+    said = subprocess.run([sys.executable, "-c", limited], capture_output=True, check=True)
+    assert float(said.stdout) <= 2**31
