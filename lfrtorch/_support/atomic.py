@@ -10,6 +10,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.paths import real
 
 TEMPORARY = ".lfrtorch-"
 """How the names of files and folders begin that are not whole yet."""
@@ -30,7 +31,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     Raises:
         OSError: names the folder.
     """
-    path = Path(path).resolve()  # a link's target is replaced, not the link
+    path = real(path)  # a link's target is replaced, not the link
     with writing_to(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=TEMPORARY, suffix=path.suffix, dir=path.parent)
@@ -49,7 +50,7 @@ def writing_to(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        named = folder if error.filename is None else Path(os.fsdecode(error.filename)).resolve()
+        named = folder if error.filename is None else real(os.fsdecode(error.filename))
         ours = folder == named or folder in named.parents or named in folder.parents
         if error.strerror is None or not ours:  # it says more, or is of another file
             raise

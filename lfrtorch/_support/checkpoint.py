@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lfrtorch._support.atomic import TEMPORARY, whole_file, whole_folder
 from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.paths import real
 
 FORMAT = "lfrtorch"
 VERSION = 1
@@ -34,7 +35,7 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
         ValueError: ``folder`` exists and is not a checkpoint.
         OSError: it cannot be written, as on a full disk.
     """
-    folder = Path(folder).resolve()  # a link's target is replaced, not the link
+    folder = real(folder)  # a link's target is replaced, not the link
     replaced = (folder / DESCRIPTION).is_file()
     if folder.exists() and not replaced and _occupied(folder):
         raise InputError(

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from lfrtorch._support.atomic import remove_leftovers
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.paths import real
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.run_folder import CONFIG, SNAPSHOTS
 
@@ -54,7 +55,7 @@ def claim(folder: Path, cfg: DictConfig) -> None:
             f"hydra.run.dir is '{folder}', which cannot be written to ({error.strerror}); "
             "give another folder."
         ) from None
-    if not locked(folder.resolve()):
+    if not locked(real(folder)):
         raise InputError(
             f"hydra.run.dir is '{folder}', where another run is at work; "
             "give another folder, or wait."

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lfrtorch._support.errors import InputError, LfrtorchError
+from lfrtorch._support.paths import real
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -99,7 +100,7 @@ def run(folders: list[Path], out: str | Path | None = None, record: Record | Non
     if not folders:
         raise InputError("no folder is given; give those of runs.")
     found = comparison.compare(folders)
-    target = Path(os.path.commonpath([path.resolve() for path in folders]) if out is None else out)
+    target = Path(os.path.commonpath([real(path) for path in folders]) if out is None else out)
     comparison.write(found, target, record)
     print("\n\n".join(map(str, found)))
     print(f"\nFigures and all runs: {target / 'comparison.html'}, comparison.md and comparison.csv")

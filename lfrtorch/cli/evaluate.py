@@ -18,6 +18,7 @@ import lfrtorch
 from lfrtorch import analysis
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.paths import real
 from lfrtorch.analysis.residual_analysis import SHORTEST
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
@@ -108,7 +109,7 @@ def fitted(checkpoint: str, path: str | list[str]) -> bool:
 def resolved(path: str | list[str]) -> set[Path]:
     """The files of paths and patterns; none if they are gone."""
     try:
-        return {file.resolve() for file in listed_files(path, "data.path")}
+        return {real(file) for file in listed_files(path, "data.path")}
     except FileNotFoundError:
         return set()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import glob
+import os
 import re
 import sys
 import textwrap
@@ -19,6 +20,7 @@ from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.paths import expanded
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import parsed
@@ -80,7 +82,7 @@ SETTING = re.compile(r"[a-z_.]+=")
 def launch(words: Sequence[str] | None = None) -> None:
     """The command line."""
     given = sys.argv[1:] if words is None else words
-    data = [word for word in given if SETTING.match(word) and not Path(word).exists()]
+    data = [word for word in given if SETTING.match(word) and not os.path.exists(word)]
     options = parser().parse_args([word for word in given if word not in data])
     with user_errors():
         for word in data:
@@ -123,7 +125,7 @@ def matching(patterns: Sequence[str]) -> list[Path]:
     """
     found: dict[Path, None] = {}
     for pattern in patterns:
-        path = Path(pattern).expanduser()
+        path = expanded(pattern)
         paths = [path] if path.exists() else sorted(map(Path, glob.glob(str(path))))
         if not paths and glob.has_magic(pattern):
             raise InputError(f"no file matches '{pattern}'.")

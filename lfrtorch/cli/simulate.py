@@ -21,6 +21,7 @@ from lfrtorch._support import checkpoint, tables
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.paths import expanded, real
 from lfrtorch._support.types import Array
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
@@ -298,7 +299,7 @@ def require(cfg: DictConfig) -> None:
 def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
     """Each file that is read with that which is written."""
     paths = listed_files(cfg.data.path, "data.path")
-    out = Path(cfg.out).expanduser()
+    out = expanded(cfg.out)
     if out.is_dir() or not out.suffix:
         # Of a compressed file the name within.
         stems = [Path(path.name.removesuffix(".gz")).stem for path in paths]
@@ -318,7 +319,7 @@ def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
     else:
         pairs = [(paths[0], out)]
     for path, file in pairs:
-        if file.resolve() == path.resolve():
+        if real(file) == real(path):
             raise InputError(f"'{file}' is the file that is read; give another name to out.")
         if not cfg.overwrite:
             refuse_existing(file, "overwrite=true")

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.paths import expanded
 from lfrtorch.files import arrays as array_table
 from lfrtorch.files.excel import EXTENSIONS, ExcelTable, workbook
 from lfrtorch.files.parquet import ParquetTable
@@ -49,7 +50,7 @@ def open_table(path: str | Path) -> Table:
         ValueError: a folder, an unknown extension, a file without samples or a damaged one, or a
             package that is missing.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     if path.is_dir():
         inside = sorted(p.name for p in path.iterdir() if extension(p) in FORMATS)
         raise InputError(
@@ -57,6 +58,8 @@ def open_table(path: str | Path) -> Table:
             + (f": {', '.join(inside[:_SHOWN])}." if inside else ", it has none of a known format.")
         )
     file, _ = workbook(path)
+    if file.exists() and not file.is_file():
+        raise InputError(f"'{file}' is a pipe or a device; give a file with what comes from it.")
     if not file.is_file():
         raise FileNotFoundError(f"there is no file '{file}'{similar(file)}.")
     kind = extension(file)

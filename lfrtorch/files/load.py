@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.paths import expanded, real
 from lfrtorch.dataset import Dataset
 from lfrtorch.files.excel import workbook
 from lfrtorch.files.formats import similar
@@ -359,7 +360,7 @@ def listed_files(given: Any, option: str) -> list[Path]:
         )
     found: list[Path] = []
     for entry in listed:
-        path = Path(entry).expanduser()
+        path = expanded(entry)
         if path.exists() or not glob.has_magic(str(path)):
             found.append(path)
             continue
@@ -367,7 +368,7 @@ def listed_files(given: Any, option: str) -> list[Path]:
         if not matches:
             raise FileNotFoundError(f"no file matches '{path}'{similar(path)}.")
         found += sorted(matches, key=lambda p: _counting(str(p)))
-    return list({path.resolve(): path for path in found}.values())
+    return list({real(path): path for path in found}.values())
 
 
 def _counting(text: str) -> list[tuple[int, str]]:
@@ -386,7 +387,7 @@ def _stem(path: Path) -> str:
 
 def _stems(paths: Sequence[Path], taken: Container[str]) -> list[str]:
     """Names of files, with as many of their folders as make them unlike one another."""
-    full = [path.resolve() for path in paths]
+    full = [real(path) for path in paths]
     names = []
     for depth in range(1, max(len(path.parts) for path in full) + 1):
         names = ["_".join([*path.parts[-depth:-1], _stem(path)]).lstrip("/") for path in full]
@@ -401,7 +402,7 @@ def _name(paths: Sequence[Path]) -> str:
         return _stem(paths[0])
     letters = zip(*map(_stem, paths), strict=False)
     common = "".join(some[0] for some in takewhile(lambda some: len(set(some)) == 1, letters))
-    return common.rstrip("0123456789_-. ") or paths[0].resolve().parent.name or "files"
+    return common.rstrip("0123456789_-. ") or real(paths[0]).parent.name or "files"
 
 
 def _some(names: Sequence[str]) -> str:
@@ -454,16 +455,16 @@ def _named(
             )
         found = [whole for whole in known if str(name) in (whole.record.name, whole.stem)]
         if not found:
-            path = Path(name).expanduser()
+            path = expanded(name)
             if not (path.exists() or path.suffix or glob.has_magic(str(name))):
                 raise InputError(
                     f"{option} names {str(name)!r}, which is neither a file nor one of the "
                     f"records: {', '.join(whole.record.name for whole in known)}."
                 )
             paths = listed_files(name, option)
-            same = {path.resolve() for path in paths}
-            found = [whole for whole in known if whole.path.resolve() in same]
-            own = [p for p in paths if p.resolve() not in {w.path.resolve() for w in found}]
+            same = {real(path) for path in paths}
+            found = [whole for whole in known if real(whole.path) in same]
+            own = [p for p in paths if real(p) not in {real(w.path) for w in found}]
             fresh = reader.read(own) if own else []
             records += [whole.record for whole in fresh]
         used = [whole.record.name for whole in found if whole not in left]

@@ -1,0 +1,41 @@
+"""Paths that a user gave."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from lfrtorch._support.errors import InputError, brief
+
+
+def expanded(path: str | Path) -> Path:
+    """The path, with a home folder for its ``~``; nothing needs to be there.
+
+    Raises:
+        ValueError: one that no file can have: a name that is too long, or of an unknown user.
+
+    Example:
+        >>> from lfrtorch._support.paths import expanded
+        >>> expanded("x.csv").name
+        'x.csv'
+    """
+    try:
+        found = Path(path).expanduser()
+        found.is_file()  # an error, unless there may be such a file
+        if "\0" in str(found):  # which is none to pathlib
+            raise ValueError("it has a zero byte")
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{brief(repr(str(path)))} is no path ({reason}); correct it.") from None
+    return found
+
+
+def real(path: str | Path) -> Path:
+    """The path without links, as far as it is there; one of a loop of links stays as it is.
+
+    Example:
+        >>> from lfrtorch._support.paths import real
+        >>> real("/no/../x.csv").name
+        'x.csv'
+    """
+    return Path(os.path.realpath(path))
