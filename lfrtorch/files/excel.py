@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import date, datetime, time, timedelta
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.memory import in_bytes
 from lfrtorch._support.types import Array
 from lfrtorch.files.arrays import optional
 from lfrtorch.files.table import BLOCK, Clock, Table
@@ -20,6 +22,14 @@ from lfrtorch.files.text import Line, is_missing, layout_of
 
 _HEAD = 1000
 """Rows that tell where the samples begin."""
+
+_MOST_ROWS = 2**20
+"""Rows that a sheet of Excel may have."""
+
+_PACKED, _LARGE = 100, 1e8
+"""How many times longer a part of that many bytes may be than it is packed: see Apache POI,
+ZipSecureFile, whose limits are 100 times and 1e5 bytes. Sheets of numbers are packed 5 to 20 times.
+"""
 
 EXTENSIONS = (".xlsx", ".xlsm")
 
@@ -71,7 +81,7 @@ class ExcelTable(Table):
 
     def _layout(self, sheet: Any) -> tuple[int, list[int], tuple[str, ...], dict, frozenset[int]]:
         """First row of samples, columns in use, headers, units and columns of date-times."""
-        head = [[_text(cell) for cell in row] for row in islice(_rows(sheet), _HEAD)]
+        head = [[_text(cell) for cell in row] for row in islice(self._rows(sheet), _HEAD)]
         width = max(map(len, head), default=0)
         used = [i for i in range(width) if any(i < len(row) and row[i] for row in head)]
         lines = [
@@ -108,27 +118,56 @@ class ExcelTable(Table):
     def _samples(self) -> Iterator[tuple[int, Sequence[Any]]]:
         """Rows that are not empty, with their numbers."""
         with self._opened() as book:
-            for number, row in enumerate(_rows(book[self._sheet]), 1):
+            for number, row in enumerate(self._rows(book[self._sheet]), 1):
                 if number >= self._first and any(_text(row[k]) for k in self._used if k < len(row)):
                     yield number, row
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
         openpyxl = optional("openpyxl")
-        book = None
         try:
+            self._refuse_bombs()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # styles and extensions that say nothing of numbers
                 book = openpyxl.load_workbook(self._file, read_only=True, data_only=True)
+        except InputError:
+            raise
         except Exception as error:  # a damaged file raises any of a dozen kinds
-            raise InputError(
-                f"'{self._file}' is not a readable Excel file ({brief(error)}); save it "
-                "again as .xlsx."
-            ) from error
+            raise self._damaged(error) from error
         try:
             yield book
         finally:
             book.close()
+
+    def _refuse_bombs(self) -> None:
+        with zipfile.ZipFile(self._file) as archive:
+            for part in archive.infolist():
+                if part.file_size > max(_LARGE, _PACKED * part.compress_size):
+                    raise InputError(
+                        f"'{self._file}': its part {part.filename!r} takes "
+                        f"{in_bytes(part.file_size)} unpacked, over {_PACKED} times what it takes "
+                        "packed, as in no workbook; save it again as .xlsx."
+                    )
+
+    def _rows(self, sheet: Any) -> Iterator[Sequence[Any]]:
+        """Rows of a sheet, read one by one."""
+        sheet.reset_dimensions()  # what programs write of the size may be wrong
+        rows = enumerate(sheet.iter_rows(values_only=True))
+        while True:
+            try:
+                number, row = next(rows, (0, None))
+            except Exception as error:
+                raise self._damaged(error) from error
+            if row is None:
+                return
+            if number >= _MOST_ROWS:
+                raise self._damaged(f"it has more than {_MOST_ROWS} rows")
+            yield row
+
+    def _damaged(self, error: Exception | str) -> InputError:
+        return InputError(
+            f"'{self._file}' is not a readable Excel file ({brief(error)}); save it again as .xlsx."
+        )
 
     def _number(self, cell: Any, row: int, column: int) -> float:
         if isinstance(cell, int | float):
@@ -158,11 +197,6 @@ class ExcelTable(Table):
             f"{self.headers[column]!r} is not a {kind}; correct it, or leave the cell empty where "
             "the value is missing."
         )
-
-
-def _rows(sheet: Any) -> Iterator[Sequence[Any]]:
-    sheet.reset_dimensions()  # what programs write of the size may be wrong
-    return sheet.iter_rows(values_only=True)
 
 
 def _text(cell: Any) -> str:

@@ -48,6 +48,17 @@ def test_an_archive_whose_header_declares_too_much(tmp_path: Path):
     refused(path, "is not a readable .npz file")
 
 
+def test_a_part_of_a_workbook_that_no_program_packs(tmp_path: Path):
+    path = tmp_path / "bomb.xlsx"
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("xl/worksheets/sheet1.xml", "w") as part,
+    ):
+        for _ in range(101):
+            part.write(bytes(10**6))
+    refused(path, "takes 101 MB unpacked, over 100 times what it takes packed")
+
+
 def test_names_of_many_columns_are_told_apart():
     found = channels(["a (N)", "a (V)", *map(str, range(20_000))], {})
     assert [found[0].name, found[1].name, len(found)] == ["a (N)", "a (V)", 20_002]
