@@ -35,5 +35,6 @@ def brief(error: BaseException | str, longest: int = LONGEST) -> str:
         >>> brief("no such\\n    key")
         'no such key'
     """
-    text = " ".join(str(error)[: 4 * longest].split())
+    said = str(error) or (type(error).__name__ if isinstance(error, BaseException) else "")
+    text = " ".join(said[: 4 * longest].split())
     return text if len(text) <= longest else f"{text[:longest]}..."

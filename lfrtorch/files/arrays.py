@@ -225,6 +225,8 @@ def npz(path: Path) -> ArrayTable:
             check_memory(size, f"'{path}', unpacked,", "give a part of it")
             for member in archive.namelist():
                 name = member.removesuffix(".npy")
+                if name in found:
+                    raise ValueError(f"it has {name!r} twice")
                 content = io.BytesIO(archive.read(member))
                 try:
                     found[name] = _signal(np.lib.format.read_array(content, allow_pickle=False))
@@ -267,7 +269,10 @@ def mat(path: Path) -> ArrayTable:
     try:
         if scipy_io.matlab.matfile_version(path)[0] == 1:
             check_elements(path)
-        numbers = sum(math.prod(shape) for _, shape, _ in scipy_io.whosmat(path))
+        shapes = [shape for _, shape, _ in scipy_io.whosmat(path)]
+        if any(size < 0 for shape in shapes for size in shape):
+            raise ValueError("an array of negative size")
+        numbers = sum(map(math.prod, shapes))
         check_memory(8.0 * numbers, f"'{path}', of {numbers:g} numbers,", "give a part of it")
         variables = scipy_io.loadmat(path, chars_as_strings=False)
     except InputError:
@@ -324,16 +329,22 @@ def hdf5(path: Path, *, matlab: bool = False) -> ArrayTable:
     try:
         with h5py.File(path) as file:
             _group(file, "", matlab, found, names)
-    except (OSError, RuntimeError, KeyError) as error:
+    except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
         raise _damaged(path, error) from error
     return ArrayTable(path, found, lambda path: _HDF5(path, names))
 
 
 def _group(
-    group: Any, prefix: str, matlab: bool, found: dict[str, Signal | str], names: dict[str, str]
+    group: Any,
+    prefix: str,
+    matlab: bool,
+    found: dict[str, Signal | str],
+    names: dict[str, str],
+    above: frozenset[int] = frozenset(),
 ) -> None:
-    """Note the signals of an HDF5 group, and where each is."""
+    """Note the signals of an HDF5 group, and where each is; ``above`` are the groups around it."""
     h5py = optional("h5py")
+    above |= {h5py.h5o.get_info(group.id).addr}
     if not matlab:
         attributes = {f"{prefix}{key}": np.asarray(value) for key, value in group.attrs.items()}
         given = {name: _signal(value) for name, value in attributes.items()}
@@ -341,7 +352,11 @@ def _group(
     for key in group:
         if matlab and key.startswith("#"):
             continue
-        name, item = f"{prefix}{key}", group[key]
+        name = f"{prefix}{key}"
+        item = _linked(group, key)
+        if isinstance(item, str):
+            found[name] = item
+            continue
         if matlab and isinstance(item, h5py.Dataset):
             cells = item.dtype.kind == "O" and item.attrs.get("MATLAB_class") == b"cell"
             if cells and item.size == 1:
@@ -359,8 +374,10 @@ def _group(
         if isinstance(item, h5py.Group):
             if "MATLAB_sparse" in item.attrs:
                 found[name] = "is sparse; store full(x)"
+            elif h5py.h5o.get_info(item.id).addr in above:
+                found[name] = "is a group that it lies in itself; leave it out"
             else:
-                _group(item, f"{name}{'.' if matlab else '/'}", matlab, found, names)
+                _group(item, f"{name}{'.' if matlab else '/'}", matlab, found, names, above)
         elif item.dtype.names:
             complex_ = set(item.dtype.names) == {"real", "imag"}
             found[name] = (
@@ -372,11 +389,28 @@ def _group(
             found[name] = "is empty"
         else:
             unit = item.attrs.get("units", item.attrs.get("unit", ""))
-            unit = unit.decode() if isinstance(unit, bytes) else unit
+            unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
             unit = unit if isinstance(unit, str) else ""
             number = np.asarray(item[()]) if item.size == 1 else None
             found[name] = Signal(item.shape, item.dtype, unit, matlab, number)
             names[name] = item.name
+
+
+def _linked(group: Any, key: str) -> Any:
+    """What a group lists, or why it is not in its file: no file opens another one, or a device."""
+    h5py = optional("h5py")
+    link = group.get(key, getlink=True)
+    if isinstance(link, h5py.ExternalLink):
+        return f"lies in another file, {link.filename!r}; give that file"
+    try:
+        item = group[key]
+    except (KeyError, OSError, RuntimeError) as error:
+        if not isinstance(link, h5py.SoftLink):
+            raise
+        return f"is a link that leads nowhere ({brief(error)}); store the array"
+    if isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
+        return "has its numbers in other files; store them in this one"
+    return item
 
 
 def optional(package: str) -> ModuleType:

@@ -33,7 +33,8 @@ _SCALED = "m|g|s|A|K|mol|cd|Hz|N|Nm|Pa|J|W|VA|V|F|Ω|[Oo]hm|T|H|Wb|S|rad|bar|l|L
 _OTHER = "min|h|d|sec|deg|°|°C|°F|deg[CF]|%|rpm|rev|psi|lbf?|in|ft|dB|px|counts?|a\\.u\\.|-|1"
 _ATOM = rf"(?:(?:da|[TGMkhdcmuµμnpf])?(?:{_SCALED})|{_OTHER})(?:\^?-?[0-9²³⁻¹]+)?"
 _UNIT = re.compile(rf"{_ATOM}(?:[/*·. ]{_ATOM})*")
-_BRACKETS = re.compile(r"(.*?)(\s*)[(\[]\s*([^()\[\]]{1,16}?)\s*[)\]]")
+_BRACKETS = re.compile(r"(.*)[(\[]([^()\[\]]*)[)\]]")
+_LONGEST_UNIT = 16
 
 
 _CHANNEL = re.compile(r"(.+)\[(\d+)\]")
@@ -211,8 +212,15 @@ def is_unit(text: str) -> bool:
 
 def bracketed(text: str) -> str | None:
     """What stands in brackets, if that is all."""
-    found = _BRACKETS.fullmatch(text)
-    return found[3] if found and not found[1] else None
+    name, inside = _parts(text)
+    return inside if inside and not name.strip() else None
+
+
+def _parts(header: str) -> tuple[str, str]:
+    """What stands before the brackets at its end and in them; empty if nothing is that short."""
+    found = _BRACKETS.fullmatch(header)
+    inside = found[2].strip() if found else ""
+    return (found[1], inside) if found and 0 < len(inside) <= _LONGEST_UNIT else (header, "")
 
 
 def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel, ...]:
@@ -233,9 +241,10 @@ def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel,
 
 
 def _channel(header: str) -> Channel:
-    found = _BRACKETS.fullmatch(header)
-    if found and found[1] and (found[2] or is_unit(found[3])):
-        return Channel(found[1], found[3])
+    before, inside = _parts(header)
+    name = before.rstrip()
+    if inside and name and (name != before or is_unit(inside)):
+        return Channel(name, inside)
     name, slash, unit = header.partition("/")
     if slash and name.strip() and is_unit(unit.strip()):
         return Channel(name.strip(), unit.strip())

@@ -29,9 +29,13 @@ _DELIMITERS = ("\t", ";", ",", "|", " ")  # " ": any blanks; the first of those 
 _MARKS = "#%"  # of comment lines
 _COMMENT = re.compile(r"^[ \t]*[#%](?!N/?A\b|[A-Z]+/?0?[!?]).*(?:\n|$)", re.MULTILINE)  # no #N/A
 _MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-nan", "<na>", "#na", "-")
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE)
-_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")  # a number with a decimal comma
-_DATE = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?(Z|[+-]\d\d:?\d\d)?")
+_NUMBER = re.compile(  # in which no digit may be of two parts: that took hours for a million
+    r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE | re.ASCII
+)
+_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?", re.ASCII)  # a number with a decimal comma
+_DATE = re.compile(
+    r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?(Z|[+-]\d\d:?\d\d)?", re.ASCII
+)
 
 _DAMAGED = (OSError, EOFError, zlib.error, UnicodeError)
 
@@ -145,7 +149,7 @@ class TextTable(Table):
                 )
             for column in sorted(columns):
                 cell = cells[column] if column < len(cells) else ""
-                known = _is_date if column in self.layout.dates else self._is_number
+                known = _is_time if column in self.layout.dates else self._is_number
                 if not (is_missing(cell) or known(cell)):
                     kind = "date-time" if column in self.layout.dates else "number"
                     raise InputError(
@@ -272,7 +276,7 @@ def _layout(path: Path) -> _Layout:
             head += stream.readline()
     except _DAMAGED as error:
         raise InputError(f"'{path}' is damaged ({brief(error)}); write it again.") from error
-    text = head.splitlines()
+    text = head.split("\n")  # as a stream has lines: splitlines ends them at form feeds, too
     if not any(line.strip() for line in text):
         raise InputError(f"'{path}' is empty; give a file with data.")
     try:
@@ -399,6 +403,16 @@ def _is_number(cell: str, comma: bool) -> bool:
 
 def _is_date(cell: str) -> bool:
     return _DATE.fullmatch(cell) is not None
+
+
+def _is_time(cell: str) -> bool:
+    """Whether there is such a day, too: 2020-02-30 is written as a date."""
+    import pandas as pd
+
+    try:
+        return _is_date(cell) and _times(pd.Series([cell])).size == 1
+    except ValueError:
+        return False
 
 
 def is_missing(cell: str) -> bool:

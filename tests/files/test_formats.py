@@ -1,8 +1,10 @@
 """Files of every format as tables of channels: layouts, missing values, memory and refusals."""
 
 import gzip
+import os
 import sys
 import tracemalloc
+import zipfile
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import scipy.io
 import scipy.sparse
 
 from lfrtorch.files.formats import open_table
+from lfrtorch.files.load import load_records
 from lfrtorch.records import Channel
 
 T = 40
@@ -225,6 +228,8 @@ def test_lines_count_comments_and_blanks(tmp_path):
         ("u1,u2,y\n1,2,3\n1,5,2,3\n", r"line 3: 4 cells.*decimal point"),
         ('u1,u2,y\n1,2,3\n"1,5",2,3\n', "line 3: '1,5' in column 'u1'"),
         ("t,u,y\n2024-01-01,2,3\nnoon,2,3\n", "line 3: 'noon' in column 't' is not a date-time"),
+        ("t,u,y\n2024-02-29,2,3\n2024-02-30,2,3\n", "line 3: '2024-02-30' in column 't' is not a"),
+        ("u,v,y\n1,2,3\n１,2,3\n", "line 3: '１' in column 'u' is not a number"),
     ],
 )
 def test_refused_text(tmp_path, content, match):
@@ -241,6 +246,20 @@ def test_a_bad_cell_late_in_the_file(tmp_path):
 def test_binary_is_no_text(tmp_path):
     with pytest.raises(ValueError, match="is not text"):
         table_of(tmp_path, b"\x89PNG\r\n\xff\x00\x00\x01" * 20)
+
+
+@pytest.mark.parametrize("mark", ["\x0b", "\x0c", "\x1c", "\x85", "\u2028"])
+def test_a_mark_of_a_page_ends_no_line(tmp_path, mark):
+    table = table_of(tmp_path, f"page 1{mark}page 2\nu,y\n1,2\n3,4\n")
+    assert np.array_equal(table.read([0, 1]), [[1, 2], [3, 4]])  # the first one was left out
+
+
+def test_long_cells_are_told_in_no_time(tmp_path):
+    """A million digits, and as many blanks in a header, took hours."""
+    with pytest.raises(ValueError, match="has no samples"):
+        table_of(tmp_path, "9" * 200_000 + "x\n")
+    header = f"u{' ' * 50_000}x"
+    assert names(table_of(tmp_path, f"{header},y\n1,2\n3,4\n")) == [header, "y"]
 
 
 def test_text_is_read_in_blocks(tmp_path):
@@ -340,7 +359,7 @@ def test_structs_and_cells_of_mat_5(tmp_path):
     refused(table, "square", "is 40 × 40, and time may run along either axis; store its channels")
 
 
-def matlab(path: Path, write) -> None:
+def matlab_file(path: Path, write) -> None:
     """A file as MATLAB's save -v7.3 writes it: arrays in its order, so transposed."""
     with h5py.File(path, "w", userblock_size=512) as file:
         write(file)
@@ -367,7 +386,7 @@ def test_mat_7_3(tmp_path):
         file["none"].attrs["MATLAB_empty"] = 1
         file["wide"] = U
 
-    matlab(tmp_path / "a.mat", write)
+    matlab_file(tmp_path / "a.mat", write)
     table = open_table(tmp_path / "a.mat")
     assert set(names(table)) == {"u1", "u2", "y", "exp.deep.y", "one", "wide1", "wide2"}
     assert ("wide", "2 × 40", "signals wide1 .. wide2") in table.contents
@@ -554,6 +573,92 @@ def test_sheets_and_cells_of_excel(tmp_path):
         table.read([2])
 
 
+def edited(path: Path, old: str, new: str) -> Path:
+    """A workbook whose sheet has another text once."""
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    sheet = "xl/worksheets/sheet1.xml"
+    assert old in parts[sheet].decode()
+    parts[sheet] = parts[sheet].replace(old.encode(), new.encode(), 1)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ('r="A30"', 'r="ZZZZZZ30"', "not a valid column name"),
+        ('r="30"', 'r="many"', "could not convert"),
+        ('r="30"', 'r="2000000000"', "has more than 1000 rows"),  # was read for an hour
+        ("</sheetData>", "<row>", "mismatched tag"),
+        ("<v>", "<v>0.1x", "could not convert string to float: '0.1x"),
+    ],
+)
+def test_damaged_rows_of_excel(tmp_path, monkeypatch, old, new, reason):
+    monkeypatch.setattr("lfrtorch.files.excel._MOST_ROWS", 1000)
+    rows = [["u"], *rows_of(Y.tolist())]
+    path = edited(book(tmp_path / "a.xlsx", Run=rows), old, new)
+    with pytest.raises(ValueError, match=rf"a\.xlsx' is not a readable Excel file \(.*{reason}"):
+        open_table(path).read([0])
+
+
+@pytest.mark.parametrize("matlab", [False, True])
+def test_hdf5_opens_no_other_file_and_no_circle(tmp_path, matlab):
+    def write(file):
+        file["u"] = U[:, :1]
+        file["other"] = h5py.ExternalLink("fifo", "/u")  # which was waited for
+        file["gone"] = h5py.SoftLink("/nowhere")
+        file["itself"] = h5py.SoftLink("/itself")
+        file.create_dataset("raw", (T,), "f8", external=[("/etc/passwd", 0, 8 * T)])
+        layout = h5py.VirtualLayout((T,), "f8")
+        layout[:] = h5py.VirtualSource("missing.h5", "u", (T,))
+        file.create_virtual_dataset("virtual", layout)  # was read as zeros
+        file.create_group("rig")["loop"] = file["/"]
+
+    path = tmp_path / ("a.mat" if matlab else "a.h5")
+    if matlab:
+        matlab_file(path, write)
+    else:
+        with h5py.File(path, "w") as file:
+            write(file)
+    table = open_table(path)
+    assert names(table) == ["u"]
+    for name, reason in {
+        "other": "lies in another file, 'fifo'", "gone": "leads nowhere", "itself": "leads nowhere",
+        "raw": "its numbers in other files", "virtual": "its numbers in other files",
+        f"rig{'.' if matlab else '/'}loop": "a group that it lies in itself",
+    }.items():  # fmt: skip
+        refused(table, name, reason)
+
+
+def test_a_name_that_two_arrays_have(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for name in ("u", "u.npy"):
+            with archive.open(name, "w") as stream:
+                np.lib.format.write_array(stream, U)
+    with pytest.raises(ValueError, match="it has 'u' twice"):
+        open_table(tmp_path / "a.npz")
+
+
+def test_a_matlab_array_of_negative_size(tmp_path):
+    scipy.io.savemat(tmp_path / "a.mat", {"u": U})
+    content = (tmp_path / "a.mat").read_bytes()
+    shape = np.array(U.shape, "<i4").tobytes()
+    fewer = np.array([-T, U.shape[1]], "<i4").tobytes()
+    (tmp_path / "a.mat").write_bytes(content.replace(shape, fewer, 1))
+    with pytest.raises(ValueError, match="an array of negative size"):
+        open_table(tmp_path / "a.mat")
+
+
+def test_a_unit_that_is_no_text(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["u"] = U[:, 0]
+        file["u"].attrs["units"] = np.bytes_(b"\xff")
+    assert names(open_table(tmp_path / "a.h5")) == ["u"]
+
+
 @pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.mat", "a.h5", "a.parquet", "a.xlsx"])
 def test_damaged_files(tmp_path, name):
     path = tmp_path / name
@@ -613,6 +718,23 @@ def test_refused_paths(tmp_path):
         open_table(tmp_path / "notes.pdf")
     with pytest.raises(ValueError, match=r"save it as \.xlsx"):
         open_table(tmp_path / "book.xls")
+    for name, match in (
+        (f"{'n' * 300}.csv", r"is no path \(File name too long\)"),
+        ("~nobody-of-that-name/a.csv", "is no path"),
+        ("a\0.csv", "is no path"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            open_table(name)
+    (tmp_path / "circle.csv").symlink_to(tmp_path / "circle.csv")
+    with pytest.raises(FileNotFoundError, match=r"no file '.*circle\.csv'"):
+        load_records(tmp_path / "circle.csv", inputs="u", outputs="y", fs=1.0)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.csv")
+    with pytest.raises(ValueError, match="is a pipe or a device; give a file"):
+        open_table(tmp_path / "a.csv")
 
 
 def test_find(tmp_path):
