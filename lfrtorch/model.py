@@ -42,6 +42,7 @@ from lfrtorch.records import (
     Scaler,
     Start,
     as_signal,
+    described_channels,
     check_start,
     with_past_outputs,
 )
@@ -549,6 +550,12 @@ def _made(
     return own
 
 
+def _layers(description: Any) -> int:
+    """Hidden layers of a static map's description."""
+    own = description if isinstance(description, dict) else {}
+    return _layers(own["base"]) if "base" in own else own.get("layers", 1)
+
+
 @typed()
 def load(folder: str | Path, *, static: Module | None = None) -> Model:
     """The model in a checkpoint folder, or in the ``model/`` folder of a run's folder.
@@ -596,6 +603,8 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
                 for name in ("u_offset", "u_scale", "y_offset", "y_scale")
             )
         )
+        if weights["A"].shape != (sizes["nx"],) * 2 or _layers(made) > len(weights):
+            raise InputError("they are of other sizes")
         static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         K = weights.pop("K", None)
@@ -608,14 +617,13 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         cell.structure = description.get("structure", "free")
         if cell.structure not in STRUCTURES:
             raise InputError(f"structure is {cell.structure!r}")
-        channels = [
-            tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")
-        ]
+        channels = [described_channels(description[side]) for side in ("inputs", "outputs")]
         fs = float(description["fs"])
         widths = [s.shape for s in vars(scaler).values()] + [(len(c),) for c in channels]
         if widths != [(size,) for size in 2 * [cell.nu] + 2 * [cell.ny] + [cell.nu, cell.ny]]:
             raise InputError("scales or channels are more or fewer than inputs and outputs")
-        if not all((scale > 0).all() for scale in (scaler.u_scale, scaler.y_scale)):
+        scales = np.concatenate([scaler.u_scale, scaler.y_scale])
+        if not (scales >= np.finfo(float).tiny).all():
             raise InputError("a scale is not positive")
         if not (math.isfinite(fs) and fs > 0):
             raise InputError(f"fs is {fs}")

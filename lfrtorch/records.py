@@ -60,6 +60,18 @@ class Channel(NamedTuple):
         return f"{self.name} ({self.unit})" if self.unit else self.name
 
 
+def described_channels(entries: Any) -> tuple[Channel, ...]:
+    """Channels as a checkpoint describes them.
+
+    Raises:
+        TypeError: no list of names and units.
+    """
+    found = tuple(Channel(**entry) for entry in entries)
+    if not all(isinstance(text, str) for channel in found for text in channel):
+        raise TypeError("a name or a unit of a channel is no text")
+    return found
+
+
 def common_unit(channels: Sequence[Channel]) -> str:
     """The unit of a number on all of the channels; none if they have several.
 

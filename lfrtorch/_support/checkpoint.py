@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from lfrtorch._support.atomic import TEMPORARY, whole_file, whole_folder
 from lfrtorch._support.errors import InputError, brief
-from lfrtorch._support.paths import real
+from lfrtorch._support.memory import check_memory
+from lfrtorch._support.paths import expanded, real
 
 FORMAT = "lfrtorch"
 VERSION = 1
@@ -21,6 +24,9 @@ DESCRIPTION, WEIGHTS = "model.json", "weights.safetensors"
 
 NEXT = "next.safetensors"
 """Weights while another model takes the place of the one in a checkpoint."""
+
+DIGEST = "sha256"
+"""In the metadata of a file of tensors: what tells a damaged one, which may still be numbers."""
 
 CODE = (".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".joblib", ".py", ".pyc", ".so")
 """Extensions of files that may carry code: none of them belongs to a checkpoint."""
@@ -60,12 +66,42 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], **metadata: str) -> None:
-    """Write a safetensors file; a full disk is an OSError, as of any other file."""
+    """Write a safetensors file with a digest; a full disk is an OSError, as of any other file."""
     held = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     try:
-        save_file(held, path, metadata=metadata or None)
+        save_file(held, path, metadata={**metadata, DIGEST: _digest(held, metadata)})
     except SafetensorError as error:
         raise OSError(f"'{path.parent}' cannot be written to: {error}") from None
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors of a safetensors file and what else stands in it; files of before have no digest.
+
+    Raises:
+        OSError: it is damaged, no file, or of more bytes than there is memory for.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError("it is no file")
+    try:
+        check_memory(path.stat().st_size, "it", "copy it again")
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, InputError, UnicodeError) as error:
+        raise OSError(brief(error)) from None
+    written = metadata.pop(DIGEST, None)
+    if written is not None and written != _digest(tensors, metadata):
+        raise OSError("its numbers are not those that were written")
+    return tensors, metadata
+
+
+def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    """SHA-256 of all that a file of tensors says."""
+    found = sha256(repr(sorted(metadata.items())).encode())
+    for name, tensor in sorted(tensors.items()):
+        found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        found.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return found.hexdigest()
 
 
 def read(
@@ -81,10 +117,11 @@ def read(
         ValueError: no checkpoint there, a damaged one, one of another program or newer version, or
             files that may carry code, which are never opened.
     """
-    folder = _located(Path(folder), inside)
+    folder = _located(expanded(folder), inside)
     try:
+        check_memory((folder / DESCRIPTION).stat().st_size, "it", "copy it again")
         description = json.loads((folder / DESCRIPTION).read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(
             f"'{folder / DESCRIPTION}' is damaged or cut off ({brief(error)}); "
             "copy the checkpoint again from where it was saved, or train anew."
@@ -104,10 +141,8 @@ def read(
         )
     file = folder / (NEXT if description.get("weights") == NEXT else WEIGHTS)
     try:
-        if file.exists() and not file.is_file():
-            raise OSError("it is no file")
-        weights = load_file(file)
-    except (SafetensorError, OSError) as error:
+        weights, _ = read_tensors(file)
+    except OSError as error:
         raise InputError(
             f"'{file}' is damaged or missing ({brief(error)}); "
             "copy the checkpoint again from where it was saved, or train anew."

@@ -55,8 +55,10 @@ class Snapshots:
         if folder is not None and (folder / ROUNDS).is_file():
             try:
                 found = json.loads((folder / ROUNDS).read_text())
-                self._count, self.rounds = found["starts"], found["rounds"]
-            except (ValueError, KeyError, TypeError) as error:
+                self._count, self.rounds = int(found["starts"]), found["rounds"]
+                if any(type(start) is not int for decided in self.rounds for start in decided):
+                    raise ValueError("starts that are no numbers")
+            except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
                 raise InputError(
                     f"'{folder / ROUNDS}' is damaged ({brief(error)}); start from the "
                     "best model of the run instead: init_from=DIR."

@@ -12,18 +12,17 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from lfrtorch._support.atomic import whole_file
-from lfrtorch._support.checkpoint import write_tensors
+from lfrtorch._support.checkpoint import read_tensors, write_tensors
 from lfrtorch._support.errors import InputError, brief
 
 State = TypeVar("State")
 Tensors = dict[str, Tensor]
 Numbers = dict[str, Any]
 
-FORMAT = "lfrtorch snapshot 1"
+FORMAT = "lfrtorch snapshot 2"
 
 
 def write(path: Path, numbers: Numbers, tensors: Tensors) -> None:
@@ -39,10 +38,8 @@ def read(path: Path) -> tuple[Numbers, Tensors]:
         ValueError: a damaged file, or one of another program or version.
     """
     try:
-        with safe_open(path, framework="pt") as file:
-            about = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+        tensors, about = read_tensors(path)
+    except OSError as error:
         raise InputError(
             f"'{path}', where a fit stood, is damaged ({brief(error)}); start from the "
             "best model of the run instead: init_from=DIR."

@@ -23,7 +23,14 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.operating_point import StateSpace
 from lfrtorch.linear.resolvent import frequency_response, response_jacobian, solve_resolvents
 from lfrtorch.model import Model
-from lfrtorch.records import Channel, Record, Scaler, with_past_outputs, without_coordinates
+from lfrtorch.records import (
+    Channel,
+    Record,
+    Scaler,
+    described_channels,
+    with_past_outputs,
+    without_coordinates,
+)
 
 SINGULAR = 1e-12
 """Singular values below this, relative to the size of the system, count as zero when zeros at
@@ -393,7 +400,7 @@ class LinearModel:
             arrays = {name: weights[name].numpy() for name in _ARRAYS}
             optional = {name: weights[name].numpy() for name in _OPTIONAL if name in weights}
             inputs, outputs = (
-                tuple(Channel(**c) for c in description[side]) for side in ("inputs", "outputs")
+                described_channels(description[side]) for side in ("inputs", "outputs")
             )
             nx, nu, ny = len(arrays["A"]), len(inputs), len(outputs)
             P = (nx + ny) * (nx + nu)

@@ -366,9 +366,28 @@ def test_a_damaged_file(tmp_path: Path, name: str):
         run(starts(2), records(), tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("0.safetensors", b'"iteration\\": 1', b'"iteration\\": 9'),
+        ("rounds.json", b'"starts": 1', b'"starts": "x"'),
+        ("rounds.json", b"[]", b"[1]"),
+        ("rounds.json", b"[]", b'[["x"]]'),
+        ("rounds.json", b"[]", b"9" * 5000),
+    ],
+)
+def test_numbers_that_were_not_written(tmp_path: Path, name: str, old: bytes, new: bytes):
+    run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
+    path = tmp_path / name
+    assert old in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(old, new))
+    with pytest.raises(ValueError, match=r"damaged .*init_from=DIR"):
+        run(starts(1), records(), tmp_path)
+
+
 def test_a_file_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with monkeypatch.context() as changed:
-        changed.setattr(state_file, "FORMAT", "lfrtorch snapshot 2")
+        changed.setattr(state_file, "FORMAT", "lfrtorch snapshot 3")
         run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
     with pytest.raises(ValueError, match="another version"):
         run(starts(1), records(), tmp_path)

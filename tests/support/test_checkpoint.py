@@ -162,10 +162,14 @@ def test_own_class_that_is_called_like_the_network(tmp_path: Path):
 
 def test_no_checkpoint(tmp_path: Path):
     refused(tmp_path / "nowhere", "nowhere'; give the folder of a run")
+    with pytest.raises(ValueError, match=r"is no path \(File name too long\)"):
+        load("n" * 400)
     refused(tmp_path, "is not a checkpoint")
 
 
-@pytest.mark.parametrize("text", [b"", b'{"format": "lfrt', b"\xff\xfe\x00", b"{]", b"[" * 100_000])
+@pytest.mark.parametrize(
+    "text", [b"", b'{"format": "lfrt', b"\xff\xfe\x00", b"{]", b"[" * 100_000, b"9" * 5000]
+)
 def test_damaged_description(saved: Path, text: bytes):
     (saved / "model.json").write_bytes(text)
     refused(saved, "is damaged")
@@ -208,6 +212,9 @@ def test_description_that_lacks_an_entry(saved: Path, entry: str):
         {"fs": []},
         {"inputs": [{"label": "u"}]},
         {"inputs": [{"name": "u1", "unit": ""}]},
+        {"inputs": [{"name": name, "unit": ""} for name in (1, 2)]},
+        {"sizes": {"nu": 2, "ny": 2, "nx": 10**6, "nz": 2, "nw": 1}},
+        {"static": {"type": "Network", "nn": 4, "activation": "tanh", "layers": 10**9}},
         {"outputs": [{"name": f"y{i}", "unit": ""} for i in range(3)]},
         {"dtype": "load"},
         {"dtype": "int64"},
@@ -226,6 +233,28 @@ def test_truncated_weights(saved: Path, kept: float):
     whole = file.read_bytes()
     file.write_bytes(whole[: int(kept if kept > 1 else kept * len(whole))])
     refused(saved, "is damaged or missing")
+
+
+@pytest.mark.parametrize("at", [-1, -100, -500])
+def test_weights_that_are_not_those_that_were_saved(saved: Path, at: int):
+    """A flipped bit of a number is a number: the digest tells."""
+    file = saved / "weights.safetensors"
+    content = bytearray(file.read_bytes())
+    content[at] ^= 1
+    file.write_bytes(content)
+    refused(saved, "its numbers are not those that were written")
+
+
+def test_weights_of_before_have_no_digest(saved: Path):
+    file = saved / "weights.safetensors"
+    save_file(load_file(file), file)
+    assert np.array_equal(load(saved).simulate(U), small().simulate(U))
+
+
+@pytest.mark.parametrize("name", ["model.json", "weights.safetensors"])
+def test_a_file_that_no_memory_holds(saved: Path, name: str):
+    os.truncate(saved / name, 10**13)
+    refused(saved, "it takes 10 TB of memory")
 
 
 def test_missing_weights(saved: Path):
@@ -249,6 +278,7 @@ def test_scales_of_another_model(saved: Path):
         ("A", float("nan"), "A have numbers that are not finite"),
         ("scaler.y_scale", float("inf"), "scaler.y_scale have numbers that are not finite"),
         ("scaler.u_scale", 0.0, "a scale is not positive"),
+        ("scaler.u_scale", 1e-320, "a scale is not positive"),
         ("scaler.y_scale", -1.0, "a scale is not positive"),
     ],
 )
