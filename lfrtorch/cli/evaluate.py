@@ -12,7 +12,7 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 import lfrtorch
 from lfrtorch import analysis
@@ -25,7 +25,7 @@ from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import loaded, require_data
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import MAIN
-from lfrtorch.cli.run_folder import CONFIG, program
+from lfrtorch.cli.run_folder import CONFIG, program, read_settings
 from lfrtorch.cli.simulate import opened
 from lfrtorch.cli.words import Terminal
 from lfrtorch.files.load import EVERYTHING, listed_files
@@ -101,7 +101,9 @@ def fitted(checkpoint: str, path: str | list[str]) -> bool:
     folder = Path(checkpoint)
     for config in (folder / CONFIG, folder.parent / CONFIG):
         if config.is_file():
-            own = OmegaConf.select(OmegaConf.load(config), "data.path")
+            settings = read_settings(config)
+            data = settings.get("data") if isinstance(settings, dict) else None
+            own = data.get("path") if isinstance(data, dict) else None
             return own is not None and not resolved(own).isdisjoint(resolved(path))
     return False
 

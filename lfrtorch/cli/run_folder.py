@@ -9,12 +9,15 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
+import yaml
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.paths import expanded
 from lfrtorch.cli.words import now
 from lfrtorch.distributed import Ranks
 
@@ -35,7 +38,7 @@ def arguments(given: Sequence[str]) -> list[str]:
     values = dict(argument.split("=", 1) for argument in given if "=" in argument)
     folder = values.get("resume", "null")
     if folder != "null":
-        overrides = Path(folder) / ".hydra" / "overrides.yaml"
+        overrides = expanded(Path(folder) / ".hydra" / "overrides.yaml")
         if not overrides.is_file():
             found = (Path(folder).glob(f"{at}/.hydra/overrides.yaml") for at in ("*", "*/*"))
             runs = sorted(str(path.parents[1]) for paths in found for path in paths)
@@ -47,7 +50,15 @@ def arguments(given: Sequence[str]) -> list[str]:
                     else "the folder that the run named at its end, runs/NAME/DATE."
                 )
             )
-        listed = cast("list[str]", OmegaConf.to_container(OmegaConf.load(overrides)))
+        listed = read_settings(overrides)
+        if not (isinstance(listed, list) and all(isinstance(word, str) for word in listed)):
+            raise InputError(f"'{overrides}' is damaged: it is no list of words; begin a new run.")
+        for word in listed:
+            if ("_target_" in word or word.lstrip("+~").startswith("hydra")) and word not in given:
+                raise InputError(
+                    f"the run in '{folder}' names code: {brief(word)}; add that word to the "
+                    "command line if you know where the run comes from."
+                )
         before = [now(word) for word in listed]
         before = [word for word in before if not word.startswith("resume=")]
         escaped = folder.replace("\\", "\\\\").replace("'", "\\'")
@@ -58,14 +69,33 @@ def arguments(given: Sequence[str]) -> list[str]:
     return list(given)
 
 
+def read_settings(path: Path) -> Any:
+    """What a YAML file of a run's folder holds.
+
+    Raises:
+        ValueError: a damaged one, or one that stands for more than is in it.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise InputError("it has aliases")
+        return OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise InputError(
+            f"'{path}' is damaged ({brief(error)}); copy the run again, or begin a new one."
+        ) from None
+
+
 def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:
     """The configuration with the sizes, starts and seed that the run to go on with chose."""
     if cfg.resume is None or not (folder / CONFIG).is_file():
         return cfg
-    before = OmegaConf.load(folder / CONFIG)
+    before = read_settings(folder / CONFIG)
     names = [n for n in ("nx", "nz", "nw", "nn", "degree") if cfg[n] == "auto"]
     names += ["starts", "seed"] if names else []
-    chosen = {name: OmegaConf.select(before, name) for name in names}
+    if not isinstance(before, dict) or not before.keys() >= set(names):
+        raise InputError(f"'{folder / CONFIG}' lacks {', '.join(names)}; begin a new run.")
+    chosen = {name: before[name] for name in names}
     return cast(DictConfig, OmegaConf.merge(cfg, chosen))
 
 

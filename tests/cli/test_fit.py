@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import os
 import signal
 import subprocess
@@ -497,6 +498,41 @@ def test_resume_needs_a_run(tmp_path: Path):
     with pytest.raises(ValueError, match=r"one of the runs in it: .*first, .*second") as refused:
         run_folder.arguments([f"resume={tmp_path}"])
     assert "hydra" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("- trainer._target_=os.system\n", "names code: trainer._target_=os.system; add that word"),
+        ("- '+x={_target_: os.system}'\n", "names code"),
+        ("- hydra.searchpath=[/tmp]\n", "names code"),
+        ("- [1\n", "is damaged"),
+        ("nx: 2\n", "is no list of words"),
+        ("- 5\n", "is no list of words"),
+        ("- &a [x]\n- *a\n", "it has aliases"),
+        ("- !!python/object/apply:os.system [ls]\n", "is damaged"),
+    ],
+)
+def test_resume_runs_no_code_of_the_folder(tmp_path: Path, text: str, message: str):
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "overrides.yaml").write_text(text)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        run_folder.arguments([f"resume={tmp_path}"])
+
+
+def test_resume_with_a_class_of_ones_own(tmp_path: Path):
+    word = "static._target_=mine.Map"
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "overrides.yaml").write_text(f"- {word}\n")
+    assert word in run_folder.arguments([f"resume={tmp_path}", word])
+
+
+@pytest.mark.parametrize("text", ["nx: [", "- 1", "nz: 2", ""])
+def test_damaged_settings_of_a_run_that_goes_on(tmp_path: Path, text: str):
+    (tmp_path / "config.yaml").write_text(text)
+    cfg = configuration("nx=auto", f"resume={tmp_path}")
+    with pytest.raises(ValueError, match=r"config\.yaml'"):
+        run_folder.chosen_before(cfg, tmp_path)
 
 
 def refused(
