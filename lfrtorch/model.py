@@ -42,8 +42,8 @@ from lfrtorch.records import (
     Scaler,
     Start,
     as_signal,
-    described_channels,
     check_start,
+    described_channels,
     with_past_outputs,
 )
 from lfrtorch.state_observer import StateObserver, SteadyGainObserver
