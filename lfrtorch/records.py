@@ -160,12 +160,7 @@ class Record:
                 f"record '{self.name}': the input has {len(u)} samples and the output {len(y)}; "
                 "both must be sampled at the same instants: cut or resample one of them."
             )
-        number(f"record '{self.name}': the sampling frequency", self.fs, positive=True)
-        if not _SMALLEST <= self.fs <= _LARGEST:
-            raise InputError(
-                f"record '{self.name}': the sampling frequency is {self.fs} Hz; give one between "
-                f"{_SMALLEST:g} and {_LARGEST:g} Hz."
-            )
+        check_rate(f"record '{self.name}': the sampling frequency", self.fs)
         check_start(self.start, f"record '{self.name}'")
         integer(f"record '{self.name}': skip", self.skip, 0)
         if self.skip >= len(u):
@@ -551,14 +546,25 @@ def _side(
     default = (Channel(letter if width == 1 else f"{letter}{i + 1}") for i in range(width))
     channels = given or tuple(default)
     array = as_signal(array, channels, what)
-    largest = np.abs(array).max(axis=0)
-    odd = np.flatnonzero((largest > _LARGEST) | ((largest > 0) & (largest < _SMALLEST)))
-    if odd.size:
-        raise InputError(
-            f"{what} '{channels[odd[0]].name}' goes up to {largest[odd[0]]:g}; give it in a unit "
-            f"that brings it between {_SMALLEST:g} and {_LARGEST:g}."
-        )
+    for channel, largest in zip(channels, np.abs(array).max(axis=0), strict=True):
+        check_largest(f"{what} '{channel.name}'", largest)
     return channels, array
+
+
+def check_largest(what: str, largest: float) -> None:
+    """Refuse a signal whose largest value has a square that is no number, or is 0."""
+    if largest > _LARGEST or 0 < largest < _SMALLEST:
+        raise InputError(
+            f"{what} goes up to {largest:g}; give it in a unit that brings it between "
+            f"{_SMALLEST:g} and {_LARGEST:g}."
+        )
+
+
+def check_rate(what: str, fs: float) -> None:
+    """Refuse a sampling frequency in Hz beyond the same limits."""
+    number(what, fs, positive=True)
+    if not _SMALLEST <= fs <= _LARGEST:
+        raise InputError(f"{what} is {fs} Hz; give one between {_SMALLEST:g} and {_LARGEST:g} Hz.")
 
 
 def _channels(given: Any, what: str) -> tuple[Channel, ...]:

@@ -64,10 +64,10 @@ def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) ->
             raise InputError(f"a benchmark is added to the settings: +{word.input_line}.")
         folder = CONF / word.key_or_group
         choices = sorted(path.stem for path in folder.glob("*.yaml"))
-        if choices and isinstance(word.value(), str) and word.value() not in choices:
-            raise InputError(
-                f"there is no {word.key_or_group}={word.value()}; give {', '.join(choices)}."
-            )
+        value = word.value()
+        chosen = not (value is None or isinstance(value, list) or word.is_sweep_override())
+        if choices and chosen and value not in choices:
+            raise InputError(f"there is no {word.key_or_group}={value}; give {', '.join(choices)}.")
     # The values of a glob or an interval are known to the sweeper alone.
     every = [w for w in every if not (isinstance(w.value(), Glob) or w.is_interval_sweep())]
     cfg = composed(command, [first_run(word) for word in every if is_choice(word)])
@@ -80,7 +80,10 @@ def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) ->
 def parsed(word: str) -> Override:
     """The word as Hydra reads it."""
     try:
-        return OverridesParser.create().parse_override(quoted(word))
+        found = OverridesParser.create().parse_override(quoted(word))
+        if not found.key_or_group:
+            raise HydraException("no name")
+        return found
     except HydraException:
         path = Path(word)
         if path.is_dir() or path.is_file():

@@ -18,7 +18,6 @@ from omegaconf import OmegaConf
 
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
-from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded
 from lfrtorch._support.types import Array, Integers
@@ -29,7 +28,7 @@ from lfrtorch.cli.preview_words import parser
 from lfrtorch.cli.words import translated
 from lfrtorch.files.formats import BLOCK, Table, open_table
 from lfrtorch.files.time_stamps import UnevenError, in_seconds, is_time, sampling
-from lfrtorch.records import Channel
+from lfrtorch.records import Channel, check_largest, check_rate
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.notes import examine
@@ -91,7 +90,7 @@ def launch(words: Sequence[str] | None = None) -> None:
         if not options.paths:
             raise InputError("no file is named; give its path, or data.path=FILE.")
         if options.fs is not None:
-            number("data.fs", options.fs, positive=True)
+            check_rate("data.fs", options.fs)
         paths = matching(options.paths)
         for path in paths:
             show(path, options, figure_path(options.out, path, len(paths)))
@@ -114,6 +113,8 @@ def take(word: str, options: argparse.Namespace) -> None:
     value: Any = read.value()
     if value is not None:
         listed = value if isinstance(value, list) else [value]
+        if name == "data.path" and not all(isinstance(path, str) for path in listed):
+            raise InputError(f"data.path is {value}; give a file, a pattern or a list of these.")
         setattr(options, USES[name], value if name in ("data.fs", "data.time") else listed)
 
 
@@ -162,6 +163,11 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
         signals = signals[:, :-1]
     if more:
         remarks.append(f"the first {len(signals)} samples are read, and no more")
+    for i, signal in zip(wanted, signals.T, strict=True):
+        known = np.abs(signal[np.isfinite(signal)])
+        check_largest(f"'{path}': {table.columns[i].name!r}", known.max(initial=0.0))
+    if fs is not None:
+        check_rate(f"'{path}': the sampling frequency", fs)
     count = len(roles.inputs)
     u, y = signals[:, :count], signals[:, count:]
     found = survey_measurement(

@@ -121,7 +121,9 @@ def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
 def _last_digit(t: Array) -> float:
     """What the last digit counts of stamps that were printed, or kept in single precision."""
     largest = float(np.abs(t).max())
-    if np.array_equal(t, t.astype(np.float32)) and not np.array_equal(t, np.rint(t)):
+    with np.errstate(over="ignore"):  # beyond single precision
+        single = t.astype(np.float32)
+    if np.array_equal(t, single) and not np.array_equal(t, np.rint(t)):
         return float(np.spacing(np.float32(largest)))
     for digits in range(10):
         scaled = t * 10.0**digits

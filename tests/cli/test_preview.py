@@ -252,9 +252,14 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
         (f"data.path={file}", "data.path is given twice"),
         ("data.inputs=[a", "is not understood"),
         ("data.fs=-3", "data.fs is -3; give a positive number"),
+        ("data.fs=1e-320", "data.fs is 1e-320 Hz; give one between 1e-100"),
     ):
         assert message in refused(capsys, file, word)
     assert "no file is named" in refused(capsys, "data.fs=3")
+    for value in ("5", "0.5", "true", "[1]", "{a: 1}"):
+        assert "give a file, a pattern" in refused(capsys, f"data.path={value}")
+    loud = written(file.parent / "loud.csv", {"y": 1e200 * signals["force"]})
+    assert "'y' goes up to 3." in refused(capsys, loud)  # was a traceback of the figure
 
 
 @pytest.mark.usefixtures("undrawn")
