@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.drawing import NL_LFR, OUTPUT, plain_ticks
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.tables import Cell, cell, engineering, table, times
 from lfrtorch._support.types import Array
 from lfrtorch.linear.model import LinearModel
@@ -368,10 +368,12 @@ def write(
 def _read(path: Path) -> Compared:
     """The run with this ``metrics.json``."""
     try:
+        if not path.is_file():  # a pipe would be waited for
+            raise OSError("no file")
         found = json.loads(path.read_text(encoding="utf-8"))
         words = (word.partition("=") for word in shlex.split(found["command"]) if "=" in word)
         judged = found["validation"]
-        return Compared(
+        run = Compared(
             folder=path.parent,
             dataset=found["bench"],
             words={name.lstrip("+"): value for name, _, value in words},
@@ -383,8 +385,18 @@ def _read(path: Path) -> Compared:
             seconds=_float(found["fit"]["seconds"]),
             outcome=found["fit"]["reason"],
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"'{path}' is not of a run: {error!r}.") from None
+        numbers = (run.parameters, run.error, run.linear, run.seconds, *run.tests.values())
+        texts = (run.dataset, run.unit, run.outcome)
+        if not all(isinstance(number, int | float) for number in numbers):
+            raise TypeError("a number is none")
+        if not all(isinstance(text, str) for text in texts):
+            raise TypeError("a text is none")
+    except (OSError, LookupError, AttributeError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"'{path}' is not of a run ({type(error).__name__}: {brief(error)}); leave its folder "
+            "out, or move it away."
+        ) from None
+    return run
 
 
 def _worst_last(error: float) -> tuple[bool, float]:

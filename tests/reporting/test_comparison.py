@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import sys
 from pathlib import Path
 
@@ -99,6 +100,33 @@ def test_folders_without_runs_are_refused(
     with pytest.raises(SystemExit):
         command.launch()
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"bench": []},
+        {"command": 5},
+        {"parameters_net": "x"},
+        {"scores": 1},
+        {"validation": {"rmse": [], "lti_rmse": 1.0, "records": {}}},
+        {"fit": {"seconds": {}, "reason": "done"}},
+        {"fit": {"seconds": 1.0, "reason": 1}},
+    ],
+)
+def test_metrics_of_other_kinds_are_refused(tmp_path: Path, change: dict):
+    written(tmp_path / "run", 5, 0, 1.0)
+    file = tmp_path / "run" / "metrics.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(ValueError, match="is not of a run"):
+        comparison.compare([tmp_path])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_metrics_that_are_no_file_are_not_waited_for(tmp_path: Path):
+    os.mkfifo(tmp_path / "metrics.json")
+    with pytest.raises(ValueError, match="is not of a run"):
+        comparison.compare([tmp_path])
 
 
 def test_other_files_of_that_name_are_refused(tmp_path: Path):
