@@ -39,7 +39,7 @@ mutants: $(READY)  ## faults put into the numerical core: does a test notice? (u
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[mutants]'
 	@$(BIN)/python tests/mutants.py $(ARGS)
 
-torture: $(READY)  ## kills, signals, full disks and nonsense: the page docs/measured/torture.md (an hour)
+torture: $(READY)  ## kills, full disks, damaged files, nonsense: the page docs/measured/torture.md (two hours; ARGS='--only files')
 	@PYTHONPATH=tests $(BIN)/python tests/torture.py $(ARGS)
 
 check: $(READY)  ## format, lint, types, import order

@@ -1,10 +1,11 @@
 """What happens to runs that are killed, and to input that makes no sense? A page says it.
 
-    python tests/torture.py [--kills N] [--signals N] [--seed N] [--out PAGE.md]
+    python tests/torture.py [--only ROWS ...] [--kills N] [--signals N] [--seed N] [--out PAGE.md]
 
 A run is killed, or asked to end, at random moments, and goes on: it must end in the bits of a run
 that was left alone. Each setting of the command line gets values that make no sense, and so do the
-arrays of Python: each case must end in one message, or in a model that is finite.
+arrays of Python; files and checkpoints are damaged: each case must end in one message, or in
+numbers that are finite. With --only the other rows of the page stay as they are.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import doors
 import nonsense
 import numpy as np
 import torch
@@ -41,8 +43,10 @@ from lfrtorch.cli import CONF, fit
 from lfrtorch.cli.claim import tidy
 
 PROCESSES = multiprocessing.get_context("forkserver")
-LOADED = ["lfrtorch.cli.fit", "lfrtorch._public", "pandas", "scipy.signal"]
+LOADED = ["lfrtorch.cli.fit", "lfrtorch._public", "pandas", "scipy.signal", "doors"]
+LOADED += [f"lfrtorch.cli.{word}" for word in ("simulate", "evaluate", "export", "preview")]
 SHORT = ["nx=2", "nn=5", "trainer.max_iter=12", "bla.max_iter=3", "threads=1"]
+ROWS = ["runs", "surroundings", "settings", "arguments", "files", "checkpoints", "commands"]
 LIMIT = 60.0
 """Seconds after which a case is taken to hang."""
 MEMORY = 4e9
@@ -72,6 +76,8 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--signals", type=int, default=40)
     parser.add_argument("--values", type=int, default=len(VALUES), help="of each setting")
+    parser.add_argument("--damaged", type=int, default=40, help="files of each format")
+    parser.add_argument("--only", nargs="+", choices=ROWS, default=ROWS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/torture.md"))
     asked = parser.parse_args()
@@ -80,7 +86,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as top:
         folder = Path(top)
         csv = measured(folder)
-        for starts in (1, 4):
+        for starts in (1, 4) if "runs" in asked.only else ():
             words = [*file_words(csv), *SHORT, f"starts={starts}"]
             for number, name, count in (
                 (signal.SIGKILL, "killed (kill -9)", asked.kills // 2),
@@ -90,15 +96,34 @@ def main() -> int:
                 row = stopped(words, folder / f"{name}{starts}", number, count, asked.seed)
                 rows.append(row._replace(what=f"a fit of {starts} start(s), {name}"))
                 print(rows[-1], flush=True)
-        rows += surroundings([*file_words(csv), *SHORT], folder)
-        print(*rows[-3:], sep="\n", flush=True)
-        rows.append(nonsense_settings(file_words(csv), folder, asked.values))
-        print(rows[-1], flush=True)
-        for what, cases in nonsense.CASES.items():
+        if "surroundings" in asked.only:
+            rows += surroundings([*file_words(csv), *SHORT], folder)
+            print(*rows[-3:], sep="\n", flush=True)
+        if "settings" in asked.only:
+            rows.append(nonsense_settings(file_words(csv), folder, asked.values))
+            print(rows[-1], flush=True)
+        for what, cases in nonsense.CASES.items() if "arguments" in asked.only else ():
             rows.append(nonsense_arguments(what, cases(folder)))
             print(rows[-1], flush=True)
-    asked.out.write_text(page(rows), encoding="utf-8")
+        for name in ("files", "checkpoints", "commands"):
+            if name in asked.only:
+                rows.append(door(name, folder / name, asked.damaged, asked.values, asked.seed))
+                print(rows[-1], flush=True)
+    before = [] if asked.only == ROWS else kept(asked.out, rows)
+    asked.out.write_text(page([*before, *rows]), encoding="utf-8")
     return int(any(row.faults for row in rows))
+
+
+def kept(path: Path, rows: Sequence[Row]) -> list[Row]:
+    """The rows of a page that are not among those, without what their faults were."""
+    found: list[Row] = []
+    if not path.is_file():
+        return found
+    for line in path.read_text(encoding="utf-8").splitlines():
+        cells = line.strip("| ").split(" | ")
+        if len(cells) == 4 and cells[1].isdecimal() and cells[0] not in [r.what for r in rows]:
+            found.append(Row(cells[0], int(cells[1]), cells[2], ["of before"] * int(cells[3])))
+    return found
 
 
 def page(rows: Sequence[Row]) -> str:
@@ -108,7 +133,7 @@ def page(rows: Sequence[Row]) -> str:
     lines = [head, ["---"] * len(head), *shown]
     faults = [f"- {row.what}: {fault}" for row in rows for fault in row.faults]
     return "\n".join([
-        "# Tried: kills, signals and input that makes no sense",
+        "# Tried: kills, signals, damage and input that makes no sense",
         "",
         "Written by `make torture`. Killed runs went on with `resume=`; their end was compared bit",
         "by bit with that of a run that was left alone, and every file was read.",
@@ -385,15 +410,20 @@ def leaves(cfg: DictConfig, prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{key}"
 
 
-def begin_with(words: Sequence[str], folder: Path) -> None:
-    """A run of a command line, which Hydra may refuse."""
+def limited() -> None:
+    """This process may not take more memory."""
     import resource
-
-    from lfrtorch.cli.composition import check_words
-    from lfrtorch.cli.errors import user_errors
 
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (int(used + MEMORY), int(used + MEMORY)))
+
+
+def begin_with(words: Sequence[str], folder: Path) -> None:
+    """A run of a command line, which Hydra may refuse."""
+    from lfrtorch.cli.composition import check_words
+    from lfrtorch.cli.errors import user_errors
+
+    limited()
     with user_errors():
         check_words("config", list(words))
         begin(configuration(words), folder)
@@ -412,6 +442,52 @@ def judged(found: Ended, folder: Path) -> str:
     if found.code != 1 or not said:
         return f"exit code {found.code}: {found.text[-200:]}"
     return ""
+
+
+def door(name: str, folder: Path, damaged: int, values: int, seed: int) -> Row:
+    """Files, checkpoints or command lines that are damaged or make no sense."""
+    folder.mkdir()
+    run = folder / "run"
+    words = [*doors.fit_words(run), f"hydra.run.dir={run}"]
+    if name != "files":
+        run.mkdir()
+        shutil.copy(measured(folder), run)
+        made = ended(partial(doors.tried, partial(doors.typed, words), folder))
+        assert made.code == 0, made.text
+    what, cases = {
+        "files": ("damaged and strange files", doors.files(folder, damaged, seed)),
+        "checkpoints": ("damaged models and runs", doors.checkpoints(run, folder, damaged, seed)),
+        "commands": ("words of the other commands", doors.commands(run, VALUES[:values])),
+    }[name]
+    faults, count, refused = [], 0, 0
+    for case, work in cases:
+        found = ended(partial(at_the_door, work, folder))
+        problem = ended_well(found)
+        count += 1
+        refused += found.code != 0
+        faults += [f"{case}: {problem}"] if problem else []
+        if (folder / "sprung").exists() or (folder / "here" / "sprung").exists():
+            faults.append(f"{case}: ran code")
+    outcome = f"{refused} refused in a message, {count - refused} taken with finite results"
+    return Row(what, count, outcome, faults)
+
+
+def at_the_door(work: Callable[[], Any], folder: Path) -> None:
+    """In a process of its own, of little memory."""
+    limited()
+    doors.tried(work, folder)
+
+
+def ended_well(found: Ended) -> str:
+    """What is wrong with the end of a case, "" for nothing."""
+    if found.code is None:
+        return "hangs"
+    if "Traceback" in found.text or "HYDRA_FULL_ERROR" in found.text:
+        return f"traceback: {found.text.strip().splitlines()[-1][:200]}"
+    _, error, said = found.text.partition("error:")
+    if found.code and not error:
+        return f"exit code {found.code}: {found.text[-200:]}"
+    return f"{len(said)} characters: {said[:200]}" if len(said) > 1500 else ""
 
 
 def nonsense_arguments(what: str, cases: Sequence[Case]) -> Row:
