@@ -33,7 +33,6 @@ import nonsense
 import numpy as np
 import torch
 import yaml
-from hydra import compose, initialize_config_dir
 from nonsense import Case
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
@@ -175,8 +174,7 @@ def file_words(path: Path) -> list[str]:
 
 def configuration(words: Sequence[str]) -> DictConfig:
     """As the command line makes it."""
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        return compose("config", list(words))
+    return composed("config", list(words))
 
 
 # --- runs that end early ---

@@ -60,6 +60,10 @@ def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) ->
     for word in words:
         if word.is_sweep_override() and not several:
             raise InputError(several_values(command, word))
+        if word.is_delete() and "." not in word.key_or_group and word.key_or_group != "data":
+            raise InputError(
+                f"{word.key_or_group} cannot be taken away; leave out {word.input_line}."
+            )
         if word.key_or_group == "bench" and not adds(word):
             raise InputError(f"a benchmark is added to the settings: +{word.input_line}.")
         folder = CONF / word.key_or_group
@@ -121,7 +125,9 @@ def composed(command: str, words: Sequence[str] = ()) -> DictConfig:
     """The configuration; where Hydra cannot make one, the first line of its reason."""
     try:
         with initialize_config_dir(**COMPOSED, config_dir=str(CONF)):
-            return compose(command, list(words))
+            cfg = compose(command, list(words))
+            OmegaConf.to_container(cfg, resolve=True)  # a name that stands for nothing is an error
+            return cfg
     except (HydraException, OmegaConfBaseException) as failed:
         raise InputError(str(failed).splitlines()[0]) from None
 

@@ -48,7 +48,7 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
         )
     require_data(cfg)
     if cfg.out is not None:
-        if Path(cfg.out).suffix.lower() != ".json":
+        if Path(str(cfg.out)).suffix.lower() != ".json":
             raise InputError(f"out is '{cfg.out}'; the scores are JSON: name it FILE.json.")
         if not cfg.overwrite:
             refuse_existing(cfg.out, "overwrite=true")

@@ -277,6 +277,8 @@ def require(cfg: DictConfig) -> None:
     ):
         if value is None:
             raise InputError(f"{option} is not set: add {option}={example}.")
+    if isinstance(cfg.out, DictConfig | ListConfig):
+        raise InputError(f"out is {cfg.out}; give a file or a folder.")
     if cfg.start not in ("zero", "given", "estimated"):
         raise InputError(f"start is {cfg.start!r}; give zero, given (with x0=[...]) or estimated.")
     if (cfg.start == "given") != (cfg.x0 is not None):
@@ -299,7 +301,7 @@ def require(cfg: DictConfig) -> None:
 def targets(cfg: DictConfig) -> list[tuple[Path, Path]]:
     """Each file that is read with that which is written."""
     paths = listed_files(cfg.data.path, "data.path")
-    out = expanded(cfg.out)
+    out = expanded(str(cfg.out))
     if out.is_dir() or not out.suffix:
         # Of a compressed file the name within.
         stems = [Path(path.name.removesuffix(".gz")).stem for path in paths]

@@ -329,6 +329,8 @@ def test_blocks_give_the_numbers_of_one_simulation(
         (["data.path='*.csv'", "out=x.csv"], "2 files cannot be written to one, 'x.csv'"),
         (["data.path=[both.csv,model/../both.txt]", "out=x"], "several files are called 'both'"),
         (["data.path=both.csv", "out=x.xlsx"], "out is 'x.xlsx'; give a file of .csv"),
+        (["data.path=both.csv", "out=0.5"], "out is '0.5'; give a file of .csv"),
+        (["data.path=both.csv", "out=[x]"], "out is ['x']; give a file or a folder"),
         (["data.path=both.csv", "out=inputs.csv"], "'inputs.csv' exists; give another name"),
         (["data.path=both.csv", "out=both.csv", "overwrite=true"], "is the file that is read"),
         (["data.path=both.csv", "out=x", "format=xlsx"], "format is 'xlsx'"),
