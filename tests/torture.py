@@ -38,8 +38,9 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from safetensors.numpy import load_file
 
-from lfrtorch.cli import CONF, fit
+from lfrtorch.cli import fit
 from lfrtorch.cli.claim import tidy
+from lfrtorch.cli.composition import check_words, composed
 
 PROCESSES = multiprocessing.get_context("forkserver")
 LOADED = ["lfrtorch.cli.fit", "lfrtorch._public", "pandas", "scipy.signal", "doors"]
@@ -418,7 +419,6 @@ def limited() -> None:
 
 def begin_with(words: Sequence[str], folder: Path) -> None:
     """A run of a command line, which Hydra may refuse."""
-    from lfrtorch.cli.composition import check_words
     from lfrtorch.cli.errors import user_errors
 
     limited()
@@ -466,7 +466,7 @@ def door(name: str, folder: Path, damaged: int, values: int, seed: int) -> Row:
         faults += [f"{case}: {problem}"] if problem else []
         if (folder / "sprung").exists() or (folder / "here" / "sprung").exists():
             faults.append(f"{case}: ran code")
-    outcome = f"{refused} refused in a message, {count - refused} taken with finite results"
+    outcome = f"{refused} refused in a message, {count - refused} taken; records and models are finite"
     return Row(what, count, outcome, faults)
 
 
@@ -496,7 +496,7 @@ def nonsense_arguments(what: str, cases: Sequence[Case]) -> Row:
         refused += found.refused
         faults += [f"{name}: {found.fault}"] if found.fault else []
     taken = len(cases) - refused - len(faults)
-    outcome = f"{refused} refused in a message, {taken} taken with finite results"
+    outcome = f"{refused} refused in a message, {taken} taken; records and models are finite"
     return Row(what, len(cases), outcome, faults)
 
 
