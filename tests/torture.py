@@ -466,7 +466,7 @@ def door(name: str, folder: Path, damaged: int, values: int, seed: int) -> Row:
         faults += [f"{case}: {problem}"] if problem else []
         if (folder / "sprung").exists() or (folder / "here" / "sprung").exists():
             faults.append(f"{case}: ran code")
-    outcome = f"{refused} refused in a message, {count - refused} taken; records and models are finite"
+    outcome = f"{refused} refused in a message, {count - refused} taken, records and models finite"
     return Row(what, count, outcome, faults)
 
 
@@ -496,7 +496,7 @@ def nonsense_arguments(what: str, cases: Sequence[Case]) -> Row:
         refused += found.refused
         faults += [f"{name}: {found.fault}"] if found.fault else []
     taken = len(cases) - refused - len(faults)
-    outcome = f"{refused} refused in a message, {taken} taken; records and models are finite"
+    outcome = f"{refused} refused in a message, {taken} taken, records and models finite"
     return Row(what, len(cases), outcome, faults)
 
 

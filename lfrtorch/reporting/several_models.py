@@ -32,7 +32,7 @@ def short(label: str) -> str:
     Example:
         >>> from lfrtorch.reporting import several_models
         >>> several_models.short("trainer.max_iter=100 trainer.tolerance=1e-9 nn=5")
-        'trainer.max_iter=100…r.tolerance=1e-9 nn=5'
+        'trainer.max_iter=100….tolerance=1e-9 nn=5'
     """
     half = LONGEST // 2
     return label if len(label) <= LONGEST else f"{label[:half]}…{label[-half:]}"

