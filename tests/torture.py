@@ -141,7 +141,7 @@ def page(rows: Sequence[Row]) -> str:
         *(f"| {' | '.join(map(str, line))} |" for line in lines),
         "",
         *faults,
-        f"Python {platform.python_version()}, torch {torch.__version__}, {processor()}.",
+        f"The rows that were tried last: Python {platform.python_version()}, torch {torch.__version__}, {processor()}.",
         "",
     ])  # fmt: skip
 
@@ -298,9 +298,9 @@ def surroundings(words: Sequence[str], top: Path) -> list[Row]:
     expected = weights(top / "usual")
     rows = []
     for what, breaks, values in (
-        ("no file may be longer than so many bytes", shortened, SIZES),
+        ("a disk that is full after 0 to 300 000 bytes of a file", shortened, SIZES),
         ("TensorBoard cannot write from an iteration on", without_board, range(0, 13, 2)),
-        ("the clock jumps by so many seconds", jumping, (-1e9, -1e5, 1e5, 1e9)),
+        ("a clock that jumps by 1e5 to 1e9 s, back or forth", jumping, (-1e9, -1e5, 1e5, 1e9)),
     ):
         faults, refused = [], 0
         for value in values:
@@ -321,7 +321,11 @@ def surroundings(words: Sequence[str], top: Path) -> list[Row]:
             elif found.code != 0 and (folder / "resume").is_dir():
                 faults.append(f"{value}: did not go on: {found.text[-300:]}")
             shutil.rmtree(folder, ignore_errors=True)
-        done = f"{refused} ended in a message, and those that had begun went on to the same bits"
+        done = "none ended early; the end is the same bits"
+        if refused:
+            done = (
+                f"{refused} ended in a message, and those that had begun went on to the same bits"
+            )
         rows.append(Row(what, len(values), done, faults))
     return rows
 
