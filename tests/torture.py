@@ -141,7 +141,8 @@ def page(rows: Sequence[Row]) -> str:
         *(f"| {' | '.join(map(str, line))} |" for line in lines),
         "",
         *faults,
-        f"The rows that were tried last: Python {platform.python_version()}, torch {torch.__version__}, {processor()}.",
+        f"The rows that were tried last: Python {platform.python_version()}, "
+        f"torch {torch.__version__}, {processor()}.",
         "",
     ])  # fmt: skip
 
