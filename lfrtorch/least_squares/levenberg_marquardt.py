@@ -191,7 +191,7 @@ class LevenbergMarquardt:
         damping: first λ relative to the largest squared singular value of the Jacobian.
         tolerance: relative decrease of the cost that counts as no progress ...
         patience: ... and the number of such steps in a row that ends the search.
-        floor: root mean square of the residual that counts as zero.
+        floor: root mean square of the residual that counts as zero: the search ends one step later.
         truncation: singular values below this part of the largest are left out as gauge. They are
             computed only if the damping is not far above rounding errors.
         finite_step: h of the directional second derivative (Transtrum et al. use 0.1).
@@ -373,7 +373,8 @@ class LevenbergMarquardt:
             rank=system.rank,
             quiet=quiet,
         )
-        if accepted.cost <= self.floor**2 * cost_of(torch.ones_like(best.residual)):
+        floor = self.floor**2 * cost_of(torch.ones_like(best.residual))
+        if max(accepted.cost, state.cost) <= floor:  # one more step for what is hardly determined
             return replace(accepted, reason=Reason.RESIDUAL_VANISHES)
         if quiet >= self.patience:
             return replace(accepted, reason=Reason.COST_SETTLED)
