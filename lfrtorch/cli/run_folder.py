@@ -60,7 +60,7 @@ def arguments(given: Sequence[str]) -> list[str]:
                     "command line if you know where the run comes from."
                 )
         before = [now(word) for word in listed]
-        before = [word for word in before if not word.startswith("resume=")]
+        before = [w for w in before if not (w.startswith("resume=") or w in given)]
         escaped = folder.replace("\\", "\\\\").replace("'", "\\'")
         return [*before, *given, f"hydra.run.dir='{escaped}'"]
     for word in given:
