@@ -38,8 +38,8 @@ def instantiate(node: Any, *args: Any, **options: Any) -> Any:
     try:
         return hydra.utils.instantiate(node, *args, **options)
     except Exception as failed:
-        wraps = isinstance(failed, InstantiationException) and failed.__cause__
-        error: BaseException = failed.__cause__ if wraps and failed.__cause__ else failed
+        cause = failed.__cause__ if isinstance(failed, InstantiationException) else None
+        error = failed if cause is None else cause  # Hydra 1.3 wraps it
         lines = [*notes_of(failed), *str(failed).splitlines()]
         note = next((line for line in lines if line.startswith(NODE)), NODE)
         if note not in notes_of(error):

@@ -21,7 +21,6 @@ COLOURS = tuple(colour for colour in CHANNELS if colour != LINEAR)
 SIZE = (11.0, 3.6)
 """Width of the figure, and height of an output in it, in inches."""
 
-
 LONGEST = 40
 """Characters of a setting in a figure."""
 
