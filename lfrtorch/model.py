@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from lfrtorch.engine.beyond_linear import Beyond, base_of
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
-from lfrtorch.engine.initial_state import simulate_estimated
+from lfrtorch.engine.initial_state import estimated_start
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network
@@ -42,6 +41,7 @@ from lfrtorch.records import (
     Scaler,
     Start,
     as_signal,
+    check_rate,
     check_start,
     described_channels,
     with_past_outputs,
@@ -65,7 +65,7 @@ def simulate_record(lfr: LFR, normalised: NormalisedRecord, start: Start) -> Tra
     signals = normalised.u, normalised.y, record.start_factors
     u, y, weight = (torch.tensor(signal).to(like).unsqueeze(0) for signal in signals)
     if start == "estimated":
-        return simulate_estimated(lfr.cell, u, y, weight)
+        return lfr.trajectory(u, estimated_start(lfr.cell, u, y, weight))
     return lfr.trajectory(u, None, start)
 
 
@@ -85,6 +85,10 @@ class Model:
 
     Shape:
         K: (nx, ny).
+
+    Raises:
+        ValueError: weights, scales, channels or a gain of other sizes, a scale that is not
+            positive, or a rate that is none.
 
     ``print(model)`` shows sizes, channels, poles and gains: of the linear part A, Bu, Cy, Dyu, and
     of the model linearised at rest at the inputs' offsets. ``lfrtorch.analysis`` has its figure,
@@ -106,6 +110,24 @@ class Model:
     outputs: tuple[Channel, ...]
     fitted_to: str = ""
     K: Float[Tensor, "nx ny"] | None = None
+
+    def __post_init__(self) -> None:
+        cell, s = self.lfr.cell, self.scaler
+        cell.check()
+        for side, size, channels, offset, scale in (
+            ("inputs", cell.nu, self.inputs, s.u_offset, s.u_scale),
+            ("outputs", cell.ny, self.outputs, s.y_offset, s.y_scale),
+        ):
+            if not np.shape(offset) == np.shape(scale) == (len(channels),) == (size,):
+                raise InputError(
+                    f"the model has {size} {side}, {len(channels)} channels, offsets of shape "
+                    f"{np.shape(offset)} and scales of shape {np.shape(scale)}; give one for each."
+                )
+        if not (np.concatenate([s.u_scale, s.y_scale]) >= np.finfo(float).tiny).all():
+            raise InputError("a scale is not positive.")
+        check_rate("the sampling frequency", self.fs)
+        if self.K is not None and self.K.shape != (cell.nx, cell.ny):
+            raise InputError(f"K has the shape {tuple(self.K.shape)}; give ({cell.nx}, {cell.ny}).")
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.sizes.items())
@@ -608,8 +630,6 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         K = weights.pop("K", None)
-        if K is not None and K.shape != (cell.nx, cell.ny):
-            raise InputError(f"K has the shape {tuple(K.shape)}")
         cell.load_state_dict(weights)
         cell.free_feedthrough(
             z=description.get("z_feedthrough", True), y=description.get("feedthrough", True)
@@ -619,14 +639,6 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             raise InputError(f"structure is {cell.structure!r}")
         channels = [described_channels(description[side]) for side in ("inputs", "outputs")]
         fs = float(description["fs"])
-        widths = [s.shape for s in vars(scaler).values()] + [(len(c),) for c in channels]
-        if widths != [(size,) for size in 2 * [cell.nu] + 2 * [cell.ny] + [cell.nu, cell.ny]]:
-            raise InputError("scales or channels are more or fewer than inputs and outputs")
-        scales = np.concatenate([scaler.u_scale, scaler.y_scale])
-        if not (scales >= np.finfo(float).tiny).all():
-            raise InputError("a scale is not positive")
-        if not (math.isfinite(fs) and fs > 0):
-            raise InputError(f"fs is {fs}")
         inputs, outputs = channels
         fitted_to = str(description.get("fitted_to", ""))
         return Model(LFR(cell), scaler, fs, inputs, outputs, fitted_to, K)

@@ -1,4 +1,9 @@
-"""The initial state of a record, estimated from its output."""
+"""The initial state of a record, estimated from its output.
+
+An output tells the initial state as long as the state is in it: until the last sample with a
+weight, and no longer than until the transition Φ(k) = ∂x(k)/∂x(0) has faded. What comes later costs
+nothing here but one simulation from rest.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +16,19 @@ from torch import Tensor
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import linearise
-from lfrtorch.engine.simulation import Trajectory, simulate
+from lfrtorch.engine.simulation import Trajectory, simulate, simulate_near
 
 ITERATIONS, HALVINGS, TOLERANCE = 20, 6, 1e-10
 """Most Gauss-Newton steps, trials in a step, and the relative decrease that ends the search."""
 
 SEEN = 1e-9
 """A direction of the initial state is estimated if it moves the weighted output by this much."""
+
+FADED = 1e-12
+"""Part of an initial state that the output does not tell from nothing: far below SEEN."""
+
+BLOCK = 1 << 11
+"""Samples, of all records together, whose rows are folded into the triangular factor at once."""
 
 PASSES, FLAT = 8, 1e-4
 """Passes that estimate the prior's weight, and its least variance relative to the largest."""
@@ -33,13 +44,13 @@ BEGINNING = 8
 
 
 @torch.no_grad()
-def simulate_from_beginning(
+def start_from_beginning(
     cell: LFRCell,
     u: Float[Tensor, "R T nu"],
     y: Float[Tensor, "R T ny"],
     weight: Float[Tensor, "R T ny"],
-) -> Trajectory:
-    """``simulate_estimated``, or from the state that a half, a quarter, ... of each record tells.
+) -> Float[Tensor, "R nx"]:
+    """``estimated_start``, or the state that a half, a quarter, ... of each record tells.
 
     Of an oscillation that runs long the error has many minima, one for each phase, and that of its
     beginning has few. A beginning's state is refined on the whole record, and taken where the
@@ -49,27 +60,27 @@ def simulate_from_beginning(
     def squares(trajectory: Trajectory) -> Tensor:
         return (weight * (trajectory.y - y)).square().sum(dim=(1, 2)).nan_to_num(math.inf)
 
-    best, T = simulate_estimated(cell, u, y, weight), u.shape[1] // 2
+    best, T = simulate(cell, u, estimated_start(cell, u, y, weight)), u.shape[1] // 2
     while T * cell.ny >= BEGINNING * cell.nx:
-        begun = simulate_estimated(cell, u[:, :T], y[:, :T], weight[:, :T])
-        found = simulate(cell, u, begun.x[:, 0])
+        begun = estimated_start(cell, u[:, :T], y[:, :T], weight[:, :T])
+        found = simulate_near(cell, u, begun, best)
         better = squares(found) < FAR_BETTER * squares(best)
         if better.any():
             found = _fitted_start(cell, u, y, weight, u.new_zeros(len(u), cell.nx, cell.nx), found)
             pairs = zip(found, best, strict=True)
             best = Trajectory(*(torch.where(better[:, None, None], a, b) for a, b in pairs))
         T //= 2
-    return best
+    return best.x[:, 0]
 
 
 @torch.no_grad()
-def simulate_estimated(
+def estimated_start(
     cell: LFRCell,
     u: Float[Tensor, "R T nu"],
     y: Float[Tensor, "R T ny"],
     weight: Float[Tensor, "R T ny"],
-) -> Trajectory:
-    """Trajectory from the most probable initial state, given the output.
+) -> Float[Tensor, "R nx"]:
+    """The most probable initial state, given the output.
 
     There are two candidates. Least squares alone follows the noise if there are few samples and
     many states. The second one adds x0ᵀ P⁻¹ x0 to the squared errors over their variance: a normal
@@ -93,6 +104,10 @@ def simulate_estimated(
     moments = moments.clamp_min(FLAT * moments[:, -1:])
     known = torch.isfinite(rest.x).all(dim=(1, 2)) & (moments > 0).all(dim=1)
     white = torch.where(known[:, None, None], axes.mT / moments.sqrt().unsqueeze(-1), 0.0)
+    # Nothing after the last sample with a weight tells the state.
+    last = int(weight.count_nonzero(dim=(0, 2)).nonzero().max()) + 1 if counted.any() else 1
+    u, y, weight = u[:, :last], y[:, :last], weight[:, :last]
+    rest = Trajectory(rest.x[:, : last + 1], *(s[:, :last] for s in rest[1:]))
 
     def variance(found: Trajectory) -> Tensor:
         errors = (weight * (found.y - y)).square().sum(dim=(1, 2))
@@ -107,7 +122,7 @@ def simulate_estimated(
     squares = _fitted_start(cell, u, y, weight, u.new_zeros(R, nx, nx), rest)
     stayed = ~squares.x[:, 0].any(dim=1)  # Gauss-Newton may fail on many states
     if not (known & (stayed | (odd(squares) > ODD * counted))).any():
-        return squares
+        return squares.x[:, 0]
     probable = rest
     for _ in range(PASSES):
         prior = white * variance(probable).nan_to_num(0.0, 0.0).sqrt()[:, None, None]
@@ -116,8 +131,7 @@ def simulate_estimated(
             break  # all passes that follow would find the same
     least = improbability(squares).nan_to_num(math.inf)
     better = known & (improbability(probable).nan_to_num(math.inf) < least)
-    pairs = zip(probable, squares, strict=True)
-    return Trajectory(*(torch.where(better[:, None, None], a, b) for a, b in pairs))
+    return torch.where(better.unsqueeze(1), probable.x[:, 0], squares.x[:, 0])
 
 
 def _fitted_start(
@@ -139,18 +153,12 @@ def _fitted_start(
 
     x0 = best.x[:, 0].clone()
     cost = squares(best, x0)
+    seen = SEEN * weight.abs().amax()
     for _ in range(ITERATIONS):
-        F, H = linearise(cell, best.z)
-        # dy(k)/dx0 = H(k) Φ(k) with Φ(k+1) = F(k) Φ(k), Φ(0) = I.
-        identity = torch.eye(cell.nx).to(x0).expand_as(F[:, 0])
-        free = H @ linear_recurrence(F, torch.zeros_like(F), identity)[:, :-1]
-        rows = torch.cat([(weight.unsqueeze(-1) * free).flatten(1, 2), prior], dim=1)
-        errors = (weight * (best.y - y)).flatten(1).unsqueeze(-1)
-        errors = torch.cat([errors, prior @ x0.unsqueeze(-1)], dim=1)
+        rows, errors = _factor(cell, weight, weight * (best.y - y), prior, best)
         usable = torch.isfinite(rows).all(dim=(1, 2)) & torch.isfinite(cost)
         rows, errors = (torch.where(usable[:, None, None], t, 0.0) for t in (rows, errors))
         # A state that the output does not show stays where it is.
-        seen = SEEN * weight.abs().amax()
         step = -(torch.linalg.pinv(rows, atol=seen, rtol=SEEN) @ errors).squeeze(-1)
         before = cost
         # A step that should lower the cost by less than its rounding is not worth a trial.
@@ -159,7 +167,7 @@ def _fitted_start(
         if not waiting.any():
             break
         for _ in range(HALVINGS):
-            trial = simulate(cell, u, x0 + step)
+            trial = simulate_near(cell, u, x0 + step, best)
             trial_cost = squares(trial, x0 + step)
             better = waiting & (trial_cost < cost)  # False for NaN
             x0 = torch.where(better[:, None], x0 + step, x0)
@@ -173,3 +181,35 @@ def _fitted_start(
         if not (cost < (1.0 - TOLERANCE) * before).any():
             break
     return best
+
+
+def _factor(
+    cell: LFRCell,
+    weight: Float[Tensor, "R T ny"],
+    errors: Float[Tensor, "R T ny"],
+    prior: Float[Tensor, "R nx nx"],
+    at: Trajectory,
+) -> tuple[Float[Tensor, "R n nx"], Float[Tensor, "R n 1"]]:
+    """Rows of the weighted errors' derivative by x0, over the prior's, and the errors; QR of both.
+
+    dy(k)/dx0 = H(k) Φ(k) with Φ(k+1) = F(k) Φ(k), Φ(0) = I.
+    """
+    R, T, _ = weight.shape
+    Phi = torch.eye(cell.nx).to(weight).expand(R, -1, -1)
+    folded = torch.cat([prior, prior @ at.x[:, 0].unsqueeze(-1)], dim=2)
+    length = max(1, BLOCK // R)
+    for k in range(0, T, length):
+        block = slice(k, k + length)
+        F, H = linearise(cell, at.z[:, block])
+        Phis = linear_recurrence(F, torch.zeros_like(F), Phi)
+        rows = weight[:, block].unsqueeze(-1) * (H @ Phis[:, :-1])
+        both = torch.cat([rows.flatten(1, 2), errors[:, block].flatten(1).unsqueeze(-1)], dim=2)
+        stacked = torch.cat([folded, both], dim=1)
+        lost = ~torch.isfinite(stacked).all(dim=2).all(dim=1)
+        # LAPACK may not end on NaN.
+        folded = torch.linalg.qr(torch.where(lost[:, None, None], 0.0, stacked), mode="r").R
+        folded[lost] = torch.nan
+        Phi = Phis[:, -1]
+        if Phi.abs().amax() < FADED:
+            break
+    return folded[..., :-1], folded[..., -1:]

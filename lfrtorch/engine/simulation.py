@@ -79,6 +79,18 @@ def simulate(
     return _with_loop_where_lost(cell, u, x0, x)
 
 
+def simulate_near(
+    cell: LFRCell, u: Float[Tensor, "R T nu"], x0: Float[Tensor, "R nx"], near: Trajectory
+) -> Trajectory:
+    """``simulate``, given the trajectory of the same model and input from another initial state.
+
+    In machine code the simulation ends where the two have met.
+    """
+    if is_compiled(cell, u):
+        return _compiled(cell, u, x0, Trajectory(*(signal.clone() for signal in near)))
+    return simulate(cell, u, x0, guess=near.x)
+
+
 def signals(cell: LFRCell, u: Float[Tensor, "R T nu"], x: Float[Tensor, "R T+1 nx"]) -> Trajectory:
     """The trajectory of given states."""
     z, w = cell.internal(u, x[:, :-1])

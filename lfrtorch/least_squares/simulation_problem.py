@@ -16,7 +16,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.block_form import zeros_of
-from lfrtorch.engine.initial_state import simulate_estimated, simulate_from_beginning
+from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.sensitivity import Linearisation
@@ -320,7 +320,7 @@ class SimulationProblem(LeastSquares):
         if self._solved:
             assert group.start_weight is not None
             cell = self.lfr.cell
-            return simulate_estimated(cell, group.u, group.y, group.start_weight).x[:, 0]
+            return estimated_start(cell, group.u, group.y, group.start_weight)
         return self._initial_states[group.estimated]
 
     def _trajectory(self, i: int) -> Trajectory:
@@ -337,8 +337,7 @@ class SimulationProblem(LeastSquares):
                 weight = group.weight
                 if group.beyond is not None:
                     weight = weight * (group.beyond == 0)
-                found = simulate_from_beginning(cell, group.u, group.y, weight)
-                states[group.estimated] = found.x[:, 0]
+                states[group.estimated] = start_from_beginning(cell, group.u, group.y, weight)
         return self.ranks.sum(states)
 
     def _ridge_of(self, ridge: Ridge) -> Float[Tensor, " P"]:

@@ -6,13 +6,20 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import POLES, normal, random_cell, special_poles
+from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.engine import initial_state
-from lfrtorch.engine.initial_state import simulate_estimated, simulate_from_beginning
-from lfrtorch.engine.simulation import simulate
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
+from lfrtorch.engine.linearised import Linearised, linearise
+from lfrtorch.engine.simulation import Trajectory, simulate, simulate_near
 
 pytestmark = pytest.mark.numeric
+
+
+def simulate_estimated(cell: LFRCell, u: Tensor, y: Tensor, weight: Tensor) -> Trajectory:
+    return simulate(cell, u, estimated_start(cell, u, y, weight))
 
 
 def test_estimated_initial_state_is_the_one_that_made_the_output():
@@ -30,12 +37,35 @@ def test_a_linear_model_is_not_simulated_from_states_that_cannot_be_better(
     y = simulate(cell, u, normal(1, 2, seed=1)).y + 0.1 * normal(1, 60, 1, seed=2)
     tried = []
     monkeypatch.setattr(
-        initial_state, "simulate", lambda *given: tried.append(1) or simulate(*given)
+        initial_state, "simulate_near", lambda *given: tried.append(1) or simulate_near(*given)
     )
     simulate_estimated(cell, u, y, torch.ones_like(y))
     # From rest, one step, and one of its rounding errors at most; a few in each further pass.
     # Before it was looked whether a step promises anything, six halvings of each followed.
     assert len(tried) <= 3 * (1 + initial_state.PASSES)
+
+
+@pytest.mark.parametrize("counted", [20, 3000])
+def test_no_sample_is_looked_at_that_does_not_tell_the_initial_state(
+    counted: int, monkeypatch: pytest.MonkeyPatch
+):
+    """Those after the last weight, and those after the transition has faded."""
+    cell, u = random_cell(1, 1, 2, 1, 1, 3, radius=0.5), normal(1, 3000, 1)
+    y = simulate(cell, u, normal(1, 2, seed=1)).y
+    weight = torch.ones_like(y)
+    weight[:, counted:] = 0.0
+    whole, looked_at = estimated_start(cell, u, y, weight), []
+
+    def watched(cell: LFRCell, z: Tensor) -> Linearised:
+        looked_at.append(z.shape[1])
+        return linearise(cell, z)
+
+    monkeypatch.setattr(initial_state, "linearise", watched)
+    monkeypatch.setattr(initial_state, "BLOCK", 64)
+    assert_close(estimated_start(cell, u, y, weight), whole, rtol=0, atol=1e-8)
+    assert set(looked_at) == {min(counted, 64)}
+    # From rest, a few Gauss-Newton steps and as many in each pass of the prior, if it is needed.
+    assert len(looked_at) <= initial_state.ITERATIONS * (1 + initial_state.PASSES)
 
 
 def test_estimated_initial_state_counts_what_is_weighted_only():
@@ -158,7 +188,7 @@ def test_estimated_initial_state_fits_as_well_as_rest(
         return float((weight * (y_hat - y)).square().sum())
 
     rest = cost(simulate(cell, u, u.new_zeros(1, nx)).y)
-    for way in (simulate_estimated, simulate_from_beginning):
-        found = way(cell, u, y, weight)
+    for way in (estimated_start, start_from_beginning):
+        found = simulate(cell, u, way(cell, u, y, weight))
         assert found.finite
         assert cost(found.y) <= (1.0 + 1e-6) * rest  # rounding
