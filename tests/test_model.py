@@ -1,6 +1,7 @@
 """The identified model: gauge invariance, parameter counts, and what simulate refuses."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -255,6 +256,26 @@ def test_starts_that_lack_what_they_need(model: Model):
         model.simulate(u, start="given")
     with pytest.raises(ValueError, match=r"start='estimated' needs a record"):
         model.simulate(u, start="estimated")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda m: {"scaler": replace(m.scaler, u_scale=np.ones(3))},
+            r"offsets of shape \(2,\) and scales of shape \(3,\)",
+        ),
+        (lambda m: {"scaler": replace(m.scaler, y_scale=-m.scaler.y_scale)}, "scale is not posi"),
+        (lambda m: {"outputs": ()}, "the model has 2 outputs, 0 channels"),
+        (lambda m: {"K": torch.zeros(3, 7)}, r"K has the shape \(3, 7\); give \(3, "),
+        (lambda m: {"fs": 0.0}, "sampling frequency is 0.0; give a positive number"),
+    ],
+)
+def test_parts_of_other_sizes_make_no_model(
+    model: Model, change: Callable[[Model], dict[str, Any]], message: str
+):
+    with pytest.raises(ValueError, match=message):
+        replace(model, **change(model))
 
 
 def test_the_old_name_of_the_count_says_the_new_one():

@@ -43,6 +43,12 @@ class Beyond(Module):
         self.register_buffer("into", into)
         self.register_buffer("out", out)
 
+    def weight_shapes(self, nz: int, nw: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of L, Z, W and the weights of f for nz and nw signals."""
+        own = self.base.weight_shapes(nz, nw) if hasattr(self.base, "weight_shapes") else {}
+        shapes: dict[str, tuple[int, ...]] = {"slope": (nw, nz), "into": (nz, nz), "out": (nw, nw)}
+        return shapes | {f"base.{name}": shape for name, shape in own.items()}
+
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
         """w of z."""
         z = z @ self.into.mT

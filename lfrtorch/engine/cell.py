@@ -81,11 +81,19 @@ class LFRCell(nn.Module):
         """Of which blocks the model is made, see ``block_form``; a fit keeps to it."""
         self.past_outputs = 0
         """How many of the last inputs are measured outputs: columns of Dzu, Dyu that stay 0."""
+        self._check_shapes()
 
     def forward(
         self, u: Float[Tensor, "*axes nu"], x: Float[Tensor, "*axes nx"]
     ) -> tuple[Float[Tensor, "*axes ny"], Float[Tensor, "*axes nx"]]:
-        """Output and next state."""
+        """Output and next state.
+
+        Raises:
+            ValueError: signals of other sizes, dtype or device than the weights.
+        """
+        axes = u.shape[:-1] if isinstance(u, Tensor) else ()
+        self._check("u", u, (*axes, self.nu))
+        self._check("x", x, (*axes, self.nx))
         w = self.internal(u, x)[1]
         y = x @ self.Cy.mT + u @ self.Dyu.mT + w @ self.Dyw.mT
         return y, x @ self.A.mT + u @ self.Bu.mT + w @ self.Bw.mT
@@ -96,6 +104,77 @@ class LFRCell(nn.Module):
         """Input z and output w of the static nonlinearity."""
         z = x @ self.Cz.mT + u @ self.Dzu.mT
         return z, (z if self.static is None else self.static(z))
+
+    def check(self) -> None:
+        """Refuse weights that do not fit each other, which machine code would not notice.
+
+        The weights may have a leading axis: one model a record. A map of a class that has no
+        ``weight_shapes`` is left to torch.
+
+        Raises:
+            ValueError: a weight of another shape, dtype or device.
+        """
+        check_dtype(self.A.dtype)
+        for name, weight in self._check_shapes().items():
+            self._check_kind(name, weight)
+
+    def _check_shapes(self) -> dict[str, Tensor]:
+        """The weights whose shapes are known, by name."""
+        nu, ny, nx, nz, nw = self.nu, self.ny, self.nx, self.nz, self.nw
+        shapes = {"A": (nx, nx), "Bu": (nx, nu), "Bw": (nx, nw), "Cz": (nz, nx), "Dzu": (nz, nu)}
+        shapes |= {"Cy": (ny, nx), "Dyu": (ny, nu), "Dyw": (ny, nw)}
+        if hasattr(self.static, "weight_shapes"):
+            own = self.static.weight_shapes(nz, nw)
+            shapes |= {f"static.{name}": shape for name, shape in own.items()}
+        weights = {**dict(self.named_parameters()), **dict(self.named_buffers())}
+        for name, shape in shapes.items():
+            found = tuple(weights[name].shape) if name in weights else ()
+            if found[-len(shape) :] != shape:
+                raise InputError(
+                    f"{name} has the shape {found}; with nu={nu}, ny={ny}, nx={nx}, nz={nz} and "
+                    f"nw={nw} it is {shape}: give a matrix or a static map of these sizes."
+                )
+        return {name: weights[name] for name in shapes}
+
+    def check_signals(
+        self, u: Tensor, x0: Tensor | None = None, guess: Tensor | None = None
+    ) -> None:
+        """Refuse signals (R, T, nu), (R, nx) and (R, any, nx) that are not the model's.
+
+        Raises:
+            ValueError: other shapes, no record or sample, or another dtype or device.
+        """
+        R, T = u.shape[:2] if isinstance(u, Tensor) and u.ndim == 3 else ("R", "T")
+        self._check("u", u, (R, T, self.nu), "records, samples and inputs")
+        if not u.numel():
+            raise InputError(
+                f"u has the shape {tuple(u.shape)}; give at least one record of one sample."
+            )
+        if x0 is not None:
+            self._check("x0", x0, (R, self.nx), "records and states")
+        if guess is not None:
+            samples = guess.shape[1] if isinstance(guess, Tensor) and guess.ndim == 3 else "T"
+            self._check("guess", guess, (R, samples or "T", self.nx), "records, samples, states")
+
+    def _check(
+        self, name: str, signal: Tensor, shape: tuple[int | str, ...], axes: str = ""
+    ) -> None:
+        if not isinstance(signal, Tensor):
+            raise InputError(f"{name} is of type {type(signal).__name__}; give a torch tensor.")
+        if signal.shape != shape:
+            raise InputError(
+                f"{name} has the shape {tuple(signal.shape)}; give ({', '.join(map(str, shape))})"
+                f"{f': {axes}' if axes else ''}."
+            )
+        self._check_kind(name, signal)
+
+    def _check_kind(self, name: str, tensor: Tensor) -> None:
+        """Refuse a tensor of another dtype or device than A."""
+        if tensor.dtype != self.A.dtype or tensor.device != self.A.device:
+            raise InputError(
+                f"{name} is {tensor.dtype} on {tensor.device} and the model {self.A.dtype} on "
+                f"{self.A.device}; give {name}.to({self.A.dtype}), or move the model: both alike."
+            )
 
     def free_feedthrough(self, *, z: bool, y: bool) -> None:
         """Which of z and y a fit lets the input act on at once; zeros elsewhere stay zeros.

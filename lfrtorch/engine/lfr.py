@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
@@ -24,6 +23,10 @@ class LFR(nn.Module):
 
     Signals are in normalised units.
 
+    Shape:
+        u: (R, T, nu), x0: (R, nx) -> (R, T, ny). One record may come without the axis R, as in
+        ``torch.nn.RNN``: u: (T, nu), x0: (nx,) -> (T, ny).
+
     Example:
         >>> u = torch.ones(3, 100, 1, dtype=torch.float64)  # three records
         >>> y = model.lfr(u)
@@ -38,11 +41,11 @@ class LFR(nn.Module):
 
     def trajectory(
         self,
-        u: Float[Tensor, "R T nu"],
-        x0: Float[Tensor, "R nx"] | None = None,
+        u: Tensor,
+        x0: Tensor | None = None,
         start: Start = "zero",
         *,
-        guess: Float[Tensor, "R _ nx"] | None = None,
+        guess: Tensor | None = None,
     ) -> Trajectory:
         """All signals of a simulation, without gradients.
 
@@ -51,8 +54,16 @@ class LFR(nn.Module):
             x0: initial state; a first guess in periodic steady state. Default: zero.
             start: ``"periodic"`` for the periodic steady state; otherwise from ``x0``.
             guess: states of a nearby trajectory, which may save time.
+
+        Shape:
+            u: (R, T, nu), x0: (R, nx), guess: (R, T + 1, nx), or (R, 1, nx) for a period.
+
+        Raises:
+            ValueError: signals of other sizes, dtype or device than the weights.
         """
         check_start(start, "simulation")
+        self.cell.check()
+        self.cell.check_signals(u, x0, guess)
         if start == "estimated":
             raise InputError("start='estimated' is fitted to a record's output: Model.simulate.")
         if start == "periodic":
@@ -62,11 +73,19 @@ class LFR(nn.Module):
 
     def forward(
         self,
-        u: Float[Tensor, "R T nu"],
-        x0: Float[Tensor, "R nx"] | None = None,
+        u: Tensor,
+        x0: Tensor | None = None,
         start: Start = "zero",
-    ) -> Float[Tensor, "R T ny"]:
-        """Simulated output; ``backward`` costs one adjoint recurrence (no second derivatives)."""
+    ) -> Tensor:
+        """Simulated output; ``backward`` costs one adjoint recurrence (no second derivatives).
+
+        Raises:
+            ValueError: signals of other sizes, dtype or device than the weights.
+        """
+        if isinstance(u, Tensor) and u.ndim == 2:  # one record
+            x0 = x0.unsqueeze(0) if isinstance(x0, Tensor) else x0
+            return self.forward(u.unsqueeze(0), x0, start).squeeze(0)
+        self.cell.check_signals(u, x0)
         weights = list(self.cell.parameters())
         if x0 is None:
             x0 = u.new_zeros(len(u), self.cell.nx)

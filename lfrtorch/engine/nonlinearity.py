@@ -103,6 +103,14 @@ class Network(Module):
         """(W2, b2), (W3, b3), ..: of the layers after the first."""
         return inner_weights(dict(self.named_parameters(recurse=False)))
 
+    def weight_shapes(self, nz: int, nw: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of the weights of a map from nz to nw signals with these neurons."""
+        nn = self.bz.shape[-1]
+        shapes: dict[str, tuple[int, ...]] = {"Wz": (nn, nz), "bz": (nn,)}
+        for layer in range(2, self.layers + 1):
+            shapes |= {f"W{layer}": (nn, nn), f"b{layer}": (nn,)}
+        return shapes | {"Ww": (nw, nn), "bw": (nw,)}
+
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
         """w of z."""
         activation = ACTIVATIONS[self.activation]
@@ -204,6 +212,10 @@ class Polynomial(Module):
         with torch.no_grad():
             self.C.uniform_(-1.0, 1.0, generator=generator).div_(self.C.shape[-1])
             self.C[:, 0] = 0.0
+
+    def weight_shapes(self, nz: int, nw: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of the weights of a map from nz to nw signals of this degree."""
+        return {"C": (nw, math.comb(nz + self.degree, self.degree))}
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
         """w of z."""

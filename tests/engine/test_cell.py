@@ -4,10 +4,11 @@ import pytest
 import reference
 import torch
 from reference import normal, random_cell
+from torch.nn import Module
 from torch.testing import assert_close
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.engine.nonlinearity import Network, Polynomial
 
 pytestmark = pytest.mark.numeric
 
@@ -47,3 +48,17 @@ def test_dtype_is_followed():
     cell = LFRCell(1, 1, 1, dtype=torch.float64)
     assert {p.dtype for p in cell.parameters()} == {torch.float64}
     assert "nu=1, ny=1, nx=1, nz=0, nw=0" in repr(cell)
+
+
+@pytest.mark.parametrize(
+    ("static", "name"), [(Network(3, 1, 2), "static.Wz"), (Polynomial(1, 1, 2), "static.C")]
+)
+def test_a_static_map_of_other_sizes_is_refused(static: Module, name: str):
+    with pytest.raises(ValueError, match=rf"{name} has the shape .* nz=2 and nw=1 it is"):
+        LFRCell(1, 1, 3, 2, 1, static)
+
+
+@pytest.mark.parametrize(("u", "x"), [((5, 8), (5, 4)), ((5, 2), (5, 1))])
+def test_a_step_refuses_signals_of_other_shapes(u: tuple[int, ...], x: tuple[int, ...]):
+    with pytest.raises(ValueError, match=r"has the shape .*; give \("):
+        random_cell(2, 3, 4, 2, 1, 3)(normal(*u), normal(*x))

@@ -184,3 +184,50 @@ def test_starts_that_it_does_not_have():
         lfr(u, None, "peridoic")
     with pytest.raises(ValueError, match="start='estimated' is fitted to a record's output"):
         lfr(u, None, "estimated")
+
+
+# --- the door -------------------------------------------------------------------------------
+
+
+def test_one_record_needs_no_axis_of_records():
+    lfr, u, x0 = small(), normal(1, 20, 2), normal(1, 2, seed=1)
+    assert torch.equal(lfr(u[0]), lfr(u)[0])
+    assert torch.equal(lfr(u[0], x0[0]), lfr(u, x0)[0])
+
+
+@pytest.mark.parametrize(
+    ("u", "message"),
+    [
+        (torch.zeros(8, 200, 8).double(), r"u has the shape \(8, 200, 8\); give \(8, 200, 2\)"),
+        (torch.zeros(200).double(), r"u has the shape \(200,\); give \(R, T, 2\)"),
+        (torch.zeros(0, 5, 2).double(), "at least one record of one sample"),
+        (torch.zeros(3, 0, 2).double(), "at least one record of one sample"),
+        (torch.zeros(3, 5, 2), r"give u\.to\(torch\.float64\), or move the model"),
+        (torch.zeros(3, 5, 2).bfloat16(), "u is torch.bfloat16"),
+        (np.zeros((3, 5, 2)), "u is of type ndarray; give a torch tensor"),
+    ],
+)
+def test_an_input_that_is_not_the_models_is_refused(u: Tensor, message: str):
+    with pytest.raises(ValueError, match=message):
+        small()(u)
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (1, 2), (2,), (3, 5)])
+def test_start_states_are_not_broadcast(shape: tuple[int, ...]):
+    with pytest.raises(ValueError, match=r"x0 has the shape .*; give \(3, 2\): records and states"):
+        small()(normal(3, 5, 2), torch.zeros(shape).double())
+
+
+def test_a_model_of_a_dtype_without_kernels_is_refused():
+    lfr = small().bfloat16()
+    with pytest.raises(ValueError, match=r"dtype is torch\.bfloat16; give torch\.float64"):
+        lfr(torch.zeros(1, 5, 2).bfloat16())
+
+
+def test_a_weight_that_was_put_in_with_another_shape_is_refused():
+    lfr = small()
+    lfr.cell.Bu = torch.nn.Parameter(normal(2, 1))
+    with pytest.raises(
+        ValueError, match=r"Bu has the shape \(2, 1\); with nu=2, .* it is \(2, 2\)"
+    ):
+        lfr(normal(1, 5, 2))
