@@ -186,8 +186,9 @@ class ExtendedKalmanFilter(StateObserver):
 
 
 def inside_limits(record: Record) -> Float[Array, "T ny"]:
-    """The outputs of a record, NaN where they may be beyond its limits."""
-    return np.where(record.beyond, np.nan, record.y)
+    """The outputs of a record, NaN where they may be beyond its limits or are not valid."""
+    y = np.where(record.beyond, np.nan, record.y)
+    return y if record.valid is None else np.where(record.valid, y, np.nan)
 
 
 def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:

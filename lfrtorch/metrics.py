@@ -33,7 +33,22 @@ def rmse(record: Record, y_hat: Array) -> float:
             f"record '{record.name}' has an output of shape {record.y.shape} and the simulation "
             f"{np.shape(y_hat)}; simulate this record."
         )
-    return float(rms(record.y[record.skip :] - y_hat[record.skip :]))
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = np.square(record.errors(y_hat)).sum()
+    return float(np.sqrt(squares / record.scored.sum()))
+
+
+def rmse_by_output(record: Record, y_hat: Array) -> Array:
+    """The same of each output, (ny,); NaN for one without a scored sample.
+
+    Example:
+        >>> from lfrtorch.metrics import rmse_by_output
+        >>> rmse_by_output(record, record.y + 0.5)
+        array([0.5])
+    """
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        squares = np.square(record.errors(y_hat)).sum(axis=0)
+        return np.sqrt(squares / record.scored.sum(axis=0))
 
 
 @typed()
@@ -46,9 +61,9 @@ def nrmse(record: Record, y_hat: Array) -> float:
         >>> lfrtorch.nrmse(record, bla.simulate(record)) < 0.3
         True
     """
-    y = record.y[record.skip :]
+    outputs = [y[there] for y, there in zip(record.y.T, record.scored.T, strict=True)]
     # About the first sample, so that those of a constant are 0: its mean has rounding errors.
-    deviation = float(np.sqrt(np.mean(np.var(y - y[0], axis=0))))
+    deviation = float(np.sqrt(np.mean([np.var(y - y[0]) for y in outputs if len(y)])))
     return rmse(record, y_hat) / deviation if deviation > 0 else float("nan")
 
 

@@ -117,15 +117,20 @@ class Record:
         reference: what the experimenter sets if a controller makes the input, or what a generator
             plays if the input is measured with noise: a channel for each input, without noise. Best
             linear approximations are estimated from it, see :func:`lfrtorch.estimate_frf`.
+        valid: which output samples are measurements: False for outliers, dropouts and samples that
+            were never taken. The model is simulated through them; they are neither fitted nor
+            scored. ``y`` may be NaN there, and is interpolated, for figures and for first guesses.
+            Default: all.
 
     Shape:
         u: (T, nu), y: (T, ny), reference: (T, nu), x0: (nx,), weight: () or (ny,),
-        line_weight: (T // 2 + 1,) or (T // 2 + 1, ny), limits: (2, ny).
+        line_weight: (T // 2 + 1,) or (T // 2 + 1, ny), limits: (2, ny), valid: (T,) or (T, ny).
 
     Raises:
         ValueError: NaN, infinite or masked samples, levels or an ``fs`` beyond 1e-100 to 1e100,
-            different lengths, wrong shapes, negative weights, a ``skip`` that leaves no sample, a
-            period that does not fit, or a reference of other samples or channels than the input.
+            different lengths, wrong shapes, negative weights, a ``skip`` or a ``valid`` that leaves
+            no sample, a period that does not fit, or a reference of other samples or channels than
+            the input.
 
     Example:
         >>> record = lfrtorch.Record(np.sin(np.arange(100.0)), np.zeros(100), fs=50.0, skip=10)
@@ -151,10 +156,11 @@ class Record:
     skip_more: bool = False
     limits: Sequence[ArrayLike | None] | Array | None = None
     reference: Array | None = None
+    valid: Array | None = None
 
     def __post_init__(self) -> None:
         inputs, u = _side(self.inputs, self.u, "u", f"record '{self.name}': input")
-        outputs, y = _side(self.outputs, self.y, "y", f"record '{self.name}': output")
+        outputs, y = _side(self.outputs, self._measured(), "y", f"record '{self.name}': output")
         if len(u) != len(y):
             raise InputError(
                 f"record '{self.name}': the input has {len(u)} samples and the output {len(y)}; "
@@ -184,6 +190,43 @@ class Record:
         self._check_reference(u)
         for field, value in (("u", u), ("y", y), ("inputs", inputs), ("outputs", outputs)):
             object.__setattr__(self, field, value)
+        self._check_valid()
+
+    def _measured(self) -> ArrayLike:
+        """The output, interpolated where it is not valid."""
+        if self.valid is None:
+            return self.y
+        what = f"record '{self.name}': valid"
+        y, valid = reals(f"record '{self.name}': output", self.y), np.asarray(self.valid)
+        y = y[:, None] if y.ndim == 1 else y
+        if valid.dtype != bool or valid.shape not in (y.shape, y.shape[:1]):
+            raise InputError(
+                f"{what} has shape {valid.shape} and type {valid.dtype}; give True and False for "
+                f"each of the {len(y)} samples, or for each sample of each output."
+            )
+        valid = np.broadcast_to(valid if valid.ndim == 2 else valid[:, None], y.shape)
+        object.__setattr__(self, "valid", None if valid.all() else valid)
+        if not valid.any(axis=0).all():
+            raise InputError(f"{what} leaves no sample of an output; leave that output out.")
+        k, filled = np.arange(len(y)), y.copy()
+        for i, there in enumerate(valid.T):
+            filled[~there, i] = np.interp(k[~there], k[there], y[there, i])
+        return filled
+
+    def _check_valid(self) -> None:
+        """Refuse what samples that are left out cannot go with."""
+        if self.valid is None:
+            return
+        if self.start == "periodic" or self.line_weight is not None:
+            raise InputError(
+                f"record '{self.name}' has outputs that are not valid, and start is "
+                f"{self.start!r}: a steady state needs whole periods. Give start='estimated'."
+            )
+        if not self.scored.any():
+            raise InputError(
+                f"record '{self.name}': valid and skip={self.skip} leave no sample; use a smaller "
+                "skip or a longer record."
+            )
 
     def _check_period(self, T: int) -> None:
         if self.period is None:
@@ -269,22 +312,43 @@ class Record:
         parts += [f"skip {self.skip}"] if self.skip else []
         parts += [f"period {self.period}"] if self.period else []
         parts += ["with reference"] if self.reference is not None else []
+        parts += [f"{(~self.valid).sum()} outputs not valid"] if self.valid is not None else []
         return f"Record({self.name!r}: {signals(self)}, {', '.join(parts)})"
 
     @property
-    def factors(self) -> Array:
-        """What the errors (T, ny) are multiplied by in a fit: √weight, 0 in the skipped samples."""
+    def scored(self) -> Array:
+        """Which outputs (T, ny) count: valid ones after the skipped samples."""
         counts = np.arange(len(self.y))[:, None] >= self.skip
-        return np.broadcast_to(np.sqrt(self.weight) * counts, self.y.shape)
+        counts = counts if self.valid is None else counts & self.valid
+        return np.broadcast_to(counts, self.y.shape)
+
+    @property
+    def factors(self) -> Array:
+        """What the errors (T, ny) are multiplied by in a fit: √weight, 0 if not scored."""
+        return np.sqrt(self.weight) * self.scored
+
+    def errors(self, y_hat: Array) -> Array:
+        """y - y_hat after the skipped samples (T - skip, ny), 0 where y is not valid."""
+        found = (self.y - y_hat)[self.skip :]
+        return found if self.valid is None else np.where(self.valid[self.skip :], found, 0.0)
+
+    def require_all_valid(self, what: str) -> None:
+        """Refuse what needs every output sample, with a ValueError that says what it is."""
+        if self.valid is not None:
+            raise InputError(
+                f"record '{self.name}' has {(~self.valid).sum()} output sample(s) that are not "
+                f"valid; {what} needs all of them: cut the record there, or interpolate them."
+            )
 
     @property
     def start_factors(self) -> Array:
         """The same for an estimated start of a given model: √weight, 0 in the scored samples."""
-        inside = self.beyond == 0
-        if not self.skip:
-            return self.factors * inside
-        counts = np.arange(len(self.y))[:, None] < self.skip
-        return np.sqrt(self.weight) * (counts & inside)
+        counts = self.beyond == 0
+        if self.valid is not None:
+            counts = counts & self.valid
+        if self.skip:
+            counts = counts & (np.arange(len(self.y))[:, None] < self.skip)
+        return np.sqrt(self.weight) * counts
 
     @property
     def beyond(self) -> Array:
@@ -362,14 +426,10 @@ class Record:
 
         Example:
             >>> sorted(record.signals_in(slice(20)))
-            ['reference', 'u', 'y']
+            ['reference', 'u', 'valid', 'y']
         """
-        r = self.reference
-        return {
-            "u": self.u[window],
-            "y": self.y[window],
-            "reference": r if r is None else r[window],
-        }
+        several = {name: getattr(self, name) for name in ("u", "y", "reference", "valid")}
+        return {name: one if one is None else one[window] for name, one in several.items()}
 
 
 def signals(record: Record) -> str:
@@ -393,11 +453,15 @@ def with_past_outputs(record: Record) -> Record:
 
     A record in steady state has an estimated start: its noise does not repeat.
 
+    Raises:
+        ValueError: outputs that are not valid.
+
     Example:
         >>> from lfrtorch.records import with_past_outputs
         >>> with_past_outputs(record)
         Record('record': u, y -> y, 400 samples at 100 Hz, start estimated)
     """
+    record.require_all_valid("a prediction from past outputs (noise=innovation or both)")
     return replace(
         record,
         u=np.hstack([record.u, record.y]),
@@ -619,7 +683,8 @@ def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: 
         k, channel = np.argwhere(bad)[0]
         raise InputError(
             f"{what} '{channels[channel].name}' has {bad.sum()} NaN, infinite or masked sample(s), "
-            f"the first at index {first + k}; cut the record there or interpolate the gap."
+            f"the first at index {first + k}; cut the record there or interpolate the gap"
+            f"{', or leave these samples out: valid=np.isfinite(y)' * what.endswith('output')}."
         )
     array.flags.writeable = False
     return array

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lfrtorch.metrics import BlockScores, nrmse, rms, rmse
+from lfrtorch.metrics import BlockScores, nrmse, rms, rmse, rmse_by_output
 from lfrtorch.records import Record, Scaler
 
 pytestmark = pytest.mark.numeric
@@ -94,3 +94,15 @@ def test_scores_of_blocks_are_those_of_all_samples(
         else:  # of 1e6 a deviation of 1e-3 has six digits
             expected /= np.std(measured - measured[0])
             assert scores.nrmse[channel] == pytest.approx(expected, rel=1e-5)
+
+
+def test_samples_that_are_not_valid_are_not_scored():
+    y, y_hat = np.random.default_rng(0).normal(size=(2, 50, 2))
+    valid = np.random.default_rng(1).random((50, 2)) < 0.8
+    record = Record(np.zeros(50), np.where(valid, y, np.nan), skip=5, valid=valid)
+    counts = valid & (np.arange(50) >= 5)[:, None]
+    assert rmse(record, y_hat) == pytest.approx(np.sqrt(np.mean((y - y_hat)[counts] ** 2)))
+    each = [np.sqrt(np.mean((y - y_hat)[counts[:, i], i] ** 2)) for i in range(2)]
+    assert rmse_by_output(record, y_hat) == pytest.approx(each)
+    deviation = np.sqrt(np.mean([np.var(y[counts[:, i], i]) for i in range(2)]))
+    assert nrmse(record, y_hat) == pytest.approx(rmse(record, y_hat) / deviation)

@@ -386,3 +386,75 @@ def test_period_must_fit():
     refused("record 'lab': period is 0; give a whole number of at least 1", period=0)
     assert lab(period=4).period == 4
     assert lab(period=10).period == lab(start="periodic", period=10).period == 10
+
+
+# --- outputs that are left out --------------------------------------------------------------
+
+RAMP = np.arange(10.0)
+
+
+def with_gap() -> Record:
+    """Two outputs, of which the second has no measurement at samples 3 and 4."""
+    y = np.stack([RAMP, 2.0 * RAMP], axis=1)
+    y[3:5, 1] = np.nan
+    return Record(np.ones(10), y, skip=2, valid=np.isfinite(y), weight=np.array([1.0, 4.0]))
+
+
+def test_outputs_that_are_not_valid_are_interpolated_and_do_not_count():
+    record = with_gap()
+    np.testing.assert_allclose(record.y[:, 1], 2.0 * RAMP)
+    expected = np.ones((10, 2))
+    expected[:2] = expected[3:5, 1] = 0.0
+    np.testing.assert_array_equal(record.scored, expected == 1.0)
+    np.testing.assert_array_equal(record.factors, expected * [1.0, 2.0])
+    np.testing.assert_array_equal(record.errors(np.zeros((10, 2))), (record.y * expected)[2:])
+    assert "2 outputs not valid" in repr(record)
+
+
+def test_what_an_output_says_where_it_is_not_valid_does_not_matter():
+    one, other = (
+        Record(RAMP, np.where(RAMP == 5.0, bad, RAMP), valid=RAMP != 5.0) for bad in (1e9, np.inf)
+    )
+    np.testing.assert_array_equal(one.y, other.y)
+    np.testing.assert_array_equal(one.y[:, 0], RAMP)
+
+
+def test_parts_of_a_record_keep_what_is_not_valid():
+    valid = with_gap()[2:6].valid
+    assert valid is not None
+    assert valid.tolist() == [[True, True], [True, False], [True, False], [True, True]]
+    assert with_gap()[5:].valid is None
+
+
+def test_valid_samples_that_are_all_leave_no_trace():
+    assert Record(RAMP, RAMP, valid=np.full(10, True)).valid is None
+
+
+def test_a_start_is_estimated_from_valid_outputs():
+    weights = dataclasses.replace(with_gap(), start="estimated", skip=5).start_factors
+    assert weights[:, 1].tolist() == [2.0, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"valid": np.ones(9, bool)}, "valid has shape (9,) and type bool; give True and False"),
+        ({"valid": np.ones(10)}, "valid has shape (10,) and type float64; give True and False"),
+        ({"valid": np.zeros(10, bool)}, "leaves no sample of an output; leave that output out"),
+        ({"valid": RAMP < 3, "skip": 3}, "valid and skip=3 leave no sample"),
+        ({"valid": RAMP < 3, "start": "periodic"}, "a steady state needs whole periods"),
+    ],
+)
+def test_samples_that_cannot_be_left_out(options: dict, message: str):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Record(RAMP, RAMP, **options)
+
+
+def test_a_prediction_needs_all_outputs():
+    with pytest.raises(ValueError, match=r"2 output sample\(s\) that are not valid; a prediction"):
+        with_past_outputs(with_gap())
+
+
+def test_an_output_with_gaps_is_told_how_to_leave_them_out():
+    with pytest.raises(ValueError, match=r"leave these samples out: valid=np\.isfinite\(y\)\."):
+        Record(RAMP, np.where(RAMP == 5.0, np.nan, RAMP))

@@ -486,7 +486,7 @@ class Judge:
     def squares(self, model: Model | LinearModel) -> Array:
         """Sums of the squared relative errors over each block, (B,), the mean of the outputs."""
         with np.errstate(over="ignore", invalid="ignore"):
-            errors = [(r.y - model.simulate(r))[r.skip :] / self._scale for r in self._records]
+            errors = [r.errors(model.simulate(r)) / self._scale for r in self._records]
         return self._ranks.first(torch.from_numpy(squares_in_blocks(errors))).numpy()
 
     def candidate(self, runner: _Runner, rounds: int) -> Candidate:

@@ -223,8 +223,10 @@ def initialise(
         natural = corners[:0]
         if modes:
             pairs = zip(data, found, strict=True)
-            errors = [scaler.normalise_y(r.y) - t.y[0].double().numpy() for r, t in pairs]
-            errors = [error[r.skip :] for r, error in zip(data, errors, strict=True)]
+            errors = [
+                r.errors(scaler.restore_y(t.y[0].double().numpy())) / scaler.y_scale
+                for r, t in pairs
+            ]
             natural = distortion_frequencies(inputs, errors, modes)
         cell = with_driven_states(cell, corners, natural, generator)
         model = replace(model, lfr=LFR(cell))

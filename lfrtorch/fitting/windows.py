@@ -105,5 +105,5 @@ def _windows(record: Record, horizon: int) -> list[Record]:
     if record.start != "periodic":
         end = record.skip + horizon
         whole = replace(record, period=None, weight=weight)
-        found[0] = replace(whole, u=record.u[:end], y=record.y[:end])
+        found[0] = replace(whole, **record.signals_in(slice(end)))
     return found

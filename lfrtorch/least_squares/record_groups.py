@@ -43,7 +43,7 @@ class RecordGroup:
     y: Float[Tensor, "R T ny"]
     x0: Float[Tensor, "R nx"] | None
     estimated: Int[Tensor, " R"] | None
-    scored: Float[Tensor, "R T"]
+    scored: Float[Tensor, "R T ny"]
     weight: Float[Tensor, "R m ny"]
     start_weight: Float[Tensor, "R T ny"] | None
     spectral: bool
@@ -127,7 +127,7 @@ def group_records(
                 if start == "given"
                 else None,
                 estimated=torch.tensor(estimated[kind]) if start == "estimated" else None,
-                scored=stacked([np.arange(r.samples) >= r.skip for r in physical]),
+                scored=stacked([r.scored for r in physical]),
                 weight=stacked([_factors(r) for r in physical]),
                 start_weight=stacked([r.start_factors for r in physical])
                 if start == "estimated"

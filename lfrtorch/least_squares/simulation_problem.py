@@ -92,7 +92,7 @@ class SimulationProblem(LeastSquares):
                 "fewer processes, or cut the data into more records."
             )
         self.groups = group_records(records, lfr.cell.A, self.ranks)
-        self.size = sum(record.samples - record.skip for record in data) * lfr.cell.ny
+        self.size = sum(int(record.scored.sum()) for record in data)
         self._solved = solve_initial_states
         self._initial_states = self._first_initial_states(
             sum(record.start == "estimated" for record in data)
@@ -151,7 +151,7 @@ class SimulationProblem(LeastSquares):
         total = torch.zeros((), dtype=torch.float64, device=self._theta_0.device)
         scale = torch.as_tensor(self._y_scale).to(self._theta_0)
         for group, trajectory in zip(self.groups, self.trajectories(theta), strict=True):
-            errors = (trajectory.y - group.y) * scale * group.scored.unsqueeze(-1)
+            errors = (trajectory.y - group.y) * scale * group.scored
             if group.beyond is not None:
                 errors = errors * (group.beyond * errors <= 0)
             total = total + errors.double().square().sum()

@@ -68,7 +68,7 @@ def shares(
             line_weight=None,
         )
         added += np.square(split.simulate(driven)[record.skip :]).sum(axis=0).reshape(nx, ny)
-        error += np.square((record.y - model.simulate(record))[record.skip :]).sum(axis=0)
+        error += np.square(record.errors(model.simulate(record))).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.sqrt(added / error)
     return poles, np.nan_to_num(share, nan=0.0, posinf=np.inf).max(axis=1)

@@ -171,7 +171,7 @@ class SignalFit:
         if not self._prediction:
             return found
         pairs = zip(problem.groups, problem.trajectories(state.theta), strict=True)
-        errors = torch.cat([(b.y - t.y)[b.scored.bool()] for b, t in pairs])
+        errors = torch.cat([(b.y - t.y)[b.scored[..., 0].bool()] for b, t in pairs])
         innovations = np.atleast_2d(np.cov(errors.numpy().T, bias=True))
         return replace(found, K=K, innovation_covariance=innovations)
 

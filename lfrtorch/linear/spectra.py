@@ -170,6 +170,7 @@ def _spectra(
     C = np.zeros((N // 2 + 1, size, size), np.complex128)
     means, references, P, changes, freedom = [], [], [], [], 0
     for record, window, excited in zip(data, windows, excitation, strict=True):
+        record.require_all_valid("a spectrum")
         signals = np.concatenate([record.y[window], record.u[window]], axis=1)
         Z = np.fft.rfft(signals.reshape(-1, N, size), axis=1) * (np.sqrt(2) / N)
         mean = Z.mean(axis=0)

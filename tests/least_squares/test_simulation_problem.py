@@ -48,6 +48,7 @@ def all_kinds(model: Model, *, given: bool = True) -> list[Record]:
         replace(third, start="estimated"),
         replace(fourth, start="estimated", weight=4.0),
         replace(zero, start="estimated", skip=3),
+        with_gaps(replace(fourth, start="estimated")),
     ]
     return [*records, replace(fourth, start="given", x0=[0.3, -0.2])] if given else records
 
@@ -72,6 +73,30 @@ def test_rmse_is_that_of_the_metrics(model: Model):
         assert score == pytest.approx(rmse(record, model.simulate(record)), rel=1e-9)
 
 
+def with_gaps(record: Record) -> Record:
+    """The same without some samples of each output, which are far off."""
+    valid = np.random.default_rng(1).random(record.y.shape) < 0.8
+    return replace(record, y=np.where(valid, record.y, 1e6), valid=valid)
+
+
+def test_samples_that_are_not_valid_have_no_error(model: Model):
+    zero, _, third, _ = some_records(model)
+    records = [with_gaps(zero), with_gaps(replace(third, start="estimated"))]
+    problem = SimulationProblem.of(model, records)
+    kept = [r.valid[r.skip :] for r in records if r.valid is not None]
+    assert problem.size == sum(int(valid.sum()) for valid in kept)
+    r = problem.residual(problem.theta)
+    (group, _) = problem.groups
+    expected = ((model.simulate(zero) - zero.y) / model.scaler.y_scale)[kept[0]]
+    assert np.count_nonzero(r[: group.y.numel()]) == len(expected)
+    np.testing.assert_allclose(
+        np.sort(r[: group.y.numel()][r[: group.y.numel()] != 0].numpy()), np.sort(expected)
+    )
+    alone = SimulationProblem.of(model, records[0])
+    score = rmse(records[0], model.simulate(records[0]))
+    assert alone.rmse(alone.theta) == pytest.approx(score, rel=1e-9)
+
+
 RIDGES = pytest.mark.parametrize("ridge", [0.0, 0.5, {"static": 0.1, "A": 0.3, "x0": 2.0}])
 
 
@@ -89,7 +114,7 @@ def test_gradient_and_jacobian_agree(model: Model, ridge):
 def test_jacobian_is_the_slope_of_the_residual(model: Model, ridge):
     problem = SimulationProblem.of(model, all_kinds(model), ridge=ridge)
     theta = problem.theta
-    assert len(theta) == model.parameter_count + 3 * 2
+    assert len(theta) == model.parameter_count + 4 * 2
     step = 1e-4 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
     expected = (problem.residual(theta + step) - problem.residual(theta - step)) / 2
     # Truncation |step|³ = 1e-11, and the periodic start is known to 1e-10.
@@ -435,7 +460,7 @@ def test_fixed_entries_have_columns_of_zeros(
     plain = SimulationProblem.of(model, records, ridge=ridge).jacobian(theta)
     problem = SimulationProblem.of(model, records, ridge=ridge)
     problem.fixed = some_fixed(model)
-    held = torch.cat([problem.fixed, torch.zeros(3 * 2, dtype=torch.bool)])  # start states follow
+    held = torch.cat([problem.fixed, torch.zeros(4 * 2, dtype=torch.bool)])  # start states follow
     r, J = problem.residual(theta), problem.jacobian(theta)
     assert torch.equal(J[:, held], torch.zeros_like(J[:, held]))
     # The same recurrence from a periodic start known to 1e-10.
