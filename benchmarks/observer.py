@@ -103,7 +103,7 @@ def kalman_filter(
 ) -> tuple[Array, Array]:
     """The same by the observer, and the variances (T, nx) that it gives them."""
     noise = lfrtorch.NoiseCovariance(Q=q**2, R=(r * model.scaler.y_scale) ** 2)
-    observer = model.observer(noise=noise)
+    observer = model.observer(noise=noise, P0=1.0)
     states, variances = [], []
     for u_k, y_k in zip(u, model.scaler.restore_y(y), strict=True):
         observer.predict(u_k)

@@ -95,7 +95,8 @@ class ExtendedKalmanFilter(StateObserver):
         cell, scaler, inputs, outputs: of the model.
         x0: where the states begin, in the model's coordinates.
         noise: on states and outputs.
-        P0: covariance of x0, its variances, or one number for all states.
+        P0: covariance of x0, its variances, or one number for all states. Default: that of the
+            states over the training data.
 
     Shape:
         x0: (nx,), P0: (nx, nx), (nx,) or a number.
@@ -125,21 +126,24 @@ class ExtendedKalmanFilter(StateObserver):
         outputs: tuple[Channel, ...],
         x0: ArrayLike,
         noise: NoiseCovariance,
-        P0: ArrayLike = 1.0,
+        P0: ArrayLike | None = None,
     ) -> None:
         super().__init__(cell, scaler, inputs, outputs, x0)
         nx, ny = cell.nx, cell.ny
         self._G = noise.root(nx, ny)
         self._G[:ny] /= np.asarray(scaler.y_scale)[:, None]
-        P = _covariance("P0", P0, nx)
-        U = _root(P, np.abs(P).max())
-        if U is None:
-            raise InputError("P0 has a negative eigenvalue; give a covariance of the states.")
-        self._U = U
+        if P0 is None:
+            self._U = data_root(self._cell)
+        else:
+            P = _covariance("P0", P0, nx)
+            U = _root(P, np.abs(P).max())
+            if U is None:
+                raise InputError("P0 has a negative eigenvalue; give a covariance of the states.")
+            self._U = U
         self._now = self._u[0], self._y_now[None]
         self._filter: list[Any] | None = None
         if self._weights is not None:
-            self._filter = [*self._weights, self._G, self._x_now, U]
+            self._filter = [*self._weights, self._G, self._x_now, self._U]
 
     @property
     def covariance(self) -> Float[Array, "nx nx"]:
@@ -183,6 +187,13 @@ class ExtendedKalmanFilter(StateObserver):
         y, x_next = self._cell(u, state)
         F, H = linearise(self._cell, self._cell.internal(u, state)[0][None, None])
         return y.numpy(), x_next.numpy(), F[0, 0].contiguous().numpy(), H[0, 0].contiguous().numpy()
+
+
+def data_root(cell: LFRCell) -> Float[Array, "nx nx"]:
+    """U with U Uᵀ = the covariance of the states over the training data."""
+    U = _root(cell.state_covariance.detach().double().cpu().numpy(), np.inf)
+    assert U is not None
+    return U
 
 
 def inside_limits(record: Record) -> Float[Array, "T ny"]:

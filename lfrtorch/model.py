@@ -180,6 +180,19 @@ class Model:
         return sizes | {"nn": len(static.bz)} | layers
 
     @property
+    def state_covariance(self) -> Float[Array, "nx nx"]:
+        """E x xᵀ of the states over the training data, about 0; before a fit 1.
+
+        So wrong is x = 0 amid data like these. The states are those of the simulation, and of a
+        model with K those of the prediction. A fit leaves a diagonal of 1.
+
+        Example:
+            >>> model.state_covariance
+            array([[1.]])
+        """
+        return self.lfr.cell.state_covariance.double().cpu().numpy()
+
+    @property
     def parameters(self) -> int:
         """Old name of ``parameter_count``.
 
@@ -336,7 +349,7 @@ class Model:
         noise: NoiseCovariance,
         after: Record | None = None,
         x0: ArrayLike | None = None,
-        P0: ArrayLike = 1.0,
+        P0: ArrayLike | None = None,
     ) -> ExtendedKalmanFilter: ...
 
     @typed()
@@ -346,7 +359,7 @@ class Model:
         noise: NoiseCovariance | None = None,
         after: Record | None = None,
         x0: ArrayLike | None = None,
-        P0: ArrayLike = 1.0,
+        P0: ArrayLike | None = None,
     ) -> StateObserver:
         """What follows the states of the running system, sample by sample.
 
@@ -358,8 +371,8 @@ class Model:
             after: what was measured until now; the states go on from its end. A filter begins at
                 its first sample from x = 0 and P0.
             x0: where they begin otherwise, in the model's coordinates. Default: 0.
-            P0: covariance of where a filter begins, variances, or one. Default: 1, as the states
-                of a model have about unit rms.
+            P0: covariance of where a filter begins, variances, or one. Default:
+                ``state_covariance``, the right one amid data like those of the fit.
 
         Raises:
             ValueError: neither K nor noise, covariances that are none, both a record and a state,
@@ -630,6 +643,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         K = weights.pop("K", None)
+        weights.setdefault("state_covariance", torch.eye(cell.nx))  # checkpoints of before
         cell.load_state_dict(weights)
         cell.free_feedthrough(
             z=description.get("z_feedthrough", True), y=description.get("feedthrough", True)

@@ -288,6 +288,13 @@ def theta(model: Model) -> Tensor:
     return parameters_to_vector(model.lfr.parameters()).detach()
 
 
+def unscaled(model: Model) -> Tensor:
+    """The weights that keep their bits when states are scaled."""
+    cell = model.lfr.cell
+    others = [p for name, p in cell.named_parameters() if name.startswith(("D", "static"))]
+    return torch.cat([p.detach().flatten() for p in (cell.A.diagonal(), *others)])
+
+
 def planted(T: int = 300, **sizes: Any) -> tuple[Model, list[Record], Record]:
     """A model some way off, a record from zero and one in steady state of the true one, a test."""
     truth, start = (random_model(random_cell(**sizes, radius=0.7)) for _ in range(2))

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from reference import measure, normal, random_cell, random_model
+from reference import measure, normal, random_cell, random_model, unscaled
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
@@ -265,7 +265,7 @@ def losing(ranks: Ranks) -> Any:
     try:
         ranks.sum(torch.ones(1))
     except ProcessLostError as error:
-        return theta(model), result, seconds, str(error)
+        return unscaled(model), result, seconds, str(error)
 
 
 def adam(ranks: Ranks) -> None:
@@ -397,7 +397,7 @@ def test_a_lost_process_ends_the_fit_with_the_best_model(folder: Path):
     assert again.startswith(Reason.PROCESS_LOST)
     assert result.iterations == 3
     assert seconds < 20
-    assert torch.equal(theta(load(folder / "model")), best)
+    assert torch.equal(unscaled(load(folder / "model")), best)
 
 
 # --- train.py -------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from reference import (
     MATRICES,
     POLES,
+    measure,
     normal,
     random_cell,
     random_model,
@@ -34,6 +35,7 @@ import lfrtorch
 from lfrtorch import NoiseCovariance
 from lfrtorch._support.types import Array
 from lfrtorch.engine.kalman_kernel import correct, propagate
+from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.model import Model
 
 pytestmark = pytest.mark.numeric
@@ -169,6 +171,32 @@ def test_errors_are_as_large_as_the_covariance_says(name: str):
         squares.append(e @ np.linalg.solve(observer.covariance, e))
     low, high = scipy.stats.chi2.ppf([1e-4, 1 - 1e-4], runs * nx) / runs
     assert low < np.mean(squares) < high
+
+
+def test_it_begins_with_the_covariance_of_the_states_in_the_data():
+    """Amid a record it knows the state after few samples, however large the states were."""
+    model = random_model(random_cell(1, 1, 2, 1, 1, 3), seed=1)
+    cell, far = model.lfr.cell, torch.tensor([30.0, 100.0], dtype=torch.float64)
+    with torch.no_grad():
+        cell.A.copy_(cell.A * far[:, None] / far)
+        for into, of in ((cell.Bu, cell.Cy), (cell.Bw, cell.Cz)):
+            into.mul_(far[:, None])
+            of.div_(far)
+    record = measure(model, 300)
+
+    def error_after_two_samples() -> float:
+        x = model.signals(record).x[0].numpy()
+        noise = NoiseCovariance(1e-6 * x.var(axis=0), 1e-4 * model.scaler.y_scale**2)
+        observer = model.observer(noise=noise)
+        assert np.allclose(observer.covariance, model.state_covariance)
+        for k in (100, 101):
+            observer.predict(record.u[k])
+            observer.update(record.y[k])
+        return float(np.abs((observer.state - x[102]) / x.std(axis=0)).max())
+
+    assert error_after_two_samples() > 0.1
+    scale_states(model, record)
+    assert error_after_two_samples() < 0.05
 
 
 def test_past_data_give_the_state_where_a_simulation_starts():

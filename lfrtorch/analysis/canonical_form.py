@@ -154,6 +154,8 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     }  # fmt: skip
     K = None if model.K is None else torch.as_tensor(X) @ model.K.double().cpu()
     same = replace(model, lfr=LFR(_cell(cell, made, slope, _inverse(Z), W)), K=K)
+    P = X @ model.state_covariance @ X.T
+    same.lfr.cell.state_covariance.copy_(torch.as_tensor(P))
     shares, bends = (part / max(part.sum(), 1e-300) for part in (power, bends))
     return Canonical(same, shares, bends, X, Z)
 

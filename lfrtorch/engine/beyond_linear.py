@@ -82,6 +82,7 @@ def folded(cell: LFRCell) -> LFRCell:
     found = LFRCell(*sizes, beyond.base, device=cell.A.device, dtype=cell.A.dtype)
     L, Z, W = beyond.slope, beyond.into, beyond.out
     Cz, Dzu, Bw, Dyw = Z @ cell.Cz, Z @ cell.Dzu, cell.Bw @ W, cell.Dyw @ W
+    found.state_covariance.copy_(cell.state_covariance)
     found.A.copy_(cell.A - Bw @ L @ Cz)
     found.Bu.copy_(cell.Bu - Bw @ L @ Dzu)
     found.Bw.copy_(Bw)

@@ -77,6 +77,9 @@ class LFRCell(nn.Module):
         self.Cz, self.Dzu = matrix(nz, nx), matrix(nz, nu)
         self.Cy, self.Dyu, self.Dyw = matrix(ny, nx), matrix(ny, nu), matrix(ny, nw)
         self.static = static
+        self.state_covariance: Tensor
+        """E x xᵀ (nx, nx) over the training data, about 0; before a fit 1."""
+        self.register_buffer("state_covariance", torch.eye(nx, device=device, dtype=dtype))
         self.structure = "free"
         """Of which blocks the model is made, see ``block_form``; a fit keeps to it."""
         self.past_outputs = 0

@@ -89,6 +89,6 @@ def _like(cell: LFRCell, nu: int) -> LFRCell:
     A = cell.A
     sizes = nu, cell.ny, cell.nx, cell.nz, cell.nw
     found = LFRCell(*sizes, deepcopy(cell.static), device=A.device, dtype=A.dtype)
-    for name in ("Cz", "Cy", "Dyw"):
+    for name in ("Cz", "Cy", "Dyw", "state_covariance"):
         getattr(found, name).copy_(getattr(cell, name))
     return found

@@ -70,10 +70,12 @@ def c_source(
         case SteadyGain(K=K):
             known["K"] = True
             known["arrays"].append(constant("K", "NX * NY", K))
-        case KalmanNoise(G=G):
+        case KalmanNoise(G=G, U=U):
             known["G"] = True
             known["arrays"].append("/* G times G transposed: covariance of y's and x's noise. */")
             known["arrays"].append(constant("G", "NG * NG", G))
+            known["arrays"].append("/* U0 times U0 transposed: covariance of x in the data. */")
+            known["arrays"].append(constant("U0", "NX * NX", U))
     inner = {"NZ": e.sizes["nz"], "NW": e.sizes["nw"]} if e.static else {}
     match e.static:
         case Layers():

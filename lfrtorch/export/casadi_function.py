@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from lfrtorch._support.optional import imported
 from lfrtorch.export.equations import Layers, Monomials, check_name, equations
 from lfrtorch.export.observer_equations import KalmanNoise, observer_equations
@@ -57,8 +59,9 @@ def casadi_observer(
 
     ``NAME_predict`` is (x, u) -> (y_hat). ``NAME_update`` is (x, u, y, missing) -> (x_next) with
     the gain K, and (x, u, y, missing, P) -> (x_next, P_next) of an extended Kalman filter. An
-    output is left out if its ``missing`` is 1; by default none is. The covariance is updated in
-    Joseph's form.
+    output is left out if its ``missing`` is 1; by default none is. A P that is left out, or NaN, is
+    the covariance of the states over the training data: where a filter begins. The covariance is
+    updated in Joseph's form.
 
     Args:
         model: what is exported.
@@ -98,7 +101,8 @@ def casadi_observer(
         assert found is not None
         made = [x_next + ca.mtimes(found.K, e)]
         return predict, ca.Function(f"{name}_update", given, made, names, ["x_next"])
-    P, joint = ca.SX.sym("P", nx, nx), found.G @ found.G.T
+    given.append(ca.SX.sym("P", nx, nx))
+    P, joint = ca.if_else(given[-1] < np.inf, given[-1], found.U @ found.U.T), found.G @ found.G.T
     Q, S, R = joint[ny:, ny:], joint[ny:, :ny], joint[:ny, :ny]
     # A missing output has a row of zeros in H, and noise of its own alone.
     known = ca.diag(1.0 - missing)
@@ -118,7 +122,8 @@ def casadi_observer(
     across = ca.mtimes([F, L, S.T])
     P_next = ca.mtimes([F, P_known, F.T]) + Q - ca.mtimes(from_e, S.T) - across - across.T
     made = [x_next, 0.5 * (P_next + P_next.T)]
-    update = ca.Function(f"{name}_update", [*given, P], made, [*names, "P"], ["x_next", "P_next"])
+    names, options = [*names, "P"], {"default_in": [0.0] * 4 + [np.nan]}
+    update = ca.Function(f"{name}_update", given, made, names, ["x_next", "P_next"], options)
     return predict, update
 
 

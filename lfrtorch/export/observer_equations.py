@@ -9,7 +9,7 @@ import numpy as np
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.export.equations import numbers
-from lfrtorch.extended_kalman_filter import NoiseCovariance
+from lfrtorch.extended_kalman_filter import NoiseCovariance, data_root
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import NO_OBSERVER, Model
 
@@ -23,9 +23,13 @@ class SteadyGain:
 
 @dataclass(frozen=True, eq=False)
 class KalmanNoise:
-    """G Gᵀ = [R Sᵀ; S Q], G: (ny + nx, ny + nx)."""
+    """G Gᵀ = [R Sᵀ; S Q], and U Uᵀ = P0, that of the states over the training data.
+
+    G: (ny + nx, ny + nx), U: (nx, nx).
+    """
 
     G: Array
+    U: Array
 
 
 def observer_equations(
@@ -40,7 +44,8 @@ def observer_equations(
         return None
     model = model.to_model() if isinstance(model, LinearModel) else model
     if isinstance(observer, NoiseCovariance):
-        return KalmanNoise(observer.root(model.lfr.cell.nx, model.lfr.cell.ny))
+        cell = model.lfr.cell
+        return KalmanNoise(observer.root(cell.nx, cell.ny), data_root(cell))
     if model.K is None:
         raise InputError(NO_OBSERVER)
     return SteadyGain(np.ascontiguousarray(numbers(model.K) / model.scaler.y_scale))

@@ -50,6 +50,7 @@ from lfrtorch.fitting.prediction import (
 )
 from lfrtorch.fitting.side_by_side import Together, any_of
 from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.fitting.trainer import (
     Fit,
     FitResult,
@@ -108,6 +109,11 @@ def fit(
 
     On a CPU each start is fitted on a thread of its own, as many at a time as torch has threads. On
     another device all go in step, their simulations and Jacobians computed together.
+
+    At the end the states are scaled to unit rms over the training records, of predictions if they
+    are fitted, and ``model.state_covariance`` is theirs. They keep their coordinates where a record
+    has a start state x0, which is given in these, or where a matrix is frozen
+    (``requires_grad_(False)``).
 
     Several processes share the starts, if each has one up to the last round or there are fewer
     records than processes; else they share the records, and fit one start after another. Starts
@@ -324,6 +330,9 @@ def _fitted(
         mean, count = judge.mean(best)
         if mean is not None:
             result = replace(result, model=mean, averaged=count, members=tuple(best[:count]))
+    given = any(record.start == "given" for record in (*train, *unseen))
+    for model in (result.model, *result.members):
+        scale_states(model, train, keep_coordinates=given)
     return replace(result, seconds=time.perf_counter() - clock)
 
 

@@ -210,7 +210,7 @@ class Checkpoint:
         >>> from lfrtorch.reporting.monitor import Checkpoint
         >>> keep, trainer = Checkpoint("best", every=0), lfrtorch.LevenbergMarquardt(max_iter=5)
         >>> result = lfrtorch.fit(model, record, trainer=trainer, monitors=[keep])
-        >>> np.array_equal(lfrtorch.load("best").simulate(record), model.simulate(record))
+        >>> np.allclose(lfrtorch.load("best").simulate(record), model.simulate(record))
         True
     """
 

@@ -251,6 +251,17 @@ def test_weights_of_before_have_no_digest(saved: Path):
     assert np.array_equal(load(saved).simulate(U), small().simulate(U))
 
 
+def test_the_covariance_of_the_states_comes_back_and_was_1_before(tmp_path: Path):
+    model = small()
+    P = model.state_covariance + 0.5
+    model.lfr.cell.state_covariance.copy_(torch.tensor(P))
+    folder = model.save(tmp_path / "saved")
+    assert np.array_equal(load(folder).state_covariance, P)
+    file = folder / "weights.safetensors"
+    save_file({k: t for k, t in load_file(file).items() if k != "state_covariance"}, file)
+    assert np.array_equal(load(folder).state_covariance, P - 0.5)
+
+
 @pytest.mark.parametrize("name", ["model.json", "weights.safetensors"])
 def test_a_file_that_no_memory_holds(saved: Path, name: str):
     os.truncate(saved / name, 10**13)

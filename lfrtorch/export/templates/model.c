@@ -196,8 +196,7 @@ void {{ name }}_observer_reset({{ name }}_observer *observer)
     static const {{ name }}_observer zero;
     *observer = zero;
 {% if G %}
-    for (int i = 0; i < NX; i++)
-        observer->U[i * NX + i] = 1.0;
+    copy(observer->U, U0, NX * NX);
 {% endif %}
 }
 

@@ -34,7 +34,8 @@ typedef struct {
     double u[{{ NAME }}_NU], y_hat[{{ NAME }}_NY]; /* of the last call of predict */
 } {{ name }}_observer;
 
-/* The state to start from: x = 0{% if G %}, with the covariance 1{% endif %}. */
+/* The state to start from: x = 0{% if G %}, with the covariance that the states have in the
+ * data of the fit{% endif %}. */
 void {{ name }}_observer_reset({{ name }}_observer *observer);
 
 /* The output at this sample, y_hat, from the input now and all samples before. */

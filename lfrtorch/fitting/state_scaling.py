@@ -1,0 +1,71 @@
+"""States of unit rms over the training data: the coordinates in which a fit leaves a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lfrtorch.model import Model
+from lfrtorch.records import Record, as_records
+
+ROUNDING = 1e-9
+"""Distance of an rms from 1 that may be rounding alone."""
+
+
+def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tensor, "nx nx"]:
+    """E x xᵀ of the simulated states over all samples of records, about 0, in float64.
+
+    Example:
+        >>> from lfrtorch.fitting.state_scaling import state_moment
+        >>> state_moment(model, record).shape
+        torch.Size([1, 1])
+    """
+    nx, samples = model.lfr.cell.nx, 0
+    total = torch.zeros(nx, nx, dtype=torch.float64)
+    for record in as_records(records):
+        x = model.signals(record).x[0].double()
+        total, samples = total + x.mT @ x, samples + len(x)
+    return (total + total.mT) / (2 * samples)
+
+
+@torch.no_grad()
+def scale_states(
+    model: Model, records: Record | Sequence[Record], *, keep_coordinates: bool = False
+) -> None:
+    """Give a model states of unit rms over records, in place, and note their covariance there.
+
+    The covariance is E x xᵀ about 0: an observer or a simulation that begins at x = 0 amid such
+    data is wrong by so much. The coordinates change by a diagonal matrix. So zeros of A stay zeros,
+    and its diagonal keeps its bits: an exact integrator stays one, and P of a proof that the model
+    contracts becomes another P. A state that never moves stays as it is, and all do if one of their
+    matrices is frozen. Of a model that diverges on the records they stay, and the covariance is 1.
+
+    Args:
+        model: a predictor has the states that the measured outputs correct.
+        records: the data.
+        keep_coordinates: whether the covariance alone is noted, as start states are given in the
+            coordinates that the model has.
+
+    Example:
+        >>> from lfrtorch.fitting.state_scaling import scale_states, state_moment
+        >>> scale_states(model, record)
+        >>> np.allclose(state_moment(model, record), model.state_covariance)
+        True
+    """
+    cell, moment = model.lfr.cell, state_moment(model, records)
+    if not torch.isfinite(moment).all():
+        moment = torch.eye(cell.nx, dtype=torch.float64)
+    rms = moment.diagonal().sqrt()
+    into, of = (cell.Bu, cell.Bw), (cell.Cz, cell.Cy)
+    if keep_coordinates or not all(weight.requires_grad for weight in (cell.A, *into, *of)):
+        rms = torch.ones_like(rms)
+    rms = torch.where((rms == 0) | ((rms - 1.0).abs() < ROUNDING), 1.0, rms)
+    cell.state_covariance.copy_(moment / torch.outer(rms, rms))
+    cell.A.mul_((rms / rms[:, None]).to(cell.A))
+    for weight in into:
+        weight.div_(rms[:, None].to(weight))
+    for weight in of:
+        weight.mul_(rms.to(weight))
