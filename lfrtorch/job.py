@@ -138,6 +138,7 @@ def _identified(
                 f"nx: {settings.nx}, as the NL-LFR makes use of {more} states than the linear model"
             )
             linear = estimate_bla(approximated, cast(int, settings.nx), **settings.linear)
+            tell(linear, observer)
             dataset = windowed(whole, linear.to_model(), observer, dataset.notes)
     models = starting_models(dataset.train, settings, linear)
     shrunk = None if sizes is None else sizes.chosen.model
@@ -246,7 +247,7 @@ def scored_run(
     if settings.noise != "output":
         judged = respond(result.model, linear, dataset, test_linear, refitted=last, ahead=True)
         error = "prediction error"
-    verdict = judge(result, judged, error=error)
+    verdict = judge(result, judged, linear_nx=linear.nx, error=error)
     residuals = worst_residuals(judged)
     found = evidence(
         result,
@@ -314,6 +315,12 @@ def linear_model(
         linear = scan.models[scan.orders.index(chosen)]
     else:
         linear = estimate_bla(data, cast(int, settings.nx), **settings.linear)
+    tell(linear, observer)
+    return linear, scan
+
+
+def tell(linear: LinearModel, observer: Observer) -> None:
+    """Say what a linear model is."""
     found = linear.fit
     assert found is not None
     observer.say(
@@ -322,7 +329,6 @@ def linear_model(
     )
     for note in found.notes:
         observer.say(f"note: {note}")
-    return linear, scan
 
 
 def linear_records(

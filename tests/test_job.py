@@ -87,12 +87,19 @@ def test_chosen_sizes_are_returned_and_what_was_asked_for_stays(dataset: Dataset
     asked = settings(
         nx="auto", nx_max=2, nn="auto", starts=1, sizes_search=SizesSearch(nn=(1, 3), starts=1)
     )
-    run = identify(dataset, asked)
+    observer = Said()
+    run = identify(dataset, asked, observer=observer)
     assert (asked.nx, asked.nn) == ("auto", "auto")
     assert run.order_scan is not None
     assert run.size_search is not None
     assert run.settings.sizes == run.model.sizes
     assert run.settings.nx == run.linear.nx >= run.order_scan.chosen
+    # All say which linear model is beside it: that of the scan, or of more states.
+    nx = run.linear.nx
+    assert [text for text in observer.texts if "BLA:" in text][-1].startswith(f"BLA: order {nx}")
+    assert f"the linear model (nx {nx}): " in run.verdict.text
+    assert f"  linear (nx {nx})  " in str(run)
+    assert run.metrics["lti_nx"] == nx
     chosen = run.size_search.chosen
     assert (run.settings.nn, run.settings.seed) == (chosen.sizes["nn"], chosen.seed)
     # The fit goes the way of the model that was chosen.

@@ -42,6 +42,7 @@ from lfrtorch.reporting.scores import (
     NOT_SCORED,
     REFITTED,
     finalists,
+    linear_name,
     neurons,
     of_samples,
     own_linear,
@@ -200,7 +201,7 @@ def _scores(
     outputs = responses[0].record.outputs
     several, units = len(outputs) > 1, any(channel.unit for channel in outputs)
     what = [*["output"] * several, *["unit"] * (several and units)]
-    errors = ["linear", "NL-LFR", "ratio", "linear NRMSE", "NRMSE"]
+    errors = [linear_name(metrics), "NL-LFR", "ratio", "linear NRMSE", "NRMSE"]
     tests, others = [], []
     for (use, name), scored in _scored(dataset, responses).items():
         for row, (channel, unit, of) in enumerate(_channels(scored[0])):

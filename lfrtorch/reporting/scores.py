@@ -230,6 +230,7 @@ def evaluation(
         "sizes": model.sizes,
         "parameters": model.parameter_count,
         "parameters_net": model.net_parameter_count,
+        "lti_nx": None if bla is None else bla.nx,
         "data": {"noise_rms": dataset.noise_rms, "notes": list(dataset.notes)},
         "validation": {
             "rmse": _pooled([s.rmse for s in validation], validation),
@@ -329,7 +330,8 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
         [s[model] for _, s in listed for model in models], unit_of(result), published_unit(others)
     )
     others = [p for p in others if tested & p.scores.keys()]
-    head = ["record", "use", *["source"] * sources, "scored", *["linear", "NL-LFR"][: len(models)]]
+    ours = [linear_name(result), "NL-LFR"] if sizes["nz"] else ["linear"]
+    head = ["record", "use", *["source"] * sources, "scored", *ours]
     head += [p.label for p in others]
     rows = [
         [
@@ -371,6 +373,12 @@ def lines(
             errors = {of: values[i] if values else None for of, values in each.items()}
             found.append((f"{name} {output}", errors))
     return found
+
+
+def linear_name(result: Mapping[str, Any]) -> str:
+    """The linear model with its order, which may differ from run to run."""
+    nx = result["lti_nx"]
+    return "linear" if nx is None else f"linear (nx {nx})"
 
 
 def own_linear(result: Mapping[str, Any]) -> str:

@@ -149,7 +149,9 @@ class _Errors(NamedTuple):
     power: float
 
 
-def judge(result: FitResult, responses: Sequence[Response], *, error: str = "error") -> Verdict:
+def judge(
+    result: FitResult, responses: Sequence[Response], *, linear_nx: int, error: str = "error"
+) -> Verdict:
     """The verdict on a fit, from all records beside their simulations.
 
     Every record that was not fitted is looked at: one on which the NL-LFR is clearly worse is
@@ -159,6 +161,7 @@ def judge(result: FitResult, responses: Sequence[Response], *, error: str = "err
     Args:
         result: the fit.
         responses: see :func:`lfrtorch.reporting.simulations.respond`.
+        linear_nx: order of the linear model, which the sentence names.
         error: what it is called, for example ``"prediction error"``.
     """
     lost = [r for r in responses if not np.isfinite(rms(r.error))]
@@ -171,52 +174,52 @@ def judge(result: FitResult, responses: Sequence[Response], *, error: str = "err
     evidence = {} if whole is None else _numbers(whole)
     evidence |= {"records": [_numbers(c) for c in every], "diverges": [_name(r) for r in lost]}
     worst = max((c for c in every if c.worse), key=lambda c: c.ratio, default=None)
+    linear = f"the linear model (nx {linear_nx})"
 
     if lost or (failed and result.chosen_iteration == 0):
         what = f"diverges on {_names(lost)}" if lost else f"was not trained: {result.reason}"
         kind, use, text = Kind.DIVERGES, LINEAR_MODEL, f"The NL-LFR {what}"
         if lost and all(nrmse(r.record, r.y_linear) >= EXPLAINS_NOTHING for r in lost):
-            text += ", where the linear model explains nothing, either"
+            text += f", where {linear} explains nothing, either"
             return Verdict(kind, f"{text}: neither is usable.", NEITHER, evidence)
     elif worst is not None:
         kind, use = Kind.WORSE, LINEAR_MODEL
         text = (
-            f"Worse than the linear model: on {worst.name} the NL-LFR's {error} is "
-            f"{of_linear(worst.ratio)}"
+            f"Worse than {linear}: on {worst.name} the NL-LFR's {error} is "
+            f"{number(worst.ratio)} times as large"
         )
     elif whole is None:
         kind, use, text = Kind.UNJUDGED, NL_LFR, f"Not judged: no record has {BLOCKS} samples"
     elif not held_out:
         kind, use = Kind.UNJUDGED, NL_LFR if whole.ratio < 1.0 - SAME else LINEAR_MODEL
         text = (
-            f"Not judged, as nothing was held out: on {whole.name} the {error} is "
-            f"{of_linear(whole.ratio)}"
+            f"Not judged (nothing held out): on {whole.name} the {error} is "
+            f"{of_linear(whole.ratio)} (nx {linear_nx})"
         )
     elif whole.better:
         kind, use = Kind.BETTER, NL_LFR
         text = (
-            f"Better than the linear model: on {whole.name} the NL-LFR's {error} is "
+            f"Better than {linear}: on {whole.name} the NL-LFR's {error} is "
             f"{of_linear(whole.ratio)}"
         )
     elif abs(whole.ratio - 1.0) + whole.ratio_std < EQUAL:
         kind, use = Kind.LINEAR, LINEAR_MODEL
         kept = "the fit kept its start, and " * (result.chosen_iteration == 0)
-        text = f"As the linear model: {kept}on {whole.name} the errors are the same"
+        text = f"As {linear}: {kept}on {whole.name} the errors are the same"
     else:
         kind, use = Kind.LINEAR, LINEAR_MODEL
         clearly = "clearly " * (whole.ratio < 1.0 - SAME)
         text = (
-            f"Not {clearly}better than the linear model: on {whole.name} the {error} is "
-            f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of the linear "
-            "model's"
+            f"Not {clearly}better than {linear}: on {whole.name} the {error} is "
+            f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of its"
         )
     if whole is not None and held_out:
         used = whole.nrmse if use == NL_LFR else whole.linear_nrmse
         if used >= EXPLAINS_NOTHING:
             text = (
                 f"Neither model is usable: on {whole.name} the output's errors are "
-                f"{percent(whole.nrmse)} (NL-LFR) and {percent(whole.linear_nrmse)} (linear) "
-                "of its deviation"
+                f"{percent(whole.nrmse)} (NL-LFR) and {percent(whole.linear_nrmse)} (linear, nx "
+                f"{linear_nx}) of its deviation"
             )
             return Verdict(kind, f"{text}.", NEITHER, evidence)
     advice = "; use the linear model" if use == LINEAR_MODEL else ""

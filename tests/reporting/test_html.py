@@ -91,7 +91,8 @@ class Run:
         views = {record.name: {"near": "a close-up"} for record in self.dataset.tests}
         html = html_report.render(
             metrics, self.result, self.bla, self.dataset, self.responses, images,
-            judge(self.result, self.responses), advice, views=views, **options,
+            judge(self.result, self.responses, linear_nx=self.bla.nx), advice, views=views,
+            **options,
         )  # fmt: skip
         return Page(html)
 
@@ -304,7 +305,7 @@ def test_a_linear_model_alone_is_shown(single: Run):
     single.bla.write(cell, single.result.model.scaler)
     result = replace(single.result, model=replace(single.result.model, lfr=LFR(cell)))
     page = Run(result, single.bla, single.dataset).page()
-    assert "As the linear model: " in page.text
+    assert "As the linear model (nx 2): " in page.text
     assert "verdict amber" in page.classes
     assert "checkpoint=RUN/linear" in page.text
     assert "9 parameters, 5 without" in page.text

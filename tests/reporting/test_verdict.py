@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 from lfrtorch._support.reasons import Reason
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.records import Record
+from lfrtorch.reporting import verdict
 from lfrtorch.reporting.simulations import Response
-from lfrtorch.reporting.verdict import Kind, Verdict, judge
+from lfrtorch.reporting.verdict import Kind, Verdict
 
+judge = partial(verdict.judge, linear_nx=2)
 LONG = "a_measurement_with_a_name_that_is_longer_than_any_line_of_a_terminal" * 2
 
 
@@ -46,7 +49,7 @@ BURST = np.where(np.arange(1000) // 20 == 30, 25.0, 0.2)
          [response("test", 0.5, name="a"), response("test", 0.8, name="b")]),
         ("better", "NL-LFR", "green", "on validation", [response("validation", 0.5)]),
         # Better on validation, which chose the iterate, and not on the test.
-        ("linear", "linear model", "amber", "As the linear model: on test the errors are the same",
+        ("linear", "linear model", "amber", "As the linear model (nx 2): on test the errors are",
          [response("validation", 0.5), response("test", 1.0)]),
         # Better by less than what is worth a choice, and worse by as little.
         ("linear", "linear model", "amber", "use the linear model", [response("test", 0.97)]),
@@ -62,7 +65,7 @@ BURST = np.where(np.arange(1000) // 20 == 30, 25.0, 0.2)
         ("diverges", "neither", "red", "neither is usable", [response("test", np.nan, linear=2.0)]),
         ("better", "neither", "red", "Neither model is usable", [response("test", 0.7, linear=3)]),
         ("linear", "neither", "red", "Neither model is usable", [response("test", 1.0, linear=2)]),
-        ("unjudged", "NL-LFR", "grey", "nothing was held out", []),
+        ("unjudged", "NL-LFR", "grey", "nothing held out", []),
     ],
 )  # fmt: skip
 def test_records_that_were_not_fitted_make_the_verdict(kind, use, colour, said, others):
@@ -148,7 +151,8 @@ def test_outputs_that_rest_are_no_error():
 def test_a_verdict_is_one_line(part: float, linear: float, use: str):
     many = [response(use, part, name=LONG, linear=linear)] * 12
     for responses in (many[:1], many):
-        found: Verdict = judge(result(), responses)
+        found: Verdict = judge(result(), responses, linear_nx=12, error="prediction error")
+        assert "nx 12" in found.text or found.kind == Kind.DIVERGES
         assert len(found.text) <= 160
         assert found.text.endswith(".")
         assert str(found) == found.text
