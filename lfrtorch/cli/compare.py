@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lfrtorch._support.errors import InputError, LfrtorchError
+from lfrtorch._support.errors import InputError, LfrtorchError, brief
 from lfrtorch._support.paths import real
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
     from lfrtorch.records import Record
+    from lfrtorch.reporting.comparison import Comparison
 
 ABOUT = """Compare runs: a table on the terminal, and comparison.html, .md and .csv.
 
@@ -32,8 +31,9 @@ All runs in the folders, and in those below them, that came to their end are rea
 data have tables of their own.
 
   out=DIR   folder of the files. Default: the one that all folders that are given lie in
-  +bench=NAME or data=file data.path=FILE ..   as in lfrtorch fit: the page shows the first
-            validation record, or the first test if there is none, simulated by the best models
+  +bench=NAME or data=file data.path=FILE ..   as in lfrtorch fit. The page shows the first
+            validation record, or the first test if there is none, simulated by the best models.
+            Default: the data of the best run
 """
 
 
@@ -74,13 +74,23 @@ def chosen(words: Sequence[str]) -> Record | None:
     return one_record(composed("evaluate", [quoted(word) for word in words]))
 
 
-def of_study(cfg: DictConfig) -> Record | None:
-    """The record of the data that the runs share; None if these cannot be read any more."""
+def of_best_run(compared: Comparison) -> Record | None:
+    """The record of the data of the best run; None of Python's runs, and if it is not there now."""
+    from lfrtorch.cli.composition import composed
     from lfrtorch.cli.config import one_record
+    from lfrtorch.cli.quotes import quoted
+    from lfrtorch.cli.run_folder import OVERRIDES, words_of
 
+    folder = compared.runs[0].folder
+    if not (folder / OVERRIDES).is_file():
+        return None
     try:
-        return one_record(cfg)
-    except (LfrtorchError, OSError):
+        return one_record(composed("config", [quoted(word) for word in words_of(folder)]))
+    except (LfrtorchError, OSError) as error:
+        print(
+            f"note: the data of '{folder}' cannot be read ({brief(error)}), so the page shows no "
+            "record; words of lfrtorch fit choose other data: data=file data.path=FILE\n"
+        )
         return None
 
 
@@ -90,7 +100,7 @@ def run(folders: list[Path], out: str | Path | None = None, record: Record | Non
     Args:
         folders: of the runs, or with runs in them.
         out: of the files. Default: the folder that all lie in.
-        record: that the best models simulate on the page.
+        record: that the best models simulate on the page. Default: that of the best run's data.
     """
     from lfrtorch.reporting import comparison
 
@@ -101,6 +111,7 @@ def run(folders: list[Path], out: str | Path | None = None, record: Record | Non
         raise InputError("no folder is given; give those of runs.")
     found = comparison.compare(folders)
     target = Path(os.path.commonpath([real(path) for path in folders]) if out is None else out)
-    comparison.write(found, target, record)
+    records = {one.name: record or of_best_run(one) for one in found}
+    comparison.write(found, target, records)
     print("\n\n".join(map(str, found)))
     print(f"\nFigures and all runs: {target / 'comparison.html'}, comparison.md and comparison.csv")

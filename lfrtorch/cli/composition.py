@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from difflib import get_close_matches
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
@@ -124,7 +126,8 @@ def first_run(word: Override) -> str:
 def composed(command: str, words: Sequence[str] = ()) -> DictConfig:
     """The configuration; where Hydra cannot make one, the first line of its reason."""
     try:
-        with initialize_config_dir(**COMPOSED, config_dir=str(CONF)):
+        within = GlobalHydra.instance().is_initialized()  # a command of Hydra, at its end
+        with nullcontext() if within else initialize_config_dir(**COMPOSED, config_dir=str(CONF)):
             cfg = compose(command, list(words))
             OmegaConf.to_container(cfg, resolve=True)  # a name that stands for nothing is an error
             return cfg

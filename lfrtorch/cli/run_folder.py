@@ -28,6 +28,9 @@ CONFIG, SNAPSHOTS, STARTS = "config.yaml", "resume", "starts"
 """In the folder of a run: its settings, its starts as far as they came, and events of those that go
 to the end."""
 
+OVERRIDES = Path(".hydra", "overrides.yaml")
+"""There, too: the words of its command line."""
+
 
 def arguments(given: Sequence[str]) -> list[str]:
     """The command line with the settings of the run in ``resume=DIR``, if there is one, before it.
@@ -38,9 +41,9 @@ def arguments(given: Sequence[str]) -> list[str]:
     values = dict(argument.split("=", 1) for argument in given if "=" in argument)
     folder = values.get("resume", "null")
     if folder != "null":
-        overrides = expanded(Path(folder) / ".hydra" / "overrides.yaml")
+        overrides = expanded(Path(folder) / OVERRIDES)
         if not overrides.is_file():
-            found = (Path(folder).glob(f"{at}/.hydra/overrides.yaml") for at in ("*", "*/*"))
+            found = (Path(folder).glob(f"{at}/{OVERRIDES}") for at in ("*", "*/*"))
             runs = sorted(str(path.parents[1]) for paths in found for path in paths)
             raise InputError(
                 f"resume is '{folder}', which is not the folder of a run; give "
@@ -50,23 +53,36 @@ def arguments(given: Sequence[str]) -> list[str]:
                     else "the folder that the run named at its end, runs/NAME/DATE."
                 )
             )
-        listed = read_settings(overrides)
-        if not (isinstance(listed, list) and all(isinstance(word, str) for word in listed)):
-            raise InputError(f"'{overrides}' is damaged: it is no list of words; begin a new run.")
-        for word in listed:
-            if ("_target_" in word or word.lstrip("+~").startswith("hydra")) and word not in given:
-                raise InputError(
-                    f"the run in '{folder}' names code: {brief(word)}; add that word to the "
-                    "command line if you know where the run comes from."
-                )
-        before = [now(word) for word in listed]
-        before = [w for w in before if not (w.startswith("resume=") or w in given)]
+        before = [word for word in words_of(folder, given) if word not in given]
         escaped = folder.replace("\\", "\\\\").replace("'", "\\'")
         return [*before, *given, f"hydra.run.dir='{escaped}'"]
     for word in given:
         if now(word) != word:
             raise InputError(f"{word} is called {now(word)} now.")
     return list(given)
+
+
+def words_of(folder: str | Path, given: Sequence[str] = ()) -> list[str]:
+    """The words that made the run in a folder, by their present names.
+
+    Args:
+        folder: of the run.
+        given: words that may name code, as the user knows them.
+
+    Raises:
+        ValueError: no list of words, or one that names code.
+    """
+    overrides = expanded(Path(folder) / OVERRIDES)
+    listed = read_settings(overrides)
+    if not (isinstance(listed, list) and all(isinstance(word, str) for word in listed)):
+        raise InputError(f"'{overrides}' is damaged: it is no list of words; begin a new run.")
+    for word in listed:
+        if ("_target_" in word or word.lstrip("+~").startswith("hydra")) and word not in given:
+            raise InputError(
+                f"the run in '{folder}' names code: {brief(word)}; add that word to the "
+                "command line if you know where the run comes from."
+            )
+    return [now(word) for word in listed if not word.startswith("resume=")]
 
 
 def read_settings(path: Path) -> Any:

@@ -347,13 +347,11 @@ def report(folder: Path, number: int, least: int) -> Monitor:
 def show(found: Plan, study: Study) -> None:
     """Print the runs and the best one, or those of the front."""
     from lfrtorch.cli import compare
-    from lfrtorch.cli.composition import composed
 
     states = Counter(trial.state.name for trial in study.trials)
     if states["COMPLETE"]:
         print()
-        record = compare.of_study(composed("config", found.fixed))
-        compare.run([found.folder], record=record)
+        compare.run([found.folder])
     failed = sum(FAILED in trial.user_attrs for trial in study.trials)
     print(f"\n{states['COMPLETE']} runs, {states['PRUNED']} pruned, {failed} failed")
     for trial in study.best_trials:

@@ -299,7 +299,7 @@ class Report(Callback):
             if ended:
                 print()
                 with user_errors():
-                    compare.run([folder], record=compare.of_study(config))
+                    compare.run([folder])
         finally:  # Hydra would make a warning of an error, and exit with 0
             print(f"\n{ended} of {len(runs)} runs in {folder} are done")
             if failed:

@@ -66,7 +66,7 @@ class Compared:
         parameters: that the data can tell apart.
         error: RMSE on the validation records, nan if there are none.
         tests: RMSE of each test.
-        linear: of the linear model on the validation records.
+        linear, linear_nx: error there and order of the linear model, if that is known.
         unit: of the errors, empty if they have several.
         seconds: that the fit took.
         outcome: how it ended.
@@ -79,6 +79,7 @@ class Compared:
     error: float
     tests: Mapping[str, float]
     linear: float
+    linear_nx: int | None
     unit: str
     seconds: float
     outcome: str
@@ -177,7 +178,7 @@ class Comparison:
         best = {label: runs[0] for label, runs in self.settings.items()}
         best = best or {self._name(run): run for run in self.runs}
         found: dict[str, Array] = {}
-        y_linear = None
+        linear: dict[str, Array] = {}
         for label, run in sorted(best.items(), key=lambda one: _worst_last(one[1].error)):
             if len(found) == len(COLOURS):
                 break
@@ -187,11 +188,12 @@ class Comparison:
                 if not found and is_open(record):
                     record = settled(model, [record], [])[0][0]
                 found[label] = model.simulate(record)
-                if y_linear is None and (run.folder / "linear").is_dir():
-                    y_linear = LinearModel.load(run.folder).simulate(record)
+                if not linear and (run.folder / "linear").is_dir():
+                    bla = LinearModel.load(run.folder)
+                    linear[f"linear (nx {bla.nx})"] = bla.simulate(record)
             except (InputError, OSError, IndexError):
                 continue
-        return side_by_side(record, found, y_linear) if found else None
+        return side_by_side(record, found, linear) if found else None
 
     def figures(self, record: Record | None = None) -> dict[str, Figure]:
         """Errors against parameters and time, and boxes of each setting, by name.
@@ -326,14 +328,17 @@ def compare(folders: Sequence[str | Path]) -> list[Comparison]:
 
 
 def write(
-    comparisons: Sequence[Comparison], folder: str | Path, record: Record | None = None
+    comparisons: Sequence[Comparison],
+    folder: str | Path,
+    records: Mapping[str, Record | None] | None = None,
 ) -> None:
     """Write ``comparison.html``, ``comparison.md`` and ``comparison.csv`` with all runs.
 
     Args:
         comparisons: see :func:`compare`.
         folder: of the files; those of an earlier comparison are replaced.
-        record: that the page shows, simulated by the best models. Default: none.
+        records: that the page shows, simulated by the best models, by the names of the data.
+            Default: none.
 
     Example:
         >>> from lfrtorch.reporting import comparison
@@ -341,11 +346,12 @@ def write(
         >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=1)
         >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(nx=1, nz=1, nn=4, trainer=trainer))
         >>> lfrtorch.reporting.write(run, "study/one", draw=False)
-        >>> comparison.write(comparison.compare(["study"]), "study", record[200:])
+        >>> comparison.write(comparison.compare(["study"]), "study", {"mine": record[200:]})
     """
-    images, parts = {}, []
+    images, parts, records = {}, [], records or {}
     for number, one in enumerate(comparisons):
-        drawn = {f"{number}_{name}": plots.png(f) for name, f in one.figures(record).items()}
+        figures = one.figures(records.get(one.name))
+        drawn = {f"{number}_{name}": plots.png(figure) for name, figure in figures.items()}
         images |= drawn
         parts.append(
             {
@@ -381,11 +387,13 @@ def _read(path: Path) -> Compared:
             error=_float(judged["rmse"]),
             tests={name: _float(score["rmse"]) for name, score in found["scores"].items()},
             linear=_float(judged["lti_rmse"]),
+            linear_nx=found.get("lti_nx"),
             unit=unit_of(found),
             seconds=_float(found["fit"]["seconds"]),
             outcome=found["fit"]["reason"],
         )
         numbers = (run.parameters, run.error, run.linear, run.seconds, *run.tests.values())
+        numbers += (run.linear_nx or 0,)
         texts = (run.dataset, run.unit, run.outcome)
         if not all(isinstance(number, int | float) for number in numbers):
             raise TypeError("a number is none")
@@ -431,7 +439,7 @@ def _csv(comparisons: Sequence[Comparison]) -> str:
     tests = list(dict.fromkeys(n for one in comparisons for run in one.runs for n in run.tests))
     stream = io.StringIO()
     file = csv.writer(stream, lineterminator="\n")
-    fields = ["parameters", "error", "linear", "unit", "seconds", "outcome"]
+    fields = ["parameters", "error", "linear", "linear_nx", "unit", "seconds", "outcome"]
     file.writerow(["folder", "dataset", *names, *fields, *(f"test {name}" for name in tests)])
     for one in comparisons:
         for run in one.runs:

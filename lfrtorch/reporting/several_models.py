@@ -38,7 +38,7 @@ def short(label: str) -> str:
 
 
 def side_by_side(
-    record: Record, simulated: Mapping[str, Array], y_linear: Array | None = None
+    record: Record, simulated: Mapping[str, Array], linear: Mapping[str, Array] | None = None
 ) -> Figure:
     """Each output about the largest error of the first model, and power spectral densities of the
     errors. The legend has the fit of each model to all scored samples, 100 % - NRMSE.
@@ -46,24 +46,24 @@ def side_by_side(
     Args:
         record: the measurement.
         simulated: outputs in physical units, by the names of their models. Five are drawn.
-        y_linear: of the linear model.
+        linear: the same of linear models.
 
     Shape:
-        simulated, y_linear: (T, ny).
+        simulated, linear: (T, ny) each.
 
     Example:
         >>> from lfrtorch.reporting import several_models
         >>> simulated = {"4 neurons": model.simulate(record), "damped": 0.9 * record.y}
-        >>> figure = several_models.side_by_side(record, simulated, bla.simulate(record))
+        >>> linear = {"linear": bla.simulate(record)}
+        >>> figure = several_models.side_by_side(record, simulated, linear)
         >>> [line.get_label() for line in figure.axes[1].lines]
         ['output', 'linear', '4 neurons', 'damped']
     """
-    models = [
+    models = [(name, y, LINEAR, "--") for name, y in (linear or {}).items()]
+    models += [
         (name, y, colour, "-")
         for (name, y), colour in zip(simulated.items(), COLOURS, strict=False)
     ]
-    if y_linear is not None:
-        models.insert(0, ("linear", y_linear, LINEAR, "--"))
     ny = len(record.outputs)
     figure = Figure(figsize=(SIZE[0], SIZE[1] * ny), layout="constrained")
     axes = figure.subplots(ny, 2, squeeze=False, sharex="col", width_ratios=[3, 2])

@@ -70,7 +70,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return math.nan if cfg.nn == 3 else 1.0 + abs(cfg.nn - 7)
 
     monkeypatch.setattr(study, "job", job)
-    monkeypatch.setattr(compare, "run", lambda folders, record: None)
+    monkeypatch.setattr(compare, "run", lambda folders: None)
     return made
 
 

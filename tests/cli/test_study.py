@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,7 +21,7 @@ import torch
 from command_line import ROOT, file_overrides, launched
 from omegaconf import DictConfig, OmegaConf
 
-from lfrtorch.cli import study
+from lfrtorch.cli import compare, study
 
 HYDRA = OmegaConf.create({
     "overrides": {"task": ["nn=2", "seed=0"]},
@@ -172,9 +173,14 @@ def test_runs_follow_each_other(
     run = tmp_path / "nn=2"
     assert (run / "model").is_dir()
     assert "NL-LFR" in (run / study.LOG).read_text()
-    with pytest.raises(SystemExit):
-        launched(monkeypatch, *words)
+    pages = []
+    for again in (partial(launched, monkeypatch, *words), partial(compare.run, [tmp_path])):
+        with suppress(SystemExit):
+            again()
+        pages.append((tmp_path / "comparison.html").read_text())
     assert "nn=2: done before" in capfd.readouterr().out
+    assert "Best models on one record" in pages[0]
+    assert pages[1] == pages[0]
 
 
 @pytest.mark.slow

@@ -87,6 +87,26 @@ def test_data_words_choose_the_record_that_is_simulated(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (["data._target_=os.getcwd"], "names code"),
+        (["data=file", "data.path=gone.csv"], "gone.csv"),
+    ],
+)
+def test_data_that_are_gone_or_that_a_folder_makes_by_code_are_not_shown(
+    study: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+):
+    best = study / "nn=10,seed=0" / ".hydra"
+    best.mkdir()
+    (best / "overrides.yaml").write_text(json.dumps(words))
+    command.run([study])
+    printed = capsys.readouterr().out
+    assert said in printed
+    assert "the page shows no record" in printed
+    assert (study / "comparison.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
         (["none"], "no folder"),
         (["."], "no run came to its end"),
         ([".", "nm=3"], "no setting 'nm'"),

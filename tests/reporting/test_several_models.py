@@ -24,7 +24,9 @@ def shown(figure: Any) -> list[list[str]]:
 
 def test_each_output_has_a_row_and_a_model_that_diverges_no_spectrum():
     y = {"good": 0.9 * RECORD.y, "bad": np.full_like(RECORD.y, np.nan)}
-    in_time, spectrum, *second = shown(several_models.side_by_side(RECORD, y, 0.5 * RECORD.y))
+    in_time, spectrum, *second = shown(
+        several_models.side_by_side(RECORD, y, {"linear": 0.5 * RECORD.y})
+    )
     assert in_time == ["measured", "linear, fit 50.0 %", "good, fit 90.0 %", "bad, diverges"]
     assert spectrum == ["output", "linear", "good"]
     assert [len(second[0]), second[1]] == [4, spectrum]
@@ -57,7 +59,7 @@ def test_the_best_run_of_each_setting_simulates_the_record(runs: Path):
     ]
     in_time, _ = shown(figure)
     assert in_time[0] == "measured"
-    assert in_time[1].startswith("linear, ")
+    assert in_time[1].startswith("linear (nx 1), ")
     assert in_time[2:] == expected
 
 
