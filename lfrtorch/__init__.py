@@ -5,29 +5,30 @@ records -> estimate_bla -> initialise or infer -> fit -> simulate, save, load
 records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 """
 
-from importlib import import_module
-from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+import typing as _typing
+from importlib import import_module as _import_module
+from importlib.metadata import version as _version
 
-if TYPE_CHECKING:
+if _typing.TYPE_CHECKING:
     from lfrtorch._public import *  # noqa: F403
     from lfrtorch._public import __all__ as __all__
 
-__version__ = version("lfrtorch")
+__version__ = _version("lfrtorch")
 
 _RENAMED = {"average": "mean_model", "fit_starts": "fit", "inference": "infer"}
 
 
-if not TYPE_CHECKING:  # a checker would take every name for one of these
+if not _typing.TYPE_CHECKING:  # a checker would take every name for one of these
 
-    def __getattr__(name: str) -> Any:
+    def __getattr__(name: str) -> object:
         """A public name, imported with all others; for an old one, an error that says the new."""
         if name == "__all__" or not name.startswith("_"):
-            public = import_module("lfrtorch._public")
+            public = _import_module("lfrtorch._public")
             if name == "__all__" or name in getattr(public, "__all__", ()):
                 return getattr(public, name)
         now = f"; it is called lfrtorch.{_RENAMED[name]} now" if name in _RENAMED else ""
         raise AttributeError(f"module 'lfrtorch' has no attribute '{name}'{now}")
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *__getattr__("__all__")})
+        own = (name for name in globals() if name.startswith("__"))
+        return sorted({*own, *__getattr__("__all__")})

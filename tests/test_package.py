@@ -151,6 +151,15 @@ def test_import_takes_what_it_needs_and_no_more():
     assert loaded("import lfrtorch; lfrtorch.identify").isdisjoint(HEAVY)
 
 
+def test_the_package_shows_its_public_names_and_no_others():
+    shown = {name for name in dir(lfrtorch) if not name.startswith("__")}
+    assert shown == set(lfrtorch.__all__)
+    for name in shown:
+        getattr(lfrtorch, name)
+    of_the_library = {"Any", "TYPE_CHECKING", "import_module", "version"}
+    assert not [name for name in of_the_library if hasattr(lfrtorch, name)]
+
+
 def test_version_is_the_same_everywhere():
     def first(pattern: str, name: str) -> str:
         found = re.search(pattern, (ROOT / name).read_text(encoding="utf-8"), re.MULTILINE)
