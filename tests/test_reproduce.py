@@ -67,6 +67,26 @@ def test_validation_chooses_and_the_row_has_all():
     ]
 
 
+def test_published_results_are_of_the_same_sizes_and_splits_if_there_are_such():
+    known = [
+        Published("old", {"test": 0.1e-3}, official.LEGACY),
+        Published("others", {"test": 0.2e-3}, official.BOARD),
+        Published("worse", {"test": 0.6e-3}, official.BOARD),
+    ]
+    own = Published("paper", {"test": 0.5e-3}, "a paper", sizes=(2, 2))
+    larger = Published("paper", {"test": 0.4e-3}, "a paper", sizes=(3, 2))
+    for listed, cell in (
+        ([*known, own, larger], "0.500 (paper, nz 2, nw 2)"),
+        ([*known, larger], "0.200 (others), 0.100 (old)"),
+        ([known[0]], "0.100 (old)"),
+        ([larger], "0.400 (paper, nz 3, nw 2)"),
+        ([], "-"),
+    ):
+        data = Dataset("wh", [RECORD], [RECORD], [RECORD], published=tuple(listed))
+        (row,) = reproduce.rows(reproduce.Case("wh", data, [metrics(1.0, 0.2e-3)]))
+        assert row.split(" | ")[-2] == cell
+
+
 def test_a_run_that_diverges_is_no_number():
     (row,) = reproduce.rows(case(metrics(1.0, 0.2e-3), metrics(None, None)))
     assert "0.200 .. diverges" in row
@@ -131,7 +151,7 @@ def test_a_stand_in_is_not_the_benchmark(tmp_path: Path, monkeypatch):
     each = reproduce.case("x", [*words, "data.source=stand-in"], tmp_path, 1, start=False)
     assert each.missing == "not run"
     assert each.dataset is not None
-    assert reproduce.published(each.dataset, "arrow") is None
+    assert reproduce.published(each, "arrow") == []
 
 
 def test_wrong_words_are_refused(monkeypatch, capsys):

@@ -39,9 +39,7 @@ _PUBLISHED = (
     Published("SUBNET", {"test": 0.37}, official.BOARD),
     Published("TSEM", {"test": 0.33}, official.BOARD),
     Published("CT-SUBNET", {"test": 0.306}, official.BOARD),
-    Published(
-        "B-splines", {"test": 0.30}, f"{official.BOARD}, before it fixed its windows; tensor"
-    ),
+    Published("B-splines", {"test": 0.30}, f"{official.LEGACY}; tensor"),
     Published("LTC", {"test": 0.298}, "closed-form liquid network, mean of 2, 0.271 to 0.381 V"),
     Published(
         "grey box", {"test": 0.221}, f"{official.BOARD}; normalised, neural state space (2025)"

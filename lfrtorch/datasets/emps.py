@@ -43,8 +43,6 @@ _FS = 1000.0  # Hz
 _SAMPLES = 24_841  # of each file
 _WINDOW = 20  # samples, unscored, of the test
 
-_LEGACY = f"{official.BOARD}, before it fixed its splits"
-
 
 def _published(label: str, millimetres: float, reference: str) -> Published:
     return Published(label, {"test": 1e-3 * millimetres}, reference, unit="mm")
@@ -54,8 +52,8 @@ _PUBLISHED = (
     _published("pNARX", 5.18, official.BOARD),
     _published("CT-SUBNET", 4.61, official.BOARD),
     _published("LTC", 4.10, "closed-form liquid network; with noise"),
-    _published("CT network", 3.68, f"{_LEGACY}; input-output stable"),
-    _published("dynoNet", 2.64, f"{_LEGACY}; 5.01 mm since"),
+    _published("CT network", 3.68, f"{official.LEGACY}; input-output stable"),
+    _published("dynoNet", 2.64, f"{official.LEGACY}; 5.01 mm since"),
 )
 
 

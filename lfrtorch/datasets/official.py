@@ -28,6 +28,9 @@ Shape = tuple[int | None, ...]
 BOARD = "leaderboard of nonlinearbenchmark.org"
 """What a published score is cited by that stands there."""
 
+LEGACY = f"{BOARD}, before it fixed its splits"
+"""The same for one on other samples, estimation or test, than it asks for now."""
+
 _AGAIN = "download the file again."
 
 

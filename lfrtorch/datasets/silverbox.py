@@ -48,7 +48,7 @@ def _published(
 
 
 _PUBLISHED = (
-    _published("PNLSS", (None, 0.26, None), f"{official.BOARD}, before it fixed its splits"),
+    _published("PNLSS", (None, 0.26, None), official.LEGACY),
     _published("SUBNET", (0.36, 1.4, 0.32)),
     _published("GP-NARX", (0.345, 0.721, 0.286)),
     _published(

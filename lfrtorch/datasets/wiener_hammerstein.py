@@ -48,7 +48,7 @@ _COMPARED = "as compared in Beintema, Schoukens and Tóth (2023)"
 _PUBLISHED = (
     _published("BLA", 44, "the best of several, which reach up to 56 mV", ("test",)),
     _published("LSTM", 1.54, official.BOARD),
-    _published("PNLSS", 0.42, f"{official.BOARD}, before it fixed its split", _BOTH),
+    _published("PNLSS", 0.42, official.LEGACY, _BOTH),
     _published("NL-LFR", 0.30, f"Schoukens and Tóth (2020), and {official.BOARD}", _BOTH),
     _published("QBLA", 0.279, f"{_COMPARED}, and {official.BOARD}", _BOTH),
     _published("SUBNET", 0.241, _OWN, _BOTH),

@@ -48,11 +48,11 @@ def test_split(numbered):
     data = ced.load(root=numbered)
     assert [r.name for r in data.train] == ["train_low", "train_high"]
     assert [r.name for r in data.validation] == ["validation_low", "validation_high"]
-    assert [r.name for r in data.tests] == ["low", "high"]
+    assert [r.name for r in data.tests] == ["low", "high", "low_site", "high_site"]
     for records, samples, first, last in (
         (data.train, 320, 1, 320),
         (data.validation, 400, 321, 400),
-        (data.tests, 500, 401 + 10, 500),
+        (data.tests[:2], 500, 401 + 10, 500),
     ):
         for record, level in zip(records, (0, 1000), strict=True):
             assert scored(record) == (level + first, level + last)
@@ -61,15 +61,16 @@ def test_split(numbered):
             assert (record.fs, record.start, record.source) == (50.0, "estimated", "official")
             channels = [str(c) for c in (*record.inputs, *record.outputs)]
             assert channels == ["u (V)", "z (ticks/s)"]
-    for record, test in zip(data.leaderboard, data.tests, strict=True):
-        assert (record.name, record.start, record.samples) == (test.name, "estimated", 100)
-        assert (scored(record), record.skip) == (scored(test), 10)
+    assert list(data.leaderboard) == data.tests[2:]
+    for record, test in zip(data.leaderboard, data.tests[:2], strict=True):
+        assert (record.name, record.start) == (f"{test.name}_site", "estimated")
+        assert (scored(record), record.skip, record.samples) == (scored(test), 10, 100)
     assert (data.name, data.noise_rms) == ("ced", None)
     assert {p.label: p.scores for p in data.published} == {
-        "pNARX": {"low": 0.230, "high": 0.137},
-        "CT-SUBNET": {"low": 0.115, "high": 0.074},
-        "GP-NARX": {"low": 0.087, "high": 0.070},
-        "dynoNet": {"low": 0.062, "high": 0.047},
+        "pNARX": {"low_site": 0.230, "high_site": 0.137},
+        "CT-SUBNET": {"low_site": 0.115, "high_site": 0.074},
+        "GP-NARX": {"low_site": 0.087, "high_site": 0.070},
+        "dynoNet": {"low_site": 0.062, "high_site": 0.047},
     }
 
 
@@ -77,7 +78,7 @@ def test_the_rule_of_the_validation_part(numbered):
     data = ced.load(root=str(numbered), validation=0.5)
     assert [scored(r) for r in data.train] == [(1, 200), (1001, 1200)]
     assert [scored(r) for r in data.validation] == [(201, 400), (1201, 1400)]
-    assert [scored(r) for r in data.tests] == [(411, 500), (1411, 1500)]
+    assert [scored(r) for r in data.tests] == 2 * [(411, 500), (1411, 1500)]
 
 
 @pytest.mark.parametrize("archive", ced._ARCHIVES)
@@ -159,7 +160,7 @@ def test_official_file(official):
     The input of the high level is that of the low one, half a volt higher.
     """
     data = official(ced.load)
-    low, high = data.tests
+    low, high = data.tests[:2]
     for record in (low, high):
         assert np.mean(record.u < -0.1) > 0.15  # the motors are driven both ways
         assert -0.03 < record.y.min() < 0.02 * record.y.max()
