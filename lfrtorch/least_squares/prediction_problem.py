@@ -3,6 +3,8 @@
 Predictions lean on the measured outputs: a model that predicts well may simulate badly, or run
 away. The parameters θ are those of the one-step predictor (``lfrtorch.engine.innovation``). Those
 of the system itself follow from them, φ(θ), so the rows of both errors are J_p and w J_s dφ/dθ.
+An estimated initial state is one parameter for both: before the first sample the predictor's state
+is the system's.
 """
 
 from __future__ import annotations
@@ -30,8 +32,7 @@ class PredictionProblem(SimulationProblem):
     """Errors of a predictor's records and, weighted, those of the system's simulation of them.
 
     Args:
-        lfr, records, y_scale, options: of the predictor, see ``SimulationProblem``. Estimated
-            initial states of simulations are solved for at every θ.
+        lfr, records, y_scale, options: of the predictor, see ``SimulationProblem``.
         simulation: weight w of the simulation errors if those of predictions were as large at the
             start.
         weight: w itself, if it is known.
@@ -57,8 +58,13 @@ class PredictionProblem(SimulationProblem):
         system, _ = split_predictor(lfr.cell)
         driven = [without_past_outputs(record, system.nu) for record in records]
         self._simulated = SimulationProblem(
-            LFR(system), driven, y_scale, solve_initial_states=True, ranks=self.ranks
+            LFR(system), driven, y_scale, solve_initial_states=self._solved, ranks=self.ranks
         )
+        # A predictor soon forgets its initial state: the simulation tells more of it.
+        states = self._simulated.initial_states(self._simulated.theta)
+        own = sum(p.numel() for p in self._parameters)
+        self.write(torch.cat([self.theta[:own], states.flatten()]))
+        self._theta_0 = self.theta
         self.weight = 1.0
         if weight is None:
             r = self.residual(self.theta)
@@ -81,21 +87,16 @@ class PredictionProblem(SimulationProblem):
         self, theta: Float[Tensor, " P"], *, reduce: bool = True
     ) -> _Both:
         """dr/dθ at θ."""
-        P = self._parameter_count
-        own, steps = theta[:P], torch.eye(P, dtype=theta.dtype, device=theta.device)
+        steps = torch.eye(len(theta)).to(theta)
         # φ is quadratic, so that this difference is its derivative.
-        change = (self._system_theta(own + steps) - self._system_theta(own - steps)).mT / 2.0
-        change = torch.cat([change, change.new_zeros(len(change), len(theta) - P)], dim=1)
-        simulated = self._simulated.linearise(self._system_theta(theta), reduce=reduce)
-        predicted = super().linearise(theta, reduce=reduce, eliminate=False)
+        change = (self._system_theta(theta + steps) - self._system_theta(theta - steps)).mT / 2.0
+        options: dict[str, Any] = {"reduce": reduce, "eliminate": False}
+        simulated = self._simulated.linearise(self._system_theta(theta), **options)
+        predicted = super().linearise(theta, **options)
         return _Both(predicted, simulated, change, self.weight, self._simulations)
 
-    @property
-    def _parameter_count(self) -> int:
-        return sum(p.numel() for p in self._parameters)
-
     def _system_theta(self, theta: Float[Tensor, "*axes n"]) -> Float[Tensor, "*axes m"]:
-        """φ(θ), of the free parameters at the beginning of θ."""
+        """φ of the free parameters at the beginning of θ, then the initial states in θ."""
         axes = theta.shape[:-1]
         cell = self.lfr.cell
         weights, first = {}, 0
@@ -107,7 +108,8 @@ class PredictionProblem(SimulationProblem):
                 first += parameter.numel()
         found, _ = split_weights(weights)
         free = [n for n, p in self._simulated.lfr.cell.named_parameters() if p.requires_grad]
-        return torch.cat([found[name].reshape(*axes, -1) for name in free], dim=-1)
+        own = [found[name].reshape(*axes, -1) for name in free]
+        return torch.cat([*own, theta[..., first:]], dim=-1)
 
 
 class _Both:

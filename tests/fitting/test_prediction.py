@@ -18,7 +18,7 @@ from lfrtorch.fitting.settings import Settings
 from lfrtorch.least_squares.prediction_problem import PredictionProblem
 from lfrtorch.metrics import rms
 from lfrtorch.model import Model
-from lfrtorch.records import Record, with_past_outputs
+from lfrtorch.records import Record, Start, with_past_outputs
 
 pytestmark = pytest.mark.numeric
 
@@ -157,13 +157,17 @@ def test_what_an_observer_cannot_follow_is_refused(said: str, act):
         act(model, record)
 
 
-def test_the_derivatives_of_both_errors_are_those_of_differences():
+@pytest.mark.parametrize("start", ["zero", "estimated"])
+def test_the_derivatives_of_both_errors_are_those_of_differences(start: Start):
     model, record, _ = noisy(60)
-    driven = with_past_outputs(replace(record, skip=5))
+    parts = [replace(part, skip=5, start=start) for part in (record[:25], record[25:])]
+    driven = [with_past_outputs(part) for part in parts]
     problem = PredictionProblem.of(model.predictor(), driven, simulation=0.5)
-    free = torch.ones_like(problem.theta) if problem.fixed is None else ~problem.fixed
+    free = torch.ones_like(problem.theta)
+    if problem.fixed is not None:
+        free[: len(problem.fixed)] = ~problem.fixed
     theta = problem.theta + 0.01 * normal(len(free)) * free
-    d_theta, h = normal(len(free), seed=1) * free, 1e-6
+    d_theta, h = normal(len(free), seed=1) * free, 1e-5
     r, jacobian = problem.residual(theta), problem.linearise(theta)
     differences = (
         problem.residual(theta + h * d_theta) - problem.residual(theta - h * d_theta)
