@@ -41,6 +41,9 @@ _SMALLEST, _LARGEST = 1e-100, 1e100
 """Levels of a signal, and sampling frequencies, beyond which squares may leave the range of numbers
 (1e-308 to 1e308)."""
 
+PAST_OUTPUTS = "a prediction from past outputs (noise=innovation or both)"
+"""What messages call it."""
+
 _MANY_CHANNELS = 16
 """An array of more channels than this and fewer samples is taken for a transposed one."""
 
@@ -323,6 +326,11 @@ class Record:
         return np.broadcast_to(counts, self.y.shape)
 
     @property
+    def scored_samples(self) -> int:
+        """Samples of which an output counts."""
+        return int(self.scored.any(axis=1).sum())
+
+    @property
     def factors(self) -> Array:
         """What the errors (T, ny) are multiplied by in a fit: √weight, 0 if not scored."""
         return np.sqrt(self.weight) * self.scored
@@ -461,7 +469,7 @@ def with_past_outputs(record: Record) -> Record:
         >>> with_past_outputs(record)
         Record('record': u, y -> y, 400 samples at 100 Hz, start estimated)
     """
-    record.require_all_valid("a prediction from past outputs (noise=innovation or both)")
+    record.require_all_valid(PAST_OUTPUTS)
     return replace(
         record,
         u=np.hstack([record.u, record.y]),

@@ -216,7 +216,7 @@ def of_simulation(
             f"record '{record.name}' has {len(y)} scored samples; residuals need {SHORTEST} at "
             "least: give a longer record, or skip less."
         )
-    errors = y - y_hat[record.skip :]
+    errors = record.errors(y_hat)  # 0 if y is not valid, which correlates with nothing
     K = lags_for(len(y), lags)
     linear = [whitened(near_one(channel)) for channel in u.T]
     squares = [whitened(near_one(channel) ** 2) for channel in (u - u.mean(axis=0)).T]

@@ -37,7 +37,7 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.job import linear_model, linear_records, windowed
 from lfrtorch.linear.requirements import of_response
 from lfrtorch.linear.score_window import fitted
-from lfrtorch.metrics import rms
+from lfrtorch.metrics import rmse_by_output
 from lfrtorch.reporting import figures as run_figures
 from lfrtorch.reporting import linear_plots
 from lfrtorch.reporting.scores import of_samples
@@ -181,14 +181,14 @@ def score(model: lfrtorch.LinearModel | None, record: lfrtorch.Record, use: str)
     rmse = deviation = np.full(y.shape[1], np.nan)
     if model is not None:
         y_hat = model.simulate(fitted(record) if use == "train" else record)
-        rmse, deviation = rms(y - y_hat[record.skip :], axis=0), np.std(y, axis=0)
+        rmse, deviation = rmse_by_output(record, y_hat), np.std(y, axis=0)
     return {
         "use": use,
         "record": record.name,
         "source": record.source,
         "samples": record.samples,
         "skip": record.skip,
-        "scored": 0 if model is None else len(y),
+        "scored": 0 if model is None else record.scored_samples,
         "outputs": [
             {
                 "output": channel.name,

@@ -57,17 +57,11 @@ def shares(
         y_offset=np.zeros(nx * ny),
         outputs=outputs,
     )
-    added, error = np.zeros((nx, ny)), np.zeros(ny)
+    parts_of, added, error = split.to_model(), np.zeros((nx, ny)), np.zeros(ny)
     for record in map(without_coordinates, as_records(data)):
-        driven = replace(
-            record,
-            y=np.zeros((record.samples, nx * ny)),
-            outputs=outputs,
-            start="periodic" if record.start == "periodic" else "zero",
-            weight=1.0,
-            line_weight=None,
-        )
-        added += np.square(split.simulate(driven)[record.skip :]).sum(axis=0).reshape(nx, ny)
+        start = "periodic" if record.start == "periodic" else "zero"
+        y = parts_of.simulate(record.u, start=start)[record.skip :]
+        added += np.square(y).sum(axis=0).reshape(nx, ny)
         error += np.square(record.errors(model.simulate(record))).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.sqrt(added / error)

@@ -29,7 +29,7 @@ from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signals
 from lfrtorch.model import simulate_record
-from lfrtorch.records import NormalisedRecord
+from lfrtorch.records import PAST_OUTPUTS, NormalisedRecord
 
 MOST_CANDIDATES, SHORT = 8, 200_000
 """Subspace estimates that are refined; only one if samples times squared states exceed SHORT."""
@@ -210,6 +210,7 @@ class SignalFit:
         """The record with the inputs of the cell: u, then y for a prediction, then the constant."""
         inputs, record = [each.u], each.record
         if self._prediction:
+            record.require_all_valid(PAST_OUTPUTS)
             inputs.append(each.y)
             if record.start == "periodic":
                 record = replace(record, start="estimated", line_weight=None)

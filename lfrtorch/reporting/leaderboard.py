@@ -16,7 +16,7 @@ from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
-from lfrtorch.metrics import rms
+from lfrtorch.metrics import rmse_by_output
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -85,9 +85,8 @@ def entry(
 
 def errors_of(model: Model, record: Record) -> list[float]:
     """RMSE of each output after the samples that are skipped; those of weight 0 are left out."""
-    error = (record.y - model.simulate(record))[record.skip :]
     counts = np.broadcast_to(np.asarray(record.weight) > 0, len(record.outputs))
-    return rms(error, axis=0)[counts].tolist()
+    return rmse_by_output(record, model.simulate(record))[counts].tolist()
 
 
 def table(entries: Sequence[Entry]) -> str:

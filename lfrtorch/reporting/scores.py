@@ -20,7 +20,7 @@ from lfrtorch.dataset import LISTED, Dataset, Published
 from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.metrics import nrmse, rms, rmse
+from lfrtorch.metrics import nrmse, rmse, rmse_by_output
 from lfrtorch.model import Model
 from lfrtorch.records import Record, common_unit, without_coordinates
 from lfrtorch.reporting.verdict import Verdict
@@ -104,7 +104,7 @@ def score(model: Model, bla: LinearModel | None, record: Record, use: str = "tes
         samples=record.samples,
         skip=record.skip,
         use=use,
-        scored=record.samples - record.skip,
+        scored=record.scored_samples,
         outputs=tuple(channel.name for channel in record.outputs),
         rmse_by_output=_by_output(record, y_hat),
         lti_rmse_by_output=() if y_linear is None else _by_output(record, y_linear),
@@ -113,7 +113,7 @@ def score(model: Model, bla: LinearModel | None, record: Record, use: str = "tes
 
 def _by_output(record: Record, y_hat: Array) -> tuple[float, ...]:
     """RMSE of each output over the scored samples."""
-    return tuple(rms((record.y - y_hat)[record.skip :], axis=0).tolist())
+    return tuple(rmse_by_output(record, y_hat).tolist())
 
 
 def together(scores: Sequence[Score]) -> Score:

@@ -43,13 +43,13 @@ class Response:
 
     @property
     def error(self) -> Array:
-        """Error of the NL-LFR after the skip window (scored samples, ny)."""
-        return self.scored - self.y_hat[self.record.skip :]
+        """Error of the NL-LFR after the skip window (scored samples, ny), 0 if y is not valid."""
+        return self.record.errors(self.y_hat)
 
     @property
     def linear_error(self) -> Array:
-        """Error of the linear model after the skip window (scored samples, ny)."""
-        return self.scored - self.y_linear[self.record.skip :]
+        """Error of the linear model after the skip window (scored samples, ny), likewise."""
+        return self.record.errors(self.y_linear)
 
     @property
     def diverged(self) -> bool:
