@@ -298,7 +298,7 @@ def _fitted(
             )
         else:
             together = Together(fits, watching, halt)
-        judge = _Judge(fits, unseen if selection else [], unseen, together)
+        judge = _Judge(fits, unseen if selection or average > 1 else [], together)
         for number, (_, until) in enumerate(planned, start=1):
             if number <= len(snapshots.rounds):
                 field = _drop_others(field, [fits[i] for i in snapshots.rounds[number - 1]])
@@ -415,22 +415,14 @@ class _Judge:
 
     Args:
         fits: of all starts.
-        records: that they are judged on. If empty, the fits' own validation or training records.
-        unseen: the records that none of them is fitted to.
+        records: that they are judged on, and none of them is fitted to. If empty, the fits' own
+            validation or training errors judge, which say nothing of a mean.
         together: has the processes that must judge alike.
     """
 
-    def __init__(
-        self,
-        fits: Sequence[Fit],
-        records: Sequence[Record],
-        unseen: Sequence[Record],
-        together: Together,
-    ) -> None:
-        self.fits, self._unseen, self._together = fits, unseen, together
-        self._errors = [
-            SimulationProblem.judge(fit.model, records) if records else None for fit in fits
-        ]
+    def __init__(self, fits: Sequence[Fit], records: Sequence[Record], together: Together) -> None:
+        self.fits, self._records, self._together = fits, records, together
+        self._errors = [self._error(fit.model) if records else None for fit in fits]
 
     def ranked(self, fits: Sequence[Fit]) -> list[Fit]:
         """The fits that have begun, the best first."""
@@ -472,19 +464,24 @@ class _Judge:
         None if a single start is better than all means. Without records to judge on, the mean of
         all.
         """
-        if not self._unseen:
+        if not self._records:
             return (mean_model(best), len(best)) if len(best) > 1 else (None, 1)
         means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]
         scores = [min(map(self._score, self.fits))]
         for mean in means:
-            error = SimulationProblem.judge(mean, self._unseen)
+            error = self._error(mean)
             scores.append(error.cost(error.residual(error.theta)))
         scores = self._together.ranks.first(torch.tensor(scores, dtype=torch.float64))
         count = 1 + int((scores <= AS_GOOD**2 * scores.nan_to_num(math.inf).min()).nonzero().max())
         return (means[count - 2], count) if count > 1 else (None, 1)
 
+    def _error(self, model: Model) -> SimulationProblem:
+        """The same error for starts and means."""
+        one = next(fit for fit in self.fits if not fit.diverges)
+        return one.judge_of(model, self._records)
+
     def _score(self, fit: Fit) -> float:
-        if not fit.history:
+        if not math.isfinite(fit.best):
             return math.inf
         error = self._errors[self.number(fit)]
         if error is None:

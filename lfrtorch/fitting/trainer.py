@@ -289,22 +289,15 @@ class Fit:
             nx = model.lfr.cell.nx
             train = windows(as_records(train), horizon, nx)
             validation = windows(as_records(validation), horizon, nx) if validation else ()
-        self.judge: SimulationProblem | None = None
+        kind: type[SimulationProblem] = SimulationProblem
         if simulation:
-            both = PredictionProblem.of(model, train, simulation=simulation, **options)
-            self.problem: SimulationProblem = both
-            if validation:
-                self.judge = PredictionProblem.of(
-                    model, validation, solve_initial_states=True, weight=both.weight
-                )
-        else:
-            kind: type[SimulationProblem] = SimulationProblem
-            if group_lasso is not None:
-                kind = GroupLassoProblem
-                options |= {"names": group_lasso[0], "weight": group_lasso[1]}
-            self.problem = kind.of(model, train, **options)
-            if validation:
-                self.judge = SimulationProblem.judge(model, validation)
+            kind = PredictionProblem
+            options["simulation"] = simulation
+        elif group_lasso is not None:
+            kind = GroupLassoProblem
+            options |= {"names": group_lasso[0], "weight": group_lasso[1]}
+        self.problem = kind.of(model, train, **options)
+        self.judge = self.judge_of(model, validation) if validation else None
         self.state: Any = None
         """The trainer's; None before the first call of ``advance``."""
         self.history: list[Progress] = []
@@ -320,6 +313,12 @@ class Fit:
             self.history.append(
                 Progress(0, self.trainer.limit, math.inf, math.nan, 0.0, False, {}, math.inf)
             )
+
+    def judge_of(self, model: Model, records: Record | Sequence[Record]) -> SimulationProblem:
+        """The errors of any model on records that are not fitted, as those of validation."""
+        if isinstance(self.problem, PredictionProblem):
+            return self.problem.judge(model, records, weight=self.problem.weight)
+        return SimulationProblem.judge(model, records)
 
     @property
     def seconds(self) -> float:

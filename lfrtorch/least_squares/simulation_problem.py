@@ -132,9 +132,9 @@ class SimulationProblem(LeastSquares):
         return cls(model.lfr, normalised, model.scaler.y_scale, **options)
 
     @classmethod
-    def judge(cls, model: Model, records: Record | Sequence[Record]) -> Self:
+    def judge(cls, model: Model, records: Record | Sequence[Record], **options: Any) -> Self:
         """The same for records that are not fitted, each from its most probable initial state."""
-        return cls.of(model, records, solve_initial_states=True)
+        return cls.of(model, records, solve_initial_states=True, **options)
 
     @property
     def theta(self) -> Float[Tensor, " P"]:

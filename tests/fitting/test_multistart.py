@@ -1,5 +1,6 @@
 """Several starts of one fit: who goes on, and that each is what it is alone."""
 
+import copy
 import math
 import threading
 from dataclasses import replace
@@ -337,6 +338,29 @@ def test_mean_of_starts_is_not_taken_if_one_is_better():
     result = fit(models, train, validation, trainer=optimiser, average=2)
     assert result.averaged == 1
     assert result.model is models[0]
+
+
+def noisy(record: Record) -> Record:
+    noise = 0.1 * torch.randn(record.y.shape, generator=torch.manual_seed(0)).numpy()
+    return replace(record, y=record.y + noise)
+
+
+def test_means_have_the_error_of_starts_whose_fit_is_over_windows():
+    models, train, validation = several(1)
+    same = [models[0], copy.deepcopy(models[0])]
+    options: Any = {"trainer": LevenbergMarquardt(max_iter=0), "average": 2}
+    assert fit(same, train, noisy(validation), horizon=8, **options).averaged == 2
+
+
+def test_means_have_the_error_of_starts_whose_predictions_count():
+    models, train, validation = several(2)
+    move(models[0], -0.05)  # the one that made the data
+    move(models[1], 0.1)
+    K = torch.zeros(models[0].lfr.cell.nx, 1, dtype=torch.float64)
+    models = [replace(model, K=K) for model in models]
+    options: Any = {"trainer": LevenbergMarquardt(max_iter=0), "average": 2}
+    train, validation = [noisy(each) for each in train], noisy(validation)
+    assert fit(models, train, validation, noise="both", **options).averaged == 1
 
 
 def test_mean_of_starts_is_taken_where_nothing_tells():
