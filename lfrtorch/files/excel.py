@@ -18,7 +18,7 @@ from lfrtorch._support.memory import in_bytes
 from lfrtorch._support.types import Array
 from lfrtorch.files.arrays import optional
 from lfrtorch.files.table import BLOCK, Clock, Table
-from lfrtorch.files.text import Line, is_missing, layout_of
+from lfrtorch.files.text import Layout, Line, is_missing, layout_of, with_thousands
 
 _HEAD = 1000
 """Rows that tell where the samples begin."""
@@ -71,17 +71,21 @@ class ExcelTable(Table):
                     refusal = error
         if not with_samples:
             raise refusal or InputError(f"'{self._file}' has no sheet.")
-        self._sheet, (self._first, self._used, headers, units, self._dates) = with_samples[0]
-        super().__init__(path, headers, units=units)
+        self._sheet, (self._head, self._used, clocks) = with_samples[0]
+        super().__init__(
+            path, self._head.headers, units=self._head.units, clocks=self._head.dates | clocks
+        )
+        self.notes = self._head.notes
         if len(with_samples) > 1:
-            self.notes = (
+            self.notes += (
                 f"the sheet {self._sheet!r} is read, the first of {len(with_samples)} with "
                 f"samples; '{self._file.name}#{with_samples[1][0]}' is the next",
             )
 
-    def _layout(self, sheet: Any) -> tuple[int, list[int], tuple[str, ...], dict, frozenset[int]]:
-        """First row of samples, columns in use, headers, units and columns of date-times."""
-        head = [[_text(cell) for cell in row] for row in islice(self._rows(sheet), _HEAD)]
+    def _layout(self, sheet: Any) -> tuple[Layout, list[int], set[int]]:
+        """Where what is, the columns in use, and those of them that are times of day."""
+        rows = list(islice(self._rows(sheet), _HEAD))
+        head = [[_text(cell) for cell in row] for row in rows]
         width = max(map(len, head), default=0)
         used = [i for i in range(width) if any(i < len(row) and row[i] for row in head)]
         lines = [
@@ -92,7 +96,13 @@ class ExcelTable(Table):
         if not lines:
             raise InputError(f"'{self._file}' is empty; give a file with data.")
         found = layout_of(self._file, "", ";", lines)
-        return found.first, used[: len(found.headers)], found.headers, found.units, found.dates
+        used = used[: len(found.headers)]
+        timed = {
+            i
+            for i, k in enumerate(used)
+            if any(k < len(row) and isinstance(row[k], time | timedelta) for row in rows)
+        }
+        return found, used, timed
 
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`; empty cells are missing values, empty rows no samples."""
@@ -103,7 +113,7 @@ class ExcelTable(Table):
             for i, column in enumerate(columns):
                 k = self._used[column]
                 cells = [(number, row[k] if k < len(row) else None) for number, row in part]
-                if column in self._dates:
+                if column in self._head.dates:
                     times = [self._date(cell, number, column) for number, cell in cells]
                     found[:, i] = clocks[column](np.array(times, "M8[ns]"))
                 else:
@@ -118,9 +128,22 @@ class ExcelTable(Table):
     def _samples(self) -> Iterator[tuple[int, Sequence[Any]]]:
         """Rows that are not empty, with their numbers."""
         with self._opened() as book:
-            for number, row in enumerate(self._rows(book[self._sheet]), 1):
-                if number >= self._first and any(_text(row[k]) for k in self._used if k < len(row)):
-                    yield number, row
+            numbered = enumerate(self._rows(book[self._sheet]), 1)
+            yield from self.without_footer(
+                (
+                    (number, row)
+                    for number, row in numbered
+                    if number >= self._head.first
+                    and any(_text(row[k]) for k in self._used if k < len(row))
+                ),
+                self._words,
+            )
+
+    def _words(self, row: tuple[int, Sequence[Any]]) -> str:
+        """What a row says that begins with words where numbers are; empty if it is a sample."""
+        cell = row[1][self._used[0]] if len(row[1]) > self._used[0] else None
+        text = cell.strip() if isinstance(cell, str) and self._head.leads else ""
+        return text if text[:1].isalpha() and not is_missing(text) else ""
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
@@ -176,6 +199,8 @@ class ExcelTable(Table):
         if is_missing(text):
             return np.nan
         try:
+            if with_thousands(text) and not self._head.comma:
+                raise ValueError
             return float(text.replace(",", "."))
         except ValueError:
             raise self._refusal(text, row, column, "number") from None
@@ -185,9 +210,8 @@ class ExcelTable(Table):
         if is_missing(text):
             return np.datetime64("NaT")
         try:
-            return np.datetime64(
-                datetime.fromisoformat(text.replace(",", ".")).replace(tzinfo=None)
-            )
+            when = datetime.fromisoformat(text.replace(",", "."))
+            return np.datetime64(when.replace(tzinfo=None) - (when.utcoffset() or timedelta()))
         except ValueError:
             raise self._refusal(text, row, column, "date-time") from None
 

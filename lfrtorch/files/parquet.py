@@ -30,13 +30,15 @@ class ParquetTable(Table):
             kinds.is_decimal,
             kinds.is_timestamp,
         )
-        headers = [f.name for f in schema if any(check(f.type) for check in usable)]
+        fields = [f for f in schema if any(check(f.type) for check in usable)]
+        headers = [f.name for f in fields]
+        clocks = {i for i, f in enumerate(fields) if kinds.is_timestamp(f.type)}
         refused = {
             f.name: f"has no numbers (its type is {f.type}); store it as numbers"
             for f in schema
             if f.name not in headers
         }
-        super().__init__(path, headers, refused=refused)
+        super().__init__(path, headers, refused=refused, clocks=clocks)
 
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`."""

@@ -6,8 +6,9 @@ import difflib
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,9 @@ BLOCK = 65536
 COPIES = 3
 """Times that the samples are in memory: as they were read, as a record, and normalised."""
 
+LEAST = 10
+"""Samples that tell a header of numbers above them, and words below, and rows of words at most."""
+
 CLOSE = 0.75
 """Similarity of names from which on one may be meant for the other."""
 
@@ -38,6 +42,8 @@ _LONGEST_UNIT = 16
 
 
 _CHANNEL = re.compile(r"(.+)\[(\d+)\]")
+
+_Row = TypeVar("_Row")
 
 _ALL, _SOME = 24, 20  # columns: up to which a message names all, and of more
 _NAME = 60  # characters of a column's name in a list
@@ -58,6 +64,7 @@ class Table(ABC):
         refused: why something in the file is not a channel, by its name.
         rates: sampling frequencies in Hz that stand in the file, by their names.
         lengths: samples of each column, if they may differ.
+        clocks: columns of date-times, which are in seconds whatever their headers say.
     """
 
     path: Path
@@ -77,10 +84,14 @@ class Table(ABC):
         refused: Mapping[str, str] | None = None,
         rates: Mapping[str, float] | None = None,
         lengths: Sequence[int] = (),
+        clocks: Container[int] = (),
     ) -> None:
         self.path = path
         self.headers = tuple(headers)
-        self.columns = channels(headers, units or {})
+        self.columns = tuple(
+            channel._replace(unit="s") if i in clocks else channel
+            for i, channel in enumerate(channels(headers, units or {}))
+        )
         self.arrays = dict(arrays or {})
         self.refused = dict(refused or {})
         self.rates = dict(rates or {})
@@ -95,6 +106,28 @@ class Table(ABC):
         Raises:
             ValueError: a damaged file, columns of different lengths, or text that is no number.
         """
+
+    def without_footer(self, rows: Iterable[_Row], said: Callable[[_Row], str]) -> Iterator[_Row]:
+        """Rows without those of words at the end, as means; a note says that they are left out.
+
+        Args:
+            rows: those of the samples, one by one.
+            said: what a row says that is no sample; empty of one that is.
+        """
+        held, words, count = [], "", 0
+        for row in rows:
+            text = said(row) if count >= LEAST and len(held) < LEAST else ""
+            words = words or text
+            if text or (held and isinstance(row, str) and row.isspace()):
+                held.append(row)
+                continue
+            yield from held
+            held.clear()
+            yield row
+            words, count = "", count + 1
+        note = f"the end of the file, from {brief(repr(words), _NAME)} on, has no samples"
+        if words and note not in self.notes:
+            self.notes = (*self.notes, note)
 
     def where(self, sample: int) -> str:
         """What a user finds the sample by."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
-from lfrtorch.files.table import BLOCK, Clock, Table, bracketed, is_unit
+from lfrtorch.files.table import BLOCK, LEAST, Clock, Table, bracketed, is_unit
 
 _HEAD = 1 << 18  # characters that tell the layout
 _LONGEST = 1 << 25  # characters of a line
@@ -33,9 +33,17 @@ _NUMBER = re.compile(  # in which no digit may be of two parts: that took hours 
     r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE | re.ASCII
 )
 _COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?", re.ASCII)  # a number with a decimal comma
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+", re.ASCII)  # or three decimals
+_WHOLE = re.compile(r"\d+", re.ASCII)
 _DATE = re.compile(
     r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?(Z|[+-]\d\d:?\d\d)?", re.ASCII
 )
+
+_HEADERS = {
+    True: "is taken for the names of the columns: such a name stands in quotes, as a number "
+    "counts columns from 0",
+    None: "is read as a sample; if it is a header, write names in its place",
+}
 
 _DAMAGED = (OSError, EOFError, zlib.error, UnicodeError)
 
@@ -49,8 +57,8 @@ class Line(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """How a file is written."""
+class Layout:
+    """How a file or a sheet is written."""
 
     encoding: str
     delimiter: str
@@ -59,6 +67,9 @@ class _Layout:
     headers: tuple[str, ...]
     units: dict[str, str]
     dates: frozenset[int]  # columns of date-times
+    leads: bool  # whether the first column holds numbers or date-times
+    rates: dict[str, float]  # sampling frequencies that the lines above the samples say
+    notes: tuple[str, ...]
 
 
 class TextTable(Table):
@@ -72,7 +83,11 @@ class TextTable(Table):
 
     def __init__(self, path: Path) -> None:
         self.layout = _layout(path)
-        super().__init__(path, self.layout.headers, units=self.layout.units)
+        layout = self.layout
+        super().__init__(
+            path, layout.headers, units=layout.units, rates=layout.rates, clocks=layout.dates
+        )
+        self.notes = layout.notes
 
     def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
         """See :meth:`Table.blocks`; a line's missing cells are missing values."""
@@ -85,7 +100,7 @@ class TextTable(Table):
         # pandas takes the number of columns from there.
         first = layout.delimiter.join(["nan"] * (beyond + 1)) + "\n"
         try:
-            for text in _texts(self.path, layout, samples):
+            for text in self._texts(samples):
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")  # a line of too many cells is refused below
                     part = pd.read_csv(
@@ -129,6 +144,28 @@ class TextTable(Table):
                 return f"line {line.number}"
         return super().where(sample)
 
+    def _texts(self, count: int) -> Iterator[str]:
+        """At most ``count`` lines at a time, from the first sample on, without comments."""
+        with _opened(self.path, self.layout.encoding) as stream:
+            for _ in range(self.layout.first - 1):
+                stream.readline()
+            lines = self.without_footer(stream, self._is_text)
+            while block := list(_bounded(lines, count)):
+                text = "".join(block)
+                if any(mark in text for mark in _MARKS):
+                    text = _COMMENT.sub("", text)
+                if text.strip(" \r\n"):
+                    yield text
+
+    def _is_text(self, line: str) -> str:
+        """What a line says that begins with words where numbers are; empty if it is a sample."""
+        start = line.lstrip(' "\t')[:1]
+        if not (self.layout.leads and (start.isalpha() or start == "*")):
+            return ""
+        cell = next(iter(_cells(line.rstrip("\r\n"), self.layout.delimiter)), "")
+        known = is_missing(cell) or self._is_number(cell) or _is_date(cell)
+        return "" if known else line.strip()
+
     def _lines(self) -> Iterator[Line]:
         """The lines of samples."""
         with _opened(self.path, self.layout.encoding) as stream:
@@ -166,19 +203,6 @@ def _exact(version: str) -> dict[str, Any]:
     """Options that make pandas read numbers to the last bit; from 3.1 on it needs none."""
     old = tuple(map(int, version.split(".")[:2])) < (3, 1)
     return {"float_precision": "round_trip"} if old else {}
-
-
-def _texts(path: Path, layout: _Layout, count: int) -> Iterator[str]:
-    """At most ``count`` lines at a time, from the first sample on, without comments."""
-    with _opened(path, layout.encoding) as stream:
-        for _ in range(layout.first - 1):
-            stream.readline()
-        while block := list(_bounded(stream, count)):
-            text = "".join(block)
-            if any(mark in text for mark in _MARKS):
-                text = _COMMENT.sub("", text)
-            if text.strip(" \r\n"):
-                yield text
 
 
 def _bounded(lines: Iterable[str], count: int) -> Iterator[str]:
@@ -268,7 +292,7 @@ def _cells(text: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def _layout(path: Path) -> _Layout:
+def _layout(path: Path) -> Layout:
     try:
         encoding = _encoding(path)
         with _opened(path, encoding) as stream:
@@ -300,9 +324,13 @@ def _bulk(lines: Sequence[Line]) -> list[list[str]]:
 def _order(delimiter: str, lines: Sequence[Line]) -> tuple[float, float]:
     """How well a delimiter does: the share of cells that are numbers, then their count."""
     bulk = _bulk(lines)
-    comma = delimiter != ","
+    commas = (False,) if delimiter == "," else (False, True)
     known = [
-        sum(_is_number(c, comma) or _is_date(c) or is_missing(c) for c in cells) / len(cells)
+        sum(
+            any(_is_number(c, comma) for comma in commas) or _is_date(c) or is_missing(c)
+            for c in cells
+        )
+        / len(cells)
         for cells in bulk
         if cells
     ]
@@ -313,29 +341,27 @@ def _order(delimiter: str, lines: Sequence[Line]) -> tuple[float, float]:
     )
 
 
-def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> _Layout:
+def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> Layout:
     """The layout of a file from its first lines."""
     bulk = _bulk(lines)
-    decimal = delimiter != ","
     width = Counter(map(len, bulk)).most_common(1)[0][0] if bulk else 0
     whole = [cells for cells in bulk if len(cells) == width]
+    comma = delimiter != "," and _decimal_comma(whole)
 
     def numeric(cell: str) -> bool:
-        return _is_number(cell, decimal) or _is_date(cell)
+        return _is_number(cell, comma) or _is_date(cell)
 
-    # Columns that hold numbers, and the first line that has them in these.
-    most = set()
-    for i in range(width):
-        given = [numeric(cells[i]) for cells in whole if not is_missing(cells[i])]
-        if 2 * sum(given) > len(given):
-            most.add(i)
+    # Columns that hold numbers or nothing, and the first line that is like them.
+    given = [[cells[i] for cells in whole if not is_missing(cells[i])] for i in range(width)]
+    most = {i for i, cells in enumerate(given) if 2 * sum(map(numeric, cells)) > len(cells)}
+    empty = {i for i, cells in enumerate(given) if not cells}
     clean = (
         i
         for i, line in enumerate(lines)
         if not line.comment
         and len(line.cells) == width
         and any(numeric(line.cells[c]) for c in most)
-        and all(numeric(line.cells[c]) or is_missing(line.cells[c]) for c in most)
+        and all(numeric(line.cells[c]) or is_missing(line.cells[c]) for c in most | empty)
     )
     start = next(clean, None)
     if start is None:
@@ -355,14 +381,100 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> _
         for line in lines[:start]
         if len(line.cells) >= width and not any(map(numeric, line.cells[:width]))
     ]
+    notes: tuple[str, ...] = ()
+    if not above:
+        below = [ln.cells for ln in lines[start + 1 :] if not ln.comment and len(ln.cells) == width]
+        named = named_by_numbers(lines[start].cells, below, comma=comma)
+        if named is not False:
+            shown = brief(repr(delimiter.join(lines[start].cells)))
+            notes = (f"line {lines[start].number}, {shown}, {_HEADERS[named]}",)
+        if named:
+            above, start = [lines[start].cells], start + 1
     if width > 1 and not any(cells[-1] for cells in whole) and _short(above, width):
         width -= 1  # every sample ends with a delimiter
         above = [line.cells for line in lines[:start] if len(line.cells) >= width]
     headers, units = _names(above, width)
-    first = lines[start]
-    dates = frozenset(i for i in range(width) if any(_is_date(cells[i]) for cells in whole))
-    comma = decimal and any(_COMMA.fullmatch(c) for cells in whole for c in cells)
-    return _Layout(encoding, delimiter, comma, first.number, headers, units, dates)
+    return Layout(
+        encoding,
+        delimiter,
+        comma,
+        lines[start].number,
+        headers,
+        units,
+        dates=frozenset(i for i in range(width) if any(_is_date(cells[i]) for cells in whole)),
+        leads=0 in most,
+        rates=_interval(lines[:start]) if 0 in empty else {},
+        notes=notes,
+    )
+
+
+def _decimal_comma(whole: list[list[str]]) -> bool:
+    """Whether numbers have a decimal comma: no column has a point, or fewer than have a comma."""
+    commas, points, thousands = set(), set(), set()
+    for cells in whole:
+        for i, cell in enumerate(cells):
+            if "." in cell and _NUMBER.fullmatch(cell):
+                points.add(i)
+            elif "," in cell and _COMMA.fullmatch(cell):
+                (thousands if with_thousands(cell) else commas).add(i)
+    return len(commas) > len(points) or bool(thousands and not points)
+
+
+def named_by_numbers(
+    cells: Sequence[str], below: Sequence[Sequence[str]], *, comma: bool = False
+) -> bool | None:
+    """Whether a line is a header in which numbers are names; None if it may be a sample, too.
+
+    It is if these are unlike all samples below, or 0, 1, 2 ... as pandas writes them. It is none
+    if a column runs on from it, as a time does.
+
+    Example:
+        >>> from lfrtorch.files.text import named_by_numbers
+        >>> rows = [[str(0.1 * k), str(1.5 + k % 3)] for k in range(1, 20)]
+        >>> [named_by_numbers(line, rows) for line in (["2023", "2024"], ["2", "1"], ["0", "2"])]
+        [True, None, False]
+    """
+    numbers = {i: int(cell) for i, cell in enumerate(cells) if _WHOLE.fullmatch(cell)}
+    words = [cell for i, cell in enumerate(cells) if i not in numbers and (cell or i)]
+    if any(is_missing(word) or not word[0].isalpha() for word in words):
+        return False
+    if len(cells) < 2 or len({*numbers.values()}) < len(numbers) or len(below) < LEAST:
+        return False
+    columns = {
+        i: [float(c[i].replace(",", ".")) for c in below if _is_number(c[i], comma)]
+        for i in numbers
+    }
+    if any(len(values) < LEAST for values in columns.values()):
+        return False
+    unlike = {i for i in numbers if not any(_WHOLE.fullmatch(c[i]) for c in below)}
+    far = all(
+        abs(number - np.median(columns[i])) > 2 * np.ptp(columns[i])
+        for i, number in numbers.items()
+    )
+    counted = [*numbers.values()] == [*range(len(numbers))]
+    running = {i for i, number in numbers.items() if _runs_on(number, columns[i])}
+    if running:
+        return None if counted and unlike and unlike >= numbers.keys() - running else False
+    if not numbers or not (far or counted or unlike == numbers.keys()):
+        return False
+    index = not cells[0] and all(_is_number(c[0], comma) for c in below)
+    if far or words or index or (counted and (len(numbers) > 2 or unlike == numbers.keys())):
+        return True
+    return None
+
+
+def _runs_on(number: float, column: Sequence[float]) -> bool:
+    """Whether a column rises evenly, or stands still, from a number on."""
+    steps = np.diff([number, *column[:LEAST]])
+    usual = float(np.median(steps))
+    return bool(not steps.any() or (steps.min() > 0 and 0.5 <= steps[0] / usual <= 2))
+
+
+def _interval(lines: Sequence[Line]) -> dict[str, float]:
+    """The sampling frequency by the row Delta_X that LabVIEW writes, if its channels have one."""
+    rows = [line.cells[1:] for line in lines if line.cells and line.cells[0] == "Delta_X"]
+    steps = {float(cell.replace(",", ".")) for cells in rows for cell in cells if cell}
+    return {"Delta_X": 1 / steps.pop()} if len(steps) == 1 and min(steps) > 0 else {}
 
 
 def _similar(cells: list[str], width: int, numeric) -> bool:
@@ -398,7 +510,9 @@ def _doubled(names: list[str]) -> bool:
 
 
 def _is_number(cell: str, comma: bool) -> bool:
-    return bool(_NUMBER.fullmatch(cell) or (comma and _COMMA.fullmatch(cell)))
+    if comma and _COMMA.fullmatch(cell):
+        return True
+    return not (comma and "." in cell) and _NUMBER.fullmatch(cell) is not None
 
 
 def _is_date(cell: str) -> bool:
@@ -418,6 +532,11 @@ def _is_time(cell: str) -> bool:
 def is_missing(cell: str) -> bool:
     """Whether a cell says that there is no value."""
     return cell.lower() in _MISSING
+
+
+def with_thousands(cell: str) -> bool:
+    """Whether a comma may be one between thousands, as in 5,189."""
+    return _THOUSANDS.fullmatch(cell) is not None
 
 
 def _times(values) -> NDArray[np.datetime64]:

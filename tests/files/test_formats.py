@@ -71,6 +71,18 @@ def test_decimal_comma(tmp_path, delimiter):
     assert np.array_equal(whole(mixed, "y")[:, 0], np.round(Y * 9))
 
 
+def test_a_comma_is_decimal_if_the_columns_say_so(tmp_path):
+    """It was if one cell had it: then 5,189 was 5.189 beside points, and all else was no number."""
+    rows = [f"0.0{k};{5100 + k:,d};1,2" for k in range(10, 40)]
+    table = table_of(tmp_path, "\n".join(["t;u;flags", *rows]))
+    assert whole(table, "t")[0, 0] == 0.01
+    with pytest.raises(ValueError, match="line 2: '5,110' in column 'u' is not a number"):
+        whole(table, "u")
+    rows = [f"0,{k};{k},25;1.5" for k in range(10, 40)]
+    table = table_of(tmp_path, "\n".join(["t;u;version", *rows]))
+    assert np.array_equal(whole(table, ["t", "u"])[0], [0.1, 10.25])
+
+
 @pytest.mark.parametrize(
     "encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16", "utf-16-le", "utf-16-be", "cp1252"]
 )
@@ -115,6 +127,93 @@ def test_labview_measurement(tmp_path):
     table = table_of(tmp_path, content, "a.lvm")
     assert names(table) == ["X_Value", "Voltage", "Voltage_0", "Comment"]
     assert np.array_equal(whole(table, ["X_Value", "Voltage", "Voltage_0"]), SIGNALS)
+
+
+@pytest.mark.parametrize("point", [".", ","])
+@pytest.mark.parametrize("first", ["", "X_Value"])
+def test_labview_without_times(tmp_path, point, first):
+    """The preamble's row of counts was the first sample, and the interval was not read."""
+    rows = "".join(f"\t{u!r}\t{y!r}\t\n" for u, y in SIGNALS[:, 1:].tolist())
+    content = (
+        "LabVIEW Measurement\t\nX_Columns\tNo\n***End_of_Header***\t\n\t\n"
+        "Channels\t2\t\t\nSamples\t40\t40\t\nX_Dimension\tTime\tTime\t\nX0\t0.0\t0.0\t\n"
+        "Delta_X\t0.010000\t0.010000\t\n***End_of_Header***\t\t\t\n"
+        f"{first}\tu\ty\tComment\n{rows}"
+    )
+    table = table_of(tmp_path, content.replace(".", point), "a.lvm")
+    assert names(table) == [first or "column 0", "u", "y", "Comment"]
+    assert np.array_equal(whole(table, ["u", "y"]), SIGNALS[:, 1:])
+    assert table.rates == {"Delta_X": 100.0}
+
+
+NUMBERED = "is taken for the names of the columns"
+
+
+@pytest.mark.parametrize(
+    ("header", "index", "known"),
+    [
+        ("0,1", 0, True),  # as pandas writes them
+        (",0,1", 1, True),
+        ("1,2", 0, None),
+        ("2023,2024", 0, True),
+        ("t,101,7", 1, True),
+        (",101,102", 1, True),
+        ("2,1", 0, None),  # a sample of whole numbers, perhaps
+        ("0,0", 0, False),  # at rest
+        ("0.5,1", 0, False),
+    ],
+)
+def test_headers_of_numbers(tmp_path, header, index, known):
+    """The first three samples were four, without a word."""
+    signals = np.round(U, 4) + 1e-5
+    rows = [[*[str(k)] * index, *map(str, row)] for k, row in enumerate(signals)]
+    table = table_of(tmp_path, "\n".join([header, *map(",".join, rows)]))
+    assert len(table.read([index])) == T + (not known)
+    assert bool(table.notes) == (known is not False)
+    if known:
+        assert table.headers[index:] == tuple(header.split(",")[index:])
+        assert NUMBERED in table.notes[0]
+        assert np.array_equal(table.read([index, index + 1]), signals)
+    elif known is None:
+        assert "is read as a sample; if it is a header" in table.notes[0]
+
+
+@pytest.mark.parametrize(
+    "t", [np.arange(1, T + 1), np.arange(1, T + 1) / 100, np.round(np.arange(1, T + 1) / 750, 3)]
+)
+def test_a_first_sample_that_a_time_runs_on_from_is_no_header(tmp_path, t):
+    rows = [f"{time:g},{1 + k % 2},{y:.4f}" for k, (time, y) in enumerate(zip(t, Y, strict=True))]
+    table = table_of(tmp_path, "\n".join(["0,2,1", *rows]))
+    assert len(table.read([0])) == T + 1
+    assert table.notes == ()
+
+
+def test_headers_of_counted_numbers_above_whole_numbers(tmp_path):
+    counts = np.random.default_rng(0).integers(0, 4096, (T, 3))
+    rows = [",".join(map(str, row)) for row in counts]
+    assert np.array_equal(table_of(tmp_path, "\n".join(["0,1,2", *rows])).read([0, 1, 2]), counts)
+    table = table_of(tmp_path, "\n".join(["0,1", *(row.rsplit(",", 1)[0] for row in rows)]))
+    assert len(table.read([0])) == T + 1
+    assert "is read as a sample" in table.notes[0]
+
+
+@pytest.mark.parametrize(
+    "end", ["End of data", "mean,0.1,0.2\nstd,1,2", "*** end ***,,\n\n", "max"]
+)
+def test_words_below_the_samples_are_left_out(tmp_path, end):
+    """They made the first column text, or samples of what stands beside them."""
+    rows = [f"{k / 100},{u},{y}" for k, (u, y) in enumerate(SIGNALS[:, 1:])]
+    table = table_of(tmp_path, "\n".join(["t,u,y", *rows, end]))
+    for columns in ([0, 1, 2], [1, 2]):
+        assert len(table.read(columns)) == T
+    (note,) = table.notes
+    assert note == f"the end of the file, from {end.splitlines()[0].strip()!r} on, has no samples"
+    table = table_of(tmp_path, "\n".join(["t,u,y", *rows, end.splitlines()[0], *rows]))
+    with pytest.raises(ValueError, match=r"line 42: '.*' in column 't' is not a number"):
+        table.read([0])
+    table = table_of(tmp_path, "\n".join(["t,u,y", *rows, "nan,1,2"]))
+    assert len(table.read([1])) == T + 1
+    assert table.notes == ()
 
 
 @pytest.mark.parametrize(
@@ -571,6 +670,28 @@ def test_sheets_and_cells_of_excel(tmp_path):
     table = open_table(book(tmp_path / "c.xlsx", Run=rows))
     with pytest.raises(ValueError, match="row 21 of sheet 'Run': 'broken' in column 'y' is not a"):
         table.read([2])
+
+
+def test_text_in_cells_of_excel(tmp_path):
+    """Zones of text dates were lost, 5,189 was 5.189, and a row of means was a sample."""
+    start = datetime(2024, 3, 31, 1, 59, 59)
+    stamps = [start + timedelta(milliseconds=250 * k) for k in range(T)]
+    texts = [
+        f"{s.isoformat()}+01:00" if s.hour < 2 else f"{(s + timedelta(hours=1)).isoformat()}+02:00"
+        for s in stamps
+    ]
+    rows = rows_of(texts, Y.tolist(), [f"{5100 + k:,d}" for k in range(T)])
+    mean = ["mean", float(Y.mean()), 5120]
+    table = open_table(book(tmp_path / "a.xlsx", Run=[["t (UTC)", "y", "n"], *rows, mean]))
+    assert table.columns[0] == Channel("t", "s")
+    assert np.allclose(whole(table, "t")[:, 0], np.arange(T) / 4)
+    assert np.allclose(whole(table, "y")[:, 0], Y)
+    assert table.notes == ("the end of the file, from 'mean' on, has no samples",)
+    with pytest.raises(ValueError, match="row 2 of sheet 'Run': '5,100' in column 'n' is not a nu"):
+        whole(table, "n")
+    commas = [[f"{v:.3f}".replace(".", ",") for v in row] for row in SIGNALS]
+    table = open_table(book(tmp_path / "b.xlsx", Run=[["a", "b", "c"], *commas]))
+    assert np.allclose(table.read([0, 1, 2]), np.round(SIGNALS, 3))
 
 
 def edited(path: Path, old: str, new: str) -> Path:
