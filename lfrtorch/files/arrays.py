@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,9 @@ _INTERVAL = re.compile(
     re.IGNORECASE,
 )
 
+_OBJECT = 3  # MATLAB_object_decode of an object: what is stored is where its parts are
+_IS_OBJECT = "is an object (a table, timetable or iddata, for example); store its arrays"
+
 _UNREADABLE = (
     OSError,
     EOFError,
@@ -58,6 +61,24 @@ Stored = Callable[[Path], AbstractContextManager[Any]]
 """Opens a file: its arrays by name."""
 
 
+class Packing(NamedTuple):
+    """Numbers that are stored as (number - offset) / scale, a missing one as ``fill``.
+
+    References:
+        NetCDF Climate and Forecast Metadata Conventions 1.11, 2.5.1 and 8.1.
+    """
+
+    scale: float
+    offset: float
+    fill: float
+
+    def unpacked(self, stored: NDArray[Any]) -> Array:
+        """The numbers, NaN for missing ones."""
+        numbers = stored.astype(np.float64)
+        numbers[stored == self.fill] = np.nan
+        return numbers * self.scale + self.offset
+
+
 @dataclass(frozen=True)
 class Signal:
     """An array of the file.
@@ -68,6 +89,7 @@ class Signal:
         unit: empty if the file does not say it.
         reverse: the file has the axes in the order that is not the user's.
         values: the array, if it is in memory; a lone number always is.
+        packing: how its numbers are stored, if not as they are.
     """
 
     shape: tuple[int, ...]
@@ -75,6 +97,7 @@ class Signal:
     unit: str = ""
     reverse: bool = False
     values: NDArray[Any] | None = None
+    packing: Packing | None = None
 
     @property
     def shown(self) -> str:
@@ -122,6 +145,9 @@ class ArrayTable(Table):
         self._stored = stored
         self._signals: list[tuple[str, int]] = []  # of each column
         self._axes: dict[str, int] = {}  # of time
+        self._packing = {
+            name: s.packing for name, s in found.items() if isinstance(s, Signal) and s.packing
+        }
         self.contents = contents = []
         signals = {name: s for name, s in found.items() if isinstance(s, Signal)}
         vectors = {max(s.shape) for s in signals.values() if s.vector and not s.refusal()}
@@ -148,7 +174,7 @@ class ArrayTable(Table):
                 arrays[name] = tuple(range(len(headers), len(headers) + width))
             headers += names
             lengths += [T] * width
-            units |= dict.fromkeys(names, signal.unit)
+            units |= dict.fromkeys(names, "s" if signal.dtype.kind in _TIMES else signal.unit)
             self._signals += [(name, i) for i in range(width)]
             self._axes[name] = axis
             channels = "signal" if width == 1 else f"signals {names[0]} .. {names[-1]}"
@@ -182,6 +208,8 @@ class ArrayTable(Table):
                     part = np.asarray(part.T if last else part)
                     if part.dtype.kind in _TIMES:
                         part = clocks[name](part)
+                    if name in self._packing:
+                        part = self._packing[name].unpacked(part)
                     parts[name] = part.reshape(stop - start, -1)
                 yield np.stack([parts[name][:, i] for name, i in chosen], axis=1, dtype=np.float64)
 
@@ -294,7 +322,7 @@ def _variable(name: str, value: Any, found: dict[str, Signal | str]) -> None:
         kind = "sparse; store full(x)" if hasattr(value, "toarray") else type(value).__name__
         found[name] = f"is {kind}"
     elif type(value).__name__ in ("MatlabOpaque", "MatlabFunction"):
-        found[name] = "is an object (a table or timetable, for example); store its arrays"
+        found[name] = _IS_OBJECT
     elif value.dtype.names and value.size == 1:
         for field in value.dtype.names:
             _variable(f"{name}.{field}", value.reshape(-1)[0][field], found)
@@ -368,6 +396,9 @@ def _group(
             elif item.attrs.get("MATLAB_class") in (b"char", b"string"):
                 found[name] = "is text; store an array of real numbers"
                 continue
+            elif item.attrs.get("MATLAB_object_decode", 0) == _OBJECT:
+                found[name] = _IS_OBJECT
+                continue
             elif "MATLAB_empty" in item.attrs:
                 found[name] = "is empty"
                 continue
@@ -392,8 +423,23 @@ def _group(
             unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
             unit = unit if isinstance(unit, str) else ""
             number = np.asarray(item[()]) if item.size == 1 else None
-            found[name] = Signal(item.shape, item.dtype, unit, matlab, number)
+            found[name] = Signal(item.shape, item.dtype, unit, matlab, number, _packing(item))
             names[name] = item.name
+
+
+def _packing(item: Any) -> Packing | None:
+    """What the attributes of a dataset say of how its numbers are stored."""
+    given = [
+        np.asarray(item.attrs.get(key)) for key in ("scale_factor", "add_offset", "_FillValue")
+    ]
+    lone = [one.size == 1 and one.dtype.kind in _REAL for one in given]
+    if not any(lone):
+        return None
+    scale, offset, fill = (
+        float(one.reshape(-1)[0]) if known else default
+        for one, known, default in zip(given, lone, (1.0, 0.0, np.nan), strict=True)
+    )
+    return Packing(scale, offset, fill)
 
 
 def _linked(group: Any, key: str) -> Any:

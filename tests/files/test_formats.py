@@ -500,6 +500,42 @@ def test_mat_7_3(tmp_path):
     assert np.array_equal(whole(table, "wide"), U)
 
 
+def test_objects_of_mat_7_3(tmp_path):
+    """They were signals of six numbers."""
+
+    def write(file):
+        file["u"] = U.T
+        for name in ("iddata", "timetable", "string"):
+            parts = np.array([[3707764736, 2, 1, 1, 1, 1]], np.uint32)
+            file[name] = parts
+            file[name].attrs["MATLAB_class"] = np.bytes_(name.encode())
+            file[name].attrs["MATLAB_object_decode"] = np.int32(3)
+
+    matlab_file(tmp_path / "a.mat", write)
+    table = open_table(tmp_path / "a.mat")
+    assert names(table) == ["u1", "u2"]
+    refused(table, "iddata", "is an object .*store its arrays")
+    refused(table, "timetable", "is an object")
+    refused(table, "string", "is text")
+
+
+def test_packed_numbers_of_hdf5(tmp_path):
+    """Volts were millivolts, and the mark of a missing value was one."""
+    stored = np.rint(1000 * SIGNALS).astype(np.int16)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["u"] = stored[:, 0]
+        file["u"].attrs.update(units="V", scale_factor=1e-3)
+        file["y"] = np.where(np.arange(T) == 7, -32768, stored[:, 2] + 200).astype(np.int16)
+        file["y"].attrs.update(scale_factor=[1e-3], add_offset=-0.2, _FillValue=np.int16(-32768))
+        file["plain"] = stored[:, 1]
+        file["plain"].attrs.update(scale_factor="none")
+    table = open_table(tmp_path / "a.h5")
+    expected = np.column_stack([stored[:, 0] / 1000, stored[:, 2] / 1000, stored[:, 1]])
+    expected[7, 1] = np.nan
+    found = whole(table, ["u", "y", "plain"])
+    assert np.allclose(found, expected, atol=1e-12, equal_nan=True)
+
+
 @pytest.mark.parametrize("name", ["a.h5", "a.HDF5"])
 def test_hdf5(tmp_path, name):
     with h5py.File(tmp_path / name, "w") as file:
