@@ -27,7 +27,7 @@ from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.preview_words import parser
 from lfrtorch.cli.words import translated
 from lfrtorch.files.formats import BLOCK, Table, open_table
-from lfrtorch.files.time_stamps import UnevenError, in_seconds, is_time, sampling
+from lfrtorch.files.time_stamps import UnevenError, column_sampling, is_time
 from lfrtorch.records import Channel, check_largest, check_rate
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import Survey, survey_measurement
@@ -217,7 +217,7 @@ def chosen(table: Table, options: argparse.Namespace) -> tuple[Roles, list[str]]
             f"'{table.path}': {', '.join(map(repr, twice)) or 'data.time'} stands for several; "
             "give every column one use, and one column of times."
         )
-    heads, remarks = {}, list(table.notes)
+    heads, remarks = {}, list[str]()
     if not table.contents:
         remarks += [f"left out: {name!r} {reason}" for name, reason in table.refused.items()]
     rest = sorted(set(range(len(table.columns))) - set(named))
@@ -255,7 +255,7 @@ def clocks(table: Table, heads: Mapping[int, Array]) -> tuple[int, ...]:
     for i, head in heads.items():
         named = is_time(table.columns[i])
         try:
-            grid = sampling(in_seconds(filled(head), table.columns[i]))
+            grid = column_sampling(head, table.columns[i])
         except UnevenError:
             even, counter = False, False
         else:
@@ -278,9 +278,9 @@ def clock(
     """The sampling frequency, what a column of times was taken for, what is wrong, and its gaps."""
     name = f"'{channel.name}'"
     try:
-        grid = sampling(in_seconds(filled(times), channel))
+        grid = column_sampling(times, channel)
     except UnevenError as error:
-        said = f"the time column {name} {error}; resample the signals to an even grid."
+        said = f"the time column {name} {error}, at sample {error.sample}; {error.remedy}."
         return fs, f"{name} is taken for the time", [said], NO_GAPS
     if grid.fs == 1 and not is_time(channel):
         return fs, f"{name} is taken for sample numbers", [], NO_GAPS
@@ -291,7 +291,7 @@ def clock(
             f"in all, the first after sample {grid.gaps[0] - 1}: data.gaps=split cuts the record "
             "there."
         )
-    remark = f"{name} is taken for the time, {grid.fs:.6g} Hz"
+    remark = f"{name} is taken for {grid}"
     if fs is None or abs(fs / grid.fs - 1) < max(RATE, grid.uncertainty):
         return fs or grid.fs, remark, sentences, gaps
     unit = next((u for f, u in THOUSANDS.items() if abs(fs / grid.fs / f - 1) < RATE), None)
@@ -300,12 +300,6 @@ def clock(
         + (f", unless they are in {unit}." if unit else "; correct one of them.")
     )
     return fs, remark, sentences, gaps
-
-
-def filled(times: Array) -> Array:
-    """Times with those that are missing on the line between their neighbours."""
-    known, k = np.isfinite(times), np.arange(len(times))
-    return np.interp(k, k[known], times[known]) if known.any() else np.zeros(len(times))
 
 
 def read(table: Table, wanted: Sequence[int]) -> tuple[Array, bool]:

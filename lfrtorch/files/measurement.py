@@ -17,7 +17,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Booleans, Integers
 from lfrtorch.files.formats import Table, open_table
 from lfrtorch.files.table import BLOCK, Columns
-from lfrtorch.files.time_stamps import Sampling, UnevenError, in_seconds, is_time, sampling
+from lfrtorch.files.time_stamps import Sampling, TwiceError, UnevenError, column_sampling, is_time
 from lfrtorch.records import Channel
 
 Gaps = Literal["error", "split"]
@@ -26,6 +26,7 @@ GLANCE = 1000
 """Samples that show of most columns that they are no grid of time."""
 
 _SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
+_NEAR = 0.1  # relative: the usual step of stamps that are uneven is of that frequency
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,10 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
             f"'{path}': {', '.join(map(repr, twice))} stands twice in inputs, outputs, "
             "reference and time; name every column once."
         )
-    notes, fs = [*table.notes], wanted.fs
-    if fs is None and not stamps:
+    notes, fs, beside = list[str](), wanted.fs, ()
+    if fs is not None and not stamps:
+        beside, notes = _beside_rate(table, columns, fs)
+    elif not stamps:
         rate = find_rate(table, columns)
         if rate is None:
             raise InputError(
@@ -105,7 +108,7 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
             )
         fs, stamps = rate.fs, rate.stamps
         columns = (*columns, *stamps)
-        notes.append(rate.note)
+        notes = [rate.note]
     known = {name for i in (*u, *y) for name in (table.headers[i], table.columns[i].name, i)}
     strange = [name for name in wanted.units if name not in known]
     if strange:
@@ -113,25 +116,33 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
             f"units names {', '.join(map(repr, strange))}, which is none of the inputs and "
             f"outputs: {', '.join(table.columns[i].name for i in (*u, *y))}."
         )
-    values = table.read(columns)
-    present = np.flatnonzero(~np.isnan(values).all(axis=1))
+    try:
+        values = table.read((*columns, *beside))
+    except InputError:  # further on than was looked at, what is beside may have words
+        beside = ()
+        values = table.read(columns)
+    present = np.flatnonzero(~np.isnan(values[:, : len(columns)]).all(axis=1))
     values = values[: present[-1] + 1 if present.size else 0]  # spreadsheets end in empty lines
+    values, t = values[:, : len(columns)], values[:, -1]
     _refuse_infinite(table, values, columns)
     missing = np.asarray(np.isnan(values).any(axis=1))
     grid = None
     if stamps and not missing.all():
-        grid = _grid(table, values[:, -1], stamps[0])
+        grid = _grid(table, t, stamps[0])
         _agree(wanted, grid, table, stamps[0])
-    elif wanted.fs is not None:
-        notes += _doubts(table, columns, wanted.fs)
+        fs = grid.fs
+        if grid.unit and wanted.time is not None:
+            notes.append(f"{_called(table, stamps[0])} is taken for {grid}")
+    elif beside:
+        grid, doubts = _beside_fs(table, t, beside[0])
+        notes += doubts
     stretches = _stretches(missing, np.array([], np.int64) if grid is None else grid.gaps)
     if len(values) and (missing.any() or len(stretches) > 1) and wanted.gaps == "error":
-        raise _gap(table, values, columns, grid)
+        raise _gap(table, values, columns, grid, beside)
     if not stretches:
         raise InputError(f"'{path}' has no sample in which all columns have a value.")
     ends = np.cumsum([0, len(u), len(y), len(r)])
     parts = [slice(a, b) for a, b in pairwise(ends)]
-    fs = fs if grid is None else grid.fs
     assert fs is not None
     return Measurement(
         path,
@@ -147,7 +158,7 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
             )
             for a, b in stretches
         ],
-        notes,
+        [*table.notes, *notes],
     )
 
 
@@ -182,7 +193,11 @@ def _refuse_infinite(table: Table, values: NDArray, columns: Sequence[int]) -> N
 
 
 def _gap(
-    table: Table, values: NDArray, columns: Sequence[int], grid: Sampling | None
+    table: Table,
+    values: NDArray,
+    columns: Sequence[int],
+    grid: Sampling | None,
+    beside: Sequence[int],
 ) -> ValueError:
     """What is missing, and what to do."""
     empty = np.isnan(values)
@@ -204,21 +219,54 @@ def _gap(
     return InputError(
         f"'{table.path}': {', and '.join(said)}.\nFill the gaps, or gaps='split' takes every "
         "stretch between them for a record of its own."
+        + "".join(_renamed(table, column) for column in beside)
     )
 
 
 def _grid(table: Table, t: Array, column: int) -> Sampling:
     """The grid of time stamps, those that are missing filled in."""
-    known = np.isfinite(t)
-    k = np.arange(len(t))
     try:
-        return sampling(in_seconds(np.interp(k, k[known], t[known]), table.columns[column]))
+        return column_sampling(t, table.columns[column])
     except UnevenError as error:
         raise InputError(
-            f"'{table.path}': the time column {table.headers[column]!r} {error}, at "
-            f"{table.where(error.sample)}; resample the signals to an even grid, or give fs "
-            "without time if the column is wrong."
+            f"'{table.path}': the time column {_uneven(table, column, error)}; {error.remedy}, or "
+            "give fs without time if the column is wrong."
         ) from error
+
+
+def _uneven(table: Table, column: int, error: UnevenError) -> str:
+    return f"{table.headers[column]!r} {error}, at {table.where(error.sample)}"
+
+
+def _beside_fs(table: Table, t: Array, column: int) -> tuple[Sampling | None, list[str]]:
+    """The grid of a column that is not named as time by the user, and doubts if it is none."""
+    doubts, missing = [], np.isnan(t)
+    name = table.headers[column]
+    if missing.any():
+        doubts.append(
+            f"the column {name!r} has no value in {missing.sum()} sample(s), the first at "
+            f"{table.where(int(np.argmax(missing)))}"
+        )
+    try:
+        return column_sampling(t, table.columns[column]), doubts
+    except UnevenError as error:
+        return None, [*doubts, _lost(table, column, error)]
+
+
+def _lost(table: Table, column: int, error: UnevenError) -> str:
+    """A note on a column that runs at the given frequency, but not evenly.
+
+    Raises:
+        ValueError: samples that stand twice beyond doubt.
+    """
+    said = f"the column {_uneven(table, column, error)}"
+    if isinstance(error, TwiceError):
+        raise InputError(f"'{table.path}': {said}; {error.remedy}.{_renamed(table, column)}")
+    return f"{said}: samples are lost or doubled unless it is wrong; {error.remedy}"
+
+
+def _renamed(table: Table, column: int) -> str:
+    return f" If {table.headers[column]!r} is no time, give it another name."
 
 
 def _agree(wanted: Wanted, grid: Sampling, table: Table, column: int) -> None:
@@ -251,7 +299,7 @@ def find_rate(table: Table, used: Sequence[int]) -> Rate | None:
         ValueError: two of them that contradict one another.
     """
     times, _ = _beside(table, used, named=True)
-    said = [(f"the column {table.columns[c].name!r}", g.fs, g.uncertainty) for c, g in times]
+    said = [(_called(table, c), g.fs, g.uncertainty) for c, g in times]
     said += [(repr(name), fs, 0.0) for name, fs in table.rates.items()]
     if not said:
         return None
@@ -264,9 +312,11 @@ def find_rate(table: Table, used: Sequence[int]) -> Rate | None:
     name, fs, _ = said[0]
     if not times:
         return Rate(fs, (), f"fs is {fs:g} Hz, as {name} in the file says")
-    return Rate(
-        fs, (times[0][0],), f"{name} is taken for the time, {fs:g} Hz; fs=HZ leaves it unread"
-    )
+    return Rate(fs, (times[0][0],), f"{name} is taken for {times[0][1]}")
+
+
+def _called(table: Table, column: int) -> str:
+    return f"the column {table.columns[column].name!r}"
 
 
 def _first(table: Table, columns: Sequence[int], samples: int) -> dict[int, Array]:
@@ -283,17 +333,9 @@ def _first(table: Table, columns: Sequence[int], samples: int) -> dict[int, Arra
     return dict(zip(columns, block.T, strict=True))
 
 
-def _sampling(t: Array, channel: Channel) -> Sampling:
-    """The grid of stamps, what is missing between filled in."""
-    known = np.flatnonzero(np.isfinite(t))
-    if known.size:
-        t = np.interp(np.arange(known[-1] + 1), known, t[known])
-    return sampling(in_seconds(t, channel))
-
-
 def _beside(
     table: Table, columns: Sequence[int], *, named: bool
-) -> tuple[list[tuple[int, Sampling]], list[str]]:
+) -> tuple[list[tuple[int, Sampling]], list[tuple[int, UnevenError]]]:
     """Columns that are none of those and an even grid of time, and why others are none.
 
     Args:
@@ -308,23 +350,24 @@ def _beside(
         and not (table.lengths and table.lengths[column] != table.lengths[columns[0]])
         and (is_time(channel) or not named)
     ]
-    reasons: dict[int, str] = {}
+    reasons: dict[int, UnevenError] = {}
     grids: dict[int, Sampling] = {}
     for samples in (BLOCK,) if named else (GLANCE, BLOCK):
         grids.clear()
         for column, t in _first(table, left, samples).items():
             try:
-                grids[column] = _sampling(t, table.columns[column])
+                grids[column] = column_sampling(t, table.columns[column])
             except UnevenError as error:
-                reasons[column] = f"the column {table.headers[column]!r} {error}"
+                reasons[column] = error
         left = list(grids)
-    return list(grids.items()), [reasons[column] for column in sorted(reasons)]
+    return list(grids.items()), sorted(reasons.items())
 
 
 def unusable_time(table: Table, used: Sequence[int]) -> str:
     """Why a column that is named as time is none; empty if there is no such column."""
-    _, reasons = _beside(table, used, named=True)
-    return reasons[0] if reasons else ""
+    for column, error in _beside(table, used, named=True)[1]:
+        return f"the column {table.headers[column]!r} {error}"
+    return ""
 
 
 def _suggested(table: Table, columns: Sequence[int]) -> str:
@@ -340,16 +383,35 @@ def _suggested(table: Table, columns: Sequence[int]) -> str:
     return f", or by a column of time stamps: time={table.columns[column].name!r} ({grid.fs:g} Hz)"
 
 
-def _doubts(table: Table, columns: Sequence[int], fs: float) -> list[str]:
-    """Notes if a column that is named as time is, or a lone number, contradicts ``fs``."""
-    notes = [
-        f"fs is {fs:g} Hz and the column {table.headers[column]!r} says {grid.fs:g} Hz; if "
-        f"that is right, give time={table.columns[column].name!r} in place of fs"
-        for column, grid in _beside(table, columns, named=True)[0]
-        if abs(fs / grid.fs - 1) > max(_SAME, grid.uncertainty)
-    ]
-    return notes + [
+def _beside_rate(
+    table: Table, columns: Sequence[int], fs: float
+) -> tuple[tuple[int, ...], list[str]]:
+    """A column that is named as time is and runs at ``fs``, in some unit, and what contradicts."""
+    grids, reasons = _beside(table, columns, named=True)
+    agree, notes = [], []
+    for column, grid in grids:
+        ratio = fs / grid.fs
+        if abs(ratio - 1) > max(_SAME, grid.uncertainty):
+            notes.append(
+                f"fs is {fs:g} Hz and the column {table.headers[column]!r} says {grid.fs:g} Hz; if "
+                f"that is right, give time={table.columns[column].name!r} in place of fs"
+            )
+        if _agrees(ratio, max(_SAME, grid.uncertainty)):
+            agree.append(column)
+    notes += [
         f"fs is {fs:g} Hz and {name!r} in the file says {said:g} Hz"
         for name, said in table.rates.items()
         if abs(fs / said - 1) > _SAME
     ]
+    if agree:
+        return (agree[0],), notes
+    return (), notes + [
+        _lost(table, column, error)
+        for column, error in reasons
+        if error.fs and _agrees(fs / error.fs, _NEAR)
+    ]
+
+
+def _agrees(ratio: float, tolerance: float) -> bool:
+    """Whether two sampling frequencies are the same, if one is in ms, us or ns, too."""
+    return abs(ratio / 1000.0 ** round(np.log10(ratio) / 3) - 1) <= tolerance

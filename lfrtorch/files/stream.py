@@ -13,7 +13,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.files.formats import BLOCK, open_table
 from lfrtorch.files.measurement import find_rate, unusable_time
 from lfrtorch.files.table import Columns, NoColumnError
-from lfrtorch.files.time_stamps import UnevenError, in_seconds, sampling
+from lfrtorch.files.time_stamps import UnevenError, sampling, time_unit
 from lfrtorch.records import Channel
 
 SAME = 1e-3
@@ -84,7 +84,7 @@ class FileStream:
         Raises:
             ValueError: a sample without an input or a time, or times that do not run at ``fs``.
         """
-        first, seen = 0, np.empty(0)
+        first, seen, seconds = 0, np.empty(0), 0.0
         columns = [*self.times, *self.u, *self.y]
         ends = [len(self.times), len(self.times) + len(self.u)]
         for block in self.table.blocks(columns, samples):
@@ -99,8 +99,8 @@ class FileStream:
                     "parts."
                 )
             times, u, y = np.split(block, ends, axis=1)
-            times = in_seconds(times, self.clock)
             if self.times:
+                times = times * (seconds := seconds or self._seconds(times[:, 0]))
                 seen = np.concatenate([seen[-OVERLAP:], times[:, 0]])
                 self._check(seen, first + len(block) - len(seen))
             yield Block(times, u, y)
@@ -154,6 +154,16 @@ class FileStream:
                 )
         return found
 
+    def _seconds(self, times: Array) -> float:
+        """The unit of the first time stamps."""
+        try:
+            return time_unit(times, self.clock).seconds
+        except UnevenError as error:
+            raise InputError(
+                f"'{self.table.path}': the time column {self.clock} {error}; {error.remedy}, or "
+                "leave out time if the column is wrong."
+            ) from error
+
     def _check(self, times: Array, first: int) -> None:
         """Refuse time stamps, those of the samples from ``first`` on, that do not run at ``fs``."""
         if len(times) < 2:
@@ -162,8 +172,8 @@ class FileStream:
             grid = sampling(times)
         except UnevenError as error:
             raise InputError(
-                f"{self._at(first + error.sample)}: the time column {self.clock} {error}; resample "
-                "the signals to an even grid, or leave out time if the column is wrong."
+                f"{self._at(first + error.sample)}: the time column {self.clock} {error}; "
+                f"{error.remedy}, or leave out time if the column is wrong."
             ) from error
         if abs(grid.fs / self.fs - 1) > max(SAME, grid.uncertainty):
             raise InputError(

@@ -346,7 +346,7 @@ def test_a_column_that_is_named_as_time_is_the_time(tmp_path):
     write(path, np.append(both, np.full((20, 5), np.nan), axis=0), "n,v,Time [ms],u,y")
     data = load_records(path, **use)
     assert data.train[0].fs == 20.0
-    assert data.notes[0] == "the column 'Time' is taken for the time, 20 Hz; fs=HZ leaves it unread"
+    assert data.notes[0] == "the column 'Time' is taken for the time, 20 Hz"
     assert load_records(path, **use, fs=20).notes == ()
     write(path, np.delete(both, [100, 101], axis=0), "n,v,Time [ms],u,y")
     refused(r"1 gap\(s\) of 2 sample\(s\)", path, use=use)
@@ -396,6 +396,64 @@ def test_a_time_column_that_contradicts_is_noted(tmp_path):
     (note,) = load_records(path, **use, fs=1000).notes
     assert note.startswith("fs is 1000 Hz and the column 't' says 100 Hz")
     assert load_records(path, **use, fs=100).notes == ()
+
+
+def lost_and_doubled(path):
+    """A whole file at 100 Hz, one of lost rows, one of a doubled row; what they hold."""
+    t, k = np.arange(3000) / 100, np.arange(3000)
+    values = timed(path / "whole.csv", t)
+    lost = np.concatenate([np.arange(a, a + 7) for a in (400, 800, 1200, 1600, 2000, 2400)])
+    doubled = np.append(k, 1500)
+    for name, kept in (("lost", np.delete(k, lost)), ("doubled", np.sort(doubled))):
+        write(path / f"{name}.csv", np.column_stack([t, values])[kept], "t,u,y")
+    return values
+
+
+def test_rows_that_are_lost_are_refused_if_the_rate_is_given_too(tmp_path):
+    values = lost_and_doubled(tmp_path)
+    use: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 100.0, "validation": 0, "test": 0}
+    message = refused(r"6 gap\(s\) of 42 sample\(s\) in all", tmp_path / "lost.csv", use=use)
+    assert message.endswith("If 't' is no time, give it another name.")
+    data = load_records(tmp_path / "lost.csv", **use, gaps="split")
+    assert [r.samples for r in data.train] == [400, *[393] * 5, 593]
+    assert np.array_equal(joined(data.train[-1]), values[-593:])
+    refused(r"1 time stamp\(s\) twice, the first 15 s, at line 1503; leave out one",
+            tmp_path / "doubled.csv", use=use)  # fmt: skip
+    assert load_records(tmp_path / "whole.csv", **use).notes == ()
+    refused(r"6 gap\(s\) of 42", tmp_path / "lost.csv", use=use | {"fs": 1e-1})  # if in ms
+    use["fs"] = 77.0
+    message = load_records(tmp_path / "lost.csv", **use).notes[0]
+    assert message.startswith("fs is 77 Hz and the column 't' says 100 Hz")
+
+
+def test_uneven_time_beside_a_rate_that_is_given_is_noted(tmp_path):
+    path, t = tmp_path / "a.csv", np.arange(300) / 100
+    use: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 100.0}
+    timed(path, t + 0.003 * np.sin(np.arange(300.0) ** 2))
+    (note,) = load_records(path, **use).notes
+    assert note.startswith("the column 't' is not evenly spaced")
+    assert "samples are lost or doubled unless it is wrong" in note
+    timed(path, np.random.default_rng(0).normal(size=300))  # some other t
+    assert load_records(path, **use).notes == ()
+    table = np.column_stack([t, timed(path, t)])
+    table[299, 0] = np.nan  # as a row of means has none
+    write(path, table, "t,u,y")
+    (note,) = load_records(path, **use).notes
+    assert note == "the column 't' has no value in 1 sample(s), the first at line 301"
+
+
+def test_a_unit_of_time_that_is_assumed_is_said(tmp_path):
+    path = tmp_path / "a.csv"
+    values = timed(path, 1.7e12 + 10 * np.arange(300))
+    write(path, np.column_stack([1.7e12 + 10 * np.arange(300), values]), "stamp,u,y")
+    data = load_records(path, inputs="u", outputs="y", time="stamp")
+    assert data.train[0].fs == 100.0
+    assert data.notes == (
+        "the column 'stamp' is taken for the time in milliseconds since 1970, 100 Hz",
+    )
+    write(path, np.column_stack([np.arange(300) / 100, values]), "t [Ms],u,y")
+    refused("the column 't .Ms.' has the unit 'Ms', which is none of time", path,
+            use={"inputs": "u", "outputs": "y"})  # fmt: skip
 
 
 def test_sheets_are_records(tmp_path, signals):

@@ -82,7 +82,8 @@ def test_columns_that_cannot_be(file: Path, tmp_path: Path):
     other = csv(tmp_path / "b.csv", **{"u1 (kN)": Y, "u2": Y})
     refused("column u1 (kN) of", other)
     refused("is in another unit than the model's u1 (N); convert it", other)
-    refused("the time column y (mm) does not rise", file, time="y")
+    refused("the time column y (mm) has the unit 'mm', which is none of time", file, time="y")
+    refused("the time column u2 does not rise", file, inputs=[3, 3], time="u2")
 
 
 @pytest.mark.parametrize("samples", [7, 300, T])
@@ -151,7 +152,10 @@ def test_samples_that_are_lost(lost: int, samples: int, tmp_path: Path):
 @pytest.mark.parametrize("samples", [300, 301, T])
 def test_a_sample_that_is_repeated(samples: int, tmp_path: Path):
     times = (np.arange(T) - (np.arange(T) >= 300)) / FS
-    refused("the time column t is not evenly", timed(tmp_path, times), samples=samples, time="t")
+    path = timed(tmp_path, times)
+    refused(
+        "line 302: the time column t has 1 time stamp(s) twice", path, samples=samples, time="t"
+    )
 
 
 def test_a_time_that_is_missing(tmp_path: Path):
@@ -176,7 +180,7 @@ def test_a_parquet_file_is_not_read_ahead(tmp_path: Path):
 def test_the_rate_that_the_file_says_is_the_models(tmp_path: Path):
     path = tmp_path / "x.mat"
     signals = {"u1": U[:, 0], "u2": U[:, 1]}
-    taken = "the column 't' is taken for the time, 750 Hz; fs=HZ leaves it unread"
+    taken = "the column 't' is taken for the time, 750 Hz"
     for found, note in (
         ({}, "nothing says how it is sampled; the model's 750 Hz are taken"),
         ({"Ts": 1 / FS}, "fs is 750 Hz, as 'Ts' in the file says"),
