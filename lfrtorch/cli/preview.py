@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.paths import expanded
+from lfrtorch._support.paths import expanded, real
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import parsed
@@ -27,6 +27,7 @@ from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.preview_words import parser
 from lfrtorch.cli.words import translated
 from lfrtorch.files.formats import BLOCK, Table, open_table
+from lfrtorch.files.load import stem_of
 from lfrtorch.files.time_stamps import UnevenError, column_sampling, is_time
 from lfrtorch.records import Channel, check_largest, check_rate
 from lfrtorch.reporting.survey_plots import survey_figure
@@ -92,8 +93,10 @@ def launch(words: Sequence[str] | None = None) -> None:
         if options.fs is not None:
             check_rate("data.fs", options.fs)
         paths = matching(options.paths)
-        for path in paths:
-            show(path, options, figure_path(options.out, path, len(paths)))
+        names = [place(path) for path in paths]
+        for path, name in zip(paths, names, strict=True):
+            own = name if names.count(name) == 1 else f"{name}{path.suffix}"
+            show(path, options, figure_path(options.out, own, len(paths)))
 
 
 def take(word: str, options: argparse.Namespace) -> None:
@@ -134,17 +137,24 @@ def matching(patterns: Sequence[str]) -> list[Path]:
     return list(found)
 
 
-def figure_path(out: Path | None, path: Path, files: int) -> Path:
+def place(path: Path) -> str:
+    """A file's name with its folders below the working one, or all: files are called alike."""
+    full, here = real(path), real(Path())
+    folders = full.relative_to(here) if full.is_relative_to(here) else full.relative_to(full.anchor)
+    return "_".join([*folders.parts[:-1], stem_of(path)])
+
+
+def figure_path(out: Path | None, name: str, files: int) -> Path:
     """Where the figure of a file goes: ``out`` for one, beside it by the file's name for several.
 
     Raises:
         ValueError: an extension that is none of a figure.
     """
     if out is None:
-        return Path(f"{path.stem}_preview.png")
+        return Path(f"{name}_preview.png")
     if out.suffix.lower() not in FIGURES:
         raise InputError(f"--out is '{out}'; give a name that ends with {', '.join(FIGURES)}.")
-    return out if files == 1 else out.with_stem(f"{out.stem}_{path.stem}")
+    return out if files == 1 else out.with_stem(f"{out.stem}_{name}")
 
 
 def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
@@ -161,6 +171,7 @@ def show(path: Path, options: argparse.Namespace, figure: Path) -> None:
         fs, remark, sentences, gaps = clock(signals[:, -1], table.columns[roles.time], fs)
         remarks.append(remark)
         signals = signals[:, :-1]
+    remarks = [*table.notes, *remarks]
     if more:
         remarks.append(f"the first {len(signals)} samples are read, and no more")
     for i, signal in zip(wanted, signals.T, strict=True):

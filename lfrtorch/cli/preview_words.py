@@ -31,7 +31,9 @@ def parser() -> argparse.ArgumentParser:
         found.add_argument(option, nargs="+", default=[], type=column, help=argparse.SUPPRESS)
     found.add_argument("--fs", type=float, help=argparse.SUPPRESS)
     found.add_argument("--time", type=column, help=argparse.SUPPRESS)
-    found.add_argument("--out", type=Path, metavar="FIGURE.png", help="default: FILE_preview.png")
+    found.add_argument(
+        "--out", type=Path, metavar="FIGURE.png", help="default: FOLDER_FILE_preview.png"
+    )
     return found
 
 

@@ -378,7 +378,8 @@ def _counting(text: str) -> list[tuple[int, str]]:
     ]
 
 
-def _stem(path: Path) -> str:
+def stem_of(path: Path) -> str:
+    """Name of a file without its extension, and of its sheet."""
     file, sheet = workbook(path)
     name = file.name
     stem = Path(name[:-3] if name.lower().endswith(".gz") else name).stem
@@ -390,7 +391,7 @@ def _stems(paths: Sequence[Path], taken: Container[str]) -> list[str]:
     full = [real(path) for path in paths]
     names = []
     for depth in range(1, max(len(path.parts) for path in full) + 1):
-        names = ["_".join([*path.parts[-depth:-1], _stem(path)]).lstrip("/") for path in full]
+        names = ["_".join([*path.parts[-depth:-1], stem_of(path)]).lstrip("/") for path in full]
         if len(set(names)) == len(names) and not any(name in taken for name in names):
             return names
     return [f"{name}{path.suffix}" for name, path in zip(names, paths, strict=True)]
@@ -399,8 +400,8 @@ def _stems(paths: Sequence[Path], taken: Container[str]) -> list[str]:
 def _name(paths: Sequence[Path]) -> str:
     """Name of a data set: its file's, or what its files' names begin with."""
     if len(paths) == 1:
-        return _stem(paths[0])
-    letters = zip(*map(_stem, paths), strict=False)
+        return stem_of(paths[0])
+    letters = zip(*map(stem_of, paths), strict=False)
     common = "".join(some[0] for some in takewhile(lambda some: len(set(some)) == 1, letters))
     return common.rstrip("0123456789_-. ") or real(paths[0]).parent.name or "files"
 

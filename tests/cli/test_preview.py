@@ -186,6 +186,23 @@ def test_several_files_and_patterns(file: Path, signals, run):
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_figures_of_files_of_one_name_overwrite_no_other(file: Path, signals, run, monkeypatch):
+    for folder in ("a", "b"):
+        (file.parent / folder).mkdir()
+        written(file.parent / folder / "lab.csv", signals)
+    savemat(file.parent / "lab.mat", {"force": signals["force"]})
+    run("a/lab.csv")
+    run(file.parent / "b" / "lab.csv")
+    run("lab.csv", "lab.mat")
+    names = ["a_lab", "b_lab", "lab.csv", "lab.mat"]
+    assert sorted(p.name for p in file.parent.glob("*.png")) == [f"{n}_preview.png" for n in names]
+    monkeypatch.chdir(file.parent / "a")
+    run(file)
+    (figure,) = Path().glob("*.png")
+    assert figure.name.endswith(f"{file.parent.name}_lab_preview.png")
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_empty_lines_at_the_end_are_no_samples(tmp_path: Path, signals, run, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     longer = {name: np.append(values, np.full(30, np.nan)) for name, values in signals.items()}
