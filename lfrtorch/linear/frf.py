@@ -24,7 +24,7 @@ from lfrtorch._support.checks import dft_lines, integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array, Complex, Integers
-from lfrtorch.linear.local_polynomial import fit_local_polynomials, half_width
+from lfrtorch.linear.local_polynomial import WindowErrors, fit_local_polynomials, half_width
 from lfrtorch.linear.regression import Regression, covariance, divided, outer, regress
 from lfrtorch.linear.spectra import (
     Removal,
@@ -115,6 +115,8 @@ class FRF:
         method: ``"robust"``, ``"fast"`` or ``"local_polynomial"``.
         distortion: levels at the output, from the fast method alone.
         notes: what is not available, why, and what would give it.
+        errors: of local polynomials, whose windows share lines: how the errors of all lines follow
+            from independent ones.
 
     Example:
         >>> frf = lfrtorch.estimate_frf(record)
@@ -138,6 +140,7 @@ class FRF:
     method: str
     distortion: Distortion | None = None
     notes: tuple[str, ...] = ()
+    errors: WindowErrors | None = None
 
     @property
     def realisations(self) -> int:
@@ -194,6 +197,7 @@ class FRF:
             cov_noise=None if self.cov_noise is None else self.cov_noise[inside],
             cov_total=None if self.cov_total is None else self.cov_total[inside],
             distortion=self.distortion and self.distortion.restricted(f_low, f_high),
+            errors=self.errors and self.errors.at(inside),
         )
 
 
@@ -404,7 +408,7 @@ def _local_polynomial(
     if spectra.reference is not None:
         driven, outputs = np.concatenate([spectra.Y, spectra.U], axis=2), spectra.Y.shape[2]
     inside = slice(1, last + 1)
-    G, cov, determined = fit_local_polynomials(
+    G, cov, determined, errors = fit_local_polynomials(
         spectra.excitation[inside], driven[inside], lines - 1, order=order, n=n, outputs=outputs
     )
     if not determined.any():
@@ -429,6 +433,7 @@ def _local_polynomial(
         cov_total=cov[determined],
         method="local_polynomial",
         notes=tuple(notes),
+        errors=errors.at(determined),
         **_about(spectra, data),
     )
 

@@ -107,6 +107,7 @@ def differenced_response(frf: FRF, integrators: int, *, feedthrough: bool) -> FR
         cov_total=None if frf.cov_total is None else size * frf.cov_total[kept],
         y_offset=np.zeros_like(frf.y_offset),
         distortion=None,
+        errors=frf.errors and frf.errors.at(kept).times(factor[:, None], 1.0),
     )
 
 

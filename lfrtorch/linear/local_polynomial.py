@@ -8,14 +8,69 @@ squares; what these do not explain is noise and nonlinear distortion.
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Bool, Complex128, Int64
+from collections.abc import Callable
+from typing import NamedTuple
 
-from lfrtorch._support.types import Booleans, Complex, Integers
+import numpy as np
+from jaxtyping import Bool, Complex128, Float, Int64
+
+from lfrtorch._support.types import Array, Booleans, Complex, Integers
 from lfrtorch.linear.regression import DEPENDENT, covariance, divided, outer, regress
 
 CHUNK = 2**21
 """Complex numbers of the windows that are in memory at a time: 32 MiB, and as many in copies."""
+
+
+class WindowErrors(NamedTuple):
+    """Errors of estimates whose windows share lines, and so are correlated.
+
+    The error of G(k)_yu is Σ weights(k)_url V_ry(first(k) + l) over records r and lines l, with V
+    the noise and distortion of the spectra, independent from line to line and record to record.
+
+    Args:
+        first: lowest line of each window, counted from the first one of the spectra.
+        weights: of the lines in it.
+        noise: covariance of V about each line.
+        sizes: variance of each column of G that noise of unit variance would make, if the inputs
+            followed the reference without noise.
+    """
+
+    first: Int64[Integers, " F"]
+    weights: Complex128[Complex, "F nu R lines"]
+    noise: Complex128[Complex, "F ny ny"]
+    sizes: Float[Array, "F nu"]
+
+    def at(self, lines: Booleans) -> WindowErrors:
+        """The errors at some of the lines."""
+        return WindowErrors(
+            self.first[lines], self.weights[lines], self.noise[lines], self.sizes[lines]
+        )
+
+    def times(self, by_y: Array | Complex, by_u: Array | float) -> WindowErrors:
+        """The errors of by_y G by_u; factors of every line are (F, 1)."""
+        factor = np.asarray(by_y)[..., :, None] * np.conj(by_y)[..., None, :]
+        weights = np.asarray(by_u)[..., :, None, None] * self.weights
+        return WindowErrors(self.first, weights, factor * self.noise, self.sizes)
+
+    def covariance(self, linear: Callable[[Complex], Complex], K: int) -> Float[Array, "K K"]:
+        """Covariance of Re Σ linear(δG)(k) over the lines k.
+
+        Args:
+            linear: from errors (F, ny, nu) to K numbers (F, K) at each line, or their conjugates.
+            K: how many.
+        """
+        values, vectors = np.linalg.eigh(self.noise)
+        roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        last, total = int(self.first.max()) + self.weights.shape[3], np.zeros((K, K))
+        for record in np.moveaxis(self.weights, 2, 0):
+            for root in np.moveaxis(roots, 2, 0):
+                sums = np.zeros((last, K), dtype=complex)  # of noise of unit variance at each line
+                for place, weights in enumerate(np.moveaxis(record, 2, 0)):
+                    found = linear(root[:, :, None] * weights[:, None])
+                    np.add.at(sums, self.first + place, found)
+                power: Complex = sums.conj().T @ sums
+                total += power.real / 2  # a part, real or imaginary, has half
+        return total
 
 
 def half_width(order: int, degrees_of_freedom: int, nu: int, records: int) -> int:
@@ -39,6 +94,7 @@ def fit_local_polynomials(
     Complex128[Complex, "F ny nu"],
     Complex128[Complex, "F ny*nu ny*nu"],
     Bool[Booleans, " F"],
+    WindowErrors,
 ]:
     """Frequency response at lines of spectra that hold transients, and its covariance.
 
@@ -59,7 +115,7 @@ def fit_local_polynomials(
 
     Returns:
         G, the covariance of vec(G) from the residuals (noise and nonlinear distortion together),
-        and whether the input determines G about each centre.
+        whether the input determines G about each centre, and the errors of all lines together.
 
     References:
         Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,
@@ -84,12 +140,15 @@ def fit_local_polynomials(
         projected = np.einsum("wm,fwry->frmy", complement, Y[window], optimize=True)
         shape = len(window), rows, -1
         fitted = regress(X.reshape(shape), projected.reshape(shape), nu)
+        alone = np.sum(np.abs(fitted.weights) ** 2, axis=2)
         if outputs is not None:
             fitted = divided(fitted, outputs)
         C = outer(fitted.residual) / freedom
         # If one line alone has power, some columns are rounding errors, which pass as independent.
         sizes = np.linalg.norm(X, axis=(1, 2))  # (line, s, input)
         determined = (sizes > DEPENDENT * sizes.max(axis=1, keepdims=True)).all(axis=(1, 2))
-        parts.append((fitted.G, covariance(C, fitted.weights), fitted.determined & determined))
-    G, cov, determined = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return G, cov, determined
+        weights = fitted.weights.reshape(len(window), nu, records, -1) @ complement.T
+        cov = covariance(C, fitted.weights)
+        parts.append((fitted.G, cov, fitted.determined & determined, weights, C, alone))
+    G, cov, determined, *errors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return G, cov, determined, WindowErrors(first, *errors)

@@ -137,9 +137,12 @@ class ModalJacobian:
         if system.rank < Q.shape[1]:
             return None
         inverse = system.inverse.numpy()
+        data, last = self._data, Z @ inverse @ Q.T
+        if data.errors is not None:
+            return data.errors.covariance(lambda e: self._scores(data.weighted(e)) @ last, len(Q))
         if known:
             return Q @ (inverse / 2) @ Q.T
-        root = (self._scores(self._errors) @ Z).real @ inverse @ Q.T
+        root = (self._scores(self._errors) @ last).real
         M, K = 2 * self._errors.size, Q.shape[1]
         return root.T @ root * (M / max(1, M - K))
 

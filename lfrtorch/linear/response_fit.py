@@ -236,7 +236,8 @@ class ResponseProblem(LeastSquares):
         Args:
             theta: the minimum.
             known: whether the weights are the inverse variances of the errors. Otherwise the error
-                found at each line stands for its variance (White's estimate).
+                found at each line stands for its variance (White's estimate). Errors that are
+                correlated from line to line are known by themselves.
         """
         jacobian = self.linearise(theta)
         if isinstance(jacobian, ModalJacobian):
@@ -245,7 +246,8 @@ class ResponseProblem(LeastSquares):
                 return found
         errors, nx = self.errors(theta), self.shapes[0][0]
         none = np.zeros(nx), np.zeros((nx, len(theta)))
-        return ResponseJacobian(*self._jacobian(theta), errors, none).covariance(known=known)
+        jacobian = ResponseJacobian(*self._jacobian(theta), errors, none)
+        return jacobian.covariance(self.data, known=known)
 
     def _jacobian(self, theta: Tensor) -> tuple[Complex, Reduction]:
         """Weighted derivative of G U in the columns that are kept, and how these give all."""
@@ -353,21 +355,21 @@ class ResponseJacobian:
     def _adjoint(self, residual: Tensor) -> Tensor:
         return self._reduced.expand.mT @ (self._rows.mT @ residual)
 
-    def covariance(self, *, known: bool) -> Array:
-        """Covariance (P, P) of θ at the minimum.
-
-        Args:
-            known: whether the weights are the inverse variances of the errors. Otherwise the error
-                found at each line stands for its variance (White's estimate).
-        """
+    def covariance(self, data: SpectralData, *, known: bool) -> Array:
+        """Covariance (P, P) of θ at the minimum, see ``ResponseProblem.covariance``."""
         inverse = self.system(0.0, TRUNCATION)[0].inverse.numpy()
-        if known:
+        if known and data.errors is None:
             return inverse / 2  # a complex error of variance 1 has real parts of variance 1/2
-        # Sandwich (JᴴJ)⁻¹ (Σ s sᵀ) (JᴴJ)⁻¹ with the score s = Re(Jᴴ r) of each line.
-        J = self._J.reshape(len(self._J), -1, self._J.shape[-1])
-        r = self._errors.reshape(J.shape[:2])
-        scores = np.einsum("fek,fe->fk", J.conj(), r).real @ self._reduced.expand.numpy()
-        root = scores @ inverse  # whose squares are positive, whatever the rounding
+        # Sandwich (JᴴJ)⁻¹ cov(Σ s) (JᴴJ)⁻¹ with the scores s = Re(Jᴴ r) of the lines.
+        J = self._J.reshape(len(self._J), -1, self._J.shape[-1]).conj()
+        expand = self._reduced.expand.numpy() @ inverse
+
+        def scores(r: Complex) -> Complex:
+            return np.einsum("fek,fe->fk", J, r.reshape(J.shape[:2])) @ expand
+
+        if data.errors is not None:
+            return data.errors.covariance(lambda e: scores(data.weighted(e)), len(inverse))
+        root = scores(self._errors).real  # whose squares are positive, whatever the rounding
         M, K = 2 * self._errors.size, self._rows.shape[1]
         return root.T @ root * (M / max(1, M - K))
 

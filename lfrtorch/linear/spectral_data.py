@@ -18,6 +18,7 @@ from jaxtyping import Complex128, Float
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.frf import FRF
+from lfrtorch.linear.local_polynomial import WindowErrors
 from lfrtorch.linear.regression import outer
 from lfrtorch.linear.spectra import (
     NOISE_LINES,
@@ -54,6 +55,7 @@ class SpectralData:
             square.
         weight: of the errors Y - G U. Default: 1 for all.
         left_out: lines at which the input has some power and yet is not meant to excite.
+        errors: of Y, if those of several lines are correlated.
     """
 
     z: Complex128[Complex, " F"]
@@ -61,6 +63,7 @@ class SpectralData:
     Y: Complex128[Complex, "F ny m"]
     weight: Float[Array, "F ny m"] | None = None
     left_out: int = 0
+    errors: WindowErrors | None = None
 
     def weighted(self, errors: Complex) -> Complex:
         """√weight times errors (F, ny, m), or times their Jacobian (F, ny, m, K)."""
@@ -288,7 +291,10 @@ def spectral_data_of_response(
     offsets = (frf.u_offset, frf.y_offset) if offset else (np.zeros(nu), np.zeros(ny))
     z = np.exp(2j * np.pi * frf.frequencies / frf.fs)
     U = np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu))
-    data = SpectralData(z, U, frf.G / size, None if weights is None else weights * size**2)
+    data = SpectralData(
+        z, U, frf.G / size, None if weights is None else weights * size**2,
+        errors=frf.errors and frf.errors.times(1.0 / y_scale, u_scale),
+    )  # fmt: skip
     return data, Scaler(offsets[0], u_scale, offsets[1], y_scale), known, notes
 
 

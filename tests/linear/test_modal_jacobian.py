@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import reference
@@ -10,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from reference import POLES, random_system, special_poles
 
-from lfrtorch import Record, estimate_bla
+from lfrtorch import Record, estimate_bla, estimate_frf
 from lfrtorch.linear.modal_jacobian import ModalJacobian, Modes, with_best_inputs
 from lfrtorch.linear.pole_limits import PoleLimits
 from lfrtorch.linear.resolvent import frequency_response
@@ -81,9 +83,17 @@ def test_slope_with_poles_beyond_their_limits_is_a_central_difference():
         np.testing.assert_allclose(jacobian.tangent(d), difference, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_covariance_is_that_of_the_general_path(known: bool):
+@pytest.mark.parametrize("errors", ["known", "as found", "of windows"])
+def test_covariance_is_that_of_the_general_path(errors: str):
+    known = errors == "known"
     modal, general, theta = problems(weighted=known)
+    if errors == "of windows":
+        rng = np.random.default_rng(7)
+        record = Record(rng.normal(size=(82, NU)), rng.normal(size=(82, NY)))
+        shared = estimate_frf(record).errors
+        assert shared is not None
+        for problem in (modal, general):
+            problem.data = replace(problem.data, errors=shared)
     expected = general.covariance(theta, known)
     atol = 1e-6 * np.abs(expected).max()
     np.testing.assert_allclose(modal.covariance(theta, known), expected, rtol=0, atol=atol)

@@ -10,7 +10,7 @@ from reference import System, random_system, refined
 
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.linear.frf import FRF
+from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.linear.response_fit import ResponseFit, ResponseProblem
 from lfrtorch.linear.spectral_data import (
@@ -202,6 +202,33 @@ def test_weights_are_inverse_variances_of_some_20_degrees_of_freedom(
     np.testing.assert_allclose(inside, 4.0**2 / means, rtol=1e-12)
 
 
+def under_feedback(seed: int, T: int) -> Record:
+    """A pole at 0.7 with output noise and u = r - y / 2, and its reference."""
+    rng = np.random.default_rng(seed)
+    r, e, u, y, x = rng.normal(size=T), 0.3 * rng.normal(size=T), np.zeros(T), np.zeros(T), 0.0
+    for k in range(T):
+        y[k] = x + e[k]
+        u[k] = r[k] - y[k] / 2
+        x = 0.7 * x + 0.3 * u[k]
+    return Record(u, y, start="estimated", reference=r)
+
+
+def test_errors_of_lines_that_share_a_window_are_known_together():
+    """Deviation of a pole over that of 30 fits; as if lines were independent it is a half."""
+    one = np.ones((1, 1))
+    poles, variances = [], []
+    for seed in range(30):
+        frf = estimate_frf(under_feedback(seed, 300))
+        data, _, known, _ = spectral_data_of_response(frf, None, offset=True)
+        fit = ResponseFit(data, known=known, feedthrough=False)
+        found = refined(fit, (0.7 * one, one, one, 0 * one), 4)
+        assert found.covariance is not None
+        poles.append(found.A[0, 0])
+        variances.append(found.covariance[0, 0])
+    # The root of a mean square of 30 draws deviates by √(1 / 58) = 13 %: two and a half times that.
+    assert 0.7 < np.sqrt(np.mean(variances)) / np.std(poles) < 1.4
+
+
 @pytest.mark.parametrize(("method", "weighted"), [("robust", False), ("local_polynomial", True)])
 def test_lines_count_alike_unless_the_input_is_random(method: str, weighted: bool):
     frf = response_of(np.linspace(0.5, 2.0, 60), "total", experiments=41, method=method)
@@ -311,6 +338,31 @@ def test_covariance_is_that_of_the_errors_or_of_each_line_by_itself(known: bool)
     # What the coordinates leave alone: the variances of the fitted lines.
     spread, wanted = (np.diag(J @ c @ J.conj().T).real for c in (found.covariance, expected))
     np.testing.assert_allclose(spread, wanted, rtol=1e-5)
+
+
+def test_covariance_of_window_errors_is_that_of_all_lines_together():
+    """Cov(Re Σ aᵀδG) with the whole covariance of δG, of two records, inputs and outputs."""
+    rng = np.random.default_rng(0)
+    records = [
+        Record(rng.normal(size=(60, 2)), rng.normal(size=(60, 2)), name=f"r{r}") for r in range(2)
+    ]
+    frf = estimate_frf(records)
+    errors = frf.errors
+    assert errors is not None
+    assert frf.cov_total is not None
+    F, nu, R, width = errors.weights.shape
+    noise = np.broadcast_to(np.array([[2.0, 0.5j], [-0.5j, 1.0]]), errors.noise.shape)
+    M = np.zeros((F, 2, nu, R, F, 2), dtype=complex)  # δG = M V
+    for k, o in np.ndindex(F, 2):
+        M[k, o, :, :, errors.first[k] : errors.first[k] + width, o] = errors.weights[k]
+    whole = np.einsum("kyurlo,op,KYUrlp->kyuKYU", M, noise[0], M.conj(), optimize=True)
+    a = rng.normal(size=(F, 2, nu, 3)) + 1j * rng.normal(size=(F, 2, nu, 3))
+    expected = np.einsum("kyui,kyuKYU,KYUj->ij", a, whole, a.conj(), optimize=True).real / 2
+    found = errors._replace(noise=noise).covariance(lambda e: np.einsum("kyui,kyu->ki", a, e), 3)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    # The blocks of one line are the covariances of the response.
+    own = np.einsum("kurl,kvrl,kop->koupv", errors.weights, errors.weights.conj(), errors.noise)
+    np.testing.assert_allclose(own.reshape(F, 4, 4), frf.cov_total, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
