@@ -10,15 +10,17 @@ import scipy
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.types import Array
-from lfrtorch.extended_kalman_filter import ExtendedKalmanFilter, NoiseCovariance, inside_limits
+from lfrtorch.extended_kalman_filter import NoiseCovariance, inside_limits
+from lfrtorch.fitting.state_scaling import state_moment
 from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.records import Record, as_records, rms_scale
 
 LEAST, MOST = 1e-12, 1e2
-"""Variances that are tried, of states and normalised outputs, both of about unit rms."""
+"""Variances that are tried, of states and outputs over their mean squares in the records."""
 
-STARTS = (1e-6, 1e-4, 1e-2)
-"""Variances of all states and of all outputs: the search begins at the best pair."""
+STARTS = (1e-4, 1e-2)
+"""Variances of all states and of all outputs, relative to the same: the search begins at the best
+pair, from above, as a variance that is far too small makes no difference to the likelihood."""
 
 DIFFERENCE = 1e-4
 """Of the logarithm of a variance, for the gradient."""
@@ -57,24 +59,28 @@ def estimate_noise(model: Model, records: Record | Sequence[Record]) -> NoiseCov
         model.check(record)
     if model.K is not None:
         return _of_innovations(model, records)
-    cell, scale = model.lfr.cell, model.scaler.y_scale
-    nx, signals = cell.nx, [(record.u, inside_limits(record)) for record in records]
+    nx, signals = model.lfr.cell.nx, [(record.u, inside_limits(record)) for record in records]
     count = sum(int(np.isfinite(y).sum()) for _, y in signals)
-    zero = np.zeros(nx)
+    P0 = state_moment(model, records).numpy()
+    if not np.isfinite(P0).all():
+        P0 = model.state_covariance
+    x_rms = np.sqrt(np.where(np.diag(P0) > 0.0, np.diag(P0), 1.0))
+    y_rms = rms_scale([record.y for record in records], model.scaler.y_offset)
+    unit = np.log(y_rms / model.scaler.y_scale).mean()  # so that the search ends alike in all
 
     def noise_of(logarithms: Array) -> NoiseCovariance:
-        variances = np.exp(logarithms)
-        return NoiseCovariance(np.diag(variances[:nx]), np.diag(variances[nx:] * scale**2))
+        rms = np.exp(logarithms / 2.0)
+        return NoiseCovariance(np.diag((rms[:nx] * x_rms) ** 2), np.diag((rms[nx:] * y_rms) ** 2))
 
     def cost(logarithms: Array) -> float:
-        known = model.scaler, model.inputs, model.outputs, zero, noise_of(logarithms)
-        log_p = sum(ExtendedKalmanFilter(cell, *known).follow(u, y) for u, y in signals)
-        return -log_p / count if np.isfinite(log_p) else np.inf
+        noise = noise_of(logarithms)
+        log_p = sum(model.observer(noise=noise, P0=P0).follow(u, y) for u, y in signals)
+        return -log_p / count - unit if np.isfinite(log_p) else np.inf
 
-    starts = [np.log([q] * nx + [r] * cell.ny) for q, r in product(STARTS, STARTS)]
+    starts = [np.log([q] * nx + [r] * len(y_rms)) for q, r in product(STARTS, STARTS)]
     found = scipy.optimize.minimize(
         cost, min(starts, key=cost), method="L-BFGS-B",
-        bounds=[(np.log(LEAST), np.log(MOST))] * (nx + cell.ny), options={"eps": DIFFERENCE},
+        bounds=[(np.log(LEAST), np.log(MOST))] * (nx + len(y_rms)), options={"eps": DIFFERENCE},
     )  # fmt: skip
     return noise_of(found.x)
 

@@ -48,6 +48,30 @@ def test_what_nothing_disturbs_has_no_noise_on_its_states():
     assert np.sqrt(np.diag(noise.R)) == pytest.approx(0.1 * model.scaler.y_scale, rel=0.15)
 
 
+def test_the_noise_of_a_linear_model_is_the_same_in_all_units():
+    """Of the outputs, and of the states, which have those units."""
+    rng, found = np.random.default_rng(0), []
+    A, B, C = np.array([[0.8, 0.3], [-0.3, 0.8]]), np.array([[0.3], [0.15]]), np.array([[1.0, 0.2]])
+    u, x, y = rng.normal(size=(400, 1)), np.zeros(2), np.zeros((400, 1))
+    for k in range(400):
+        y[k] = C @ x + 0.1 * rng.normal()
+        x = A @ x + B @ u[k] + 0.03 * rng.normal(size=2)
+    for y_unit, x_unit in ((1.0, 1.0), (1e5, 1.0), (1e-6, 1e-3)):
+        linear = lfrtorch.LinearModel(
+            A, B * x_unit, C * y_unit / x_unit, np.zeros((1, 1)), fs=1.0, u_offset=np.zeros(1),
+            y_offset=np.zeros(1), inputs=(lfrtorch.Channel("u"),), outputs=(lfrtorch.Channel("y"),),
+        )  # fmt: skip
+        noise = lfrtorch.estimate_noise(linear.to_model(), lfrtorch.Record(u, y * y_unit))
+        found.append(
+            [
+                *np.diag(np.asarray(noise.Q)) / x_unit**2,
+                float(np.trace(np.asarray(noise.R))) / y_unit**2,
+            ]
+        )
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=1e-3)
+    assert found[0][2] == pytest.approx(0.01, rel=0.3)
+
+
 def test_the_noise_of_an_innovation_form_follows_from_its_errors():
     model = replace(random_model(random_cell(1, 2, 3, 1, 1, 3)), K=0.2 * normal(3, 2, seed=5))
     record = replace(measured(model, 0.0, 1e-2, 300, seed=0), skip=50)
