@@ -7,14 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import engineering, number, quantity, table
 from lfrtorch._support.types import Array
+from lfrtorch.engine.beyond_linear import Beyond, folded
 from lfrtorch.engine.operating_point import double
 from lfrtorch.engine.reach import reach
+from lfrtorch.engine.static_enclosure import Interval
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
 
@@ -88,10 +91,28 @@ def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) ->
     start = np.zeros(cell.nx) if x0 is None else reals("x0", x0).ravel()
     if len(start) != cell.nx or not np.isfinite(start).all():
         raise InputError(f"x0 is {x0!r}; the model has {cell.nx} states: give as many numbers.")
-    reached = reach(cell, size / scaler.u_scale, start)
+    reached = reach(folded(cell), size / scaler.u_scale, start)
     y = np.stack([scaler.restore_y(side) for side in reached.y], axis=-1)
-    x, z, w = (np.stack(signal, axis=-1) for signal in (reached.x, reached.z, reached.w))
+    signals = reached.x, *_unfolded(cell.static, reached.z, reached.w)
+    x, z, w = (np.stack(signal, axis=-1) for signal in signals)
     return Bound(size, y, x, z, w, model.inputs, model.outputs)
+
+
+def _unfolded(static: Module | None, z: Interval, w: Interval) -> tuple[Interval, Interval]:
+    """Bounds of z and w of a map from those of the f in it, see ``Beyond``."""
+    if not isinstance(static, Beyond):
+        return z, w
+    z, w = _unfolded(static.base, z, w)
+    L, Z, W = (M.double().cpu().numpy() for M in (static.slope, static.into, static.out))
+    less = _mapped(-W @ L, z)
+    w = _mapped(W, w)
+    return _mapped(np.linalg.inv(Z), z), Interval(w.low + less.low, w.high + less.high)
+
+
+def _mapped(M: Array, v: Interval) -> Interval:
+    """Bounds of M v."""
+    middle, radius = M @ v.middle, np.abs(M) @ v.radius
+    return Interval(middle - radius, middle + radius).wider()
 
 
 def amplitudes(given: ArrayLike, nu: int) -> Array:
