@@ -8,7 +8,7 @@ from typing import Any
 from lfrtorch._support.optional import imported
 from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
 from lfrtorch.export.rendering import rendered
-from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.model import LinearModel, control_labels
 from lfrtorch.model import Model
 
 ACTIVATIONS = {
@@ -24,7 +24,8 @@ ACTIVATIONS = {
 def control_system(model: Model | LinearModel, name: str = "model") -> Any:
     """A model as a ``control.NonlinearIOSystem`` in discrete time, physical units.
 
-    Dots in channel names, which that package does not allow, become underscores.
+    Dots in channel names, which that package does not allow, become underscores; of two names that
+    are the same then, the second one has one more.
 
     Args:
         model: what is exported.
@@ -73,6 +74,7 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
     if isinstance(e.static, Layers):
         known |= {"layers": e.static.names[:-1], "value": ACTIVATIONS[e.static.activation]}
     sides = {"inputs": e.inputs, "outputs": e.outputs, "static": e.static}
+    known |= {"labels": {name: control_labels(sides[name]) for name in ("inputs", "outputs")}}
     return rendered("model_py.txt", **known, **sides, **e.sizes, repr=repr)
 
 

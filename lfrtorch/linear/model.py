@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -338,7 +339,8 @@ class LinearModel:
     def to_control(self) -> Any:
         """The deviations from the operating point as a ``control.StateSpace``.
 
-        Dots in channel names, which that package does not allow, become underscores.
+        Dots in channel names, which that package does not allow, become underscores; of two names
+        that are the same then, the second one has one more.
 
         Raises:
             ImportError: the package ``control`` is not installed.
@@ -355,8 +357,7 @@ class LinearModel:
             ) from error
         return control.ss(
             self.A, self.B, self.C, self.D, 1.0 / self.fs,
-            inputs=[c.name.replace(".", "_") for c in self.inputs],
-            outputs=[c.name.replace(".", "_") for c in self.outputs],
+            inputs=control_labels(self.inputs), outputs=control_labels(self.outputs),
         )  # fmt: skip
 
     def save(self, folder: str | Path) -> Path:
@@ -429,6 +430,23 @@ class LinearModel:
         if f.ndim != 1:
             raise InputError(f"the frequencies have shape {f.shape}; give one dimension, in Hz.")
         return np.exp(2j * np.pi * f / self.fs)
+
+
+def control_labels(channels: Sequence[Channel]) -> list[str]:
+    """Names of channels as labels of python-control: without dots, and each another one.
+
+    Example:
+        >>> from lfrtorch.linear.model import control_labels
+        >>> control_labels([lfrtorch.Channel("a.b"), lfrtorch.Channel("a_b")])
+        ['a_b', 'a_b_']
+    """
+    labels: list[str] = []
+    for channel in channels:
+        label = channel.name.replace(".", "_")
+        while label in labels:
+            label += "_"
+        labels.append(label)
+    return labels
 
 
 def without_units(record: Record) -> Record:

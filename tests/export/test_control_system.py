@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,16 @@ def test_the_system_simulates(name: str):
     response = control.input_output_response(system, np.arange(200) / model.fs, u.T)
     check_output(response.outputs.T, model, u)
     assert (system.name, system.dt, system.nstates) == (name, 0.01, model.lfr.cell.nx)
+
+
+def test_channels_whose_labels_would_be_one_have_two():
+    model = MODELS["polynomial"]
+    named = replace(model, inputs=(Channel("a.b"), Channel("a_b")))
+    system = control_system(named)
+    assert system.input_labels == ["a_b", "a_b_"]
+    u = inputs(model, 50)
+    response = control.input_output_response(system, np.arange(50) / model.fs, u.T)
+    check_output(response.outputs.T, model, u)
 
 
 def test_the_file_stands_alone(tmp_path: Path):
