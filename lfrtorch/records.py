@@ -211,10 +211,7 @@ class Record:
         object.__setattr__(self, "valid", None if valid.all() else valid)
         if not valid.any(axis=0).all():
             raise InputError(f"{what} leaves no sample of an output; leave that output out.")
-        k, filled = np.arange(len(y)), y.copy()
-        for i, there in enumerate(valid.T):
-            filled[~there, i] = np.interp(k[~there], k[there], y[there, i])
-        return filled
+        return interpolated(y, valid)
 
     def _check_valid(self) -> None:
         """Refuse what samples that are left out cannot go with."""
@@ -438,6 +435,22 @@ class Record:
         """
         several = {name: getattr(self, name) for name in ("u", "y", "reference", "valid")}
         return {name: one if one is None else one[window] for name, one in several.items()}
+
+
+def interpolated(y: Array, valid: Array) -> Array:
+    """Outputs (T, ny), those that are not valid (T, ny) on a line between their neighbours.
+
+    Example:
+        >>> from lfrtorch.records import interpolated
+        >>> y = np.array([[1.0], [np.nan], [3.0]])
+        >>> interpolated(y, np.isfinite(y)).ravel()
+        array([1., 2., 3.])
+    """
+    k, filled = np.arange(len(y)), y.copy()
+    for i, there in enumerate(valid.T):
+        if there.any():
+            filled[~there, i] = np.interp(k[~there], k[there], y[there, i])
+    return filled
 
 
 def signals(record: Record) -> str:

@@ -108,8 +108,9 @@ def load_records(
         skip: samples at the beginning of every record that are left out of cost and score.
             Default: the periods that the output takes to settle; 5 % of the record if the input
             does not repeat, and for the score of an estimated start as many more as determine it.
-        gaps: ``"error"`` refuses missing values and missing time stamps, ``"split"`` makes a record
-            of every stretch between them.
+        gaps: ``"error"`` refuses missing inputs and missing time stamps, and leaves outputs without
+            a value out of fits and scores (``Record.valid``); ``"split"`` makes a record of every
+            stretch between missing values of any kind.
         limits: least and greatest output that the sensors show, see :class:`lfrtorch.Record`; for
             example ``(None, 10)``.
         reference: what is set if a controller makes the inputs, or what a generator plays if the
@@ -345,6 +346,7 @@ class _Reader:
             skip_more=self.skip is None and start == "estimated",
             limits=self.limits,
             reference=None if r is None else r[kept],
+            valid=None if stretch.valid is None else stretch.valid[kept],
         )
         return record, notes
 

@@ -18,7 +18,7 @@ from lfrtorch._support.types import Array, Booleans, Integers
 from lfrtorch.files.formats import Table, open_table
 from lfrtorch.files.table import BLOCK, Columns
 from lfrtorch.files.time_stamps import Sampling, TwiceError, UnevenError, column_sampling, is_time
-from lfrtorch.records import Channel
+from lfrtorch.records import Channel, interpolated
 
 Gaps = Literal["error", "split"]
 
@@ -49,13 +49,15 @@ class Wanted:
 class Stretch(NamedTuple):
     """Consecutive samples: u (T, nu), y (T, ny), and which sample of the file is the first.
 
-    ``reference`` (T, nr) is that of the inputs, if one was asked for.
+    ``reference`` (T, nr) is that of the inputs, if one was asked for; ``valid`` (T, ny) says which
+    outputs have a value, if some have none: they are interpolated.
     """
 
     u: Array
     y: Array
     first: int
     reference: Array | None = None
+    valid: Booleans | None = None
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,12 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
     values = values[: present[-1] + 1 if present.size else 0]  # spreadsheets end in empty lines
     values, t = values[:, : len(columns)], values[:, -1]
     _refuse_infinite(table, values, columns)
-    missing = np.asarray(np.isnan(values).any(axis=1))
+    ends = np.cumsum([0, len(u), len(y), len(r)])
+    parts = [slice(a, b) for a, b in pairwise(ends)]
+    needed = np.arange(len(columns))
+    if wanted.gaps == "error":  # an output without a value leaves no gap
+        needed = np.delete(needed, parts[1])
+    missing = np.asarray(np.isnan(values[:, needed]).any(axis=1))
     grid = None
     if stamps and not missing.all():
         grid = _grid(table, t, stamps[0])
@@ -138,12 +145,20 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
         notes += doubts
     stretches = _stretches(missing, np.array([], np.int64) if grid is None else grid.gaps)
     if len(values) and (missing.any() or len(stretches) > 1) and wanted.gaps == "error":
-        raise _gap(table, values, columns, grid, beside)
+        raise _gap(table, values[:, needed], [columns[i] for i in needed], grid, beside)
     if not stretches:
         raise InputError(f"'{path}' has no sample in which all columns have a value.")
-    ends = np.cumsum([0, len(u), len(y), len(r)])
-    parts = [slice(a, b) for a, b in pairwise(ends)]
     assert fs is not None
+    outputs = values[:, parts[1]]
+    valid = np.isfinite(outputs)
+    if wanted.gaps == "error" and not valid.all():
+        sample, i = np.argwhere(~valid)[0]
+        notes.append(
+            f"{(~valid).sum()} output sample(s) have no value, the first at "
+            f"{table.where(int(sample))} in column {table.headers[y[i]]!r}: they are simulated "
+            "through, and neither fitted nor scored"
+        )
+        outputs = interpolated(outputs, valid)
     return Measurement(
         path,
         fs,
@@ -152,9 +167,10 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
         [
             Stretch(
                 values[a:b, parts[0]],
-                values[a:b, parts[1]],
+                outputs[a:b],
                 int(a),
                 values[a:b, parts[2]] if r else None,
+                None if valid[a:b].all() else valid[a:b],
             )
             for a, b in stretches
         ],

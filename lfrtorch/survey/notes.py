@@ -158,8 +158,9 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
         elif one.missing:
             yield Note(
                 f"missing {name}",
-                f"'{name}' misses {one.missing} of {T} samples, up to {one.gap} in a row; "
-                "fill short gaps by interpolation; gaps='split' cuts the record at them.",
+                f"'{name}' misses {one.missing} of {T} samples, up to {one.gap} in a row: of an "
+                "output they are neither fitted nor scored; fill short gaps of an input by "
+                "interpolation, or gaps='split' cuts the record at them.",
             )
         if one.values == 1:
             told = f"'{name}' is constant at {one.mean:.6g}"

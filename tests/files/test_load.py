@@ -478,15 +478,30 @@ def test_sheets_are_records(tmp_path, signals):
 def test_gaps_are_refused_with_their_place(tmp_path):
     path = tmp_path / "a.csv"
     timed(path, np.arange(300) / 100, slice(50, 60))
-    message = refused("10 sample.* in 1 place.*line 52 in column 'y'", path, use=TIMED)
+    turned = TIMED | {"inputs": "y", "outputs": "u"}
+    message = refused("10 sample.* in 1 place.*line 52 in column 'y'", path, use=turned)
     assert "gaps='split'" in message
     assert max(map(len, message.replace(str(path), "a.csv").splitlines())) <= 160
     timed(path, np.delete(np.arange(300), [100, 101, 102, 200]) / 100)
     refused(r"2 gap\(s\) of 4 sample\(s\) in all, the first before line 102", path, use=TIMED)
     np.savez(tmp_path / "a.npz", u=np.arange(60.0), y=np.where(np.arange(60) == 7, np.nan, 1))
     refused(r"1 sample.*the first at sample 7 \(from 0\) in column 'y'", tmp_path / "a.npz",
-            use={"inputs": "u", "outputs": "y", "fs": 1})  # fmt: skip
+            use={"inputs": "y", "outputs": "u", "fs": 1})  # fmt: skip
     refused("gaps is 'skip'", path, use=TIMED, gaps="skip")
+
+
+def test_outputs_without_a_value_are_left_out(tmp_path):
+    path = tmp_path / "a.csv"
+    values = timed(path, np.arange(300) / 100, slice(50, 60))
+    data = load_records(path, **TIMED, validation=0.2, test=0.2)
+    (note,) = [note for note in data.notes if "no value" in note]
+    assert "10 output sample(s) have no value, the first at line 52 in column 'y'" in note
+    (train,), (test,) = data.train, data.tests
+    assert train.valid is not None
+    assert np.array_equal(np.flatnonzero(~train.valid), np.arange(50, 60))
+    assert np.array_equal(train.y[train.valid], values[: train.samples, 1][train.valid[:, 0]])
+    assert test.scored.sum() == 60  # simulated from the beginning, so through the gap
+    refused("a steady state needs whole periods", path, use=TIMED, start="periodic", period=100)
 
 
 def test_stretches_between_gaps_are_records(tmp_path):
