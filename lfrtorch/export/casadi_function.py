@@ -18,7 +18,8 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
     """One sample of a model as a ``casadi.Function`` (x, u) -> (x_next, y), physical units.
 
     It is a graph of scalars (SX) without calls of Python, so that CasADi has derivatives of any
-    order, can print it as C, and solvers may run it in threads.
+    order, can print it as C, and solvers may run it in threads. CasADi itself fills a vector with a
+    number that is given in its place, and refuses other sizes.
 
     Args:
         model: what is exported.

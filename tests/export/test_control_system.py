@@ -41,6 +41,19 @@ def test_the_system_simulates(name: str):
     assert (system.name, system.dt, system.nstates) == (name, 0.01, model.lfr.cell.nx)
 
 
+def test_another_number_of_inputs_or_states_is_refused():
+    made: dict[str, Any] = {}
+    exec(python_source(MODELS["polynomial"]), made)
+    x, u = np.zeros(2), np.ones(2)
+    for wrong in (3.0, np.ones(3), np.ones((2, 1))):
+        with pytest.raises(ValueError, match=r"u has the shape \(.*\); give \(2,\)"):
+            made["step"](x, wrong)
+    with pytest.raises(ValueError, match=r"x has the shape \(1,\); give \(2,\)"):
+        made["step"](0.0, u)
+    exec(python_source(MODELS["smallest"]), made)
+    assert made["step"](0.0, 1.0)[1].shape == (1,)  # a number is a vector of one
+
+
 def test_channels_whose_labels_would_be_one_have_two():
     model = MODELS["polynomial"]
     named = replace(model, inputs=(Channel("a.b"), Channel("a_b")))

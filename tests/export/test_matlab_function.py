@@ -42,6 +42,16 @@ for i = 1:numel(names)
         ps(k, :) = p;
     end
     r.lpv_run = y; r.p = ps;
+    r.refused = {};
+    for wrong = {{t.x, [t.u(1, :) 1]}, {[t.x; 1], t.u(1, :)}}
+        for g = {str2func(name), lpv}
+            try
+                g{1}(wrong{1}{:});
+            catch e
+                r.refused{end + 1} = e.message;
+            end
+        end
+    end
     found.(name) = r;
 end
 save('-v7', 'found.mat', '-struct', 'found');
@@ -87,3 +97,12 @@ def test_the_lpv_form_runs_as_the_model(name: str, found: dict[str, Any]):
     check_output(np.reshape(one["lpv_run"], (200, -1)), model, u)
     p = form.scheduling(model.signals(u).x[0, :-1].numpy(), u)
     np.testing.assert_allclose(np.reshape(one["p"], p.shape), p, rtol=0, atol=1e-9)
+
+
+@needs_octave
+def test_another_number_of_inputs_or_states_is_refused(found: dict[str, Any]):
+    said = found["f_polynomial"]["refused"]
+    message = "f_polynomial takes x of 2 and u of 2 numbers; these have "
+    assert list(said) == [
+        message + f"{each}." for each in ("2 and 3", "2 and 3", "3 and 2", "3 and 2")
+    ]

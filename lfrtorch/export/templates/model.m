@@ -15,6 +15,10 @@ persistent m
 if isempty(m)
     m = load([mfilename('fullpath') '.mat']);
 end
+if numel(x) ~= {{ nx }} || numel(u) ~= {{ nu }}
+    error('{{ name }}:size', '{{ name }} takes x of {{ nx }} and u of {{ nu }} numbers; these have %d and %d.', ...
+        numel(x), numel(u));
+end
 x = x(:);
 v = u(:) - m.u_offset;
 x_next = m.A * x + m.Bu * v;

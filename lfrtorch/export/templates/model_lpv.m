@@ -21,6 +21,10 @@ if isempty(m)
     m = load(fullfile(fileparts(mfilename('fullpath')), '{{ name }}.mat'));
 end
 f = m.lpv;
+if numel(x) ~= {{ nx }} || numel(u) ~= {{ nu }}
+    error('{{ name }}:size', '{{ name }} takes x of {{ nx }} and u of {{ nu }} numbers; these have %d and %d.', ...
+        numel(x), numel(u));
+end
 {% if static %}
 d = f.Cz * (x(:) - f.x0) + f.Dzu * (u(:) - f.u0); % z - z0
 z = m.Cz * f.x0 + m.Dzu * (f.u0 - m.u_offset); % z0
