@@ -60,11 +60,6 @@ class PredictionProblem(SimulationProblem):
         self._simulated = SimulationProblem(
             LFR(system), driven, y_scale, solve_initial_states=self._solved, ranks=self.ranks
         )
-        # A predictor soon forgets its initial state: the simulation tells more of it.
-        states = self._simulated.initial_states(self._simulated.theta)
-        own = sum(p.numel() for p in self._parameters)
-        self.write(torch.cat([self.theta[:own], states.flatten()]))
-        self._theta_0 = self.theta
         self.weight = 1.0
         if weight is None:
             r = self.residual(self.theta)
