@@ -14,6 +14,7 @@ from lfrtorch.survey.causality import TwoSidedResponse, two_sided_response
 from lfrtorch.survey.integration import integrators
 from lfrtorch.survey.measurement import Survey, survey_measurement
 from lfrtorch.survey.mechanics import reacting, rubs
+from lfrtorch.survey.outliers import input_outliers, output_outliers
 from lfrtorch.survey.signal import SignalSurvey, longest_run
 
 SHORT = 300
@@ -62,6 +63,9 @@ BEFORE, AFTER, CERTAIN = -0.15, 0.5, -0.4
 reverse gain that rises with frequency speaks against it, as an integrator with feedthrough has it;
 then the causality must be below CERTAIN."""
 
+SHOWN = 6
+"""Outliers that a note names; it counts the others."""
+
 COHERENT, UNRELATED = 0.1, 0.05
 """Coherence beyond chance above which the causality test means something, and below which the
 output does not follow the inputs."""
@@ -97,7 +101,7 @@ def examine(
         >>> examine(survey_measurement(u, y), u, y)[0].kind
         'constant u1'
     """
-    notes = [*_levels(found, u, y, skipped)]
+    notes = [*_levels(found, u, y, skipped), *_outliers(found, u, y, skipped)]
     u, y = u[found.whole], y[found.whole]
     if len(y) >= ENOUGH:
         notes += _excitation(found, u, skipped)
@@ -214,6 +218,25 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
             "short",
             f"{T} samples{_after(skipped)} are few to fit: a small nonlinear model has 50 to 100 "
             "parameters; measure longer.",
+        )
+
+
+def _outliers(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
+    """Lone samples that stick out of a signal."""
+    places = [input_outliers(signal, y) for signal in u.T]
+    places += [output_outliers(s, u) if found.inputs else input_outliers(s) for s in y.T]
+    for i, (one, k) in enumerate(zip(found.signals, places, strict=True)):
+        if not len(k):
+            continue
+        kind = ("input " if i < u.shape[1] else "output ") if found.inputs else ""
+        shown = ", ".join(str(skipped + sample) for sample in k[:SHOWN])
+        more = f" and {len(k) - SHOWN} more" if len(k) > SHOWN else ""
+        remedy = "interpolate, or leave the outputs that follow out"
+        yield Note(
+            f"outliers {one.channel.name}",
+            f"{kind}'{one.channel.name}' has {len(k)} outlier(s), at sample {shown}{more}: if "
+            f"misread, {remedy if kind == 'input ' else 'leave them out'}, by Record(valid=...) "
+            "or an empty cell of the output.",
         )
 
 

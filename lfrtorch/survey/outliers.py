@@ -1,0 +1,146 @@
+"""Outliers: one or two samples that stick out of a signal as nothing else in it does.
+
+How far a sample sticks out is what opening and closing by three samples take off (the white and the
+black top-hat): nothing at a step, at a drift or in a smooth signal, the whole height of a lone
+sample. Outliers stick out farther than the tail of these heights promises, a Weibull tail
+
+    P(height > h) = exp(-(h / b)ᶜ),
+
+or are divided from all others by a gap; and they lie beyond the range of all other samples, or are
+higher than their jumps. So a pulse among pulses is none, nor is the peak of a random signal.
+
+References:
+    Serra (1982), Image Analysis and Mathematical Morphology, Academic Press: the top-hat.
+    Coles (2001), An Introduction to Statistical Modeling of Extreme Values, Springer: the tails.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+
+from lfrtorch._support.types import Array, Integers
+
+SHORTEST, LEVELS = 100, 16
+"""Least samples of a record that can tell; a signal of at most that many values has levels."""
+
+MOST, FEW = 0.02, 3
+"""Outliers are at most this share of the samples, or FEW of a short record: more are by design."""
+
+TAIL, BODY, CHANCE = 0.97, (0.5, 0.8), 0.01
+"""Quantiles of the heights that fix the tail, the lighter one of those from BODY to TAIL, and how
+likely the largest height of a record exceeds what it promises."""
+
+GAP = 3.0
+"""Heights that are this many times the next lower one are no part of the tail."""
+
+BEYOND, ABOVE, STEPS = 0.2, 1.5, 5.0
+"""Outliers are farther from all other samples than BEYOND of these samples' range, or higher than
+ABOVE times their largest jump, and than STEPS steps of the converter."""
+
+BEFORE, ACTIVE, RARELY, ALIKE = 20, 2.0, 0.1, 0.5
+"""An input is active if it jumped in the last BEFORE samples by ACTIVE times what is usual. What
+sticks out of an output then is its response, unless the inputs are active for more than RARELY of
+the record and ALIKE of what would by chance sticks out while they are not."""
+
+DESIGN, RESPONDS = 0.5, 10.0
+"""Lone samples with more than DESIGN of the power are an experiment with impulses, if the power of
+each output is RESPONDS times as large in the next BEFORE samples."""
+
+
+def input_outliers(u: Array, y: Array | None = None) -> Integers:
+    """Samples of an input (T,), or of any signal, that stick out of it.
+
+    Args:
+        u: the signal, NaN for a missing sample.
+        y: outputs (T, ny), which respond to impulses.
+
+    Example:
+        >>> from lfrtorch.survey.outliers import input_outliers
+        >>> u = np.random.default_rng(0).standard_normal(1000)
+        >>> u[[300, 700]] = 9.0, -8.0
+        >>> input_outliers(u).tolist()
+        [300, 700]
+    """
+    u = _filled(u)
+    k = _sticking_out(u)
+    power = (u - np.median(u)) ** 2
+    if not k.size or power[k].sum() <= DESIGN * power.sum():
+        return k
+    after = np.zeros(len(u), bool)
+    after[np.minimum(k[:, None] + np.arange(BEFORE), len(u) - 1)] = True
+    for output in () if y is None else y.T:
+        power = (_filled(output) - np.nanmedian(output)) ** 2
+        if power[after].mean() <= RESPONDS * power[~after].mean():
+            return k
+    return k[:0]
+
+
+def output_outliers(y: Array, u: Array) -> Integers:
+    """Samples of an output (T,) that stick out of it, not because inputs (T, nu) jump."""
+    k = _sticking_out(_filled(y))
+    active = np.zeros(len(y), bool)
+    for channel in u.T if k.size else ():
+        jump = np.abs(np.diff(_filled(channel), append=channel[-1:]))  # to the next sample, too
+        largest = maximum_filter1d(np.nan_to_num(jump), BEFORE + 2, origin=BEFORE // 2)
+        active |= largest > ACTIVE * np.median(largest)
+    rest, share = k[~active[k]], float(active.mean())
+    return k if share > RARELY and len(rest) >= ALIKE * (1 - share) * len(k) else rest
+
+
+def _sticking_out(x: Array) -> Integers:
+    T = len(x)
+    values = np.unique(x) if T >= SHORTEST else x[:0]
+    if len(values) <= LEVELS:
+        return np.zeros(0, np.int64)
+    height = _heights(x)
+    found = height > max(_limit(height), STEPS * float(np.diff(values).min()))
+    if not 0 < np.count_nonzero(found) <= max(FEW, MOST * T):
+        return np.zeros(0, np.int64)
+    low, high = float(x[~found].min()), float(x[~found].max())
+    jumps = np.abs(np.diff(x))[~found[1:] & ~found[:-1]]
+    outside = np.maximum(x - high, low - x)
+    found &= (outside > BEYOND * (high - low)) | (height > ABOVE * jumps.max(initial=0.0))
+    between = np.zeros(T, bool)  # a good sample between two bad ones sticks out on their other side
+    between[1:-1] = found[:-2] & found[2:] & (outside[1:-1] <= 0)
+    return np.flatnonzero(found & ~between)
+
+
+def _heights(x: Array) -> Array:
+    """What opening and closing by three samples take off, the larger one: (T,)."""
+
+    def three(of: Callable[[Array, Array], Array], x: Array) -> Array:
+        return of(of(x[:-2], x[1:-1]), x[2:])
+
+    opened = three(np.maximum, three(np.minimum, x))
+    closed = three(np.minimum, three(np.maximum, x))
+    height = np.zeros(len(x))
+    height[2:-2] = np.maximum(x[2:-2] - opened, closed - x[2:-2])
+    return height
+
+
+def _limit(height: Array) -> float:
+    """The height that only outliers exceed."""
+    some = np.sort(height[height > 0])[::-1]
+    if len(some) < SHORTEST // 3:
+        return 0.0
+    tail = float(np.quantile(some, TAIL))
+    depth = np.log(1 / (1 - TAIL))
+    c = max(
+        np.log(depth / np.log(1 / (1 - q))) / np.log(max(tail / np.quantile(some, q), 1.05))
+        for q in BODY
+    )
+    promised = tail * float(np.log(len(some) / CHANCE) / depth) ** (1 / c)
+    top = some[: max(FEW, int(MOST * len(height))) + 1]
+    gaps = np.flatnonzero(top[:-1] > GAP * top[1:])
+    return min(promised, float(top[gaps[-1] + 1])) if gaps.size else promised
+
+
+def _filled(x: Array) -> Array:
+    """A signal with straight lines where samples are missing, which stick out of nothing."""
+    known = np.isfinite(x)
+    if known.all() or not known.any():
+        return np.nan_to_num(x)
+    return np.interp(np.arange(len(x)), np.flatnonzero(known), x[known])
