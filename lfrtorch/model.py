@@ -258,7 +258,7 @@ class Model:
         Example:
             >>> model.simulate(record).shape
             (400, 1)
-            >>> model.simulate(np.zeros(50)).shape  # any input, from rest
+            >>> model.simulate(np.zeros(50)).shape  # any input, from x = 0
             (50, 1)
         """
         y = self.signals(data, start=start, x0=x0).y[0].double().numpy()

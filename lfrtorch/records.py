@@ -95,7 +95,7 @@ class Record:
         u: input, physical units. A one-dimensional array is one channel.
         y: output, physical units. A one-dimensional array is one channel.
         fs: sampling frequency in Hz.
-        start: ``"zero"`` simulates from x = 0 (at rest at the input's offset), ``"given"`` from
+        start: ``"zero"`` simulates from x = 0 (near rest at the input's offset), ``"given"`` from
             ``x0``; ``"estimated"`` fits the start state to the record, too: in a fit together with
             the parameters; in a simulation to the skipped samples alone, or to all if none is
             skipped; ``"periodic"`` says that the record is a whole number of periods in steady

@@ -90,6 +90,14 @@ def check_step(step: Step, model: Model) -> None:
             assert np.abs(found - one.numpy()).max() <= 1e-12 * np.abs(one.numpy()).max()
 
 
+def check_rest(x_rest: Array, model: Model) -> None:
+    """The state stays where it is with the inputs at their operating point."""
+    with torch.no_grad():
+        u = torch.tensor(model.scaler.u_offset)
+        after = cell_step(model, torch.tensor(x_rest), u)[0].numpy()
+    assert np.abs(after - x_rest).max() <= 1e-9
+
+
 def check_run(step: Step, model: Model) -> None:
     """A thousand samples from rest are those of the model to 1e-10 of the output's rms."""
     u, x, y = inputs(model, 1000), np.zeros(model.lfr.cell.nx), []

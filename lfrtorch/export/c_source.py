@@ -33,12 +33,13 @@ LINE = 96
 def c_source(
     model: Model | LinearModel, name: str = "model", *, observer: bool | NoiseCovariance = False
 ) -> tuple[str, str]:
-    """A model as C99: one step, its Jacobians, and the state at rest.
+    """A model as C99: one step, its Jacobians, and the states to start from.
 
     ``NAME_step`` is one sample in physical units, ``NAME_jacobians`` the matrices of the model
-    linearised at a state and an input, ``NAME_reset`` the state 0. Sizes and the sampling time
-    are macros, as ``NAME_NX`` and ``NAME_TS``. The code allocates nothing and keeps no state of
-    its own. It computes in double precision.
+    linearised at a state and an input, ``NAME_reset`` the state 0, ``NAME_rest`` that at rest with
+    the inputs at their operating point, if there is one. Sizes and the sampling time are macros, as
+    ``NAME_NX`` and ``NAME_TS``. The code allocates nothing and keeps no state of its own. It
+    computes in double precision.
 
     With an observer there are ``NAME_observer_reset``, ``NAME_observer_predict`` and
     ``NAME_observer_update`` as well, on a struct ``NAME_observer`` of the caller.
@@ -66,6 +67,7 @@ def c_source(
     e = equations(model)
     known = {"name": name, "NAME": name.upper(), "ts": repr(1.0 / e.fs), **e.sizes}
     known |= {"about": comment(e.about(name)), "static": e.static, "arrays": list(_arrays(e))}
+    known["rest"] = bool(e.x_rest.size)
     match observer_equations(model, observer):
         case SteadyGain(K=K):
             known["K"] = True
@@ -94,7 +96,7 @@ def _arrays(e: Equations) -> Iterator[str]:
     for name, size in (
         ("u_offset", "NU"), ("y_offset", "NY"), ("A", "NX * NX"), ("Bu", "NX * NU"),
         ("Cy", "NY * NX"), ("Dyu", "NY * NU"), ("Cz", "NZ * NX"), ("Dzu", "NZ * NU"),
-        ("Bw", "NX * NW"), ("Dyw", "NY * NW"),
+        ("Bw", "NX * NW"), ("Dyw", "NY * NW"), ("x_rest", "NX"),
     ):  # fmt: skip
         value = getattr(e, name)
         if value.size:

@@ -70,7 +70,13 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
     """
     check_name(name)
     e = equations(model)
-    known = {"name": name, "about": e.about(name), "arrays": _arrays(e), "fs": float(e.fs)}
+    known = {
+        "name": name,
+        "about": e.about(name),
+        "rest": e.x_rest.size,
+        "arrays": _arrays(e),
+        "fs": float(e.fs),
+    }
     if isinstance(e.static, Layers):
         known |= {"layers": e.static.names[:-1], "value": ACTIVATIONS[e.static.activation]}
     sides = {"inputs": e.inputs, "outputs": e.outputs, "static": e.static}
@@ -82,7 +88,19 @@ def _arrays(e: Equations) -> Iterator[tuple[str, str | list[str]]]:
     """Names and rows of all constants."""
     named = {
         name: getattr(e, name)
-        for name in ("u_offset", "y_offset", "A", "Bu", "Cy", "Dyu", "Cz", "Dzu", "Bw", "Dyw")
+        for name in (
+            "u_offset",
+            "y_offset",
+            "x_rest",
+            "A",
+            "Bu",
+            "Cy",
+            "Dyu",
+            "Cz",
+            "Dzu",
+            "Bw",
+            "Dyw",
+        )
     }
     match e.static:
         case Layers():

@@ -6,7 +6,7 @@ import keyword
 import re
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -19,6 +19,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.nonlinearity import is_network, is_polynomial
+from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
@@ -92,6 +93,7 @@ class Equations:
     Args:
         A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw: matrices; nz = nw = 0 of a linear model.
         u_offset, y_offset: operating point.
+        x_rest: state at rest under u_offset, (nx,); empty if none was found. x = 0 is near it.
         static: f; None for a linear model.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
@@ -107,6 +109,7 @@ class Equations:
     Dyw: Array
     u_offset: Array
     y_offset: Array
+    x_rest: Array
     static: Layers | Monomials | Own | None
     fs: float
     inputs: tuple[Channel, ...]
@@ -160,6 +163,7 @@ class Equations:
             "name": name,
             "fs": self.fs,
             "states": self.sizes["nx"],
+            "x_rest": self.x_rest.tolist(),
             **{
                 side: [c._asdict() | {"offset": o} for c, o in zip(channels, offset, strict=True)]
                 for side, channels, offset in sides
@@ -204,6 +208,7 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         Dyw=numbers(cell.Dyw) * s.y_scale[:, None],
         u_offset=np.asarray(s.u_offset, dtype=np.float64),
         y_offset=np.asarray(s.y_offset, dtype=np.float64),
+        x_rest=np.empty(0),
         static=static_map(cell.static, own),
         fs=model.fs,
         inputs=model.inputs,
@@ -214,7 +219,8 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         parts += map(numbers, found.static.module.state_dict().values())
     if not all(np.isfinite(part).all() for part in parts):
         raise InputError("the model has weights that are not finite; nothing can be exported.")
-    return found
+    rest = equilibrium(double(cell), torch.zeros(cell.nu, dtype=torch.float64))
+    return found if rest is None else replace(found, x_rest=numbers(rest))
 
 
 def static_map(static: Module | None, own: bool) -> Layers | Monomials | Own | None:

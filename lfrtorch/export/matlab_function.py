@@ -55,7 +55,8 @@ def matlab_function(
     matrices of the model linearised there. ``[A, B, C, D, p] = NAME_lpv(x, u)`` has those of the
     exact LPV form, ``lfrtorch.analysis.lpv(model)``. Both load what ``scipy.io.savemat`` writes to
     ``NAME.mat`` beside them: all matrices of the model, offsets, names and units of the channels,
-    fs, and in ``lpv`` the matrices of the LPV form (the third index counts them) and its bounds.
+    fs, the state ``x_rest`` at rest under the inputs' offsets (empty if there is none), and in
+    ``lpv`` the matrices of the LPV form (the third index counts them) and its bounds.
 
     Args:
         model: what is exported.
@@ -80,7 +81,8 @@ def matlab_function(
     model = model.to_model() if isinstance(model, LinearModel) else model
     e, form = equations(model), lpv(model)
     found: dict[str, Any] = {letters: getattr(e, letters) for letters in MATRICES}
-    found |= {"u_offset": e.u_offset[:, None], "y_offset": e.y_offset[:, None], "fs": e.fs}
+    offsets = {name: getattr(e, name)[:, None] for name in ("u_offset", "y_offset", "x_rest")}
+    found |= offsets | {"fs": e.fs}
     for side, channels in (("input", e.inputs), ("output", e.outputs)):
         found[f"{side}_names"] = np.array([c.name for c in channels], dtype=object)[:, None]
         found[f"{side}_units"] = np.array([c.unit for c in channels], dtype=object)[:, None]
@@ -89,6 +91,7 @@ def matlab_function(
         "NAME": name.upper(),
         "about": e.about(name, "{0}({2})"),
         "static": e.static,
+        "rest": e.x_rest.size,
     }
     match e.static:
         case Layers():

@@ -14,6 +14,7 @@ import torch
 from exported import (
     MODELS,
     OBSERVED,
+    check_rest,
     check_run,
     check_step,
     inputs,
@@ -25,7 +26,7 @@ from reference import random_cell, random_model
 
 from lfrtorch import InputError, NoiseCovariance
 from lfrtorch._support.types import Array
-from lfrtorch.export import c_source, write
+from lfrtorch.export import c_source, python_source, write
 from lfrtorch.extended_kalman_filter import ExtendedKalmanFilter
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
@@ -93,6 +94,28 @@ def test_jacobians_are_those_of_the_model(name: str, library: ctypes.CDLL):
     call(library, f"{name}_jacobians", x, u, *found)
     for one, other in zip(found, expected, strict=True):
         assert np.abs(one - other).max() <= 1e-12 * np.abs(other).max()
+
+
+@needs_compiler
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", MODELS)
+def test_the_state_at_rest_stays(name: str, library: ctypes.CDLL):
+    x = np.full(MODELS[name].lfr.cell.nx, np.nan)
+    call(library, f"{name}_rest", x)
+    check_rest(x, MODELS[name])
+    assert (name == "linear") == (not x.any())  # a network's bias moves it from 0
+
+
+def test_a_model_without_rest_says_so():
+    """An integrator that drifts by the bias of the network."""
+    model = random_model(random_cell(1, 1, 1, 1, 1, 3))
+    with torch.no_grad():
+        model.lfr.cell.A.fill_(1.0)
+        model.lfr.cell.Cz.zero_()
+    assert not any("_rest" in text for text in c_source(model))
+    text = python_source(model)
+    assert "none at rest" in text
+    assert "x_rest" not in text
 
 
 @needs_compiler

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exported import MODELS, check_output, check_run, check_step, inputs, jacobians
+from exported import MODELS, check_output, check_rest, check_run, check_step, inputs, jacobians
 
 from lfrtorch.export import control_system, python_source, write
 from lfrtorch.model import Model
@@ -28,6 +28,7 @@ def test_steps_are_those_of_the_model(name: str):
     exec(python_source(MODELS[name], name), made)
     check_step(made["step"], MODELS[name])
     check_run(made["step"], MODELS[name])
+    check_rest(made["x_rest"], MODELS[name])
 
 
 @pytest.mark.numeric

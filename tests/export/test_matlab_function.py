@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exported import MODELS, check_output, inputs, jacobians
+from exported import MODELS, check_output, check_rest, inputs, jacobians
 from scipy.io import loadmat, savemat
 
 from lfrtorch.analysis import lpv
@@ -32,6 +32,7 @@ for i = 1:numel(names)
     end
     r.run = y;
     m = load([name '.mat']);
+    r.x_rest = m.x_rest;
     f = m.lpv;
     lpv = str2func([name '_lpv']);
     x = zeros(numel(t.x), 1); y = []; ps = [];
@@ -82,6 +83,7 @@ def test_samples_and_jacobians_are_those_of_the_model(name: str, found: dict[str
     model, one = MODELS[name], found[f"f_{name}"]
     u = inputs(model, 1000)
     check_output(np.reshape(one["run"], (1000, -1)), model, u)
+    check_rest(np.atleast_1d(one["x_rest"]), model)
     x = np.random.default_rng(4).normal(size=model.lfr.cell.nx)
     for letter, expected in zip("ABCD", jacobians(model, x, u[0]), strict=True):
         error = np.reshape(one[letter], expected.shape) - expected

@@ -146,6 +146,13 @@ void {{ name }}_reset(double x[NX])
         x[i] = 0.0;
 }
 
+{% if rest %}
+void {{ name }}_rest(double x[NX])
+{
+    copy(x, x_rest, NX);
+}
+
+{% endif %}
 void {{ name }}_step(const double x[NX], const double u[NU], double x_next[NX], double y[NY])
 {
     double v[NU], next[NX] = {0.0};

@@ -11,9 +11,14 @@
 extern "C" {
 #endif
 
-/* The state to start from: x = 0, that of the operating point. */
+/* The state to start from: x = 0, as the model's simulations do. */
 void {{ name }}_reset(double x[{{ NAME }}_NX]);
 
+{% if rest %}
+/* The state at rest with the inputs at their operating point. */
+void {{ name }}_rest(double x[{{ NAME }}_NX]);
+
+{% endif %}
 /* The output y at this sample, and the state at the next one. x_next may be x itself. */
 void {{ name }}_step(const double x[{{ NAME }}_NX], const double u[{{ NAME }}_NU],
     double x_next[{{ NAME }}_NX], double y[{{ NAME }}_NY]);

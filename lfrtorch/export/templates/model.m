@@ -3,7 +3,8 @@ function [x_next, y, A, B, C, D] = {{ name }}(x, u)
 %
 %   [x_next, y] = {{ name }}(x, u) gives the output y at this sample and the state at the next one.
 %   [x_next, y, A, B, C, D] = {{ name }}(x, u) gives the model linearised at x and u as well:
-%   dx_next/dx, dx_next/du, dy/dx and dy/du. Start from x = zeros({{ nx }}, 1), the operating point.
+%   dx_next/dx, dx_next/du, dy/dx and dy/du. Start from x = zeros({{ nx }}, 1), as the model's
+%   simulations do{% if rest %}, or from x_rest in {{ name }}.mat, at rest with u = u_offset{% endif %}.
 %
 {% for line in about %}
 %{{ "   " + line if line }}
