@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.tables import number
+from lfrtorch._support.tables import factor_of, number
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.bounds import amplitudes, levels_of
 from lfrtorch.engine.beyond_linear import folded
@@ -37,6 +37,13 @@ LEAST, HALVINGS = 1e-3, 9
 """The rate is looked for between this part of the best possible 1 - ρ and all of it, by so many
 halvings of the logarithm."""
 
+SLOW = 2
+"""Ratio of the time to forget to that of the spectral radius, above which a hint is given."""
+
+SMALLER = (
+    "For inputs of an amplitude the rate may be far smaller: contraction(model, amplitude=...)."
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
@@ -45,14 +52,13 @@ class Contraction:
     Args:
         amplitude: of the inputs about their offsets, (nu,), physical units, for which it holds:
             infinite if for all; 0 if nothing was found.
-        rate: ρ, by which the norm of the difference shrinks in every sample; NaN if nothing was
-            found.
+        rate: ρ, the norm of the difference shrinks to ρ times its size or less in every sample; NaN
+            if nothing was found.
         gain: γ, the largest root sum of squares of the outputs' difference over that of the
-            inputs', in physical units (of one input and output; otherwise of all together); NaN if
-            none was found.
+            inputs', of all channels together, in physical units; NaN if none was found.
         P: of the norm √(ΔxᵀPΔx), (nx, nx), in the model's coordinates; ``None`` if nothing was
             found.
-        reason: why nothing was found.
+        reason: why nothing was found, or where a smaller rate may be.
         inputs, outputs: channel names and units.
 
     Example:
@@ -83,26 +89,39 @@ class Contraction:
         samples = number(-1.0 / math.log(self.rate)) if self.rate > 0 else "0"
         lines = [
             f"The model contracts, for {for_which}: differences of states under the same input",
-            f"shrink by {self.rate:.6g} or more in every sample, to 1/e in {samples} samples.",
+            f"shrink to {self.rate:.6g} of their size or less in every sample, to 1/e in {samples} "
+            "samples.",
         ]
         if math.isfinite(self.gain):
-            one = len(self.inputs) == len(self.outputs) == 1
-            unit = f"{self.outputs[0].unit}/{self.inputs[0].unit}" if one else ""
-            lines.append(f"Incremental gain: {number(self.gain)} {unit.strip('/')}".rstrip())
-        return "\n".join(lines)
+            lines.append(f"Incremental gain: {number(self.gain)}{self._gain_unit()}")
+        return "\n".join([*lines, *filter(None, [self.reason])])
+
+    def _gain_unit(self) -> str:
+        """The unit of the gain, with the channels whose root sums of squares it compares."""
+        y, u = (
+            list(dict.fromkeys(channel.unit for channel in channels))
+            for channels in (self.outputs, self.inputs)
+        )
+        if len(y) > 1 or len(u) > 1:
+            of, over = (", ".join(unit or "1" for unit in units) for units in (y, u))
+            return f", of all outputs together ({of}) over all inputs ({over})"
+        unit = f"{factor_of(y[0]) or '1'}/{factor_of(u[0])}" if u[0] else y[0]
+        several = len(self.outputs) > 1 or len(self.inputs) > 1
+        return f" {unit}".rstrip() + ", of all channels together" * several
 
 
 @typed()
 def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction:
     """A proof that a model contracts, with its rate and gain, or why there is none.
 
-    Under the same input, the difference of any two states shrinks by ``rate`` or more in each
-    sample, in a norm that is the same everywhere. So the model forgets its start, answers a
-    periodic input with that period, and a change of the input changes the output by ``gain`` times
-    as much at most.
+    Under the same input, the difference of any two states shrinks to ``rate`` times its size or
+    less in each sample, in a norm that is the same everywhere. So the model forgets its start,
+    answers a periodic input with that period, and a change of the input changes the output by
+    ``gain`` times as much at most.
 
     For inputs of an amplitude the slopes of the static map are those between the bounds of z that
-    ``bound`` proves, and the states those that such inputs reach from x = 0.
+    ``bound`` proves, and the states those that such inputs reach from x = 0. Rate and gain may be
+    far smaller then than for all inputs, however loud.
 
     Args:
         model: with a network of any activation, or linear. With an amplitude, A must be stable, and
@@ -154,7 +173,9 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
     )  # fmt: skip
     proven = gain(physical)
     proven = math.nan if proven is None else proven
-    return Contraction(size, rate, proven, found.P, "", model.inputs, model.outputs)
+    slow = np.isinf(size).all() and rate**SLOW > _radius(system)
+    hint = SMALLER if slow and cell.static is not None else ""
+    return Contraction(size, rate, proven, found.P, hint, model.inputs, model.outputs)
 
 
 _Proof = tuple[Differences, Certificate]
@@ -229,14 +250,17 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
 
 def _slow(system: Differences) -> float:
     """The largest rate that counts."""
-    best = float(np.abs(np.linalg.eigvals(system.A)).max())
-    return max(SLOWEST, 1.0 - LEAST * (1.0 - best))
+    return max(SLOWEST, 1.0 - LEAST * (1.0 - _radius(system)))
+
+
+def _radius(system: Differences) -> float:
+    """The spectral radius with the slopes in the middle of their bounds: no rate is below it."""
+    return float(np.abs(np.linalg.eigvals(system.A)).max())
 
 
 def _fastest(system: Differences, slow: Certificate) -> tuple[float, Certificate]:
     """The smallest rate that is proven, with its certificate."""
-    rate, found = _slow(system), slow
-    best = float(np.abs(np.linalg.eigvals(system.A)).max())
+    rate, found, best = _slow(system), slow, _radius(system)
     low, high = LEAST, 1.0
     for _ in range(HALVINGS):
         part = math.sqrt(low * high)

@@ -1,6 +1,7 @@
 """Certificates that a model's trajectories come together."""
 
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import torch
 from reference import frf, polynomial_cell, random_cell, random_model
 
-from lfrtorch import analysis
+from lfrtorch import Channel, analysis
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.contraction import Contraction
 from lfrtorch.engine.nonlinearity import Network
@@ -96,6 +97,22 @@ def test_one_slope_is_bounded_exactly():
     contraction = analysis.contraction(scalar(0.5, Ww=0.25))
     assert contraction.rate == pytest.approx(0.75, abs=0.01)
     assert contraction.gain == pytest.approx(4.0, rel=0.01)
+
+
+def test_what_is_printed_says_how_far_in_which_units():
+    slow = analysis.contraction(scalar(0.0, Ww=0.99))
+    said = str(slow).splitlines()
+    assert "shrink to 0.99" in said[1]
+    assert "of their size or less in every sample, to 1/e in 99." in said[1]
+    assert said[2].endswith(" mm/N")
+    assert "contraction(model, amplitude=...)" in said[3]
+    assert "amplitude=" not in str(analysis.contraction(scalar(0.0, Ww=0.99), 0.5))
+    assert "amplitude=" not in str(analysis.contraction(scalar(0.5, Ww=0.25)))
+    model = random_model(random_cell(2, 2, 2, 1, 1, 3))
+    assert str(analysis.contraction(model)).endswith(" mm/N, of all channels together")
+    mixed = replace(model, outputs=(Channel("y1", "mm"), Channel("y2")))
+    said = str(analysis.contraction(mixed))
+    assert said.endswith(", of all outputs together (mm, 1) over all inputs (N)")
 
 
 def test_two_rests_have_no_certificate():
