@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfrtorch._support.checks import integer, number, reals
 from lfrtorch._support.errors import InputError, brief
-from lfrtorch._support.types import Array
+from lfrtorch._support.types import Array, Booleans
 
 Start = Literal["zero", "given", "estimated", "periodic"]
 
@@ -159,7 +159,7 @@ class Record:
     skip_more: bool = False
     limits: Sequence[ArrayLike | None] | Array | None = None
     reference: Array | None = None
-    valid: Array | None = None
+    valid: Booleans | None = None
 
     def __post_init__(self) -> None:
         inputs, u = _side(self.inputs, self.u, "u", f"record '{self.name}': input")
@@ -316,7 +316,7 @@ class Record:
         return f"Record({self.name!r}: {signals(self)}, {', '.join(parts)})"
 
     @property
-    def scored(self) -> Array:
+    def scored(self) -> Booleans:
         """Which outputs (T, ny) count: valid ones after the skipped samples."""
         counts = np.arange(len(self.y))[:, None] >= self.skip
         counts = counts if self.valid is None else counts & self.valid
@@ -437,7 +437,7 @@ class Record:
         return {name: one if one is None else one[window] for name, one in several.items()}
 
 
-def interpolated(y: Array, valid: Array) -> Array:
+def interpolated(y: Array, valid: Booleans) -> Array:
     """Outputs (T, ny), those that are not valid (T, ny) on a line between their neighbours.
 
     Example:

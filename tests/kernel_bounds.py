@@ -60,10 +60,10 @@ def model(draw: random.Random) -> lfrtorch.Model:
 def allowed(made: lfrtorch.Model, draw: random.Random) -> None:
     """Signals that fit go through every kernel."""
     lfr, cell = made.lfr, made.lfr.cell
-    like = {"dtype": cell.A.dtype}
+    dtype = cell.A.dtype
     R, T = draw.randint(1, 4), draw.choice([1, 2, 7, 40])
-    u = torch.randn(R, T, cell.nu, **like).requires_grad_()
-    x0 = torch.zeros(R, cell.nx, **like).requires_grad_()
+    u = torch.randn(R, T, cell.nu, dtype=dtype).requires_grad_()
+    x0 = torch.zeros(R, cell.nx, dtype=dtype).requires_grad_()
     for start in ("zero", "periodic"):
         lfr(u, x0, start).square().sum().backward()
         trajectory = lfr.trajectory(u.detach(), x0.detach(), start)

@@ -24,11 +24,10 @@ def measured(T: int, name: str) -> Record:
 
 
 def test_a_fit_goes_through_outliers_that_are_left_out(tmp_path):
-    records = {"train": [measured(400, "train")], "validation": [measured(200, "validation")]}
-    data = lfrtorch.Dataset("mine", **records, tests=[measured(301, "test")])
-    sizes = {"nx": 1, "nz": 1, "nw": 1, "nn": 3}
+    train, validation, test = (measured(T, f"record_{T}") for T in (400, 200, 301))
+    data = lfrtorch.Dataset("mine", train=[train], validation=[validation], tests=[test])
     trainer = lfrtorch.LevenbergMarquardt(max_iter=20)
-    run = lfrtorch.identify(data, lfrtorch.Settings(**sizes, trainer=trainer))
+    run = lfrtorch.identify(data, lfrtorch.Settings(nx=1, nz=1, nw=1, nn=3, trainer=trainer))
     (record,) = run.dataset.tests
     # The outliers are two thousand times the noise.
     assert lfrtorch.rmse(record, run.model.simulate(record)) < 1.3 * NOISE

@@ -45,7 +45,8 @@ class Beyond(Module):
 
     def weight_shapes(self, nz: int, nw: int) -> dict[str, tuple[int, ...]]:
         """Shapes of L, Z, W and the weights of f for nz and nw signals."""
-        own = self.base.weight_shapes(nz, nw) if hasattr(self.base, "weight_shapes") else {}
+        of_base = getattr(self.base, "weight_shapes", None)
+        own = {} if of_base is None else of_base(nz, nw)
         shapes: dict[str, tuple[int, ...]] = {"slope": (nw, nz), "into": (nz, nz), "out": (nw, nw)}
         return shapes | {f"base.{name}": shape for name, shape in own.items()}
 

@@ -126,9 +126,9 @@ class LFRCell(nn.Module):
         nu, ny, nx, nz, nw = self.nu, self.ny, self.nx, self.nz, self.nw
         shapes = {"A": (nx, nx), "Bu": (nx, nu), "Bw": (nx, nw), "Cz": (nz, nx), "Dzu": (nz, nu)}
         shapes |= {"Cy": (ny, nx), "Dyu": (ny, nu), "Dyw": (ny, nw)}
-        if hasattr(self.static, "weight_shapes"):
-            own = self.static.weight_shapes(nz, nw)
-            shapes |= {f"static.{name}": shape for name, shape in own.items()}
+        of_static = getattr(self.static, "weight_shapes", None)
+        if of_static is not None:
+            shapes |= {f"static.{name}": shape for name, shape in of_static(nz, nw).items()}
         weights = {**dict(self.named_parameters()), **dict(self.named_buffers())}
         for name, shape in shapes.items():
             found = tuple(weights[name].shape) if name in weights else ()

@@ -34,7 +34,7 @@ _NUMBER = re.compile(  # in which no digit may be of two parts: that took hours 
 )
 _COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?", re.ASCII)  # a number with a decimal comma
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+", re.ASCII)  # or three decimals
-_WHOLE = re.compile(r"\d+", re.ASCII)
+_WHOLE = re.compile(r"\d{1,9}", re.ASCII)
 _DATE = re.compile(
     r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?(Z|[+-]\d\d:?\d\d)?", re.ASCII
 )
@@ -440,10 +440,7 @@ def named_by_numbers(
         return False
     if len(cells) < 2 or len({*numbers.values()}) < len(numbers) or len(below) < LEAST:
         return False
-    columns = {
-        i: [float(c[i].replace(",", ".")) for c in below if _is_number(c[i], comma)]
-        for i in numbers
-    }
+    columns = {i: _finite((c[i] for c in below), comma) for i in numbers}
     if any(len(values) < LEAST for values in columns.values()):
         return False
     unlike = {i for i in numbers if not any(_WHOLE.fullmatch(c[i]) for c in below)}
@@ -473,8 +470,14 @@ def _runs_on(number: float, column: Sequence[float]) -> bool:
 def _interval(lines: Sequence[Line]) -> dict[str, float]:
     """The sampling frequency by the row Delta_X that LabVIEW writes, if its channels have one."""
     rows = [line.cells[1:] for line in lines if line.cells and line.cells[0] == "Delta_X"]
-    steps = {float(cell.replace(",", ".")) for cells in rows for cell in cells if cell}
-    return {"Delta_X": 1 / steps.pop()} if len(steps) == 1 and min(steps) > 0 else {}
+    steps = {step for cells in rows for comma in (False, True) for step in _finite(cells, comma)}
+    return {"Delta_X": 1 / steps.pop()} if len(steps) == 1 and 1e-99 < min(steps) < 1e99 else {}
+
+
+def _finite(cells: Iterable[str], comma: bool) -> list[float]:
+    """The finite numbers among cells."""
+    numbers = (float(cell.replace(",", ".")) for cell in cells if _is_number(cell, comma))
+    return [number for number in numbers if abs(number) < np.inf]
 
 
 def _similar(cells: list[str], width: int, numeric) -> bool:

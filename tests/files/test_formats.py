@@ -178,6 +178,16 @@ def test_headers_of_numbers(tmp_path, header, index, known):
         assert "is read as a sample; if it is a header" in table.notes[0]
 
 
+def test_odd_cells_in_the_first_lines_are_no_fault(tmp_path):
+    for first, cell in (("9" * 5000, "1e999"), ("1", "inf"), ("0", "9" * 400)):
+        rows = [f"0.5,{cell if k == 5 else k + 0.5}" for k in range(T)]
+        table = table_of(tmp_path, "\n".join([f"{first},1", *rows]))
+        assert len(table.read([1])) >= T
+    for step in ("no", "0", "1e-320", "0.1\t0.2"):
+        table = table_of(tmp_path, f"Delta_X\t{step}\n\tu\n" + "\t0.5\n" * T)
+        assert table.rates == {}
+
+
 @pytest.mark.parametrize(
     "t", [np.arange(1, T + 1), np.arange(1, T + 1) / 100, np.round(np.arange(1, T + 1) / 750, 3)]
 )
