@@ -162,9 +162,8 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
         elif one.missing:
             yield Note(
                 f"missing {name}",
-                f"'{name}' misses {one.missing} of {T} samples, up to {one.gap} in a row: of an "
-                "output they are neither fitted nor scored; fill short gaps of an input by "
-                "interpolation, or gaps='split' cuts the record at them.",
+                f"'{name}' misses {one.missing} of {T} samples, up to {one.gap} in a row: outputs "
+                "are not fitted there; fill the gaps of inputs, or cut there by gaps='split'.",
             )
         if one.values == 1:
             told = f"'{name}' is constant at {one.mean:.6g}"
