@@ -173,7 +173,8 @@ def fit(
     Raises:
         ValueError: no model, none that is stable on the training records at the start, validation
             records that all have too few samples, one start and fewer records than processes,
-            another number of lists of monitors, or models to average that have no network.
+            another number of lists of monitors, models to average that have no network, or another
+            ``noise`` than ``"output"`` and a trainer that is ``stable`` or ``contracting``.
         ProcessLostError, StoppedError: before there was an iterate to keep.
 
     Example:
@@ -199,7 +200,7 @@ def fit(
     if noise == "output":
         models = without_gain(models)
         return found(models, train, validation, selection, monitors=monitors)
-    starts, *data = predicting(noise, models, train, validation, selection)
+    starts, *data = predicting(noise, trainer, models, train, validation, selection)
     result = found(
         starts, *data, monitors=shown_innovation_form(monitors), simulation=SIMULATION[noise]
     )

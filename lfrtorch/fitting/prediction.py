@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any, Literal, get_args
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.fitting.trainer import Monitor
+from lfrtorch.fitting.trainer import Monitor, Trainer
 from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, with_past_outputs
@@ -19,10 +19,17 @@ SIMULATION: dict[str, float] = {"innovation": 0.0, "both": 3.0}
 """Weight of simulation errors beside those of predictions, if both were as large at the start."""
 
 
-def check_noise(noise: str) -> None:
-    """Refuse an unknown kind of noise with a ValueError."""
+def check_noise(noise: str, trainer: Trainer | None = None) -> None:
+    """Refuse an unknown kind of noise, or one that the trainer's bounds are not for: ValueError."""
     if noise not in get_args(Noise):
         raise InputError(f"noise is {noise!r}; use 'output', 'innovation' or 'both'.")
+    for name in ("stable", "contracting"):
+        if noise != "output" and getattr(trainer, name, False):
+            raise InputError(
+                f"trainer.{name} is True, which bounds what is fitted, and noise is {noise!r}, "
+                f"which fits a predictor: the model itself could run away. Give {name}=False, or "
+                "noise='output'."
+            )
 
 
 def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
@@ -34,15 +41,17 @@ def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
 
 def predicting(
     noise: str,
+    trainer: Trainer | None,
     models: Model | Sequence[Model],
     *records: Record | Sequence[Record],
 ) -> tuple[Model | list[Model], *tuple[list[Record], ...]]:
     """The predictors of models, and the records that drive them.
 
     Raises:
-        ValueError: an unknown kind of noise, a model without K, or one with exact integrators.
+        ValueError: an unknown kind of noise, a trainer that keeps A stable or the model
+            contracting, a model without K, or one with exact integrators.
     """
-    check_noise(noise)
+    check_noise(noise, trainer)
     given = [models] if isinstance(models, Model) else list(models)
     for model in given:
         if integrating_states(model.lfr.cell).any():

@@ -193,7 +193,7 @@ class Settings:
                 object.__setattr__(self, name, size)
         for name in ("layers", "nx_max", "starts", "average"):
             integer(name, getattr(self, name), 1)
-        check_noise(self.noise)
+        check_noise(self.noise, self.trainer)
         check_horizon(self.horizon, self.noise)
         if self.noise != "output":
             refine = self.linear.get("refine") or "prediction"

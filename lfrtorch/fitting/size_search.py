@@ -338,7 +338,7 @@ def search_sizes(
     if noise != "output":
         begin, linear = start, None if linear is None else linear.predictor()
         start = lambda sizes, seed: begin(sizes, seed).predictor()  # noqa: E731
-        _, train, validation = predicting(noise, [], train, validation)
+        _, train, validation = predicting(noise, trainer, [], train, validation)
     given_records = all_records(as_records(train), as_records(validation)) if folds else []
     ranks = Ranks() if ranks is None else ranks
     trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer

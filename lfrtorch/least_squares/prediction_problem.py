@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.innovation import split_predictor, split_weights
 from lfrtorch.engine.lfr import LFR
@@ -48,12 +47,6 @@ class PredictionProblem(SimulationProblem):
         weight: float | None = None,
         **options: Any,
     ) -> None:
-        for name in ("stable", "contracting"):
-            if options.get(name):
-                raise InputError(
-                    f"{name} is True, which a fit of predictions and simulations together cannot "
-                    f"keep; give {name}=False, or noise='output'."
-                )
         super().__init__(lfr, records, y_scale, **options)
         system, _ = split_predictor(lfr.cell)
         driven = [without_past_outputs(record, system.nu) for record in records]

@@ -258,6 +258,14 @@ def test_a_run_predicts():
             "distil is for noise='output'",
             lambda m, r: Settings(nx=1, noise="innovation", distil=True),
         ),
+        *(
+            ("which fits a predictor: the model itself could run away", act)
+            for trainer in (lfrtorch.Adam(stable=True), lfrtorch.Adam(contracting=True))
+            for act in (
+                lambda m, r, t=trainer: lfrtorch.fit(m, r, noise="innovation", trainer=t),
+                lambda m, r, t=trainer: Settings(nx=1, noise="both", trainer=t),
+            )
+        ),
         ("horizon is 0", lambda m, r: m.predict(r, horizon=0)),
     ],
 )
