@@ -378,16 +378,21 @@ class Record:
         It keeps its period if it is as long as that.
 
         Raises:
-            ValueError: not a slice, or one with a step (it would change the rate).
+            ValueError: not a slice, one with a step (it would change the rate), or a record with
+                weights by spectral line, as a part has other lines.
         """
         if not isinstance(window, slice) or window.step not in (None, 1):
             raise InputError(f"a record is cut by record[first:last], not by {window!r}.")
+        if self.line_weight is not None:
+            raise InputError(
+                f"record '{self.name}' has line_weight, and a part of it has other lines; cut "
+                "replace(record, line_weight=None), and give the part weights of its own."
+            )
         part = self.signals_in(window)
         period = self.period if self.period is not None and self.period <= len(part["u"]) else None
         return replace(
-            self, **part, start="zero", skip=0, period=period, x0=None, line_weight=None,
-            skip_more=False,
-        )  # fmt: skip
+            self, **part, start="zero", skip=0, period=period, x0=None, skip_more=False
+        )
 
     def mean_period(self) -> Record:
         """One period, the mean of all of a record in steady state, that weighs as much as they do.
@@ -426,8 +431,8 @@ class Record:
             limits=None,
         )
 
-    def signals_in(self, window: slice) -> dict[str, Any]:
-        """The signals in ``window`` by name, for ``dataclasses.replace``.
+    def signals_in(self, window: slice | NDArray[np.integer]) -> dict[str, Any]:
+        """The signals in ``window``, or at some samples, by name, for ``dataclasses.replace``.
 
         Example:
             >>> sorted(record.signals_in(slice(20)))
@@ -545,11 +550,13 @@ class NormalisedRecord:
     Args:
         u, y: normalised input (T, nu) and output (T, ny); a predictor's input has y as well.
         record: how it starts, and how its errors count.
+        limits: least and greatest output (2, ny), normalised.
     """
 
     u: Array
     y: Array
     record: Record
+    limits: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

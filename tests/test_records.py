@@ -365,9 +365,14 @@ def test_line_weights_are_of_whole_periods():
     refused("record 'lab': line_weight needs start='periodic' and skip=0", **options)
 
 
-def test_part_of_a_record_begins_at_zero_state_without_line_weights():
-    part = lab(start="periodic", line_weight=np.ones(6), weight=3.0)[2:]
-    assert (part.start, part.line_weight, float(part.weight)) == ("zero", None, 3.0)
+def test_part_of_a_record_begins_at_zero_state():
+    part = lab(start="periodic", weight=3.0)[2:]
+    assert (part.start, float(part.weight)) == ("zero", 3.0)
+
+
+def test_no_part_of_a_record_loses_its_line_weights():
+    with pytest.raises(ValueError, match="has line_weight, and a part of it has other lines"):
+        lab(start="periodic", line_weight=np.ones(6))[2:]
 
 
 # --- periods --------------------------------------------------------------------------------

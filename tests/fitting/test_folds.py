@@ -58,6 +58,9 @@ def test_what_was_left_out_is_simulated_from_the_start_of_its_record():
 def test_folds_that_cannot_be_say_so():
     with pytest.raises(ValueError, match="folds is 1"):
         folds(record(200), 1)
+    weighted = replace(record(60, "periodic", period=20), line_weight=np.ones(31))
+    with pytest.raises(ValueError, match="has line_weight"):
+        folds(weighted, 3)
     for records in (record(200, "periodic", period=200), record(15)):
         with pytest.raises(ValueError, match="folds is 2, and one of these stretches"):
             folds(records, 2)
