@@ -37,6 +37,7 @@ class RecordGroup:
         start: how the records begin.
         beyond: which way an output may be beyond a limit of its sensor, 1, -1 or 0; None if there
             are no limits.
+        limits: least and greatest output that the sensors show.
     """
 
     u: Float[Tensor, "R T nu"]
@@ -49,6 +50,11 @@ class RecordGroup:
     spectral: bool
     start: Start
     beyond: Float[Tensor, "R T ny"] | None = None
+    limits: Float[Tensor, "R 2 1 ny"] | None = None
+
+    def shown(self, y_hat: Float[Tensor, "R T ny"]) -> Float[Tensor, "R T ny"]:
+        """An output as the sensors show it, which is what a score sees."""
+        return y_hat if self.limits is None else y_hat.clamp(*self.limits.unbind(1))
 
     def counted(self, y_hat: Float[Tensor, "R T ny"]) -> RecordGroup:
         """The group with the weights of the samples that count at an output.
@@ -137,9 +143,18 @@ def group_records(
                 beyond=stacked([r.beyond for r in physical])
                 if any(r.limits is not None for r in physical)
                 else None,
+                limits=stacked([_limits(each) for each in group])
+                if any(each.limits is not None for each in group)
+                else None,
             )
         )
     return groups
+
+
+def _limits(each: NormalisedRecord) -> Float[Array, "2 1 ny"]:
+    """Limits of each output; infinite if there are none."""
+    none = np.outer([-np.inf, np.inf], np.ones(each.y.shape[1]))
+    return (none if each.limits is None else each.limits)[:, None]
 
 
 def _factors(record: Record) -> Float[Array, "m ny"]:

@@ -147,13 +147,11 @@ class SimulationProblem(LeastSquares):
         return theta[len(theta) - self._initial_states.numel() :].view(self._initial_states.shape)
 
     def rmse(self, theta: Float[Tensor, " P"]) -> float:
-        """Root mean squared error at θ over scored samples and outputs, unweighted, output unit."""
+        """RMSE at θ over scored samples and outputs, unweighted, in output units, as in a score."""
         total = torch.zeros((), dtype=torch.float64, device=self._theta_0.device)
         scale = torch.as_tensor(self._y_scale).to(self._theta_0)
         for group, trajectory in zip(self.groups, self.trajectories(theta), strict=True):
-            errors = (trajectory.y - group.y) * scale * group.scored
-            if group.beyond is not None:
-                errors = errors * (group.beyond * errors <= 0)
+            errors = (group.shown(trajectory.y) - group.y) * scale * group.scored
             total = total + errors.double().square().sum()
         return math.sqrt(self.ranks.sum(total) / self.size)
 
@@ -174,8 +172,10 @@ class SimulationProblem(LeastSquares):
 
     def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """r at θ; infinite or NaN if the model diverges."""
-        pairs = zip(self.groups, self.trajectories(theta), strict=True)
-        errors = [group.counted(t.y).weigh(t.y - group.y).flatten() for group, t in pairs]
+        errors = []
+        for group, trajectory in zip(self.groups, self.trajectories(theta), strict=True):
+            y_hat = group.shown(trajectory.y) if self._solved else trajectory.y
+            errors.append(group.counted(y_hat).weigh(y_hat - group.y).flatten())
         if self._ridge.any() and self.ranks.rank == 0:
             errors.append(self._ridge.sqrt() * (theta - self._theta_0))
         return torch.cat(errors)

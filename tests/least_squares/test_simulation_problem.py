@@ -185,6 +185,13 @@ def test_beyond_a_limit_there_is_no_error(model: Model):
     beyond = (record.y >= high) & (y_hat > high)
     assert beyond.any()
     assert ((record.y >= high) & ~beyond).any()
+    shown = rmse(record, model.simulate(record))
+    assert problem.rmse(other) == pytest.approx(shown, rel=1e-12)
+    judge = SimulationProblem.judge(model, record)
+    assert judge.rmse(judge.theta) == pytest.approx(shown, rel=1e-12)
+    error = (model.simulate(record) - record.y) / model.scaler.y_scale
+    assert judge.cost(judge.residual(judge.theta)) == pytest.approx(np.sum(error**2), rel=1e-12)
+    problem.write(other)
     expected = np.where(beyond, 0.0, y_hat - record.y) / model.scaler.y_scale
     assert_close(errors, torch.as_tensor(expected))
     step = 1e-6 * torch.linspace(-1.0, 1.0, len(theta)).to(theta)
