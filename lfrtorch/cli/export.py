@@ -5,18 +5,23 @@ lfrtorch export checkpoint=runs/run/DATE to=c name=engine out=firmware
 
 from __future__ import annotations
 
+from typing import Any
+
 import hydra
 import numpy as np
 from omegaconf import DictConfig
 
 from lfrtorch import export
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import MAIN
 from lfrtorch.cli.simulate import introduced, opened
 from lfrtorch.extended_kalman_filter import NoiseCovariance
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
 
 
 def written(cfg: DictConfig) -> None:
@@ -29,22 +34,37 @@ def written(cfg: DictConfig) -> None:
         raise InputError(f"to is not set: add to=c, or another of {', '.join(export.TARGETS)}.")
     model = opened(str(cfg.checkpoint))
     print(introduced(str(cfg.checkpoint), model))
-    name, observer = str(cfg.name), observer_of(cfg)
+    name, observer = str(cfg.name), observer_of(cfg, model)
     paths = export.write(
         model, str(cfg.to), cfg.out, name=name, overwrite=cfg.overwrite, observer=observer
     )
     print(f"written: {', '.join(map(str, paths))}")
-    print(f"use: {export.TARGETS[cfg.to].use.format(name=name, path=paths[0])}")
+    print(f"use: {export.TARGETS[cfg.to].usage(name, paths, observer)}")
 
 
-def observer_of(cfg: DictConfig) -> bool | NoiseCovariance:
+def observer_of(cfg: DictConfig, model: Model | LinearModel) -> bool | NoiseCovariance:
     """The observer that is asked for: with Q and R an extended Kalman filter."""
-    Q, R = cfg.Q, cfg.R
-    if Q is None and R is None:
+    if cfg.Q is None and cfg.R is None:
+        if cfg.observer and model.K is None:
+            raise InputError(
+                "this model has no innovation gain K: give Q=... R=..., the noise of a Kalman "
+                "filter, or fit it with noise=innovation."
+            )
         return bool(cfg.observer)
-    if Q is None or R is None or not cfg.observer:
+    if cfg.Q is None or cfg.R is None or not cfg.observer:
         raise InputError("Q and R are the noise of a Kalman filter: give observer=true Q=... R=...")
-    return NoiseCovariance(np.array(Q, dtype=float), np.array(R, dtype=float))
+    return NoiseCovariance(_variances("Q", cfg.Q), _variances("R", cfg.R))
+
+
+def _variances(name: str, given: Any) -> Array:
+    """A variance, or several."""
+    try:
+        return np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{name} is {given}; give a variance or a list, {name}=1e-4 or {name}=[1e-4,1e-3]. "
+            "lfrtorch.estimate_noise finds them in Python."
+        ) from None
 
 
 @hydra.main(**MAIN, config_path=str(CONF), config_name="export")

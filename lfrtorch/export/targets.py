@@ -33,12 +33,21 @@ class Target(NamedTuple):
         use: a line of a program that uses it, with {name} and the {path} of the first file.
         observer: endings of further files with an observer; None if there is no observer.
             ``write`` then takes one.
+        follow: what ``use`` is with an observer; {path} is the last file.
     """
 
     endings: tuple[str, ...]
     write: Callable[..., None]
     use: str
     observer: tuple[str, ...] | None = None
+    follow: str = ""
+
+    def usage(self, name: str, paths: list[Path], observer: bool | NoiseCovariance) -> str:
+        """The line of a program that uses the files, the observer's if there is one."""
+        if observer is False:
+            return self.use.format(name=name, path=paths[0])
+        P = ", P=P" if isinstance(observer, NoiseCovariance) else ""
+        return self.follow.format(name=name, path=paths[-1], P=P)
 
 
 def _c(
@@ -82,12 +91,19 @@ def _fmu(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
 
 
 TARGETS = {
-    "c": Target((".h", ".c"), _c, "{name}_step(x, u, x_next, y);", ()),
+    "c": Target(
+        (".h", ".c"),
+        _c,
+        "{name}_step(x, u, x_next, y);",
+        (),
+        "{name}_observer_predict(&observer, u, y_hat); {name}_observer_update(&observer, y);",
+    ),
     "casadi": Target(
         (".casadi", "_channels.json"),
         _casadi,
         "x_next, y = casadi.Function.load('{path}')(x, u)",
         ("_predict.casadi", "_update.casadi"),
+        "after = casadi.Function.load('{path}')(x=x, u=u, y=y{P})",
     ),
     "onnx": Target(
         (".onnx", "_simulate.onnx"),

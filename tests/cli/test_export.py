@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
-from exported import MODELS
+from exported import MODELS, OBSERVED
 
 from lfrtorch import NoiseCovariance
 from lfrtorch import export as exports
@@ -36,12 +37,27 @@ def test_c_is_written_with_its_use(folder: Path, monkeypatch, capsys):
     ]
 
 
-def test_an_observer_is_written_with_its_model(folder: Path, monkeypatch):
+def test_an_observer_is_written_with_its_model(folder: Path, monkeypatch, capsys):
     words = ["observer=true", "Q=1e-4", "R=[1e-2,1e-2,4e-2]"]
     run(monkeypatch, "checkpoint=model", "to=c", *words)
     noise = NoiseCovariance(Q=1e-4, R=[1e-2, 1e-2, 4e-2])
     expected = exports.c_source(MODELS["tanh"], observer=noise)
     assert tuple((folder / f"model.{kind}").read_text() for kind in "hc") == expected
+    assert capsys.readouterr().out.splitlines()[-1] == (
+        "use: model_observer_predict(&observer, u, y_hat); model_observer_update(&observer, y);"
+    )
+
+
+@pytest.mark.parametrize(("K", "words"), [(True, []), (False, ["Q=1e-4", "R=1e-2"])])
+def test_the_use_is_that_of_the_observer(K: bool, words: list[str], folder, monkeypatch, capsys):
+    casadi = pytest.importorskip("casadi")
+    model = OBSERVED["smallest"] if K else MODELS["smallest"]
+    model.save(folder / "other")
+    run(monkeypatch, "checkpoint=other", "to=casadi", "observer=true", *words)
+    use = capsys.readouterr().out.splitlines()[-1].removeprefix("use: ")
+    known = {"casadi": casadi, "x": 0.1, "u": 0.2, "y": 0.3, "P": 1.0}
+    exec(use, known)
+    assert np.isfinite(float(known["after"]["x_next"]))
 
 
 def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
@@ -60,7 +76,15 @@ def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
             "to is 'rust'; give one of c, casadi, onnx, matlab, control, fmu",
         ),
         (["checkpoint=model", "to=c", "Q=1"], "give observer=true Q=... R=..."),
-        (["checkpoint=model", "to=c", "observer=true"], "no innovation gain K"),
+        (
+            ["checkpoint=model", "to=c", "observer=true"],
+            "this model has no innovation gain K: give Q=... R=..., the noise of a Kalman filter",
+        ),
+        (
+            ["checkpoint=model", "to=c", "observer=true", "Q=auto", "R=1"],
+            "Q is auto; give a variance or a list, Q=1e-4 or Q=[1e-4,1e-3]",
+        ),
+        (["checkpoint=model", "to=c", "observer=true", "Q=1", "R=[1,a,1]"], "R is [1, 'a', 1]"),
         (["checkpoint=model", "to=c", "name=1"], "name is '1'; give letters"),
         (
             ["checkpoint=model", "to=c", "name=there"],
