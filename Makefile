@@ -57,9 +57,9 @@ first-try: $(READY)  ## eight measurements with all sizes auto, beside a grid (A
 reproduce: $(READY)  ## the public benchmarks at hand -> RESULTS.md (ARGS="silverbox data.root=DIR")
 	@$(BIN)/python scripts/reproduce.py $(ARGS)
 
-docs: $(READY)  ## guide, notebooks and reference, in site/; a broken link in it is an error
+docs: $(READY)  ## guide, notebooks, reference -> site/; a broken link is an error (ARGS="-D nb_execution_mode=off")
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[docs]'
-	@$(BIN)/sphinx-build -qW --keep-going -d site/doctrees docs site/html
+	@$(BIN)/sphinx-build -qW --keep-going $(ARGS) -d site/doctrees docs site/html
 	@echo "Open site/html/index.html"
 
 docs-links: docs  ## links to other sites, too; needs the network

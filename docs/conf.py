@@ -21,7 +21,10 @@ html_show_copyright = False
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["**.ipynb_checkpoints"]
-suppress_warnings = ["myst.header"]  # a page of benchmarks/ may leave out a level of headings
+suppress_warnings = [
+    "myst.header",  # a page of benchmarks/ may leave out a level of headings
+    "myst-nb.lexer",  # cells of notebooks that are not run, with -D nb_execution_mode=off
+]
 
 # Markdown: links to headings.
 myst_heading_anchors = 3

@@ -83,7 +83,7 @@ class LFRCell(nn.Module):
         self.structure = "free"
         """Of which blocks the model is made, see ``block_form``; a fit keeps to it."""
         self.past_outputs = 0
-        """How many of the last inputs are measured outputs: columns of Dzu, Dyu that stay 0."""
+        """Number of inputs, the last ones, that are measured outputs; their Dzu and Dyu stay 0."""
         self._check_shapes()
 
     def forward(
