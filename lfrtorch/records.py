@@ -390,9 +390,7 @@ class Record:
             )
         part = self.signals_in(window)
         period = self.period if self.period is not None and self.period <= len(part["u"]) else None
-        return replace(
-            self, **part, start="zero", skip=0, period=period, x0=None, skip_more=False
-        )
+        return replace(self, **part, start="zero", skip=0, period=period, x0=None, skip_more=False)
 
     def mean_period(self) -> Record:
         """One period, the mean of all of a record in steady state, that weighs as much as they do.
@@ -594,7 +592,10 @@ class Scaler:
 
     def normalise(self, record: Record) -> NormalisedRecord:
         """The record from physical to normalised units."""
-        return NormalisedRecord(self.normalise_u(record.u), self.normalise_y(record.y), record)
+        limits = None if record.limits is None else self.normalise_y(np.asarray(record.limits))
+        return NormalisedRecord(
+            self.normalise_u(record.u), self.normalise_y(record.y), record, limits
+        )
 
     def normalise_u(self, u: Array) -> Array:
         """Input (T, nu) from physical to normalised units."""

@@ -26,9 +26,8 @@ def check_noise(noise: str, trainer: Trainer | None = None) -> None:
     for name in ("stable", "contracting"):
         if noise != "output" and getattr(trainer, name, False):
             raise InputError(
-                f"trainer.{name} is True, which bounds what is fitted, and noise is {noise!r}, "
-                f"which fits a predictor: the model itself could run away. Give {name}=False, or "
-                "noise='output'."
+                f"trainer.{name} is True and noise is {noise!r}: what is bounded is the predictor, "
+                f"and the model could run away. Give {name}=False, or noise='output'."
             )
 
 

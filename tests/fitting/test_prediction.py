@@ -259,7 +259,7 @@ def test_a_run_predicts():
             lambda m, r: Settings(nx=1, noise="innovation", distil=True),
         ),
         *(
-            ("which fits a predictor: the model itself could run away", act)
+            ("what is bounded is the predictor, and the model could run away", act)
             for trainer in (lfrtorch.Adam(stable=True), lfrtorch.Adam(contracting=True))
             for act in (
                 lambda m, r, t=trainer: lfrtorch.fit(m, r, noise="innovation", trainer=t),
