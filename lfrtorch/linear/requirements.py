@@ -52,6 +52,12 @@ def check_length(records: list[Record], nx: int) -> None:
         )
 
 
+def without_inputs(record: Record, last: int) -> Record:
+    """The record without its last inputs."""
+    kept = len(record.inputs) - last
+    return replace(record, u=record.u[:, :kept], inputs=record.inputs[:kept], reference=None)
+
+
 def steady_state(records: Sequence[Record]) -> list[Record] | None:
     """The whole periods in steady state of all records, if these are most of the scored samples."""
     found = [_steady_part(record) for record in records]
@@ -87,10 +93,11 @@ def _steady_part(record: Record) -> Record | None:
     return replace(record, **part, start="periodic", skip=0, skip_more=False)
 
 
-def check_spectral_data(data: SpectralData, nx: int) -> None:
-    """Refuse fewer equations than unknowns with a ValueError."""
-    nu, ny = data.U.shape[1], data.Y.shape[1]
-    unknowns, equations = nx * (nu + ny) + nu * ny, data.equations
+def check_spectral_data(data: SpectralData, nx: int, direct: int = 0) -> None:
+    """Refuse fewer equations than unknowns with a ValueError; the last ``direct`` inputs act on
+    the output alone."""
+    nu, ny = data.U.shape[1] - direct, data.Y.shape[1]
+    unknowns, equations = nx * (nu + ny) + (nu + direct) * ny, data.equations
     if equations < unknowns:
         raise InputError(
             f"{len(data.z)} excited line(s) make {equations} equations; order nx={nx} with {nu} "

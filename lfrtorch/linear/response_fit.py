@@ -55,12 +55,20 @@ class ResponseFit:
         known: whether the weights are the inverse variances of the errors.
         feedthrough: whether D is a parameter; it is 0 otherwise.
         starts: how many of the last inputs are those of initial states, whose D is 0.
+        direct: how many of the last inputs act on the output alone: their part of B is 0.
     """
 
     def __init__(
-        self, data: SpectralData, *, known: bool, feedthrough: bool = True, starts: int = 0
+        self,
+        data: SpectralData,
+        *,
+        known: bool,
+        feedthrough: bool = True,
+        starts: int = 0,
+        direct: int = 0,
     ) -> None:
         self.data, self.known, self.feedthrough, self.starts = data, known, feedthrough, starts
+        self._driving = data.U.shape[1] - direct
 
     def most_candidates(self, nx: int) -> int:
         """How many subspace estimates are refined: one if an iteration takes long."""
@@ -71,11 +79,12 @@ class ResponseFit:
         """Whether a model of the order has so many unknowns that its modes save work."""
         nu, free = self.data.U.shape[1], int(self._free_feedthrough.sum())
         unknowns = nx * (nu + self.data.Y.shape[1]) + free
-        return unknowns >= MANY and not self.starts
+        return unknowns >= MANY and not self.starts and self._driving == nu
 
     def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
         """Subspace estimates of A and C."""
-        return from_spectra(*self.equal_noise(self.data.Y), nx)
+        z, U, Y = self.equal_noise(self.data.Y)
+        return from_spectra(z, U[:, : self._driving], Y, nx)
 
     def equal_noise(self, Y: Complex) -> tuple[Complex, Complex, Complex]:
         """z, U and Y (F, ny, m) with lines whose errors are of about the same size."""
@@ -100,7 +109,8 @@ class ResponseFit:
                 return float(np.sum(np.abs(errors) ** 2)), matrices
         matrices = A, np.zeros((nx, nu)), C, np.zeros((ny, nu))
         X, L = solve_resolvents(*matrices[:3], self.data.z)
-        of_B = nx * nx + np.arange(nx * nu)
+        free_B = self._free_inputs(nx)
+        of_B = nx * nx + np.flatnonzero(free_B)
         free = self._free_feedthrough
         of_D = nx * (nx + nu + ny) + np.flatnonzero(free)
         columns = np.concatenate([of_B, of_D])
@@ -110,9 +120,8 @@ class ResponseFit:
             return np.inf, matrices
         size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
         best = scipy.linalg.lstsq(J / size, r, check_finite=False)[0] / size
-        D = matrices[3]
-        D[free] = best[nx * nu :]
-        matrices = A, best[: nx * nu].reshape(nx, nu), C, D
+        _, B, _, D = matrices
+        B[free_B], D[free] = np.split(best, [len(of_B)])
         return float(np.sum((r - J @ best) ** 2)), matrices
 
     def state_deviation(self, matrices: Matrices) -> Array:
@@ -126,6 +135,7 @@ class ResponseFit:
             self.data,
             len(matrices[0]),
             LARGEST_POLE,
+            free_inputs=self._free_inputs(len(matrices[0])),
             free_feedthrough=self._free_feedthrough,
             together=self.starts > 0,
             by_modes=self.many(len(matrices[0])),
@@ -133,6 +143,10 @@ class ResponseFit:
         )
         theta = torch.as_tensor(np.concatenate([m.ravel() for m in matrices]))
         return Search(problem, theta, COARSE if self.many(len(matrices[0])) else TOLERANCE)
+
+    def _free_inputs(self, nx: int) -> Booleans:
+        """Which entries of B (nx, nu) are parameters."""
+        return np.tile(np.arange(self.data.U.shape[1]) < self._driving, (nx, 1))
 
     @property
     def _free_feedthrough(self) -> Booleans:
@@ -167,6 +181,7 @@ class ResponseProblem(LeastSquares):
         data: what is fitted.
         nx: order.
         largest_pole: limit for the radius of poles. Default: no limit.
+        free_inputs: which entries of B may change, (nx, nu). Default: all.
         free_feedthrough: which entries of D may change, (ny, nu). Default: all.
         together: whether the states under all inputs together are solved for, not those under each
             alone: less work for inputs of few columns, other last digits.
@@ -180,6 +195,7 @@ class ResponseProblem(LeastSquares):
         nx: int,
         largest_pole: float = np.inf,
         *,
+        free_inputs: Booleans | None = None,
         free_feedthrough: Booleans | None = None,
         together: bool = False,
         by_modes: bool = False,
@@ -188,12 +204,12 @@ class ResponseProblem(LeastSquares):
         self.data, self.largest_pole, self._together = data, largest_pole, together
         nu, ny = data.U.shape[1], data.Y.shape[1]
         self.shapes = (nx, nx), (nx, nu), (ny, nx), (ny, nu)
-        self._fixed: Tensor | None = None
-        if free_feedthrough is not None and not free_feedthrough.all():
-            self._fixed = torch.zeros(nx * (nx + nu + ny) + ny * nu, dtype=torch.bool)
-            self._fixed[nx * (nx + nu + ny) :] = torch.as_tensor(~free_feedthrough.ravel())
-        free = np.ones((ny, nu), dtype=bool) if free_feedthrough is None else free_feedthrough
-        self._free = free
+        free = [np.ones(shape, dtype=bool) for shape in self.shapes]
+        for i, given in ((1, free_inputs), (3, free_feedthrough)):
+            free[i] = free[i] if given is None else given
+        self._free = free[3]
+        fixed = torch.as_tensor(~np.concatenate([part.ravel() for part in free]))
+        self._fixed = fixed if fixed.any() else None
         self._by_modes = by_modes
         self._limits = limits
         self._latest: tuple[Tensor, Complex] | None = None

@@ -53,6 +53,7 @@ class SignalFit:
         offset: whether the output has a constant as a parameter.
         prediction: whether the error is that of the one-step-ahead prediction.
         feedthrough: whether D is a parameter; it is 0 otherwise.
+        direct: how many of the last inputs act on the output alone: their part of B is 0.
     """
 
     def __init__(
@@ -62,10 +63,12 @@ class SignalFit:
         offset: bool,
         prediction: bool,
         feedthrough: bool = True,
+        direct: int = 0,
     ) -> None:
         self._us, self._ys = [each.u for each in records], [each.y for each in records]
         self.nu, self.ny = self._us[0].shape[1], self._ys[0].shape[1]
         self._offset, self._prediction, self._feedthrough = offset, prediction, feedthrough
+        self._driving = self.nu - direct
         self._driven = [self._with_all_inputs(each) for each in records]
 
     def most_candidates(self, nx: int) -> int:
@@ -78,7 +81,7 @@ class SignalFit:
 
     def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
         """Subspace estimates of A and C."""
-        return from_signals(self._us, self._ys, nx)
+        return from_signals([u[:, : self._driving] for u in self._us], self._ys, nx)
 
     def with_input_matrices(self, A: Array, C: Array) -> tuple[float, Matrices]:
         """Cost and system with the best B and D for A and C: y is linear in them."""
@@ -226,7 +229,7 @@ class SignalFit:
         Bu, Dyu = np.zeros((len(A), width)), np.zeros((ny, width))
         Bu[:, :nu], Dyu[:, :nu] = B - K @ D, D
         free_B, free_D = np.zeros_like(Bu, dtype=bool), np.zeros_like(Dyu, dtype=bool)
-        free_B[:, :nu], free_D[:, :nu] = True, self._feedthrough
+        free_B[:, : self._driving], free_D[:, :nu] = True, self._feedthrough
         if self._prediction:
             Bu[:, nu : nu + ny] = K
             free_B[:, nu : nu + ny] = observed

@@ -269,7 +269,7 @@ def _compressed(U: Complex, Y: Complex) -> tuple[Complex, Complex]:
 
 
 def spectral_data_of_response(
-    frf: FRF, weight: Weight | Array | None, *, offset: bool
+    frf: FRF, weight: Weight | Array | None, *, offset: bool, differences: int = 0
 ) -> tuple[SpectralData, Scaler, bool, list[str]]:
     """A frequency response as spectra, scaled to channels of unit size.
 
@@ -277,6 +277,7 @@ def spectral_data_of_response(
         frf: the response.
         weight: as for ``estimate_bla``.
         offset: whether the means of the records are its operating point.
+        differences: how many differences of the inputs follow these.
 
     Returns:
         The spectra, the scaling, whether the weights are inverse variances, and notes on the
@@ -287,15 +288,19 @@ def spectral_data_of_response(
     G = frf.G * u_scale
     y_scale = rms_scale([np.abs(G).swapaxes(1, 2).reshape(-1, G.shape[1])], np.zeros(1))
     size = y_scale[:, None] / u_scale
-    nu, ny = len(u_scale), len(y_scale)
-    offsets = (frf.u_offset, frf.y_offset) if offset else (np.zeros(nu), np.zeros(ny))
+    nu = len(u_scale)
     z = np.exp(2j * np.pi * frf.frequencies / frf.fs)
-    U = np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu))
+    powers = (z[:, None] - 1.0) ** np.arange(differences + 1)
+    U = np.einsum("fd,uv->fduv", powers, np.eye(nu)).reshape(len(z), -1, nu)
     data = SpectralData(
         z, U, frf.G / size, None if weights is None else weights * size**2,
         errors=frf.errors and frf.errors.times(1.0 / y_scale, u_scale),
     )  # fmt: skip
-    return data, Scaler(offsets[0], u_scale, offsets[1], y_scale), known, notes
+    u_offset = np.pad(frf.u_offset, (0, nu * differences))
+    scaler = Scaler(
+        u_offset * offset, np.tile(u_scale, differences + 1), frf.y_offset * offset, y_scale
+    )
+    return data, scaler, known, notes
 
 
 def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, bool, list[str]]:

@@ -1,6 +1,7 @@
 """Linear fits to signals: exact without noise, efficient and with the right covariance with it."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.numeric
 OMEGA = np.linspace(0.05, 3.0, 40)
 
 
-def fit_of(records: list[Record], **options: bool) -> SignalFit:
+def fit_of(records: list[Record], **options: Any) -> SignalFit:
     options = {"offset": False, "prediction": False} | options
     return SignalFit([NormalisedRecord(r.u, r.y, r) for r in records], **options)
 
@@ -353,3 +354,15 @@ def test_prediction_estimates_the_start_of_what_repeats_but_for_its_noise(start,
     assert driven.record.start == predicted_from
     (driven,) = SignalFit([record], prediction=False, **options)._driven
     assert driven.record.start == start
+
+
+def test_an_input_that_acts_on_the_output_alone():
+    system, rng = random_system(2), np.random.default_rng(1)
+    A, B, C, D = system
+    u, ramp = rng.normal(size=(200, 1)), 0.9 ** np.arange(200.0)[:, None]
+    record = Record(np.hstack([u, ramp]), reference.dlsim(system, u) + 3.0 * ramp)
+    whole = np.hstack([B, np.zeros((2, 1))]), np.hstack([D, np.zeros((1, 1))])
+    found = refined(fit_of([record], direct=1), (0.98 * A, whole[0], 1.02 * C, whole[1]), 50)
+    assert not found.B[:, 1].any()
+    assert error((found.A, found.B[:, :1], found.C, found.D[:, :1]), system) < 1e-9
+    assert found.D[0, 1] == pytest.approx(3.0, abs=1e-8)
