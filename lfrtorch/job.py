@@ -44,13 +44,16 @@ from lfrtorch.reporting.diagnosis import evidence
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
 from lfrtorch.reporting.simulations import respond, worst_residuals
-from lfrtorch.reporting.verdict import judge
+from lfrtorch.reporting.verdict import judge, reconsidered
 
 SEARCHED_STARTS = 2
 """Least number of starts of a model whose sizes were searched: the first is the search's."""
 
 SLOW_SAMPLES = 5000
 """Training samples from which a static map that is not compiled is worth a note."""
+
+SOME = 10
+"""Samples ahead that predictions are judged at, beside one."""
 
 
 @typed("dataset")
@@ -242,12 +245,18 @@ def scored_run(
         again = replace(again, model=replace(again.model, fitted_to=fitted_to))
     test_linear = linear_models_of_tests(dataset, settings)
     last = None if again is None else again.model
-    simulations = respond(result.model, linear, dataset, test_linear, refitted=last)
-    judged, error = simulations, "error"
-    if settings.noise != "output":
-        judged = respond(result.model, linear, dataset, test_linear, refitted=last, ahead=True)
-        error = "prediction error"
-    verdict = judge(result, judged, linear_nx=linear.nx, error=error)
+    responses = partial(respond, result.model, linear, dataset, test_linear, refitted=last)
+    judged = simulations = responses()
+    if settings.noise == "output":
+        verdict = judge(result, simulations, linear_nx=linear.nx)
+    else:
+        judged = responses(ahead=1)
+        views = {
+            f"error {SOME} ahead": responses(ahead=SOME),
+            "simulation error": simulations,
+        }
+        verdict = judge(result, judged, linear_nx=linear.nx, error="prediction error")
+        verdict = reconsidered(verdict, result, views, linear_nx=linear.nx)
     residuals = worst_residuals(judged)
     found = evidence(
         result,

@@ -15,7 +15,7 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.score_window import fitted
 from lfrtorch.metrics import nrmse
 from lfrtorch.model import Model
-from lfrtorch.records import Record
+from lfrtorch.records import Record, without_coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ def respond(
     own: Mapping[str, LinearModel],
     *,
     refitted: Model | None = None,
-    ahead: bool = False,
+    ahead: int = 0,
 ) -> list[Response]:
     """All records beside their simulations; tests with linear models of their own have those.
 
@@ -75,9 +75,8 @@ def respond(
         model, bla, dataset: what is simulated.
         own: linear models of single tests, by name.
         refitted: the model that was fitted again.
-        ahead: predictions one sample ahead in the place of simulations, of models with K.
+        ahead: predictions so many samples ahead in the place of simulations, of models with K.
     """
-
     used = {
         "train": dataset.train,
         "validation": dataset.validation,
@@ -91,10 +90,18 @@ def respond(
             if use == "test":
                 linear, chosen = own.get(dataset.score_of(record), bla), refitted or model
             driven = fitted(record) if use == "train" else record
-            models = linear, chosen
-            outputs = [m.predict(driven) if ahead else m.simulate(driven) for m in models]
+            outputs = [_output(each, driven, ahead) for each in (linear, chosen)]
             found.append(Response(record, use, *outputs))
     return found
+
+
+def _output(model: Model | LinearModel, record: Record, ahead: int) -> Array:
+    """Simulated, or predicted so many samples ahead."""
+    if not ahead:
+        return model.simulate(record)
+    if isinstance(model, LinearModel):
+        model, record = model.to_model(), without_coordinates(record)
+    return model.predict(record, horizon=ahead)
 
 
 def ranked(responses: Sequence[Response]) -> list[Response]:

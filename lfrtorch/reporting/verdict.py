@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -224,6 +224,38 @@ def judge(
             return Verdict(kind, f"{text}.", NEITHER, evidence)
     advice = "; use the linear model" if use == LINEAR_MODEL else ""
     return Verdict(kind, f"{text}{advice}.", use, evidence)
+
+
+def reconsidered(
+    verdict: Verdict,
+    result: FitResult,
+    views: Mapping[str, Sequence[Response]],
+    *,
+    linear_nx: int,
+) -> Verdict:
+    """The verdict on predictions one sample ahead, in view of others and of simulations.
+
+    Sensor noise may be all that both models leave one sample ahead. If they do alike there, the
+    NL-LFR is better where it is so in one of the views and worse in none.
+
+    Args:
+        verdict: of ``judge``, on predictions one sample ahead.
+        result: the fit.
+        views: the same records farther ahead and simulated, by what their errors are called.
+        linear_nx: states of the linear model.
+    """
+    if verdict.kind != Kind.LINEAR or verdict.use == NEITHER:
+        return verdict
+    others = [
+        judge(result, responses, linear_nx=linear_nx, error=error)
+        for error, responses in views.items()
+    ]
+    better = [other for other in others if other.kind == Kind.BETTER and other.use == NL_LFR]
+    if not better or any(other.kind in (Kind.WORSE, Kind.DIVERGES) for other in others):
+        return verdict
+    text = f"{better[0].text[:-1]}, {percent(verdict.evidence['ratio'])} one ahead."
+    evidence = {**better[0].evidence, "one_ahead": verdict.evidence}
+    return replace(better[0], text=text, evidence=evidence)
 
 
 def of_linear(ratio: float) -> str:

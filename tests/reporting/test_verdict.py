@@ -16,6 +16,7 @@ from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import Kind, Verdict
 
 judge = partial(verdict.judge, linear_nx=2)
+reconsidered = partial(verdict.reconsidered, linear_nx=2)
 LONG = "a_measurement_with_a_name_that_is_longer_than_any_line_of_a_terminal" * 2
 
 
@@ -129,6 +130,43 @@ def test_a_failed_search_is_no_model():
     assert "not trained" in found.text
     kept = judge(result(Reason.GRADIENT_DIVERGED, 5), [TRAIN, response("test", 0.3)])
     assert kept.kind == Kind.BETTER
+
+
+@pytest.mark.parametrize(
+    ("ahead", "simulated", "kind", "said"),
+    [
+        (
+            0.78,
+            0.69,
+            "better",
+            "error 10 ahead is 78.0 % of the linear model's, 97.0 % one",
+        ),
+        (
+            0.97,
+            0.69,
+            "better",
+            "simulation error is 69.0 % of the linear model's, 97.0 % one ahead.",
+        ),
+        (0.97, 0.97, "linear", "use the linear model"),
+        (0.78, 1.50, "linear", "use the linear model"),
+        (0.78, np.inf, "linear", "use the linear model"),
+    ],
+)
+def test_models_that_predict_alike_are_judged_farther_ahead(ahead, simulated, kind, said):
+    first, *others = (
+        [TRAIN, response("test", part, name=LONG)] for part in (0.97, ahead, simulated)
+    )
+    views: dict[str, Any] = dict(zip(("error 10 ahead", "simulation error"), others, strict=True))
+    found = reconsidered(judge(result(), first, error="prediction error"), result(), views)
+    assert found.kind == kind
+    assert said in found.text
+    assert len(found.text) <= 160
+
+
+def test_what_is_clear_one_sample_ahead_stays():
+    for part in (0.5, 3.0, np.nan):
+        first = judge(result(), [TRAIN, response("test", part)], error="prediction error")
+        assert reconsidered(first, result(), {"error": [TRAIN, response("test", 0.5)]}) is first
 
 
 def test_the_training_error_alone_is_no_verdict():
