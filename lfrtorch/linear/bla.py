@@ -42,6 +42,7 @@ from lfrtorch.linear.requirements import (
     excitation_notes,
     of_response,
     steady_state,
+    without_inputs,
 )
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
@@ -70,8 +71,13 @@ ROUNDING = 1e-6
 POOR = 0.7
 """A model with an error above this part of the output's rms explains little: half its power."""
 
-COLOURED = 0.3
-"""Pole of the whitening filter up to which the fit of a differenced output does without."""
+AT_ONCE = 0.99
+"""D of a system that integrates is a parameter if that brings the error below this part of what it
+is without: few have one, and it costs precision at high frequencies."""
+
+COLOURED, CLOSER, ROUNDS = 0.3, 0.7, 4
+"""A differenced output is fitted without a filter if its pole λ is below COLOURED. Others are fitted
+again, ROUNDS times at most, while 1 - λ of the errors is below the part CLOSER of the last one."""
 
 BETTER = 0.25
 """The data come from an unstable system if its cost is below this part of a stable model's."""
@@ -124,9 +130,10 @@ def estimate_bla(
         feedthrough: whether the input acts on the output at once; otherwise D is 0, as it must be
             for data under feedback, which a prediction fits without bias.
         integrators: poles at z = 1 behind each output, exactly: 1 from a speed to a position, 2
-            from a force without friction. ``nx`` counts them. Then G₁ = (z - 1)ⁿ G is fitted, in a
-            simulation error that is filtered so that it is about white. Not for a prediction, and
-            not for records in steady state: the system has none of its own.
+            from a force without friction. ``nx`` counts them. Then (z - 1)ⁿ G is fitted, in a
+            simulation error that is filtered so that it is about white, and D is 0 unless it lowers
+            the error by 1 %. Not for a prediction, and not for records in steady state: the system
+            has none of its own.
         coordinates: ``"balanced"`` states, or ``"given"`` by the subspace estimate.
         max_iter: iterations of the refinement; 0 keeps the best subspace estimate.
 
@@ -209,16 +216,35 @@ class _Settings(NamedTuple):
     max_iter: int
 
 
-def _stable(data: list[Record] | FRF, nx: int, settings: _Settings) -> LinearModel:
-    """The model with all poles inside the unit circle."""
+def _stable(
+    data: list[Record] | FRF,
+    nx: int,
+    settings: _Settings,
+    direct: int = 0,
+    near: LinearModel | None = None,
+) -> LinearModel:
+    """The model with all poles inside the unit circle.
+
+    Args:
+        data: records or a response.
+        nx: order.
+        settings: checked.
+        direct: how many inputs act on the output alone: the last of the records, or differences of
+            the inputs of a response, which it need not have.
+        near: a model whose A and C the search starts from, too.
+    """
     refine, weight, offset, feedthrough, coordinates, max_iter = settings
     records = [] if isinstance(data, FRF) else data
     notes: list[str] = []
     about: FRF | Record
     if refine == "frequency":
         about = data if isinstance(data, FRF) else estimate_frf(records)
-        spectra, scaler, known, more = spectral_data_of_response(about, weight, offset=offset)
-        problem = ResponseFit(spectra, known=known, feedthrough=feedthrough)
+        differences = direct // len(about.inputs)
+        spectra, scaler, known, more = spectral_data_of_response(
+            about, weight, offset=offset, differences=differences
+        )
+        about = replace(about, inputs=about.inputs * (1 + differences))
+        problem = ResponseFit(spectra, known=known, feedthrough=feedthrough, direct=direct)
         notes += [*about.notes, *more]
     else:
         if refine == "simulation":
@@ -231,16 +257,23 @@ def _stable(data: list[Record] | FRF, nx: int, settings: _Settings) -> LinearMod
             offset=offset,
             prediction=refine == "prediction",
             feedthrough=feedthrough,
+            direct=direct,
         )
     if isinstance(problem, ResponseFit):
-        check_spectral_data(problem.data, nx)
+        check_spectral_data(problem.data, nx, direct)
         notes += _band_notes(problem.data, about.fs)
     else:
-        check_length(records, nx)
-        notes += excitation_notes(records, nx)
+        driving = [without_inputs(record, direct) for record in records]
+        check_length(driving, nx)
+        notes += excitation_notes(driving, nx)
 
     balanced = coordinates == "balanced"
-    estimate, found = best_minimum(problem, candidates(problem, nx), max_iter, balanced=balanced)
+    given = []
+    if near is not None:
+        values = np.array(_fit(near).singular_values)
+        given = [SubspaceEstimate(near.A, near.C / scaler.y_scale[:, None], values, None)]
+    tried = candidates(problem, nx, given)
+    estimate, found = best_minimum(problem, tried, max_iter, balanced=balanced)
     notes += _notes(problem, estimate, found)
     if max_iter and found.iterations >= max_iter:
         notes.append(
@@ -278,48 +311,61 @@ def _integrating(
 ) -> LinearModel:
     """The model of the differenced output, with the integrators behind it."""
     about = data if isinstance(data, FRF) else data[0]
-    added = integrators * len(about.outputs)
+    nu, ny = len(about.inputs), len(about.outputs)
+    added, refine = integrators * ny, settings.refine
     order, records = nx - added, [] if isinstance(data, FRF) else data
-    if order < isinstance(data, FRF):
+    if order < (refine == "frequency"):
+        more = ", and a fit to a response takes one more" if refine == "frequency" else ""
         raise InputError(
-            f"nx is {nx}, and {integrators} integrator(s) behind each of {len(about.outputs)} "
-            f"output(s) take {added} states; raise nx."
+            f"nx is {nx}, and {integrators} integrator(s) behind each of {ny} output(s) take "
+            f"{added} states{more}: raise nx."
         )
-    if settings.refine != "frequency" and any(r.start == "periodic" for r in records):
+    if refine != "frequency" and any(r.start == "periodic" for r in records):
         raise InputError(
             "start is 'periodic', and a system that integrates has no steady state of its own: "
             "use start='estimated'."
         )
+    own, response = settings._replace(feedthrough=True), None
+    if isinstance(data, FRF):
+        response = differenced_response(data, integrators)
+        if isinstance(own.weight, np.ndarray):
+            own = own._replace(weight=differenced_weight(data, own.weight, integrators))
+        elif own.weight is None:  # differences raise the noise of the highest lines
+            known = [w for w in ("total", "noise") if getattr(data, f"var_{w}") is not None]
+            own = own._replace(weight=known[0] if known else None)
+    elif refine == "frequency":
+        response = estimate_frf(differenced(data, integrators))
 
-    def found(max_iter: int, *, feedthrough: bool, pole: float = 0.0) -> LinearModel:
-        own = settings._replace(feedthrough=True, max_iter=max_iter)
-        if isinstance(data, FRF):
-            if isinstance(own.weight, np.ndarray):
-                own = own._replace(weight=differenced_weight(data, own.weight, integrators))
-            elif own.weight is None:  # differences raise the noise of the highest lines
-                known = [w for w in ("total", "noise") if getattr(data, f"var_{w}") is not None]
-                own = own._replace(weight=known[0] if known else None)
-            response = differenced_response(data, integrators, feedthrough=feedthrough)
-            return _stable(response, order, own)
-        parts = [differenced(r, integrators, pole, feedthrough=feedthrough) for r in data]
-        return _stable(parts, order, own) if order else gain(parts, offset=settings.offset)
+    def found(
+        differences: int, own: _Settings, pole: float = 0.0, near: LinearModel | None = None
+    ) -> tuple[LinearModel, list[Record]]:
+        if response is not None:
+            return _stable(response, order, own, nu * differences, near), []
+        parts = differenced(records, integrators, differences, pole)
+        if not order:
+            return gain(parts, offset=own.offset), parts
+        return _stable(parts, order, own, len(parts[0].inputs) - nu, near), parts
 
-    # The input acts on the output at once or with the next sample, whichever explains more.
-    feedthrough = settings.feedthrough and (
-        _fit(found(0, feedthrough=True)).rmse < _fit(found(0, feedthrough=False)).rmse
-    )
-    model = found(settings.max_iter, feedthrough=feedthrough)
-    if settings.refine == "simulation":
-        parts = [differenced(r, integrators, feedthrough=feedthrough) for r in records]
-        pole = whitening_pole([simulation_errors(model, r) for r in parts], integrators)
-        if pole > COLOURED:
-            model = found(settings.max_iter, feedthrough=feedthrough, pole=pole)
+    differences, pole, models = integrators - 1, 0.0, []
+    model, parts = found(differences, own)
+    if settings.feedthrough:
+        at_once, _ = found(integrators, own._replace(max_iter=0), near=model)
+        if _fit(at_once).rmse < AT_ONCE * _fit(model).rmse:
+            differences = integrators
+            model, parts = found(differences, own, near=model)
+    while True:
+        whole = integrated(model, about, integrators, differences)
+        models.append(placed(whole, records, added, offset=own.offset) if records else whole)
+        if refine == "frequency" or len(models) == ROUNDS:
+            break
+        before, errors = pole, [simulation_errors(model, part) for part in parts]
+        pole = whitening_pole(errors, integrators, pole)
+        if pole < COLOURED or 1.0 - pole > CLOSER * (1.0 - before):
+            break
+        model, parts = found(differences, own, pole, model)
+    model = min(models, key=lambda each: _fit(each).rmse)
     notes = tuple(f"of the differenced output: {note}" for note in _fit(model).notes)
-    for _ in range(integrators):
-        model = integrated(model, feedthrough=feedthrough)
-    fit = replace(_fit(model), criterion=settings.refine, notes=notes)
-    model = replace(model, outputs=about.outputs, fit=fit)
-    return placed(model, records, added, offset=settings.offset) if records else model
+    return replace(model, fit=replace(_fit(model), criterion=refine, notes=notes))
 
 
 def _fit(model: LinearModel) -> LinearFit:
@@ -328,7 +374,13 @@ def _fit(model: LinearModel) -> LinearFit:
 
 
 def _of_records(
-    records: list[Record], scaler: Scaler, *, offset: bool, prediction: bool, feedthrough: bool
+    records: list[Record],
+    scaler: Scaler,
+    *,
+    offset: bool,
+    prediction: bool,
+    feedthrough: bool,
+    direct: int,
 ) -> ResponseFit | SignalFit:
     """The fit to the spectra of the records if that is the same, else to their signals."""
     normalised = [scaler.normalise(record) for record in records]
@@ -336,7 +388,9 @@ def _of_records(
         spectra = spectral_data_of_records(normalised, offset=offset)
         if spectra is not None:
             return ResponseFit(spectra, known=False, feedthrough=feedthrough)
-    return SignalFit(normalised, offset=offset, prediction=prediction, feedthrough=feedthrough)
+    return SignalFit(
+        normalised, offset=offset, prediction=prediction, feedthrough=feedthrough, direct=direct
+    )
 
 
 def _band_notes(data: SpectralData, fs: float) -> list[str]:

@@ -1,23 +1,24 @@
 """Integrators in a linear model: one or two poles at z = 1, exactly, behind each output.
 
-The output of a system that integrates is y = G(z) u with G = G₁(z) / (z - 1), where G₁ is stable.
-So G₁ is the system from u to the difference v(k) = y(k + 1) - y(k), which the methods for stable
-systems find, and the integrator is put back behind it:
+The output of a system that integrates is y = G(z) u with (z - 1)ⁿ G = G₁ + (z - 1) Q₁ + ... +
+(z - 1)ⁿ Qₙ, where G₁ is stable. So the difference v = (z - 1)ⁿ y follows from u by G₁, which the
+methods for stable systems find, and from the differences of u by constants. The integrators are
+put back behind them:
 
-    x+ = A x + B u,   s+ = s + C x + D u,   y = s.
+    x+ = A x + B u,   s₁+ = s₁ + C x + D u,   s₂+ = s₂ + s₁ + Q₁ u,   ...   y = sₙ + Qₙ u.
 
 The difference turns white noise of y into blue noise, and errors that the system has integrated,
 such as those of friction, into white noise. With both of them the error of the difference is a
-moving average 1 - λ z⁻¹ of white noise. Both signals are filtered by 1 / (1 - λ z⁻¹), which whitens
+moving average 1 - λ z⁻¹ of white noise. All signals are filtered by 1 / (1 - λ z⁻¹), which whitens
 the error and leaves G₁ as it is: with λ = 0 the fit is to the difference, with λ near 1 to the
-output itself.
+output itself. What the filters hold at the beginning is not known. It adds λᵏ to the output, whose
+size is a parameter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import comb
 
 import numpy as np
 import scipy
@@ -30,74 +31,105 @@ from lfrtorch.metrics import rms
 from lfrtorch.model import simulate_record
 from lfrtorch.records import Channel, NormalisedRecord, Record, Scaler
 
-FORGOTTEN = 3.0
-"""The filter's time constants after which its start no longer counts."""
-
 LONGEST = 0.1
 """Largest time constant of the n filters together, in lengths of the shortest record."""
+
+POLES = 50
+"""Values of λ that are tried."""
 
 SAME_LINE = 1e-9
 """Distance from z = 1 below which a line is the one at 0, where the response is infinite."""
 
 
 def differenced(
-    record: Record, integrators: int, pole: float = 0.0, *, feedthrough: bool
-) -> Record:
-    """The record of G₁: the output differenced, and both signals filtered.
+    records: Sequence[Record], integrators: int, differences: int = 0, pole: float = 0.0
+) -> list[Record]:
+    """The records of G₁: the output differenced, and all signals filtered.
 
     Args:
-        record: u (T, nu) and y (T, ny).
-        integrators: how often the output is differenced; each time takes one sample off, and the
-            start state is unknown.
-        pole: λ.
-        feedthrough: whether v(k) = y(k) - y(k - 1), so that the input acts on the output at once.
+        records: u (T, nu) and y (T, ny).
+        integrators: n; it takes n samples off, and the start state is unknown.
+        differences: how many differences of u follow it as inputs.
+        pole: λ. With a filter, the last inputs are what its start adds, n for each record.
+
+    Returns:
+        Records with a reference if they have the inputs that were given.
     """
-    u, r, v, n = record.u, record.reference, record.y, integrators
-    if record.start == "periodic":
-        for _ in range(n):
-            v = v - np.roll(v, 1, axis=0) if feedthrough else np.roll(v, -1, axis=0) - v
-        return replace(record, y=v, limits=None)
-    kept = slice(n, None) if feedthrough else slice(len(u) - n)
-    v, u, r = np.diff(v, n, axis=0), u[kept], None if r is None else r[kept]
-    skip = record.skip
-    if pole:
-        for _ in range(n):
-            u, v = (scipy.signal.lfilter([1.0 - pole], [1.0, -pole], s, axis=0) for s in (u, v))
-        skip = max(skip, round(n * FORGOTTEN / (1.0 - pole)))
-    outputs = tuple(Channel(f"{c.name} differenced", c.unit) for c in record.outputs)
-    skip = min(skip, len(u) - 1)
-    return replace(
-        record, u=u, y=v, reference=r, skip=skip, start="estimated", outputs=outputs, period=None,
-        limits=None,
-    )  # fmt: skip
+    found = []
+    for i, record in enumerate(records):
+        u, v, r, T = record.u, record.y, record.reference, record.samples - integrators
+        if record.start == "periodic":
+            for _ in range(integrators):
+                v = np.roll(v, -1, axis=0) - v
+            found.append(replace(record, y=v, limits=None))
+            continue
+        u = np.hstack([np.diff(u, times, axis=0)[:T] for times in range(differences + 1)])
+        v, skip = np.diff(v, integrators, axis=0), min(record.skip, T - 1)
+        if pole:
+            u, v = (_filtered(signal, integrators, pole) for signal in (u, v))
+            starts = np.zeros((T, len(records), integrators))
+            starts[skip:, i] = _filter_starts(T - skip, integrators, pole)
+            u = np.hstack([u, starts.reshape(T, -1)])
+        more = tuple(Channel(f"added {j}") for j in range(u.shape[1] - len(record.inputs)))
+        r = None if r is None or more else r[:T]
+        differenced = replace(
+            record, u=u, y=v, reference=r, skip=skip, start="estimated",
+            inputs=record.inputs + more, period=None, limits=None,
+        )  # fmt: skip
+        found.append(differenced)
+    return found
 
 
-def whitening_pole(errors: Sequence[Array], integrators: int) -> float:
-    """λ such that the errors of G₁ without a filter are white after n filters.
+def _filtered(signal: Array, times: int, pole: float) -> Array:
+    """Filtered some times about its mean."""
+    mean = signal.mean(axis=0)
+    signal = signal - mean
+    for _ in range(times):
+        signal = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], signal, axis=0)
+    return signal + mean
+
+
+def whitening_pole(errors: Sequence[Array], integrators: int, pole: float = 0.0) -> float:
+    """λ of n filters that leave least of the errors of G₁.
 
     The errors count as white noise of the output, n times differenced, and white noise of G₁: a
-    moving average (1 - λ z⁻¹)ⁿ, whose autocorrelation at lag 1 gives λ.
+    moving average (1 - λ z⁻¹)ⁿ of white noise, which is smaller than what any other λ leaves.
 
     Args:
         errors: of each record, (T, ny).
         integrators: n.
+        pole: λ of the filters that the errors have passed.
     """
-    products = sum(float(np.sum(e[1:] * e[:-1])) for e in errors)
-    power = sum(float(np.sum(e**2)) for e in errors)
-    most = max(0.0, 1.0 - integrators / (LONGEST * min(len(e) for e in errors)))
-    poles = np.linspace(0.0, most, 200)
-    signs = np.array([comb(integrators, i) * (-1.0) ** i for i in range(integrators + 1)])
-    average = signs * poles[:, None] ** np.arange(integrators + 1)
-    correlation = (average[:, 1:] * average[:, :-1]).sum(axis=1) / (average**2).sum(axis=1)
-    return float(poles[np.argmin(np.abs(correlation - products / max(power, 1e-300)))])
+    n, T = integrators, min(map(len, errors))
+    plain = [scipy.signal.lfilter(np.poly([pole] * n), [1.0], e, axis=0)[n:] for e in errors]
+    poles = 1.0 - np.geomspace(1.0, min(1.0, n / (LONGEST * T)), POLES)
+    left = np.array([np.sum([_squares(e, n, pole) for e in plain], axis=0) for pole in poles])
+    return float(poles[np.argmin(np.log(np.maximum(left, 1e-300)).sum(axis=1))])
 
 
-def differenced_response(frf: FRF, integrators: int, *, feedthrough: bool) -> FRF:
-    """The response of G₁, without the line at 0."""
+def _squares(errors: Array, n: int, pole: float) -> Array:
+    """Squares (ny,) of the errors (T, ny), filtered from the best start, but for a constant."""
+    T, ny = errors.shape
+    signals = np.hstack([errors, np.ones((T, 1))])
+    filtered = scipy.signal.lfilter([1.0], np.poly([pole] * n), signals, axis=0)
+    known = np.hstack([filtered[:, ny:], _filter_starts(T, n, pole)])
+    known /= np.maximum(np.linalg.norm(known, axis=0), 1e-300)
+    left = filtered[:, :ny] - known @ np.linalg.lstsq(known, filtered[:, :ny], rcond=None)[0]
+    return np.sum(left**2, axis=0)
+
+
+def _filter_starts(samples: int, n: int, pole: float) -> Array:
+    """What n filters make of what they hold at the beginning: λᵏ, k λᵏ, ..., (T, n)."""
+    k = np.arange(float(samples))[:, None]
+    return pole**k * k ** np.arange(n)
+
+
+def differenced_response(frf: FRF, integrators: int) -> FRF:
+    """(z - 1)ⁿ times a response, without the line at 0."""
     z = np.exp(2j * np.pi * frf.frequencies / frf.fs)
     kept = np.abs(z - 1.0) > SAME_LINE
     z = z[kept]
-    factor = ((z - 1.0) / (z if feedthrough else 1.0)) ** integrators
+    factor = (z - 1.0) ** integrators
     size = np.abs(factor)[:, None, None] ** 2
     return replace(
         frf,
@@ -120,24 +152,24 @@ def differenced_weight(frf: FRF, weight: Array, integrators: int) -> Array:
 
 def gain(records: Sequence[Record], *, offset: bool) -> LinearModel:
     """A model without states: the input times a matrix, by least squares."""
-    first = records[0]
-    u, y = (np.concatenate([getattr(r, name)[r.skip :] for r in records]) for name in ("u", "y"))
-    u_offset, y_offset = (s.mean(axis=0) * offset for s in (u, y))
-    D = np.linalg.lstsq(u - u_offset, y - y_offset, rcond=None)[0].T
-    ny, nu = D.shape
-    errors = y - y_offset - (u - u_offset) @ D.T
-    rmse = float(rms(errors / np.maximum(y.std(axis=0), 1e-300)))
+    first, scaler = records[0], Scaler.of(records, offset=offset)
+    parts = [(scaler.normalise(r), r.skip) for r in records]
+    u = np.concatenate([n.u[skip:] for n, skip in parts])
+    y = np.concatenate([n.y[skip:] for n, skip in parts])
+    rows = np.hstack([u, np.full((len(u), 1), float(offset))])
+    solved = np.asarray(np.linalg.lstsq(rows, y, rcond=None)[0], dtype=np.float64)
+    nu, ny = u.shape[1], y.shape[1]
     return LinearModel(
         np.zeros((0, 0)),
         np.zeros((0, nu)),
         np.zeros((ny, 0)),
-        D,
+        scaler.y_scale[:, None] * solved[:nu].T / scaler.u_scale,
         first.fs,
-        u_offset,
-        y_offset,
+        scaler.u_offset,
+        scaler.restore_y(solved[nu]),
         first.inputs,
         first.outputs,
-        fit=LinearFit("simulation", rmse, 0, "linear least squares", 0.0),
+        fit=LinearFit("simulation", float(rms(y - rows @ solved)), 0, "linear least squares", 0.0),
     )
 
 
@@ -150,21 +182,31 @@ def simulation_errors(model: LinearModel, record: Record) -> Array:
     return (record.y - y)[record.skip :]
 
 
-def integrated(model: LinearModel, *, feedthrough: bool) -> LinearModel:
-    """The model with an integrator behind each output, whose states come last.
+def integrated(
+    model: LinearModel, like: FRF | Record, integrators: int, differences: int
+) -> LinearModel:
+    """The model with integrators behind each output, whose states come last.
 
     The operating point of the input moves to where the output of the given model is 0, so that the
     integrators stay where they are; with fewer inputs than outputs as close to it as it can.
+
+    Args:
+        model: from the inputs of ``differenced`` to its output.
+        like: data with the channels of the result.
+        integrators: n.
+        differences: how many differences of u are inputs of the given model.
     """
-    nx, ny = model.nx, len(model.outputs)
+    nu, ny = len(like.inputs), len(like.outputs)
 
     def behind(A: Array, B: Array, C: Array, D: Array, one: float = 1.0) -> list[Array]:
-        return [
-            np.block([[A, np.zeros((nx, ny))], [C, one * np.eye(ny)]]),
-            np.vstack([B, D]),
-            np.hstack([C if feedthrough else np.zeros_like(C), one * np.eye(ny)]),
-            D if feedthrough else np.zeros_like(D),
-        ]
+        B, one_each = B[:, :nu], one * np.eye(ny)
+        known = np.pad(D[:, : nu * (differences + 1)], ((0, 0), (0, nu * integrators)))
+        gains = [known[:, i * nu : (i + 1) * nu] for i in range(integrators + 1)]
+        for gain in gains[:-1]:
+            nothing = np.zeros((len(A), ny))
+            A = np.block([[A, nothing], [C, one_each]])
+            B, C = np.vstack([B, gain]), np.hstack([nothing.T, one_each])
+        return [A, B, C, gains[-1]]
 
     matrices = model.A, model.B, model.C, model.D
     covariance = model.covariance
@@ -174,10 +216,11 @@ def integrated(model: LinearModel, *, feedthrough: bool) -> LinearModel:
         numbered = (n.reshape(m.shape) for n, m in zip(numbers, matrices, strict=True))
         entries = np.concatenate([part.ravel() for part in behind(*numbered, one=0.0)]).astype(int)
         covariance = np.pad(covariance, ((1, 0), (1, 0)))[np.ix_(entries, entries)]
-    u_offset = model.u_offset
-    if model.y_offset.any():
-        at_rest = model.D + model.C @ np.linalg.solve(np.eye(nx) - model.A, model.B)
-        u_offset = u_offset - np.linalg.lstsq(at_rest, model.y_offset, rcond=None)[0]
+    u_offset, others = model.u_offset[:nu], model.u_offset[nu:]
+    constant = model.y_offset - model.D[:, nu:] @ others
+    if constant.any():
+        at_rest = model.D + model.C @ np.linalg.solve(np.eye(model.nx) - model.A, model.B)
+        u_offset = u_offset - np.linalg.lstsq(at_rest[:, :nu], constant, rcond=None)[0]
     A, B, C, D = behind(*matrices)
     return replace(
         model,
@@ -187,6 +230,8 @@ def integrated(model: LinearModel, *, feedthrough: bool) -> LinearModel:
         D=D,
         u_offset=u_offset,
         y_offset=np.zeros(ny),
+        inputs=like.inputs,
+        outputs=like.outputs,
         covariance=covariance,
     )
 
@@ -205,8 +250,9 @@ def placed(
     records = [replace(r, start="estimated") if r.start == "periodic" else r for r in records]
     scaler = Scaler.of(records, offset=offset)
     model = replace(model, y_offset=scaler.y_offset)
-    if offset:
-        error = np.concatenate([simulation_errors(model, r) for r in records]).mean(axis=0)
+    at_rest = [record for record in records if record.start == "zero"]
+    if offset and at_rest:  # an estimated start state has the output's offset in it
+        error = np.concatenate([simulation_errors(model, r) for r in at_rest]).mean(axis=0)
         model = replace(model, y_offset=model.y_offset + error)
     lfr = LFR(linear_cell(model.A, model.B, model.C, model.D))
     states = []

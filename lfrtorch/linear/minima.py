@@ -7,6 +7,7 @@ end, as a single search may end in a poor minimum.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -77,10 +78,12 @@ class Candidate(NamedTuple):
     matrices: Matrices
 
 
-def candidates(problem: LinearLeastSquares, nx: int) -> list[Candidate]:
-    """The candidates of finite cost, the best one first."""
+def candidates(
+    problem: LinearLeastSquares, nx: int, more: Sequence[SubspaceEstimate] = ()
+) -> list[Candidate]:
+    """The candidates of finite cost, and more of them, the best one first."""
     found = []
-    for estimate in problem.subspace_estimates(nx):
+    for estimate in (*problem.subspace_estimates(nx), *more):
         cost, matrices = problem.with_input_matrices(estimate.A, estimate.C)
         if np.isfinite(cost):
             found.append(Candidate(cost, estimate, matrices))

@@ -5,16 +5,17 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import butter, freqz, lfilter
 
 from lfrtorch._support.types import Array
 from lfrtorch.fitting.starts import initialise
+from lfrtorch.linear import bla
 from lfrtorch.linear.bla import estimate_bla
-from lfrtorch.linear.frf import estimate_frf
+from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.integrators import differenced_response, whitening_pole
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import scan_orders
-from lfrtorch.records import Record
+from lfrtorch.records import Channel, Record
 
 pytestmark = pytest.mark.numeric
 
@@ -47,9 +48,10 @@ def record(integrators: int = 1, *, noise: float = 0.0, load: float = 0.0, **mor
     return Record(u + load, y + 3.0 + noise * rng.standard_normal((T, 1)), FS, **more)
 
 
-def error(model: LinearModel, expected: Array) -> float:
-    """Largest relative error of the response at all frequencies."""
-    return float(np.abs(model.frf(OMEGA * FS / 2 / np.pi)[:, 0, 0] / expected - 1).max())
+def error(model: LinearModel, expected: Array, below: float = np.inf) -> float:
+    """Largest relative error of the response at the frequencies OMEGA below a limit."""
+    relative = np.abs(model.frf(OMEGA * FS / 2 / np.pi)[:, 0, 0] / expected - 1)
+    return float(relative[below > OMEGA].max())
 
 
 @pytest.mark.parametrize(("integrators", "start"), [(1, "zero"), (2, "estimated")])
@@ -60,6 +62,80 @@ def test_a_system_that_integrates_is_recovered(integrators: Literal[1, 2], start
     assert error(model, response(integrators)) < EXACT
     assert model.u_offset == pytest.approx(0.5, abs=EXACT)
     np.testing.assert_allclose(model.simulate(data), data.y, atol=1e-6)
+
+
+def in_motion(constant: float, samples: int) -> tuple[Record, Array, Array]:
+    """A record cut in mid-motion, about a constant input, its noise, and the response."""
+    begin, b, a = 300, [0.0, 0.3, 0.1], np.poly([1.0, 0.98])
+    u, e = np.random.default_rng(1).standard_normal((2, begin + samples))
+    y = lfilter(b, a, u) + 0.03 * e
+    data = Record(u[begin:] + constant, y[begin:] + 5.0, FS, start="estimated")
+    return data, 0.03 * e[begin:], freqz(b, a, OMEGA)[1]
+
+
+@pytest.mark.parametrize("constant", [0.0, 3.0])
+def test_a_constant_input_and_a_start_in_mid_motion(constant: float):
+    """The filter's start is a parameter: it takes up neither the constant nor the motion."""
+    data, noise, expected = in_motion(constant, 200)
+    model = estimate_bla(data, 2, integrators=1)
+    assert error(model, expected) < 0.05
+    assert np.std(data.y - model.simulate(data)) < 1.05 * np.std(noise)
+    assert model.u_offset == pytest.approx(constant, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_records_that_begin_at_rest_and_in_mid_motion():
+    moving, noise, expected = in_motion(2.0, 400)
+    u = np.random.default_rng(2).standard_normal(500)
+    y = lfilter([0.0, 0.3, 0.1], np.poly([1.0, 0.98]), u) + 5.0
+    model = estimate_bla([Record(u + 2.0, y, FS), moving], 2, integrators=1)
+    assert error(model, expected) < 0.02
+    assert model.y_offset == pytest.approx(5.0, abs=0.05)
+    assert np.std(moving.y - model.simulate(moving)) < 1.05 * np.std(noise)
+
+
+def test_nothing_but_an_integrator_about_any_input():
+    u, e = np.random.default_rng(1).standard_normal((2, 500))
+    data = Record(u + 3.0, lfilter([0.0, 0.5], [1.0, -1.0], u) + 0.05 * e, start="estimated")
+    model = estimate_bla(data, 1, integrators=1)
+    assert (model.C @ model.B).item() == pytest.approx(0.5, rel=0.01)
+    assert model.u_offset == pytest.approx(3.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("integrators", "b"), [(2, [0.0, 0.5, 0.5]), (1, [0.25, 0.25]), (2, [0.25, 0.5, 0.25])]
+)
+def test_an_input_that_acts_on_every_integrator(integrators: Literal[1, 2], b: list[float]):
+    """A mass under a held force, 0.5 (z + 1) / (z - 1)², and Tustin's integrators."""
+    rng, a = np.random.default_rng(0), np.poly([1.0] * integrators)
+    u = lfilter(*butter(2, [0.01, 0.6], "bandpass"), rng.standard_normal(T))
+    y = lfilter(b, a, u) + 1e-4 * rng.standard_normal(T)
+    data = Record(u, y, FS, start="estimated")
+    model = estimate_bla(data, integrators, integrators=integrators)
+    assert (model.poles == 1.0).all()
+    assert error(model, freqz(b, a, OMEGA)[1], below=2.0) < 1e-3
+
+
+def test_a_fit_that_simulates_worse_is_not_returned(monkeypatch: pytest.MonkeyPatch):
+    best = estimate_bla(record(noise=0.1), 2, integrators=1, max_iter=2)
+    fits, placed = [], bla.placed
+
+    def spoilt(*args: Any, **options: Any) -> LinearModel:
+        fits.append(placed(*args, **options))
+        assert fits[-1].fit is not None
+        return replace(fits[-1], fit=replace(fits[-1].fit, rmse=float(len(fits))))
+
+    monkeypatch.setattr(bla, "placed", spoilt)
+    kept = estimate_bla(record(noise=0.1), 2, integrators=1, max_iter=2)
+    assert len(fits) > 1
+    assert (kept.A == fits[0].A).all()
+    assert (kept.A != best.A).any()
+
+
+def test_a_reference_is_no_hindrance_to_a_fit_by_simulation():
+    data = record(noise=0.1, reference=np.zeros((T, 1)), start="estimated")
+    model = estimate_bla(data, 1, integrators=1, refine="simulation")
+    assert np.sum(model.poles == 1.0) == 1
 
 
 @pytest.mark.slow
@@ -116,6 +192,8 @@ def test_whitening():
             coloured = lfilter([1, -pole], [1], coloured, axis=0)
         assert whitening_pole([coloured], n) == pytest.approx(pole, abs=0.05)
     assert whitening_pole([np.cumsum(e, axis=0)], 1) == 0.0
+    filtered_twice = lfilter(np.poly([0.5, 0.5]), np.poly([0.8, 0.8]), e, axis=0)
+    assert whitening_pole([filtered_twice], 2, pole=0.8) == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_response_that_integrates():
@@ -127,9 +205,17 @@ def test_a_response_that_integrates():
     assert np.sum(model.poles == 1.0) == 1
     assert error(model, response(1)) < 0.02
     f = frf.frequencies[5:50]
-    once = estimate_bla(differenced_response(frf, 1, feedthrough=False), 1, weight="noise")
+    once = estimate_bla(differenced_response(frf, 1), 1, weight="noise")
     factor = np.abs(np.exp(2j * np.pi * f / FS) - 1)[:, None, None]
     np.testing.assert_allclose(factor * model.frf_std(f), once.frf_std(f), rtol=1e-6)
+
+
+def test_a_response_of_a_mass_with_a_lag():
+    b, a = [0.0, 0.05, 0.19, 0.04], np.poly([0.6, 1.0, 1.0])
+    f, none, one = np.arange(1, 200) * FS / 400, np.zeros(1), (Channel("u"),)
+    G = freqz(b, a, 2 * np.pi * f / FS)[1][:, None, None]
+    frf = FRF(f, G, FS, none, none, one, one, None, None, 1, 1, "robust")
+    assert error(estimate_bla(frf, 3, integrators=2), freqz(b, a, OMEGA)[1]) < EXACT
 
 
 def test_states_have_unit_deviation_and_start_a_nonlinear_model():
@@ -156,6 +242,7 @@ def test_orders_below_the_integrators(tmp_path):
         ({"integrators": 3}, "give 0, 1 or 2"),
         ({"integrators": 2, "nx": 1}, "raise nx"),
         ({"integrators": 1, "refine": "prediction"}, "integrators are for refine"),
+        ({"integrators": 1, "nx": 1, "refine": "frequency"}, "a fit to a response takes one more"),
     ],
 )
 def test_refused(options: dict[str, Any], said: str):
