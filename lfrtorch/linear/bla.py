@@ -76,7 +76,7 @@ AT_ONCE = 0.99
 is without: few have one, and it costs precision at high frequencies."""
 
 COLOURED, CLOSER, ROUNDS = 0.3, 0.7, 4
-"""A differenced output is fitted without a filter if its pole λ is below COLOURED. Others are fitted
+"""A differenced output is fitted without a filter if its pole λ is below COLOURED. Others are fit
 again, ROUNDS times at most, while 1 - λ of the errors is below the part CLOSER of the last one."""
 
 BETTER = 0.25
