@@ -1,4 +1,4 @@
-"""The same data and seed give the same bits on one thread and on two."""
+"""The same data and seed give the same bits on any number of threads."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 import lfrtorch
+from lfrtorch._support.types import Array
+from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
+from lfrtorch.engine.simulation import simulate
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
@@ -98,6 +101,39 @@ def test_simulation(options: Callable[[], dict[str, Any]], start: Any):
 def test_best_linear_approximation(refine: Any):
     data = noisy(records())
     same(lambda: lfrtorch.estimate_bla(data, nx=3, refine=refine, max_iter=3))
+
+
+THREADS = (1, 2, 3, 4, 8)
+
+
+@pytest.mark.parametrize("nx", [3, 8, 12, 20])
+@pytest.mark.parametrize("R", [1, 3])
+def test_jacobian(nx: int, R: int):
+    """Each number of threads shares its columns in another way."""
+    cell = random_cell(2, 2, nx, 2, 2, 9, radius=0.7)
+    u = torch.from_numpy(np.random.default_rng(0).normal(size=(R, 50, 2)))
+    trajectory = simulate(cell, u, u.new_zeros(R, nx))
+
+    def work() -> Array:
+        return output_jacobian(Linearisation(cell, u, trajectory)).numpy()
+
+    first, *others = (bits(on_threads(threads, work)) for threads in THREADS)
+    assert others == 4 * [first]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nx", [3, 8, 12, 20])
+def test_linear_model_and_fit(nx: int):
+    data = noisy([measure(random_model(random_cell(1, 1, nx, 2, 1, 5, radius=0.7)), 1000)])
+
+    def work() -> Any:
+        bla = lfrtorch.estimate_bla(data, nx=nx, max_iter=3)
+        model = lfrtorch.initialise(bla, data, nz=2, nw=1, nn=5)
+        return bla, lfrtorch.fit(model, data, trainer=LM)
+
+    found = (on_threads(threads, work) for threads in THREADS)
+    first, *others = ([bits(each) for each in both] for both in found)
+    assert others == 4 * [first]
 
 
 def test_initialisation():

@@ -18,11 +18,17 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lfrtorch.engine.jacobian_kernel import between, copy_to, network_by_weight
+from lfrtorch.engine.jacobian_kernel import copy_to, network_by_weight
 from lfrtorch.engine.linear_recurrence import NOTHING
 
 SAMPLES = 12
 """Samples in a block: 8 to 16 are as fast for 12 to 28 states; the responses then fit in cache."""
+
+WIDER = 2
+"""Samples after which the responses, which grow, are copied to wider room."""
+
+TOGETHER = 32
+"""Least columns of a product, but for the last one."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -30,185 +36,181 @@ def blocked_rows(
     job, A, Bw, Cz, Cy, Dyw, J, v, by_weight, slope, h, Ww, z, x_entries, z_entries, y_entries,
     first, chunks, S, rows,
 ):  # fmt: skip
-    """What ``jacobian_rows`` writes, from the same arguments."""
+    """What ``jacobian_rows`` writes, from the same arguments.
+
+    BLAS rounds by the sizes of a product, so these are the same for any number of jobs.
+    """
     r, chunk = job // chunks, job % chunks
-    T, ny, C = rows.shape[1], rows.shape[2], S.shape[2]
-    c0, c1 = C * chunk // chunks, C * (chunk + 1) // chunks
     m = min(r, len(A) - 1)  # which model
     A, Bw, Cz, Cy, Dyw = A[m], Bw[m], Cz[m], Cy[m], Dyw[m]
-    J, v, by_weight, rows, S = J[r], v[r], by_weight[r], rows[r, :, :, c0:c1], S[r, :, c0:c1]
+    J, v, by_weight, rows, S = J[r], v[r], by_weight[r], rows[r], S[r]
     slope, h, z, Ww = slope[r], h[r], z[r], Ww[min(m, len(Ww) - 1)]
-    (nx, nw), nn = Bw.shape, h.shape[1]
-    n_weights = nn * (z.shape[1] + 1 + nw) + nw if nn > 0 else by_weight.shape[2]
-    x_own, z_own, y_own = (
-        between(x_entries, c0, c1), between(z_entries, c0, c1), between(y_entries, c0, c1)
-    )  # fmt: skip
+    (nx, nw), nn, (T, ny) = Bw.shape, h.shape[1], rows.shape[:2]
+    n_x, n_z, n_y, C = len(x_entries), len(z_entries), len(y_entries), S.shape[1]
     # The columns are those of x, z, y, the static map and the initial state, in this order.
-    s0 = min(max(first, c0), c1)
-    s1 = max(min(first + n_weights, c1), s0)
-    n_x, n_z, n_y, n_static = len(x_own), len(z_own), len(y_own), s1 - s0
-    to_static = n_x + n_z + n_y
-    to_initial = to_static + n_static
-    n_initial = c1 - c0 - to_initial
-    place, start = _by_state(x_own, nx)
+    column, start, edges = _sorted(x_entries, n_z, n_y, C, nx)
+    k0 = np.searchsorted(edges[1:] * chunks, chunk * len(column), "right")
+    k1 = np.searchsorted(edges[1:] * chunks, (chunk + 1) * len(column), "right")
+    c0, c1 = edges[k0], edges[k1]
+    # Its own columns, how many of them are of x, and which is the first of the others.
+    own, n_own, w0 = column[c0:c1], max(0, min(c1, n_x) - c0), max(0, c0 - n_x)
 
     # The first rows of a response are those of the state after the block; the outputs follow, the
     # last one first, so that each step backwards adds rows at the end. All are transposed.
     wide = nx + SAMPLES * ny
     P = np.zeros((nx, SAMPLES, wide), rows.dtype)
     QW = np.zeros((nx + nw * SAMPLES, wide), rows.dtype)
-    room = np.zeros((2 * nx + nw) * wide, rows.dtype)
+    room = np.empty((nx + nw) * wide, rows.dtype), np.empty((nx + nw) * wide, rows.dtype)
     M = np.zeros((nx + nw, nx), rows.dtype)
     copy_to(Bw.T, M[nx:], 0)
-    # Columns that w drives: S, and below it d_w. Columns of x, and of the initial state: S.
-    Sw = np.zeros((nx + nw * SAMPLES, n_z + n_static), rows.dtype)
-    Sx = np.zeros((nx, n_x + n_initial), rows.dtype)
-    by_w, by_x = (
-        np.zeros((wide, Sw.shape[1]), rows.dtype),
-        np.zeros((wide, Sx.shape[1]), rows.dtype),
-    )
-    direct = np.zeros((n_x, SAMPLES), rows.dtype)
-    of_direct = np.zeros((n_x, wide), rows.dtype)
-    d_w = np.zeros((nw, n_weights), rows.dtype)
+    AT, CyT, DywT = A.T.copy(), Cy.T.copy(), Dyw.T.copy()
+    # Transposed as well: columns of x have S and direct terms, the others S with d_w beside it.
+    Sx, direct = np.zeros((n_own, nx), rows.dtype), np.zeros((n_own, SAMPLES), rows.dtype)
+    Sw = np.zeros((len(own) - n_own, len(QW)), rows.dtype)
+    by, of_direct = np.empty((len(own), wide), rows.dtype), np.empty((n_own, wide), rows.dtype)
+    d_w = np.zeros((nw, len(column) - n_x), rows.dtype)
     for i in range(nx):
-        _gather(S[i], Sx[i], 0, n_x, 0)
-        _gather(S[i], Sx[i], to_initial, n_initial, n_x)
-        _gather(S[i], Sw[i], n_x, n_z, 0)
-        _gather(S[i], Sw[i], to_static, n_static, n_z)
+        for n in range(n_own):
+            Sx[n, i] = S[i, own[n]]
+        for n in range(len(Sw)):
+            Sw[n, i] = S[i, own[n_own + n]]
 
     for t0 in range(0, T, SAMPLES):
         count = min(SAMPLES, T - t0)
         if count < SAMPLES:
-            P[:], QW[:], Sw[nx:], direct[:] = 0.0, 0.0, 0.0, 0.0
-        _responses(A, Bw, Cz, Cy, Dyw, J[t0 : t0 + count], M, room, P, QW)
-        for b in range(count):
-            k = t0 + b
-            for q in range(nw):
-                row = Sw[nx + q * SAMPLES + b]
-                for n in range(n_z):
-                    row[n] = J[k, q, z_own[n, 1]] * v[k, z_own[n, 2]]
-                if nn > 0:
-                    network_by_weight(Ww, slope, h, z, k, q, d_w[q], 0)
-                    for n in range(n_static):
-                        row[n_z + n] = d_w[q, s0 - first + n]
-                else:
-                    for n in range(n_static):
-                        row[n_z + n] = by_weight[k, q, s0 - first + n]
-            for n in range(n_x):
-                direct[place[n], b] = v[k, x_own[n, 2]]
-        np.dot(QW.T, Sw, by_w)
-        np.dot(QW[:nx].T, Sx, by_x)
+            P[:], QW[:] = 0.0, 0.0
+        _responses(AT, Cz, CyT, DywT, J[t0 : t0 + count], M, room, P, QW)
+        for n in range(n_own):
+            entry = x_entries[own[n], 2]
+            for b in range(count):
+                direct[n, b] = v[t0 + b, entry]
+        if len(Sw) > 0:
+            for b in range(count):
+                k = t0 + b
+                for q in range(nw):
+                    row = d_w[q]
+                    for n in range(n_z):
+                        row[n] = J[k, q, z_entries[n, 1]] * v[k, z_entries[n, 2]]
+                    if nn > 0:
+                        network_by_weight(Ww, slope, h, z, k, q, row, n_z)
+                    else:
+                        for n in range(by_weight.shape[2]):
+                            row[n_z + n] = by_weight[k, q, n]
+                    for n in range(len(Sw)):
+                        Sw[n, nx + q * SAMPLES + b] = row[w0 + n]
+        for k in range(k0, k1):
+            n0, n1 = edges[k] - c0, edges[k + 1] - c0
+            if n1 <= n_own:
+                np.dot(Sx[n0:n1], QW[:nx], by[n0:n1])
+            else:
+                np.dot(Sw[n0 - n_own : n1 - n_own], QW, by[n0:n1])
         for i in range(nx):
-            if start[i] < start[i + 1]:
-                own = slice(start[i], start[i + 1])
-                np.dot(direct[own], P[i], of_direct[own])
-        for t in range(nx + count * ny):
-            for n in range(n_x):
-                by_x[t, n] += of_direct[place[n], t]
+            n0, n1 = start[i] - c0, start[i + 1] - c0
+            if 0 <= n0 < n1 <= n_own:
+                np.dot(direct[n0:n1], P[i], of_direct[n0:n1])
+        for n in range(n_own):
+            for t in range(wide):
+                by[n, t] += of_direct[n, t]
 
         for b in range(count):
             for i in range(ny):
                 t, out = nx + (count - 1 - b) * ny + i, rows[t0 + b, i]
-                _gather(by_x[t], out, 0, n_x, 0)
-                _gather(by_w[t], out, 0, n_z, n_x)
+                for n in range(len(own)):
+                    out[own[n]] = by[n, t]
+        if chunk == 0:
+            rows[t0 : t0 + count, :, n_x + n_z : n_x + n_z + n_y] = 0.0
+            for k in range(t0, t0 + count):
                 for n in range(n_y):
-                    out[n_x + n_z + n] = 0.0
-                _gather(by_w[t], out, n_z, n_static, to_static)
-                _gather(by_x[t], out, n_x, n_initial, to_initial)
-            for n in range(n_y):
-                rows[t0 + b, y_own[n, 1], y_own[n, 0]] = v[t0 + b, y_own[n, 2]]
-        _without_dust(by_x, Sx, nx)
-        _without_dust(by_w, Sw, nx)
+                    rows[k, y_entries[n, 1], y_entries[n, 0]] = v[k, y_entries[n, 2]]
+        _without_dust(by[:n_own], Sx, nx)
+        _without_dust(by[n_own:], Sw, nx)
 
     for i in range(nx):
-        _gather(Sx[i], S[i], 0, n_x, 0)
-        _gather(Sw[i], S[i], 0, n_z, n_x)
-        _gather(Sw[i], S[i], n_z, n_static, to_static)
-        _gather(Sx[i], S[i], n_x, n_initial, to_initial)
+        for n in range(n_own):
+            S[i, own[n]] = Sx[n, i]
+        for n in range(len(Sw)):
+            S[i, own[n_own + n]] = Sw[n, i]
 
 
 @njit(nogil=True, fastmath={"contract"})
-def _responses(A, Bw, Cz, Cy, Dyw, J, M, room, P, QW):
+def _responses(AT, Cz, CyT, DywT, J, M, room, P, QW):
     """Fill P (nx, b, row of a response) and QW, the rows of Q and then of W (nw, b), transposed.
 
     M has Bwᵀ below the place of Fᵀ. What a block leaves untouched stays zero.
     """
-    (nx, nw), ny = Bw.shape, len(Cy)
-    steps, width = P.shape[1], nx
-    latest = room[: nx * nx].reshape(nx, nx)
-    for i in range(nx):
-        for j in range(nx):
-            latest[i, j] = 0.0
-        latest[i, i] = 1.0
-    for b in range(len(J) - 1, -1, -1):
+    (nx, ny), nw = CyT.shape, len(DywT)
+    width, steps = nx, P.shape[1]
+    latest, (now, after) = np.eye(nx, dtype=P.dtype), room
+    for done in range(len(J)):
+        b, at = len(J) - 1 - done, nx + done * ny
+        if done % WIDER == 0:
+            wider = now[: (nx + nw) * (width + WIDER * ny)].reshape(nx + nw, width + WIDER * ny)
+            wider[:] = 0.0
+            copy_to(latest[:nx], wider, 0)
+            latest, now, after = wider, after, now
+            width += WIDER * ny
         for i in range(nx):
             for t in range(width):
                 P[i, b, t] = latest[i, t]
             for j in range(nx):
-                M[i, j] = A[j, i]
-        add_feedback(Bw, J[b], Cz, M)
-        found = room[nx * len(P[0, 0]) :][: (nx + nw) * width].reshape(nx + nw, width)
-        np.dot(M, latest, found)
-        latest = room[: nx * (width + ny)].reshape(nx, width + ny)
-        for i in range(nx):
-            for t in range(width):
-                latest[i, t] = found[i, t]
-            for o in range(ny):
-                latest[i, width + o] = Cy[o, i]
-        add_feedback(Dyw, J[b], Cz, latest[:, width:])
+                M[i, j] = AT[i, j]
+        add_feedback(M[nx:], J[b], Cz, M)
+        found = now[: (nx + nw) * width].reshape(nx + nw, width)
+        np.dot(M, latest[:nx], found)
+        for o in range(ny):
+            for i in range(nx):
+                found[i, at + o] = CyT[i, o]
+            for q in range(nw):
+                found[nx + q, at + o] = DywT[q, o]
+        add_feedback(DywT, J[b], Cz, found[:, at:])
         for q in range(nw):
-            response = QW[nx + q * steps + b]
             for t in range(width):
-                response[t] = found[nx + q, t]
-            for o in range(ny):
-                response[width + o] = Dyw[o, q]
-        width += ny
-    for i in range(nx):
-        for t in range(width):
-            QW[i, t] = latest[i, t]
+                QW[nx + q * steps + b, t] = found[nx + q, t]
+        latest, now, after = found, after, now
+    copy_to(latest[:nx], QW, 0)
 
 
 @njit(nogil=True, fastmath={"contract"})
-def add_feedback(drive, J, Cz, out):
+def add_feedback(driveT, J, Cz, out):
     """out += (drive J Cz)ᵀ."""
-    nw, nz = J.shape
-    column = np.empty(len(drive), out.dtype)
-    for j in range(nz):
-        for c in range(len(drive)):
+    for i in range(Cz.shape[1]):
+        for q in range(len(driveT)):
             a = out.dtype.type(0)
-            for q in range(nw):
-                a += drive[c, q] * J[q, j]
-            column[c] = a
-        for i in range(Cz.shape[1]):
-            for c in range(len(drive)):
-                out[i, c] += Cz[j, i] * column[c]
+            for j in range(len(Cz)):
+                a += J[q, j] * Cz[j, i]
+            for c in range(driveT.shape[1]):
+                out[i, c] += driveT[q, c] * a
 
 
 @njit(nogil=True)
-def _by_state(entries, nx):
-    """Places of the columns sorted by the state that they drive, and where each state's begin."""
-    start = np.zeros(nx + 1, np.int64)
-    for n in range(len(entries)):
-        start[entries[n, 1] + 1] += 1
+def _sorted(x_entries, n_z, n_y, C, nx):
+    """All columns but those of y, which leave S alone, and where products of them begin.
+
+    First come those of x, by the state that they drive: where each state's begin is returned, too.
+    Their products hold all columns of a state, as these share its P.
+    """
+    n_x, start = len(x_entries), np.zeros(nx + 1, np.int64)
+    for n in range(n_x):
+        start[x_entries[n, 1] + 1] += 1
     start = np.cumsum(start)
-    place, next_one = np.empty(len(entries), np.int64), start.copy()
-    for n in range(len(entries)):
-        place[n] = next_one[entries[n, 1]]
-        next_one[entries[n, 1]] += 1
-    return place, start
-
-
-@njit(nogil=True, inline="always")
-def _gather(source, target, first, count, at):
-    """target[at : at + count] = source[first : first + count]."""
-    for n in range(count):
-        target[at + n] = source[first + n]
+    column, at = np.arange(C - n_y), start.copy()
+    column[n_x + n_z :] += n_y
+    for n in range(n_x):
+        column[at[x_entries[n, 1]]] = n
+        at[x_entries[n, 1]] += 1
+    edges = [0]
+    for i in range(1, nx + 1):
+        if start[i] - edges[-1] >= TOGETHER or (i == nx and n_x > edges[-1]):
+            edges.append(start[i])
+    while edges[-1] < len(column):
+        edges.append(min(edges[-1] + TOGETHER, len(column)))
+    return column, start, np.array(edges)
 
 
 @njit(nogil=True)
 def _without_dust(source, target, n):
-    """The first n rows, with zeros for what would fade to denormal numbers: these are slow."""
-    for i in range(n):
-        for c in range(source.shape[1]):
-            a = source[i, c]
-            target[i, c] = a if abs(a) > NOTHING else source.dtype.type(0)
+    """The first n columns, with zeros for what would fade to denormal numbers: these are slow."""
+    for c in range(len(source)):
+        for i in range(n):
+            a = source[c, i]
+            target[c, i] = a if abs(a) > NOTHING else source.dtype.type(0)

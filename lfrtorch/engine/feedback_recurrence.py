@@ -154,12 +154,12 @@ def _backwards(r, A, Bw, Cz, J, g, s):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _transition(r, A, Bw, Cz, J, Phi):
     m = min(r, len(A) - 1)
-    A, Bw, Cz, J, Phi = A[m], Bw[m], Cz[m], J[r], Phi[r]
+    A, BwT, Cz, J, Phi = A[m], Bw[m].T.copy(), Cz[m], J[r], Phi[r]
     F, X = np.empty_like(A), Phi.T.copy()
     X_next = np.empty_like(X)
     for k in range(len(J)):
         copy_to(A.T, F, 0)
-        add_feedback(Bw, J[k], Cz, F)
+        add_feedback(BwT, J[k], Cz, F)
         np.dot(X, F, X_next)  # transposed, all of them
         X, X_next = X_next, X
         if k % 256 == 255:
