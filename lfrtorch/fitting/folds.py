@@ -2,6 +2,10 @@
 
 A short record has no part to spare for validation. So each of several stretches is left out once,
 the rest of the record trains, and the model simulates the whole record through what was left out.
+
+The errors there compare models. They are no estimate of the error on new data: the start of a fit,
+with its linear model and scales, may have seen the whole record, and what was left out chooses the
+iterate. Of outputs that are noise alone they were 0.5 to 3 % below the rms of the noise.
 """
 
 from __future__ import annotations

@@ -81,7 +81,9 @@ ITERATIONS = 75
 """Iterations of the last round: three eighths of those of a fit."""
 
 LEGEND = """\
-validation: rms error over that of the output. above best: in standard errors of the difference.
+validation: rms error over that of the output. It compares sizes, and is smaller than on new data:
+it chose the iterate, too, and by folds the linear model of the start has seen all samples.
+above best: in standard errors of the difference.
 chosen: the fewest net parameters with 1 at most and an error up to 5 % above the best, or with an
 error up to 1 % above it; or fewer with a smaller error."""
 
@@ -300,7 +302,9 @@ def search_sizes(
         finalists: models that get all iterations.
         folds: if not 0, the finalists are fitted again, to all but one of so many stretches of the
             training and validation records in turn (:func:`lfrtorch.fitting.folds.folds`), and the
-            errors in the stretches that were left out choose, those of finalists alone.
+            errors in the stretches that were left out choose, those of finalists alone. These
+            errors compare sizes and are too small to quote: each fit begins with the linear model
+            and scales of all samples, and what was left out chooses its iterate.
         trainer: the search. Default: Levenberg-Marquardt with 75 iterations.
         ridge, noise, horizon, ranks, stop: see :func:`lfrtorch.fit`.
         monitor: called after every iteration of any model. Default: a line on a terminal or in a
