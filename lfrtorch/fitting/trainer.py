@@ -283,12 +283,14 @@ class Fit:
             "ridge": ridge,
             "stable": self.trainer.stable,
             "contracting": self.trainer.contracting,
+            "longest": max(record.samples for record in as_records(train)),
             "ranks": ranks,
         }
         if horizon is not None:
             nx = model.lfr.cell.nx
             train = windows(as_records(train), horizon, nx)
-            validation = windows(as_records(validation), horizon, nx) if validation else ()
+            if validation:
+                validation = windows(as_records(validation), horizon, nx, fitted=False)
         kind: type[SimulationProblem] = SimulationProblem
         if simulation:
             kind = PredictionProblem

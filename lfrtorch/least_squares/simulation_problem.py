@@ -58,7 +58,10 @@ class SimulationProblem(LeastSquares):
             at θ_0, within the circle that they are in.
         contracting: whether a search stays among models that are proven to contract; A is then
             stable, too.
-        solve_initial_states: estimated initial states are no part of θ, but solved for at every θ.
+        longest: samples of the longest record before they were cut into windows, which ``stable``
+            goes by. Default: of these records.
+        solve_initial_states: estimated initial states are no part of θ, but solved for at every θ,
+            and outputs end at the limits of a record, as in a score.
         ranks: the processes that share the records. All have the same θ, cost and gradient; each
             has the residual of its own records.
 
@@ -76,6 +79,7 @@ class SimulationProblem(LeastSquares):
         ridge: Ridge = 0.0,
         stable: bool = False,
         contracting: bool = False,
+        longest: int | None = None,
         solve_initial_states: bool = False,
         ranks: Ranks | None = None,
     ) -> None:
@@ -112,8 +116,7 @@ class SimulationProblem(LeastSquares):
         self._integrating = integrating_states(lfr.cell)
         if stable and lfr.cell.A.requires_grad and not self._integrating.all():
             radius = spectral_radius(fading(lfr.cell.A, self._integrating)).double()
-            longest = max((record.samples for record in data), default=1)
-            limit = largest_modulus(longest)
+            limit = largest_modulus(longest or max((r.samples for r in data), default=1))
             self._largest_pole = max(limit, float(self.ranks.first(radius)))
         self._reduced: Reduction | None = None
         self._memory = Memory()

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from reference import measure, normal, random_cell, random_model
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
@@ -48,6 +49,35 @@ def test_windows_have_every_scored_sample_and_the_weight_of_the_record(start, T,
     assert {window.start for window in others} == {"estimated"}
     assert first.start == ("estimated" if start == "periodic" else start)
     assert first.skip == (0 if start == "periodic" else skip)
+
+
+@pytest.mark.parametrize("start", ["zero", "estimated", "periodic"])
+@pytest.mark.parametrize("skip", [0, 7, 40])
+def test_start_states_of_validation_are_fitted_to_samples_before_a_window(start, skip):
+    T, horizon = 203, 25  # 20 samples for each state before a window
+    record = counted(T, start=start, skip=skip)
+    found = windows([record], horizon, nx=1, fitted=False)
+    scored = np.concatenate([window.y[window.skip :, 0] for window in found])
+    assert set(scored) == set(range(skip, T))
+    total = sum(float(window.weight) * horizon for window in found)
+    assert total == pytest.approx(T - skip)
+    for window in found:
+        assert window.samples == window.skip + horizon
+        first = window.y[window.skip, 0]
+        assert (window.y[:, 0] == np.arange(first - window.skip, first + horizon) % T).all()
+        if window.y[0, 0] or start == "periodic":
+            assert window.start == "estimated"
+            assert window.skip == max(20, skip)
+        else:
+            assert window.start == start
+
+
+def test_windows_keep_the_reference():
+    record = counted(100, reference=np.arange(100.0))
+    for fitted in (True, False):
+        for window in windows([record], 20, nx=2, fitted=fitted):
+            assert window.reference is not None
+            assert np.array_equal(window.reference, window.u)
 
 
 def test_a_record_that_is_no_longer_than_a_window_stays_as_it_is():
@@ -115,13 +145,23 @@ def test_a_fit_over_windows_finds_the_system(model: Model, horizon):
 
 
 @numeric
-def test_errors_of_training_and_validation_are_of_windows(model: Model):
+def test_validation_in_windows_compares_with_whole_records_and_training_does_not(model: Model):
     record = measure(model, 200, seed=1)
     fit = Fit(moved(model), record, record, horizon=20)
     fit.begin()
     (start,) = fit.history
     whole = lfrtorch.rmse(record, fit.model.simulate(record))
-    assert max(start.train, start.validation) < 0.95 * whole
+    assert start.train < 0.95 * whole
+    assert start.validation == pytest.approx(whole, rel=0.02)
+
+
+@numeric
+def test_poles_of_a_fit_over_windows_stay_within_the_limit_of_whole_records(model: Model):
+    trainer = lfrtorch.LevenbergMarquardt(stable=True)
+    problem = Fit(model, measure(model, 400), trainer=trainer, horizon=20).problem
+    slow = problem.theta
+    slow[:4] = torch.diag(slow.new_tensor([0.99, 0.5])).flatten()
+    assert torch.equal(problem.admissible(slow), slow)
 
 
 @numeric
