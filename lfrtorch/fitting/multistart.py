@@ -144,9 +144,10 @@ def fit(
         horizon: samples of the windows that training records are cut into, each simulated from a
             start state of its own that is fitted with the parameters
             (``lfrtorch.fitting.windows``). Errors of training and validation are then those in
-            windows, of validation from states that are fitted to samples before them. ``"grow"``: the fit of whole records comes after fits over windows of 20
-            samples for each state, of 4 times as many, and so on, each until the cost settles or
-            half of the iterations are spent. Default: whole records.
+            windows, of validation from states that are fitted to samples before them. ``"grow"``:
+            the fit of whole records comes after fits over windows of 20 samples for each state, of
+            4 times as many, and so on, each until the cost settles or half of the iterations are
+            spent. Default: whole records.
         average: most starts that the model of the result is the mean of
             (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
             averaged as bring the mean within 1 % of the least error on validation and selection,
