@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.records import Record, signals
+from lfrtorch.score_window import with_window
 
 LISTED = 3
 """Most records of a use that a printed dataset lists."""
@@ -56,8 +57,6 @@ class Dataset:
             test or group and of records; others have the linear model of all records.
         notes: what a reader of the scores should know of the data, a sentence each.
         seed: that simulated data were drawn with.
-        unscored: records that cannot be scored, each after its use (``"test"``, ...): too few
-            samples to determine the start state and score the rest.
         groups: test or validation records that make one score together, by its name and theirs: the
             mean of the RMSE of each output of each record.
         leaderboard: test records as nonlinearbenchmark.org has them scored: cut by the package
@@ -87,7 +86,6 @@ class Dataset:
     linear: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     leaderboard: list[Record] = field(default_factory=list)
     seed: int | None = None
-    unscored: Sequence[tuple[str, Record]] = ()
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -101,6 +99,18 @@ class Dataset:
                     f"{use} has something else than records; give a list of them, or [] for none."
                 )
             object.__setattr__(self, use, records)
+
+    def with_windows(self) -> Dataset:
+        """The same with windows for the scores of estimated starts that leave them open.
+
+        Example:
+            >>> test = lfrtorch.Record(u[100:], y[100:], fs=100.0, start="estimated", name="test")
+            >>> data = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[test])
+            >>> data.with_windows().tests[0].skip
+            50
+        """
+        held_out = ("validation", "selection", "tests")
+        return replace(self, **{use: [*map(with_window, getattr(self, use))] for use in held_out})
 
     def score_of(self, record: Record) -> str:
         """The name of the score that a record counts for: its group's, or its own."""

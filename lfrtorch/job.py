@@ -36,7 +36,6 @@ from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
 from lfrtorch.linear.requirements import check_excitation, excited_directions
-from lfrtorch.linear.score_window import with_score_windows
 from lfrtorch.model import Model, check_channels
 from lfrtorch.records import Record
 from lfrtorch.reporting.advice import advise
@@ -125,12 +124,12 @@ def _identified(
     """``identify`` with somebody who looks on."""
     if settings.init_from is not None:
         check_channels(settings.init_from, dataset.train[0])
+    whole, dataset = dataset, dataset.with_windows()
     approximated = linear_records(dataset.train, settings, observer)
     linear, order_scan = linear_model(
         approximated, settings, dataset.validation, observer=observer, ranks=ranks
     )
     settings, asked = replace(settings, nx=linear.nx), settings
-    whole, dataset = dataset, windowed(dataset, linear.to_model(), observer)
     sizes = choose_sizes(dataset, asked, linear, observer=observer, ranks=ranks, stop=stop)
     if sizes is not None:
         chosen, starts = sizes.chosen, max(SEARCHED_STARTS, asked.starts)
@@ -142,7 +141,6 @@ def _identified(
             )
             linear = estimate_bla(approximated, cast(int, settings.nx), **settings.linear)
             tell(linear, observer)
-            dataset = windowed(whole, linear.to_model(), observer, dataset.notes)
     models = starting_models(dataset.train, settings, linear)
     shrunk = None if sizes is None else sizes.chosen.model
     if snapshots is not None:
@@ -194,23 +192,6 @@ def _identified(
     return scored_run(
         dataset, settings, linear, result, order_scan=order_scan, size_search=sizes, again=again
     )
-
-
-def windowed(
-    dataset: Dataset, model: Model, observer: Observer, said: Sequence[str] = ()
-) -> Dataset:
-    """The records with the windows that a model gives their scores; tells new notes.
-
-    Args:
-        dataset, model: see :func:`lfrtorch.linear.score_window.with_score_windows`.
-        observer: who is told.
-        said: notes that are known already.
-    """
-    found = with_score_windows(dataset, model)
-    for note in found.notes:
-        if note not in (*dataset.notes, *said):
-            observer.say(f"note: {note}")
-    return found
 
 
 def _most_averaged(models: Sequence[Model], average: int, observer: Observer) -> int:

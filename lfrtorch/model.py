@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, overload
@@ -40,6 +40,7 @@ from lfrtorch.records import (
     Record,
     Scaler,
     Start,
+    as_records,
     as_signal,
     check_rate,
     check_start,
@@ -553,6 +554,22 @@ def simulate_blocks(
             )
         yield y
         first, state = first + len(u), trajectory.x[0, -1].numpy()
+
+
+def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tensor, "nx nx"]:
+    """E x xᵀ of the simulated states over all samples of records, about 0, in float64.
+
+    Example:
+        >>> from lfrtorch.model import state_moment
+        >>> state_moment(model, record).shape
+        torch.Size([1, 1])
+    """
+    nx, samples = model.lfr.cell.nx, 0
+    total = torch.zeros(nx, nx, dtype=torch.float64)
+    for record in as_records(records):
+        x = model.signals(record).x[0].double()
+        total, samples = total + x.mT @ x, samples + len(x)
+    return (total + total.mT) / (2 * samples)
 
 
 def _described(static: Module | None) -> dict[str, Any] | None:

@@ -100,9 +100,8 @@ class Record:
             the parameters; in a simulation to the skipped samples alone, or to all if none is
             skipped; ``"periodic"`` says that the record is a whole number of periods in steady
             state.
-        skip: samples at the beginning that are left out of cost and score.
-        skip_more: whether ``skip`` is the least number only: if the start is estimated, a score
-            then leaves out as many as determine the state. Without ``skip`` that is so anyway.
+        skip: samples at the beginning that are left out of cost and score. Of an estimated start
+            without it, a score leaves out the first 50, or the first fifth of a shorter record.
         x0: the given start state, in the coordinates of the model.
         weight: of the squared normalised errors in a fit, one number or one for each output.
         line_weight: of the squared errors in a fit by spectral line, for whole periods without
@@ -156,7 +155,6 @@ class Record:
     x0: Array | None = None
     weight: float | Array = 1.0
     line_weight: Array | None = None
-    skip_more: bool = False
     limits: Sequence[ArrayLike | None] | Array | None = None
     reference: Array | None = None
     valid: Booleans | None = None
@@ -390,7 +388,7 @@ class Record:
             )
         part = self.signals_in(window)
         period = self.period if self.period is not None and self.period <= len(part["u"]) else None
-        return replace(self, **part, start="zero", skip=0, period=period, x0=None, skip_more=False)
+        return replace(self, **part, start="zero", skip=0, period=period, x0=None)
 
     def mean_period(self) -> Record:
         """One period, the mean of all of a record in steady state, that weighs as much as they do.

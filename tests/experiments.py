@@ -1,11 +1,13 @@
 """Experiments made of known parts, and what their estimated covariances must be."""
 
 import numpy as np
+import scipy.signal
 from reference import System, frf, periodic_response
 
 from lfrtorch._support.types import Array
 from lfrtorch.linear.frf import FRF
-from lfrtorch.records import Record
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.records import Channel, Record
 
 FS, SEEDS = 50.0, 80
 
@@ -85,3 +87,35 @@ def slow_system() -> System:
     """Two poles of radius 0.97 at 0.3 rad: a transient of some 100 samples."""
     pole = 0.97 * np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
     return pole, np.array([[0.3], [0.2]]), np.array([[1.0, 0.5]]), np.array([[0.1]])
+
+
+# --- parts of long measurements -------------------------------------------------------------
+
+
+def resonance(radius: float, angle: float, ny: int = 1) -> LinearModel:
+    """A pole pair, seen in ``ny`` outputs."""
+    A = radius * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    C = np.array([[1.0, 0.0], [0.5, 1.0]])[:ny]
+    names = [tuple(Channel(f"{s}{i}") for i in range(n)) for s, n in (("u", 1), ("y", ny))]
+    return LinearModel(
+        A, np.array([[1.0], [0.3]]), C, np.zeros((ny, 1)), fs=1.0,
+        u_offset=np.zeros(1), y_offset=np.zeros(ny), inputs=names[0], outputs=names[1],
+    )  # fmt: skip
+
+
+def noise_of(T: int, memory: float, seed: int, ny: int = 1) -> Array:
+    """(T, ny), of unit variance, with a first-order spectrum."""
+    e = np.random.default_rng([3, seed]).standard_normal((T, ny))
+    e[1:] *= np.sqrt(1 - memory**2)
+    return scipy.signal.lfilter([1.0], [1.0, -memory], e, axis=0)
+
+
+def cut_from(
+    model: LinearModel, T: int, memory: float, seed: int, level: float = 1.0
+) -> tuple[Record, Array]:
+    """A part of a longer measurement, with an estimated start, and its errors."""
+    u = np.random.default_rng([1, seed]).standard_normal(T + 500)
+    e = level * noise_of(T, memory, seed, len(model.outputs))
+    y = model.simulate(u)[500:] + e
+    record = Record(u[500:], y, start="estimated", inputs=model.inputs, outputs=model.outputs)
+    return record, e

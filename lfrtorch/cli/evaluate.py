@@ -27,9 +27,7 @@ from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import MAIN
 from lfrtorch.cli.run_folder import CONFIG, program, read_settings
 from lfrtorch.cli.simulate import opened
-from lfrtorch.cli.words import Terminal
 from lfrtorch.files.load import EVERYTHING, listed_files
-from lfrtorch.job import windowed
 from lfrtorch.model import check_channels
 from lfrtorch.reporting import scores as report
 
@@ -56,14 +54,13 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
     model, bla = opened(folder), linear_beside(folder)
     if cfg.data._target_ == FILES:
         from_files(cfg, model, command)
-    dataset = loaded(cfg)
+    dataset = loaded(cfg).with_windows()
     for record in (*dataset.tests, *dataset.validation, *dataset.selection):
         check_channels(model, record)
     if bla is None and model.sizes["nz"]:
         print(f"note: '{folder}' has no folder linear/, so no linear model is scored")
     elif bla is not None and dataset.linear:
         print("note: the linear model is that of all training records; a run has one a test")
-    dataset = windowed(dataset, model if bla is None else bla.to_model(), Terminal(cfg))
     scores = report.evaluation(model, bla, dataset, command=command)
     print(f"\n{report.table(scores, dataset.published)}")
     scored = [r for r in dataset.tests or dataset.validation if r.samples - r.skip >= SHORTEST]

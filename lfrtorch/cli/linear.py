@@ -34,21 +34,21 @@ from lfrtorch.cli.run_folder import CONFIG, arguments, no_empty_folder, program
 from lfrtorch.cli.words import Terminal
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
-from lfrtorch.job import linear_model, linear_records, windowed
+from lfrtorch.job import linear_model, linear_records
 from lfrtorch.linear.requirements import of_response
-from lfrtorch.linear.score_window import fitted
 from lfrtorch.metrics import rmse_by_output
 from lfrtorch.reporting import figures as run_figures
 from lfrtorch.reporting import linear_plots
-from lfrtorch.reporting.scores import of_samples
+from lfrtorch.reporting.scores import counted, of_samples
 from lfrtorch.reporting.verdict import EXPLAINS_NOTHING
+from lfrtorch.score_window import fitted
 
 
 def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     """One run, its files written into ``folder``."""
     settings = configured(cfg)
     limit_threads(cfg)
-    dataset = loaded(cfg)
+    dataset = loaded(cfg).with_windows()
     print(f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples")
     frf, notes = response(cfg, dataset.train)
     # A fit to the response takes the one that the figures show.
@@ -56,7 +56,6 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     data = frf if frf and wants_response(cfg, dataset.train) else None
     data = data or linear_records(dataset.train, settings, terminal)
     model, scan = linear_model(data, settings, dataset.validation, observer=terminal, ranks=Ranks())
-    dataset = windowed(dataset, model.to_model(), terminal)
     cfg.nx = model.nx
     assert model.fit is not None
     for note in notes:
@@ -130,7 +129,6 @@ def numbers(
     assert fit is not None
     used = {"train": dataset.train, "validation": dataset.validation, "test": dataset.tests}
     scores = [score(model, r, use) for use, records in used.items() for r in records]
-    scores += [score(None, r, use) for use, r in dataset.unscored]
     found: dict[str, Any] = {
         "bench": dataset.name,
         "nx": model.nx,
@@ -172,23 +170,19 @@ def numbers(
     return found
 
 
-def score(model: lfrtorch.LinearModel | None, record: lfrtorch.Record, use: str) -> dict[str, Any]:
-    """Simulation errors of each output after the skip window; no model: of one not scored.
+def score(model: lfrtorch.LinearModel, record: lfrtorch.Record, use: str) -> dict[str, Any]:
+    """Simulation errors of each output after the skip window.
 
     The estimated start of a training record is fitted to all samples, as in the fit.
     """
     y = record.y[record.skip :]
-    rmse = deviation = np.full(y.shape[1], np.nan)
-    if model is not None:
-        y_hat = model.simulate(fitted(record) if use == "train" else record)
-        rmse, deviation = rmse_by_output(record, y_hat), np.std(y, axis=0)
+    y_hat = model.simulate(fitted(record) if use == "train" else record)
+    rmse, deviation = rmse_by_output(record, y_hat), np.std(y, axis=0)
     return {
         "use": use,
         "record": record.name,
         "source": record.source,
-        "samples": record.samples,
-        "skip": record.skip,
-        "scored": 0 if model is None else record.scored_samples,
+        **counted(record),
         "outputs": [
             {
                 "output": channel.name,
@@ -276,7 +270,7 @@ def table(found: dict[str, Any]) -> str:
     scores = [
         [
             *(s[key] for key in about),
-            of_samples(s["scored"], s["samples"]),
+            of_samples(s),
             o["output"],
             tables.times(prefixed[o["unit"]][0], o["rmse"]),
             prefixed[o["unit"]][1],

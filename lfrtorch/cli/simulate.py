@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,9 +31,10 @@ from lfrtorch.cli.words import translated
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import Block, FileStream
 from lfrtorch.files.writer import FORMATS, table_writer
-from lfrtorch.linear.score_window import determining_samples
 from lfrtorch.metrics import BlockScores
+from lfrtorch.periods import find_period, find_transient
 from lfrtorch.reporting.scores import of_samples
+from lfrtorch.score_window import PART, WINDOW, score_window, warm_up
 
 BEGINNING = 100
 """Samples in which the transient of a wrong start state would be seen."""
@@ -42,8 +42,8 @@ BEGINNING = 100
 TRANSIENT = 3.0
 """Error there over that of the rest above which it is."""
 
-LOOKED_AT = 10_000
-"""Samples among which those are sought that determine the start state."""
+LOOKED_AT = 1_000_000
+"""Most samples of a file whose input is looked at for a period."""
 
 FAR = 6.0
 """Standard deviations of the training input that Gaussian noise and most signals stay within."""
@@ -87,7 +87,7 @@ class Written(NamedTuple):
     """What is known of a file that was simulated.
 
     Args:
-        samples: written.
+        samples, skip: written, and how many at the beginning are not scored.
         scores: of measured outputs after the skipped samples.
         settled: the same without the first ``BEGINNING`` of those, either.
         peaks: largest inputs about the operating point, in standard deviations of the model's
@@ -95,6 +95,7 @@ class Written(NamedTuple):
     """
 
     samples: int
+    skip: int
     scores: BlockScores
     settled: BlockScores
     peaks: Array
@@ -105,18 +106,18 @@ def written(
     stream: FileStream,
     x0: Array | None,
     out: Path,
-    skip: int | None,
+    skip: int,
     asked: int,
 ) -> Written:
     """Simulate a file block by block into another.
 
     Args:
         model, stream, x0, out: what is simulated, from where and to where.
-        skip: samples that are not scored; None for all.
+        skip: samples that are not scored.
         asked: that the user wants to be skipped.
     """
     names = [channel.name for channel in model.outputs]
-    scores, settled = (BlockScores(len(names), (skip or 0) + more) for more in (0, BEGINNING))
+    scores, settled = (BlockScores(len(names), skip + more) for more in (0, BEGINNING))
     first, peaks = 0, np.zeros(len(model.inputs))
     read: list[Block] = []
 
@@ -135,7 +136,7 @@ def written(
                 if stream.y:
                     found[name] = block.y[:, i]
                     found[f"{name}_error"] = block.y[:, i] - y_hat[:, i]
-            if stream.y and skip is not None:
+            if stream.y:
                 scores.add(block.y, y_hat)
                 settled.add(block.y, y_hat)
             peaks = np.maximum(peaks, np.abs(model.scaler.normalise_u(block.u)).max(axis=0))
@@ -147,7 +148,7 @@ def written(
             raise InputError(
                 f"skip={asked} leaves none of the {first} samples to score; give a smaller one."
             )
-    return Written(first, scores, settled, peaks)
+    return Written(first, skip, scores, settled, peaks)
 
 
 def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
@@ -184,57 +185,59 @@ def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
 
 def start_state(
     cfg: DictConfig, model: lfrtorch.Model, stream: FileStream
-) -> tuple[Array | None, int | None]:
-    """The state to start from, None for zero, and how many samples are not scored, None for all.
+) -> tuple[Array | None, int]:
+    """The state to start from, None for zero, and how many samples are not scored.
 
     How a state was estimated is printed. It is never fitted to samples that are scored.
     """
     if cfg.start == "given":
         return np.array(cfg.x0, dtype=np.float64), cfg.skip or 0
     if cfg.start == "zero":
-        return None, cfg.skip or 0
+        return None, from_rest(stream) if stream.y and cfg.skip is None else cfg.skip or 0
     if not stream.y:
         raise InputError(
             "start=estimated needs measured outputs; name their columns with data.outputs=[...], "
             "or use start=zero."
         )
     asked = cfg.estimate or cfg.skip
-    parts, count, most = [], 0, asked or LOOKED_AT
-    for block in stream.blocks(most):
-        parts.append(block)
-        count += len(block.u)
-        if count >= most:
-            break
-    if not parts:
-        return None, cfg.skip
-    u, y = (np.concatenate(part)[:most] for part in list(zip(*parts, strict=True))[1:])
-    if not asked:
-        u, y = (signal[: first_missing(y)] for signal in (u, y))
-    record = lfrtorch.Record(u, y, fs=model.fs, start="estimated", name=stream.table.path.name)
-    skip: int | None = len(u)
-    if not asked:
-        skip = determining_samples(model, record)
-        u, y = u[:skip], y[:skip]
-        record = replace(record, u=u, y=y)
+    u, y = beginning(stream, asked or PART * WINDOW)
+    if not len(u):
+        return None, 0
+    N = asked or max(1, score_window(len(u)))
+    u, y = u[:N], y[:N]
+    name = stream.table.path.name
+    record = lfrtorch.Record(u, y, fs=model.fs, start="estimated", name=name, valid=np.isfinite(y))
     trajectory = model.signals(record)
     fitted = lfrtorch.rmse(record, model.scaler.restore_y(trajectory.y[0].double().numpy()))
     there, at_rest = map(tables.number, (fitted, lfrtorch.rmse(record, model.simulate(u))))
     print(
-        f"start: the state is estimated from the first {len(u)} samples of '{record.name}'; RMSE "
-        f"there {there}, from zero state {at_rest} (they are not scored)"
+        f"start: the state is estimated from the first {len(u)} samples of '{name}'; RMSE there "
+        f"{there}, from zero state {at_rest} (they are not scored)"
     )
-    if skip is None:
-        print(
-            f"note: the first {len(u)} samples of '{record.name}' are too few to determine the "
-            "start state and score the rest: not scored"
-        )
-    return trajectory.x[0, 0].numpy(), None if skip is None else max(skip, cfg.skip or 0)
+    return trajectory.x[0, 0].numpy(), max(len(u), cfg.skip or 0)
 
 
-def first_missing(y: Array) -> int | None:
-    """Number of the first sample after the first one that lacks an output; None if none does."""
-    missing = ~np.isfinite(y[1:]).all(axis=1)
-    return 1 + int(missing.argmax()) if missing.any() else None
+def beginning(stream: FileStream, samples: int) -> tuple[Array, Array]:
+    """The first inputs and outputs of a file, fewer if it has no more."""
+    u, y, count = [np.empty((0, len(stream.u)))], [np.empty((0, len(stream.y)))], 0
+    for block in stream.blocks(samples):
+        u.append(block.u.copy())  # of a block with more columns
+        y.append(block.y.copy())
+        count += len(block.u)
+        if count >= samples:
+            break
+    return np.concatenate(u)[:samples], np.concatenate(y)[:samples]
+
+
+def from_rest(stream: FileStream) -> int:
+    """Samples that the score of a file from rest leaves out, as ``lfrtorch.load_records`` does."""
+    samples = sum(len(block.u) for block in stream.blocks())
+    settling = 0
+    if samples <= LOOKED_AT:
+        u, y = beginning(stream, LOOKED_AT)
+        period = find_period(u) if np.isfinite(y).all() else None
+        settling = 0 if period is None else find_transient(y, period)
+    return warm_up(samples, settling)
 
 
 def scored(path: Path, model: lfrtorch.Model, result: Written) -> list[list]:
@@ -245,7 +248,13 @@ def scored(path: Path, model: lfrtorch.Model, result: Written) -> list[list]:
             path.name,
             channel.name,
             channel.unit,
-            of_samples(int(scores.samples[i]), result.samples),
+            of_samples(
+                {
+                    "samples": result.samples,
+                    "skip": result.skip,
+                    "scored": int(scores.samples[i]),
+                }
+            ),
             finite(scores.rmse[i]),
             tables.in_percent(finite(scores.nrmse[i])),
         ]

@@ -80,7 +80,7 @@ def casadi_observer(
         >>> predict, update = lfrtorch.export.casadi_observer(model, "plant", observer=noise)
         >>> update
         Function(plant_update:(x,u,y,missing,P)->(x_next,P_next) SXFunction)
-        >>> after = update(x=0, u=0.5, y=0.2, P=1)
+        >>> after = update(x=0, u=0.5, y=0.2, P=model.state_covariance)
         >>> online = model.observer(noise=noise)
         >>> y_hat = online.predict(0.5)
         >>> e = online.update(0.2)

@@ -31,6 +31,7 @@ from lfrtorch.files.split import SHORTEST, TooShortError, cut
 from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.periods import find_period, find_transient
 from lfrtorch.records import Record
+from lfrtorch.score_window import warm_up
 from lfrtorch.survey.integration import integrators
 
 __all__ = ["load_records"]
@@ -44,8 +45,6 @@ Period = int | Literal["auto"] | None
 EVERYTHING = "all"
 """Value of ``test`` that takes all records."""
 
-_WARM_UP = 0.05  # of a record: default of skip
-_LONGEST_TRANSIENT = 1 / 3  # of a record; beyond it, leaving it out costs more than it helps
 _LEFT_OUT = "left out, as it is too short"
 _SAME = 1e-4  # relative, of sampling frequencies: what printed time stamps leave open
 
@@ -106,8 +105,9 @@ def load_records(
             every record is cut to whole periods in steady state.
         period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
         skip: samples at the beginning of every record that are left out of cost and score.
-            Default: the periods that the output takes to settle; 5 % of the record if the input
-            does not repeat, and for the score of an estimated start as many more as determine it.
+            Default: of records from rest the periods that the output takes to settle, or 5 % if
+            the input does not repeat. Of an estimated start nothing, and scores leave out the first
+            50 samples, or a fifth of a shorter record.
         gaps: ``"error"`` refuses missing inputs and missing time stamps, and leaves outputs without
             a value out of fits and scores (``Record.valid``); ``"split"`` makes a record of every
             stretch between missing values of any kind.
@@ -290,8 +290,10 @@ class _Reader:
         seen = y[: T - round(T * self.unseen)]  # outputs of the test choose nothing
         automatic = self.period == "auto"
         N = find_period(u if r is None else r) if automatic else cast("int | None", self.period)
-        settling = 0 if N is None or self.skip is not None else find_transient(seen, N)
-        start: Start = self.start
+        start: Start = "estimated" if stretch.first and self.start != "periodic" else self.start
+        settling = 0
+        if N is not None and self.skip is None and start != "estimated":
+            settling = find_transient(seen, N)
         if start == "periodic":
             if N is None:
                 raise InputError(
@@ -306,11 +308,10 @@ class _Reader:
                 )
             kept, skip = slice(begin, begin + (T - begin) // N * N), 0
         else:
-            if settling > _LONGEST_TRANSIENT * T:
-                settling = 0
-            kept = slice(0, T)
-            skip = (settling or round(_WARM_UP * T)) if self.skip is None else self.skip
-            start = "estimated" if stretch.first else start
+            kept, skip = slice(0, T), self.skip or 0
+            if self.skip is None and start == "zero":
+                skip = warm_up(T, settling)
+            settling = settling if skip == settling else 0
             if T - skip < SHORTEST:
                 raise TooShortError(
                     f"record '{name}' has {max(T - skip, 0)} scored samples of {T}, with "
@@ -343,7 +344,6 @@ class _Reader:
             inputs=measured.inputs,
             outputs=measured.outputs,
             period=N,
-            skip_more=self.skip is None and start == "estimated",
             limits=self.limits,
             reference=None if r is None else r[kept],
             valid=None if stretch.valid is None else stretch.valid[kept],

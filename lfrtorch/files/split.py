@@ -55,6 +55,6 @@ def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
                     f"samples of {total}, with skip={record.skip}; it needs {SHORTEST}: change the "
                     "fractions or skip."
                 )
-            part = replace(record[:end], start=record.start, skip=first, skip_more=record.skip_more)
+            part = replace(record[:end], start=record.start, skip=first)
         parts[name], begin = part, end
     return parts

@@ -65,9 +65,9 @@ from lfrtorch.fitting.trainer import (
 from lfrtorch.fitting.windows import Horizon, check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
-from lfrtorch.linear.score_window import settled
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, common_unit
+from lfrtorch.score_window import with_window
 
 ROUNDS = (1 / 16, 1 / 8)
 """Parts of the iterations after which the worse half is left."""
@@ -252,7 +252,9 @@ def _fitted(
     given = [monitors] if alone and monitors is not None else monitors
     watching = cast(Sequence[Sequence[Monitor]], given or ())
     _check(starts, watching, average)
-    validation, selection = (_scored(starts[0], some, train) for some in (validation, selection))
+    validation, selection = (
+        [*map(with_window, as_records(some))] if some else [] for some in (validation, selection)
+    )
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots
     halt = Event()
@@ -396,20 +398,6 @@ def line_of(
         return ProgressLine(every=None)
     unit = common_unit(models[0].outputs)
     return StartsLine(len(models), unit, iterations=iterations_of(planned), rounds=False)
-
-
-def _scored(
-    model: Model, records: Record | Sequence[Record], train: Record | Sequence[Record]
-) -> list[Record]:
-    """Those of the records that can be scored, with their windows."""
-    given = as_records(records) if records else []
-    found, _ = settled(model, given, as_records(train))
-    if given and not found:
-        raise InputError(
-            f"record '{given[0].name}' has {given[0].samples} samples, too few to determine the "
-            "start state and score the rest; give a longer one, or none."
-        )
-    return found
 
 
 class _Judge:

@@ -55,9 +55,9 @@ from lfrtorch.least_squares.group_lasso import ENTRIES, GroupLassoProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
 from lfrtorch.linear.model import LinearModel, balancing
-from lfrtorch.linear.score_window import is_open, settled
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, as_records
+from lfrtorch.score_window import with_window
 
 WEIGHTS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 """What a group of norm 1 costs, over the squared error that the largest model leaves."""
@@ -150,11 +150,9 @@ def shrink_sizes(
     largest = {name: values[-1] for name, values in tried.items()}
     models = [replace(begun(start, largest, seed), K=None) for seed in seeds]
     _check_cell(models[0].lfr.cell, searched)
-    if any(map(is_open, as_records(validation))):  # the same samples for all sizes
-        model = models[0] if linear is None else linear.to_model()
-        validation, _ = settled(model, as_records(validation), as_records(train))
-    scale = Scaler.of(as_records(validation)).y_scale
-    judge = Judge(as_records(validation), linear, Ranks(), scale)
+    validation = [*map(with_window, as_records(validation))]
+    scale = Scaler.of(validation).y_scale
+    judge = Judge(validation, linear, Ranks(), scale)
     trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer
     options: dict[str, Any] = {"ridge": ridge, "stop": stop}
     watching = [monitor or (lambda model, progress: None)]

@@ -40,7 +40,6 @@ from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.distributed import ProcessLostError, Ranks
-from lfrtorch.fitting.folds import Fold
 from lfrtorch.fitting.folds import folds as folds_of
 from lfrtorch.fitting.live_line import StartsLine
 from lfrtorch.fitting.multistart import iterations_of
@@ -52,7 +51,6 @@ from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.score_window import is_open, settled
 from lfrtorch.model import Model
 from lfrtorch.paired_blocks import (
     as_good,
@@ -62,6 +60,7 @@ from lfrtorch.paired_blocks import (
     standard_errors_above,
 )
 from lfrtorch.records import Record, Scaler, as_records
+from lfrtorch.score_window import with_window
 
 Sizes = dict[str, Any]
 
@@ -346,12 +345,9 @@ def search_sizes(
     given_records = all_records(as_records(train), as_records(validation)) if folds else []
     ranks = Ranks() if ranks is None else ranks
     trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer
-    if any(map(is_open, as_records(validation))):  # the same samples for all sizes
-        first = {name: values[0] for name, values in tried.items()}
-        model = begun(start, first, seeds[0]) if linear is None else linear.to_model()
-        validation, _ = settled(model, as_records(validation), as_records(train))
-    scale = Scaler.of(as_records(validation)).y_scale
-    judge, clock = Judge(as_records(validation), linear, ranks, scale), time.perf_counter()
+    validation = [*map(with_window, as_records(validation))]
+    scale = Scaler.of(validation).y_scale
+    judge, clock = Judge(validation, linear, ranks, scale), time.perf_counter()
     drawn = _drawn(tried, seeds, ROUNDS[0][0] * finalists)
     planned = race(len(drawn), finalists, trainer.limit)
     halt = Event()
@@ -383,7 +379,10 @@ def search_sizes(
         counts = judge.counts
         last = [judge.candidate(each, len(planned)) for each in field]
         if folds:
-            parts = _left_out(given_records, folds, linear or field[0].fit.model)
+            parts = [
+                part._replace(left_out=[*map(with_window, part.left_out)])
+                for part in folds_of(given_records, folds)
+            ]
             judges = [Judge(part.left_out, linear, ranks, scale) for part in parts]
             fits = [
                 [
@@ -405,13 +404,6 @@ def search_sizes(
             "amplitudes like theirs, or set the sizes."
         )
     return search
-
-
-def _left_out(records: list[Record], count: int, model: Model | LinearModel) -> list[Fold]:
-    """The folds, their scores from where the start states are determined."""
-    model = model if isinstance(model, Model) else model.to_model()
-    parts = folds_of(records, count)
-    return [part._replace(left_out=settled(model, part.left_out, part.train)[0]) for part in parts]
 
 
 def _crossed(candidate: Candidate, fits: Sequence[Fit], judges: Sequence[Judge]) -> Candidate:

@@ -187,6 +187,8 @@ def initialise(
         cell.A.copy_(cell.A * std / std[:, None])
         cell.Bu.div_(std[:, None])
         cell.Cy.mul_(std)
+        if bla.state_covariance is not None:
+            cell.state_covariance.div_(torch.outer(std, std))
         K = None
         if bla.K is not None:
             K = torch.as_tensor(bla.K * scaler.y_scale).to(std) / std[:, None]

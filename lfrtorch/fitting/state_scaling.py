@@ -5,30 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from lfrtorch.model import Model
-from lfrtorch.records import Record, as_records
+from lfrtorch.model import Model, state_moment
+from lfrtorch.records import Record
 
 ROUNDING = 1e-9
 """Distance of an rms from 1 that may be rounding alone."""
-
-
-def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tensor, "nx nx"]:
-    """E x xᵀ of the simulated states over all samples of records, about 0, in float64.
-
-    Example:
-        >>> from lfrtorch.fitting.state_scaling import state_moment
-        >>> state_moment(model, record).shape
-        torch.Size([1, 1])
-    """
-    nx, samples = model.lfr.cell.nx, 0
-    total = torch.zeros(nx, nx, dtype=torch.float64)
-    for record in as_records(records):
-        x = model.signals(record).x[0].double()
-        total, samples = total + x.mT @ x, samples + len(x)
-    return (total + total.mT) / (2 * samples)
 
 
 @torch.no_grad()
@@ -50,7 +32,8 @@ def scale_states(
             coordinates that the model has.
 
     Example:
-        >>> from lfrtorch.fitting.state_scaling import scale_states, state_moment
+        >>> from lfrtorch.fitting.state_scaling import scale_states
+        >>> from lfrtorch.model import state_moment
         >>> scale_states(model, record)
         >>> np.allclose(state_moment(model, record), model.state_covariance)
         True

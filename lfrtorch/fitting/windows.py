@@ -112,7 +112,7 @@ def _windows(record: Record, horizon: int, before: int) -> list[Record]:
     scored = record.samples - record.skip
     count = math.ceil(scored / horizon)
     weight = np.asarray(record.weight) * scored / (count * horizon)
-    whole = replace(record, period=None, weight=weight, skip_more=False)
+    whole = replace(record, period=None, weight=weight)
     amid = replace(whole, start="estimated", x0=None, skip=before)
     found = []
     for b in record.skip + np.linspace(0, scored - horizon, count).round().astype(int):

@@ -54,6 +54,7 @@ from lfrtorch.linear.spectral_data import (
 )
 from lfrtorch.linear.subspace import SubspaceEstimate
 from lfrtorch.metrics import rms
+from lfrtorch.model import state_moment
 from lfrtorch.records import Record, Scaler, as_records, without_coordinates
 from lfrtorch.survey.integration import integrators as count_integrators
 
@@ -191,6 +192,9 @@ def estimate_bla(
             f"the model explains little: {100 * fit.rmse:.0f} % of the output's rms remain. Are "
             "columns swapped, or is there drift, a long delay, noise, an even nonlinearity?",
         )
+    if not isinstance(data, FRF):
+        moment = state_moment(model.to_model(), data)
+        model = replace(model, state_covariance=moment.numpy())
     return replace(model, fit=replace(fit, seconds=time.perf_counter() - clock, notes=notes))
 
 

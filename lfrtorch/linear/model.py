@@ -86,6 +86,9 @@ class LinearModel:
         inputs, outputs: channel names and units.
         K: gain of the innovations e. Default: no noise model.
         innovation_covariance: of e. Default: no noise model.
+        state_covariance: E x xᵀ over the training data, about 0: what is known of a start state
+            before its outputs are. Default: not known; that of the states which the record's input
+            excites from rest takes its place.
         covariance: of the P = (nx + ny) (nx + nu) entries of A, B, C and D, row by row, one matrix
             after another. Default: not known.
         fit: how the model was found.
@@ -114,6 +117,7 @@ class LinearModel:
     outputs: tuple[Channel, ...]
     K: Float[Array, "nx ny"] | None = None
     innovation_covariance: Float[Array, "ny ny"] | None = None
+    state_covariance: Float[Array, "nx nx"] | None = None
     covariance: Float[Array, "P P"] | None = None
     fit: LinearFit | None = None
 
@@ -281,7 +285,7 @@ class LinearModel:
             (True, True)
         """
         back = np.asarray(np.linalg.inv(T) if inverse is None else inverse, dtype=np.float64)
-        covariance = self.covariance
+        covariance, P = self.covariance, self.state_covariance
         if covariance is not None:
             nu, ny = np.eye(len(self.inputs)), np.eye(len(self.outputs))
             blocks = np.kron(T, back.T), np.kron(T, nu), np.kron(ny, back.T), np.kron(ny, nu)
@@ -294,10 +298,13 @@ class LinearModel:
             C=self.C @ back,
             K=None if self.K is None else T @ self.K,
             covariance=covariance,
+            state_covariance=None if P is None else T @ P @ T.T,
         )
 
     def write(self, cell: LFRCell, scaler: Scaler) -> None:
         """Put A, B, C, D into A, Bu, Cy, Dyu of a cell, in the scaler's normalised units.
+
+        What is known of a start state goes with them.
 
         Example:
             >>> cell = lfrtorch.LFRCell(nu=1, ny=1, nx=1, dtype=torch.float64)
@@ -313,6 +320,8 @@ class LinearModel:
                 (cell.Dyu, self.D * scaler.u_scale / scaler.y_scale[:, None]),
             ):
                 weight.copy_(torch.as_tensor(np.ascontiguousarray(value)))
+            if self.state_covariance is not None:
+                cell.state_covariance.copy_(torch.as_tensor(self.state_covariance))
 
     def to_model(self) -> Model:
         """The same as a ``Model`` without static nonlinearity, in the same coordinates.
@@ -324,6 +333,8 @@ class LinearModel:
         nu, ny = len(self.inputs), len(self.outputs)
         unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
         cell = linear_cell(self.A, self.B, self.C, self.D)
+        if self.state_covariance is not None:
+            cell.state_covariance.copy_(torch.as_tensor(self.state_covariance))
         K = None if self.K is None else torch.as_tensor(self.K)
         return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs, K=K)
 
@@ -408,7 +419,8 @@ class LinearModel:
             for name, shape in (
                 ("A", (nx, nx)), ("B", (nx, nu)), ("C", (ny, nx)), ("D", (ny, nu)),
                 ("u_offset", (nu,)), ("y_offset", (ny,)), ("K", (nx, ny)),
-                ("innovation_covariance", (ny, ny)), ("covariance", (P, P)),
+                ("innovation_covariance", (ny, ny)), ("state_covariance", (nx, nx)),
+                ("covariance", (P, P)),
             ):  # fmt: skip
                 found = (arrays | optional).get(name)
                 if found is not None and found.shape != shape:
@@ -458,7 +470,7 @@ def without_units(record: Record) -> Record:
 
 
 _ARRAYS = ("A", "B", "C", "D", "u_offset", "y_offset")
-_OPTIONAL = ("K", "innovation_covariance", "covariance")
+_OPTIONAL = ("K", "innovation_covariance", "state_covariance", "covariance")
 
 
 def linear_cell(A: Array, B: Array, C: Array, D: Array) -> LFRCell:

@@ -96,7 +96,8 @@ def without_slow_minor_modes(
     new = np.where(slow, radius * np.exp(1j * np.angle(old)), old)
     gain = np.sqrt((1 - np.abs(new) ** 2) / (1 - np.abs(old) ** 2))
     A, B = ((right * new) @ left).real, ((right * gain) @ left @ model.B).real
-    quick = replace(model, A=A, B=B, K=None, innovation_covariance=None, covariance=None)
+    unknown = dict.fromkeys(("K", "innovation_covariance", "covariance", "state_covariance"))
+    quick = replace(model, A=A, B=B, **unknown)
     return quick.transformed(*balancing(A, B, model.C))
 
 

@@ -30,7 +30,6 @@ from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_fits import OrderFits, Window
 from lfrtorch.linear.requirements import check_length, check_signals, excited_directions
-from lfrtorch.linear.score_window import settled
 from lfrtorch.metrics import rms
 from lfrtorch.paired_blocks import (
     BLOCKS,
@@ -41,6 +40,7 @@ from lfrtorch.paired_blocks import (
     squares_in_blocks,
 )
 from lfrtorch.records import Record, Scaler, as_records, without_coordinates
+from lfrtorch.score_window import with_window
 
 ORDERS = range(1, 13)
 
@@ -155,7 +155,7 @@ def scan_orders(
     outputs = data.outputs if isinstance(data, FRF) else as_records(data)[0].outputs
     orders = _rising(orders, options.get("integrators", 0) * len(outputs))
     none = isinstance(validation, list | tuple) and not validation
-    judges = [] if none else as_records(validation)
+    judges = [] if none else [*map(with_window, as_records(validation))]
     records = [] if isinstance(data, FRF) else [without_coordinates(r) for r in as_records(data)]
     if records:
         check_signals(records)
@@ -192,9 +192,6 @@ def scan_orders(
                 notes.append(narrow)
                 break
             models.append(fit(nx))
-            if judges and len(models) == 1:  # the same samples for all orders
-                judges, _ = settled(models[0].to_model(), judges, records)
-                how = how if judges else "MDL"
         except ValueError:
             if not models:
                 raise
@@ -216,7 +213,7 @@ def scan_orders(
             )
         lengths = [each for each, m in zip(lengths, models, strict=True) if m.nx in kept]
         models = [model for model in models if model.nx in kept]
-        held_back = _Folds(models[0], records, judges, models[-1].nx, options).errors
+        held_back = _Folds(records, judges, models[-1].nx, options).errors
         for model in models:
             if score(model, time.perf_counter()):
                 break
@@ -322,14 +319,12 @@ class _Folds:
 
     def __init__(
         self,
-        model: LinearModel,
         train: list[Record],
         judges: list[Record],
         most: int,
         options: Mapping[str, Any],
     ) -> None:
-        records = _united(train, judges)
-        self._records = settled(model.to_model(), records, train)[0] or records
+        self._records = [*map(with_window, _united(train, judges))]
         self._scale = Scaler.of(self._records).y_scale
         whole = [(r.skip, r.samples) for r in self._records]
         ends = np.cumsum([0] + [last - first for first, last in whole])

@@ -90,7 +90,7 @@ def _steady_part(record: Record) -> Record | None:
     drift = y.reshape(P, N, -1).mean(axis=1).std(axis=0)
     if (changes > REPEATS * repeated.std(axis=0)).any() or (drift > REPEATS * y.std(axis=0)).any():
         return None
-    return replace(record, **part, start="periodic", skip=0, skip_more=False)
+    return replace(record, **part, start="periodic", skip=0)
 
 
 def check_spectral_data(data: SpectralData, nx: int, direct: int = 0) -> None:

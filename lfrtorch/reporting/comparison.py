@@ -24,12 +24,12 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.tables import Cell, cell, engineering, table, times
 from lfrtorch._support.types import Array
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.score_window import is_open, settled
 from lfrtorch.model import check_channels, load
 from lfrtorch.records import Record
 from lfrtorch.reporting import html, plots
 from lfrtorch.reporting.scores import unit_of
 from lfrtorch.reporting.several_models import COLOURS, short, side_by_side
+from lfrtorch.score_window import with_window
 
 SEEDS = ("seed", "data.seed")
 """Words that differ between repetitions of one setting."""
@@ -175,6 +175,7 @@ class Comparison:
         Args:
             record: of the same channels as the models; others are left out.
         """
+        record = with_window(record)
         best = {label: runs[0] for label, runs in self.settings.items()}
         best = best or {self._name(run): run for run in self.runs}
         found: dict[str, Array] = {}
@@ -185,8 +186,6 @@ class Comparison:
             try:
                 model = load(run.folder)
                 check_channels(model, record)
-                if not found and is_open(record):
-                    record = settled(model, [record], [])[0][0]
                 found[label] = model.simulate(record)
                 if not linear and (run.folder / "linear").is_dir():
                     bla = LinearModel.load(run.folder)

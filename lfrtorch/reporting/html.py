@@ -39,14 +39,15 @@ from lfrtorch.metrics import rms
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.scores import (
-    NOT_SCORED,
     REFITTED,
+    counted,
     finalists,
     linear_name,
     neurons,
     of_samples,
     own_linear,
     published_unit,
+    start_matters,
 )
 from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import LINEAR_MODEL, Verdict, of_linear
@@ -216,16 +217,14 @@ def _scores(
                 tests.append([name if row == 0 else "", *cells, *known])
             else:
                 others.append([*([name, USES[use]] if row == 0 else ["", ""]), *cells])
-    for use, record in dataset.unscored:
-        nothing = [*[""] * len(what), *[UNKNOWN] * len(errors)]
-        nothing[len(what) + 1] = NOT_SCORED
-        if use == "test":
-            tests.append([record.name, *nothing, *[""] * len(published)])
-        else:
-            others.append([record.name, USES[use], *nothing])
-    references = [f"{p.label}: {p.reference}" for p in published if tests]
-    if metrics["linear"]:
-        references.insert(0, own_linear(metrics))
+    references = [own_linear(metrics)] if metrics["linear"] else []
+    references += [f"{p.label}: {p.reference}" for p in published if tests]
+    references += [
+        f"{name}: the uncertainty of its start state adds {quantity(s['start_error'], s['unit'])} "
+        f"to the NL-LFR's error of {quantity(s['rmse'], s['unit'])}"
+        for name, s in (metrics["scores"] | metrics["validation"]["records"]).items()
+        if start_matters(s)
+    ]
     return {
         "unit": "" if several else in_unit[outputs[0].unit][1],
         "words": 1 + len(what),
@@ -317,11 +316,9 @@ def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
             moments = _moments(x)
             factor, unit = engineering([moments[1]], channel.unit)
             channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
-    counted = [(response.use, response.record, len(response.scored)) for response in responses]
-    counted += [(use, record, 0) for use, record in dataset.unscored]
     records = [
-        [r.name, USES.get(use, use), r.source, r.start, of_samples(count, r.samples), r.period]
-        for use, r, count in counted
+        [r.name, USES.get(use, use), r.source, r.start, of_samples(counted(r)), r.period]
+        for use, r in ((response.use, response.record) for response in responses)
     ]
     return {
         "summary": summary,

@@ -16,6 +16,7 @@ from lfrtorch._support.reasons import Reason
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
 from lfrtorch.analysis.residual_analysis import Residuals
+from lfrtorch.analysis.start_uncertainty import start_error
 from lfrtorch.dataset import LISTED, Dataset, Published
 from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult
@@ -32,7 +33,15 @@ ERRORS = "rmse", "lti_rmse"
 """Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
 
 NOT_SCORED = "not scored"
-"""What tables say of a record that has too few samples."""
+"""What tables say of a record of which no sample counts."""
+
+SEEN = 0.2
+"""Part of an RMSE that an error must have to be told: it makes 2 % of it."""
+
+FROM_START = (
+    "from the start: what the uncertainty of the estimated start state adds to the NL-LFR's error"
+)
+"""Of the column that says so."""
 
 REFITTED = "Refitted to all estimation records: validation errors are those before it."
 """What is said of a model that was."""
@@ -43,22 +52,23 @@ class Score:
     """Simulation errors on one record, after its skip window.
 
     Args:
-        rmse, lti_rmse: of the model and of the linear model, in ``unit``; None without the latter,
-            or if the record cannot be scored.
+        rmse, lti_rmse: of the model and of the linear model, in ``unit``; None without the latter.
         nrmse: rmse over the standard deviation of the measured output.
         unit: of the outputs.
         source: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
         samples, skip: length of the record, and how many at its beginning do not count.
         use: ``"test"``, ``"validation"`` or ``"selection"``.
-        scored: how many samples count, 0 of a record that cannot be scored.
+        scored: how many samples count.
         outputs: their names.
         rmse_by_output, lti_rmse_by_output: errors of each output.
         records: how many the score is of.
+        start_error: what the uncertainty of an estimated start state adds to ``rmse``, see
+            :func:`lfrtorch.analysis.start_uncertainty.start_error`.
     """
 
-    rmse: float | None
+    rmse: float
     lti_rmse: float | None
-    nrmse: float | None
+    nrmse: float
     unit: str
     source: str
     samples: int
@@ -69,6 +79,7 @@ class Score:
     rmse_by_output: tuple[float, ...] = ()
     lti_rmse_by_output: tuple[float, ...] = ()
     records: int = 1
+    start_error: float | None = None
 
     def entry(self) -> dict[str, Any]:
         """For ``metrics.json``: errors of each output and the number of records if several."""
@@ -84,8 +95,7 @@ class Score:
 def score(model: Model, bla: LinearModel | None, record: Record, use: str = "test") -> Score:
     """Scores of the model, and of the linear model if there is one, on one record.
 
-    The record says which samples are scored: see
-    :func:`lfrtorch.linear.score_window.with_score_windows` for estimated starts.
+    The record says which samples are scored: see ``lfrtorch.score_window``.
 
     Example:
         >>> from lfrtorch.reporting.scores import score
@@ -101,13 +111,12 @@ def score(model: Model, bla: LinearModel | None, record: Record, use: str = "tes
         nrmse=nrmse(record, y_hat),
         unit=", ".join(dict.fromkeys(c.unit for c in record.outputs)),
         source=record.source,
-        samples=record.samples,
-        skip=record.skip,
+        **counted(record),
         use=use,
-        scored=record.scored_samples,
         outputs=tuple(channel.name for channel in record.outputs),
         rmse_by_output=_by_output(record, y_hat),
         lti_rmse_by_output=() if y_linear is None else _by_output(record, y_linear),
+        start_error=start_error(model, record, y_hat),
     )
 
 
@@ -119,6 +128,7 @@ def _by_output(record: Record, y_hat: Array) -> tuple[float, ...]:
 def together(scores: Sequence[Score]) -> Score:
     """The score of a group of records: means of the RMSE of each output of each record."""
     first = scores[0]
+    of_starts = [s.start_error for s in scores if s.start_error is not None]
     errors, linear = (
         np.mean([getattr(s, f"{of}_by_output") for s in scores], axis=0) for of in ERRORS
     )
@@ -126,18 +136,13 @@ def together(scores: Sequence[Score]) -> Score:
         first,
         rmse=float(np.mean(errors)),
         lti_rmse=float(np.mean(linear)) if linear.size else None,
-        nrmse=float(np.mean([math.nan if s.nrmse is None else s.nrmse for s in scores])),
+        nrmse=float(np.mean([s.nrmse for s in scores])),
         rmse_by_output=tuple(errors.tolist()),
         lti_rmse_by_output=tuple(linear.tolist()),
         records=len(scores),
+        start_error=float(np.mean(of_starts)) if len(of_starts) == len(scores) else None,
         **{name: sum(getattr(s, name) for s in scores) for name in ("samples", "skip", "scored")},
     )
-
-
-def _unscored(record: Record, use: str) -> Score:
-    """The entry of a record that has too few samples."""
-    unit = ", ".join(dict.fromkeys(c.unit for c in record.outputs))
-    return Score(None, None, None, unit, record.source, record.samples, record.skip, use, 0)
 
 
 def metrics(
@@ -222,9 +227,6 @@ def evaluation(
     own, chosen = own or {}, chosen or model
     validation = [score(chosen, bla, record, "validation") for record in dataset.validation]
     selection = [score(chosen, bla, record, "selection") for record in dataset.selection]
-    lost: dict[bool, dict[str, Any]] = {True: {}, False: {}}
-    for use, record in dataset.unscored:
-        lost[use == "test"][record.name] = _unscored(record, use).entry()
     entries = {
         "bench": dataset.name,
         "sizes": model.sizes,
@@ -237,8 +239,7 @@ def evaluation(
             "lti_rmse": _pooled([s.lti_rmse for s in validation], validation),
             "records": _entries(
                 dataset, (*dataset.validation, *dataset.selection), (*validation, *selection)
-            )
-            | lost[False],
+            ),
         },
         "scores": _entries(
             dataset,
@@ -247,8 +248,7 @@ def evaluation(
                 score(model, own.get(dataset.score_of(record), bla), record)
                 for record in dataset.tests
             ],
-        )
-        | lost[True],
+        ),
         "predictions": predictions(model, chosen, bla, dataset),
         "linear": {name: list(dataset.linear[name]) for name in own},
         "command": command,
@@ -331,12 +331,14 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     )
     others = [p for p in others if tested & p.scores.keys()]
     ours = [linear_name(result), "NL-LFR"] if sizes["nz"] else ["linear"]
+    uncertain = any(map(start_matters, (s for _, s, _ in shown)))
     head = ["record", "use", *["source"] * sources, "scored", *ours]
-    head += [p.label for p in others]
+    head += ["from the start"] * uncertain + [p.label for p in others]
     rows = [
         [
-            *(line, s["use"], *[s["source"]] * sources, of_samples(s["scored"], s["samples"])),
+            *(line, s["use"], *[s["source"]] * sources, of_samples(s)),
             *(tables.times(factor, of[model]) for model in models),
+            *[tables.times(factor, s["start_error"])] * uncertain,
             *(tables.times(factor, p.scores.get(line) if line in tested else None) for p in others),
         ]
         for line, s, of in shown
@@ -348,9 +350,9 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     if not rows:
         return f"{title}: nothing is scored, as there is no test and no validation record"
     predicted = prediction_table(result)
-    references = [f"{p.label}: {p.reference}" for p in others]
-    if result["linear"]:
-        references.insert(0, own_linear(result))
+    references = [FROM_START] * uncertain
+    references += [own_linear(result)] if result["linear"] else []
+    references += [f"{p.label}: {p.reference}" for p in others]
     simulated = [title, "", tables.table(head, rows), *[""] * bool(references), *references]
     return "\n".join(simulated) + predicted
 
@@ -402,9 +404,28 @@ def unit_of(result: Mapping[str, Any]) -> str:
     return units.pop() if len(units) == 1 else ""
 
 
-def of_samples(scored: int, samples: int) -> str:
-    """How many samples count, in words."""
-    return f"{scored} of {samples}" if scored else NOT_SCORED
+def counted(record: Record) -> dict[str, int]:
+    """How many samples a record has, skips and scores."""
+    return {
+        "samples": record.samples,
+        "skip": record.skip,
+        "scored": record.scored_samples,
+    }
+
+
+def of_samples(score: Mapping[str, Any]) -> str:
+    """Which samples count, in words: the last ones of a record."""
+    scored, samples, skip = (score[name] for name in ("scored", "samples", "skip"))
+    if not scored:
+        return NOT_SCORED
+    last = skip and scored == samples - skip and score.get("records", 1) == 1
+    return f"{'last ' * bool(last)}{scored} of {samples}"
+
+
+def start_matters(score: Mapping[str, Any]) -> bool:
+    """Whether the uncertainty of the start state makes a part of the error that is seen."""
+    added, error = score["start_error"], score["rmse"]
+    return added is not None and error is not None and added > SEEN * error
 
 
 def neurons(sizes: Mapping[str, int]) -> str:

@@ -12,10 +12,10 @@ from lfrtorch._support.types import Array
 from lfrtorch.analysis.residual_analysis import SHORTEST, Residuals, of_simulation
 from lfrtorch.dataset import Dataset
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.score_window import fitted
 from lfrtorch.metrics import nrmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record, without_coordinates
+from lfrtorch.score_window import fitted
 
 
 @dataclass(frozen=True, eq=False)

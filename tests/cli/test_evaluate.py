@@ -84,7 +84,7 @@ def test_scores_are_those_of_the_model_from_the_start_of_each_record(
         assert words in printed.out
     assert "note: the linear model is that of all training records" in printed.out
     rest = next(line for line in printed.out.splitlines() if line.startswith("rest "))
-    assert rest.split()[1:6] == ["test", "simulated", "50", "of", "80"]
+    assert rest.split()[1:7] == ["test", "simulated", "last", "50", "of", "80"]
     assert rest.split()[-2:] == ["0.250", "0.125"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "scores.json"]
 

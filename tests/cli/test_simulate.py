@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import sys
 import weakref
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from reference import random_cell, random_model
 
 import lfrtorch
 from lfrtorch._support.types import Array
-from lfrtorch.cli import simulate
+from lfrtorch.cli import evaluate, simulate
 from lfrtorch.cli.composition import composed
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.stream import Block, FileStream
@@ -131,9 +132,9 @@ def test_measured_outputs_are_scored(folder: Path, monkeypatch, capsys):
     rows = [line.split() for line in lines if line.startswith("both.csv")]
     for i, row in enumerate(rows):
         rmse = np.sqrt(np.mean(NOISE[100:, i] ** 2))
-        assert row[:6] == ["both.csv", f"y{i + 1}", "mm", "200", "of", "300"]
-        assert float(row[6]) == pytest.approx(rmse, rel=5e-3)
-        assert float(row[7]) == pytest.approx(100 * rmse / np.std(Y[100:, i]), rel=5e-3)
+        assert row[:7] == ["both.csv", f"y{i + 1}", "mm", "last", "200", "of", "300"]
+        assert float(row[7]) == pytest.approx(rmse, rel=5e-3)
+        assert float(row[8]) == pytest.approx(100 * rmse / np.std(Y[100:, i]), rel=5e-3)
     assert len(rows) == 2
 
 
@@ -167,7 +168,7 @@ def test_a_wrong_start_state_is_said(folder: Path, monkeypatch, capsys):
     y[: simulate.BEGINNING, 1] += 10.0
     csv(folder / "late.csv", u1=U[:, 0], u2=U[:, 1], y1=Y[:, 0], y2=y[:, 1])
     words = ["data.path=late.csv", "data.fs=50", "out=x.csv", "overwrite=true"]
-    run(monkeypatch, folder, *words)
+    run(monkeypatch, folder, *words, "skip=0")
     assert "the error over the first 100 scored samples is 1" in capsys.readouterr().out
     run(monkeypatch, folder, *words, "skip=100")
     assert "scored samples" not in capsys.readouterr().out
@@ -179,7 +180,8 @@ def test_missing_outputs_are_left_out_of_the_scores(folder: Path, monkeypatch, c
     csv(folder / "some.csv", u1=U[:, 0], u2=U[:, 1], y1=y, y2=Y[:, 1])
     run(monkeypatch, folder, "data.path=some.csv", "out=x.csv")
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[3] for line in lines if line.startswith("some.csv")] == ["200", "300"]
+    rows = [line.split()[3:5] for line in lines if line.startswith("some.csv")]
+    assert rows == [["190", "of"], ["last", "285"]]  # 15 of 300 are left out
     assert np.array_equal(columns(folder / "x.csv")["y1"], y, equal_nan=True)
 
 
@@ -241,17 +243,17 @@ def test_an_estimated_start_goes_on_where_the_measurement_was_cut(
     assert np.allclose(found["y1_hat"], y[:, 0], rtol=0, atol=1e-8)  # tolerance of the state
     printed = capsys.readouterr().out
     assert "start: the state is estimated from the first 50 samples of 'cut.csv'; RMSE" in printed
-    assert [line.split()[3:6] for line in printed.splitlines() if line.startswith("cut.csv ")] == [
-        ["150", "of", "200"]
+    assert [line.split()[3:7] for line in printed.splitlines() if line.startswith("cut.csv ")] == [
+        ["last", "150", "of", "200"]
     ] * 2
 
 
 @pytest.mark.numeric
 def test_no_start_is_fitted_to_samples_that_are_scored(folder: Path, monkeypatch, capsys):
     for words, fitted, scored in (
-        (["skip=299"], 299, "1 of 300"),
+        (["skip=299"], 299, "last 1 of 300"),
         (["estimate=1000"], 300, "not scored"),
-        (["estimate=50", "skip=70"], 50, "230 of 300"),
+        (["estimate=50", "skip=70"], 50, "last 230 of 300"),
     ):
         run(monkeypatch, folder, "data.path=both.csv", "out=x.npz", "start=estimated",
             "overwrite=true", *words)  # fmt: skip
@@ -261,22 +263,39 @@ def test_no_start_is_fitted_to_samples_that_are_scored(folder: Path, monkeypatch
 
 
 @pytest.mark.numeric
-def test_as_many_samples_as_determine_the_start_are_left_out(folder: Path, monkeypatch, capsys):
-    run(monkeypatch, folder, "data.path=both.csv", "out=x.npz", "start=estimated")
-    row = next(
-        line for line in capsys.readouterr().out.splitlines() if line.startswith("both.csv ")
-    )
-    scored = int(row.split()[3])
-    assert 200 < scored < 300
-    assert float(row.split()[6]) == pytest.approx(
-        np.sqrt(np.mean(NOISE[-scored:, 0] ** 2)), rel=0.1
-    )
-    short = columns(folder / "both.csv")
-    csv(folder / "short.csv", **{name: column[:10] for name, column in short.items()})
-    run(monkeypatch, folder, "data.path=short.csv", "data.fs=50", "out=y.npz", "start=estimated")
-    printed = capsys.readouterr().out
-    assert "10 samples of 'short.csv' are too few to determine the start state" in printed
-    assert printed.count("not scored  ") == 2
+@pytest.mark.parametrize("start", ["zero", "estimated"])
+@pytest.mark.parametrize(("samples", "period"), [(300, None), (40, None), (300, 60), (12, None)])
+def test_evaluate_scores_the_same_samples(
+    start: str, samples: int, period: int | None, folder: Path, monkeypatch, capsys
+):
+    """Also where an input repeats, and its output takes time to settle."""
+    u = U[np.arange(samples) % (period or samples)]
+    y = MODEL.simulate(u) + 0.01 * NOISE[:samples]
+    y[: period or 0] += 0.1
+    csv(folder / "x.csv", u1=u[:, 0], u2=u[:, 1], y1=y[:, 0], y2=y[:, 1])
+    given = "data.path=x.csv", "data.fs=50"
+    run(monkeypatch, folder, *given, f"start={start}", "out=made.csv")
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    here = [line[3:] for line in lines if line[:1] == ["x.csv"]]
+    words = ["data=file", *given, f"data.start={start}", "out=scores.json"]
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "checkpoint=model", *words])
+    evaluate.main()
+    score = json.loads((folder / "scores.json").read_text())["scores"]["x"]
+    skip = {"estimated": min(50, samples // 5), "zero": period or round(samples / 20)}[start]
+    said = f"last {samples - skip} of {samples}"
+    assert said in capsys.readouterr().out
+    assert score["skip"] == skip
+    for row, error in zip(here, score["rmse_by_output"], strict=True):
+        assert " ".join(row[:4]) == said
+        assert float(row[4]) == pytest.approx(error, rel=5e-3)
+
+
+@pytest.mark.numeric
+def test_a_file_of_one_sample_has_no_start_to_be_scored(folder: Path, monkeypatch, capsys):
+    csv(folder / "one.csv", u1=U[:1, 0], u2=U[:1, 1], y1=Y[:1, 0], y2=Y[:1, 1])
+    words = "data.path=one.csv", "data.fs=50", "out=y.npz", "start=estimated"
+    run(monkeypatch, folder, *words)
+    assert capsys.readouterr().out.count("not scored  ") == 2
 
 
 # --- long files -----------------------------------------------------------------------------

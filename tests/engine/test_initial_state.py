@@ -79,17 +79,15 @@ def test_estimated_initial_state_counts_what_is_weighted_only():
 
 
 def test_estimated_initial_state_of_a_state_that_no_output_shows_is_the_likeliest():
-    """Given the other one, with the moments that the input gives both."""
+    """Given the other one, and the covariance of both over the training data."""
     cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 30, 1)
     with torch.no_grad():
         cell.A.copy_(torch.diag(torch.tensor([0.5, 0.4])))
         cell.Cy[0, 1] = 0.0
+        cell.state_covariance.copy_(torch.tensor([[1.0, 0.8], [0.8, 1.0]]))
     y = simulate(cell, u, u.new_tensor([[2.0, 3.0]])).y + 1e-4 * normal(1, 30, 1, seed=3)
     found = simulate_estimated(cell, u, y, torch.ones_like(y))
-    x = simulate(cell, u, u.new_zeros(1, 2)).x[0]
-    moments = x.mT @ x
-    expected = u.new_tensor([[2.0, 2.0 * moments[1, 0] / moments[0, 0]]])
-    assert expected[0, 1] > 1.0
+    expected = u.new_tensor([[2.0, 0.8 * 2.0]])
     # Noise of 1e-4 over an output gain of about 1: a few of it in either state. (Without noise the
     # likelihoods compared are logarithms of rounding errors.)
     assert_close(found.x[:, 0], expected, rtol=0, atol=2e-3)
@@ -118,6 +116,19 @@ def test_estimated_initial_state_of_a_system_left_alone_is_that_of_least_squares
     clean = simulate(cell, u, x0).y
     found = simulate_estimated(cell, u, clean + 1e-3 * normal(1, 60, 1, seed=3), torch.ones_like(u))
     assert_close(found.x[:, 0], x0, rtol=0, atol=0.02)
+
+
+def test_estimated_initial_state_is_not_fitted_to_noise_by_fewer_outputs_than_states():
+    """Least squares meets three outputs with four states, whatever they are."""
+    cell, u, x0 = random_cell(1, 1, 4, radius=0.95), normal(40, 60, 1), normal(40, 4, seed=1)
+    made = simulate(cell, u, x0).y
+    weight = torch.zeros_like(made)
+    weight[:, :3] = 1.0
+    noisy = made + 0.5 * normal(40, 60, 1, seed=2)
+    found = simulate_estimated(cell, u, noisy, weight)
+    rest = simulate(cell, u, torch.zeros_like(x0))
+    errors = [(y - made)[:, 3:].square().mean().sqrt() for y in (found.y, rest.y)]
+    assert errors[0] < errors[1]
 
 
 def test_estimated_initial_state_of_a_diverging_model_is_not_finite():

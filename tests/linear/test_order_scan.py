@@ -283,7 +283,7 @@ def test_folds_score_each_sample_once_from_its_whole_record():
     record = driven(0, 500)
     train, validation, other = part(record, 300, 20), part(record, 500, 300), driven(1, 200)
     model = estimate_bla(train, 3)
-    folds = order_scan._Folds(model, [train, other], [validation], 3, {})
+    folds = order_scan._Folds([train, other], [validation], 3, {})
     assert len(folds._left_out) == FOLDS
     scored = [np.zeros(500, int), np.zeros(200, int)]
     for fold in folds._left_out:

@@ -97,6 +97,7 @@ def test_metrics_are_what_the_model_scores(result):
         "skip": 5,
         "use": "test",
         "scored": 295,
+        "start_error": None,
     }
     expected = lfrtorch.rmse(validation, fitted.model.simulate(validation))
     assert metrics["validation"]["rmse"] == pytest.approx(expected, rel=1e-12)
@@ -127,31 +128,20 @@ def test_table_shows_published_results_of_these_sizes_only(result):
     head, row = lines[2].split(), lines[4].split()
     columns = ["record", "use", "source", "scored", "linear", "(nx", "2)"]  # ours has its own nx
     assert head == [*columns, "NL-LFR", "everybody", "small"]
-    assert row[:6] == ["test", "test", "simulated", "295", "of", "300"]
-    assert float(row[7]) == pytest.approx(1e3 * metrics["scores"]["test"]["rmse"], rel=5e-3)
-    assert row[8:] == ["500", "250"]
+    assert row[:7] == ["test", "test", "simulated", "last", "295", "of", "300"]
+    assert float(row[8]) == pytest.approx(1e3 * metrics["scores"]["test"]["rmse"], rel=5e-3)
+    assert row[9:] == ["500", "250"]
     assert lines[5].split()[:3] == ["validation", "validation", "simulated"]
     assert lines[-2:] == ["everybody: A (2001)", "small: B (2002)"]
 
 
-def test_records_that_cannot_be_scored_are_named_without_numbers(result):
-    fitted, bla, data = result
-    lost = [("test", replace(data.tests[0], name="short")), ("validation", data.validation[0])]
-    metrics = report.metrics(
-        fitted, bla, replace(data, validation=[], unscored=lost, published=()), seeds=[0]
-    )
-    assert metrics["scores"]["test"]["rmse"] > 0
-    assert metrics["validation"]["rmse"] is None
-    rows = report.table(metrics, []).splitlines()[4:]
-    for name, of, row in (
-        ("short", metrics["scores"], rows[1]),
-        ("validation", metrics["validation"]["records"], rows[2]),
-    ):
-        assert [of[name][key] for key in ("rmse", "lti_rmse", "nrmse", "scored")] == [None] * 3 + [
-            0
-        ]
-        assert row.startswith(name)
-        assert row.split()[-4:] == ["not", "scored", "–", "–"]
+def test_the_table_says_which_samples_are_scored():
+    counts = {"samples": 300, "skip": 5, "scored": 295}
+    assert report.of_samples(counts) == "last 295 of 300"
+    assert report.of_samples(counts | {"scored": 290}) == "290 of 300"  # some are not valid
+    assert report.of_samples(counts | {"records": 2}) == "295 of 300"
+    assert report.of_samples(counts | {"skip": 0, "scored": 300}) == "300 of 300"
+    assert report.of_samples(counts | {"skip": 300, "scored": 0}) == "not scored"
 
 
 def test_what_is_not_finite_becomes_null():
