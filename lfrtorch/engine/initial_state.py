@@ -43,6 +43,9 @@ FAR = 0.1
 FAR_BETTER = 0.25
 """Ratio of squared errors at which the state that the beginning of a record tells is better."""
 
+AWAY = 100.0
+"""Growth of xᵀ P⁻¹ x after the samples that tell a state, at which the model runs away from it."""
+
 BEGINNING = 8
 """Least outputs of a beginning for each state."""
 
@@ -91,7 +94,8 @@ def estimated_start(
     variance: a normal prior, see ``state_moments``. The variance is estimated in PASSES. The state
     of least squares is taken if it is FAR better, as a system may begin far from where the training
     data have been, or if the prior makes no difference, as where there are far more samples than
-    states.
+    states. A state from which the model runs away, though it does not from rest, is improbable: the
+    simulation begins at rest then.
 
     Args:
         cell: the model.
@@ -108,7 +112,7 @@ def estimated_start(
     white = torch.where(known[:, None, None], axes.mT / moments.sqrt().unsqueeze(-1), 0.0)
     # Nothing after the last sample with a weight tells the state.
     last = int(weight.count_nonzero(dim=(0, 2)).nonzero().max()) + 1 if counted.any() else 1
-    u, y, weight = u[:, :last], y[:, :last], weight[:, :last]
+    whole, u, y, weight = u, u[:, :last], y[:, :last], weight[:, :last]
     rest = simulate(cell, u, u.new_zeros(R, nx))
 
     def squares(found: Trajectory) -> Tensor:
@@ -118,7 +122,7 @@ def estimated_start(
     stayed = ~free.x[:, 0].any(dim=1)  # Gauss-Newton may fail on many states
     odd = (white @ free.x[:, 0].unsqueeze(-1)).square().sum(dim=(1, 2))
     if not (known & (stayed | (odd > ODD * counted))).any():
-        return free.x[:, 0]
+        return _staying(cell, whole, free.x, white)
     probable = rest
     for _ in range(PASSES):
         variance = squares(probable).nan_to_num(0.0, 0.0) / counted.clamp_min(1)
@@ -128,7 +132,29 @@ def estimated_start(
             break  # all passes that follow would find the same
     lost = ~torch.isfinite(squares(probable))
     better = ~known | lost | ((squares(free) < FAR * squares(probable)) & (counted > 2 * nx))
-    return torch.where(better.unsqueeze(1), free.x[:, 0], probable.x[:, 0])
+    found = torch.where(better[:, None, None], free.x, probable.x)
+    return _staying(cell, whole, found, white)
+
+
+def _staying(
+    cell: LFRCell,
+    u: Float[Tensor, "R T nu"],
+    x: Float[Tensor, "R S nx"],
+    white: Float[Tensor, "R nx nx"],
+) -> Float[Tensor, "R nx"]:
+    """The first of the states x, or 0 if the model runs away after them and not from 0."""
+
+    def farthest(states: Tensor) -> Tensor:
+        return (states @ white.mT).square().sum(dim=2).amax(dim=1).nan_to_num(math.inf)
+
+    near, x0 = farthest(x), x[:, 0]
+    if u.shape[1] < x.shape[1]:
+        return x0
+    there = farthest(simulate(cell, u, x0).x)
+    away = there > AWAY * near
+    if away.any():
+        away &= there > AWAY * farthest(simulate(cell, u, torch.zeros_like(x0)).x)
+    return torch.where(away.unsqueeze(1), 0.0, x0)
 
 
 def state_moments(cell: LFRCell, u: Float[Tensor, "R T nu"]) -> Float[Tensor, "R nx nx"]:

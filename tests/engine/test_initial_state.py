@@ -13,6 +13,7 @@ from lfrtorch.engine import initial_state
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
 from lfrtorch.engine.linearised import Linearised, linearise
+from lfrtorch.engine.nonlinearity import Network
 from lfrtorch.engine.simulation import Trajectory, simulate, simulate_near
 
 pytestmark = pytest.mark.numeric
@@ -135,6 +136,26 @@ def test_estimated_initial_state_of_a_diverging_model_is_not_finite():
     cell, u = random_cell(1, 1, 2, 0, 0, radius=3.0), normal(1, 2000, 1)
     y = torch.zeros_like(u)
     assert not simulate_estimated(cell, u, y, torch.ones_like(y)).finite
+
+
+def test_no_initial_state_is_taken_from_which_the_model_runs_away_and_not_from_rest():
+    """x+ = 1.2 x - 0.5 tanh x + u is unstable beyond |x| = 2.47, where noise puts the state."""
+    cell = LFRCell(1, 1, 1, 1, 1, Network(1, 1, 1, dtype=torch.float64), dtype=torch.float64)
+    with torch.no_grad():
+        for name, value in {"A": 1.2, "Bu": 1.0, "Bw": -0.5, "Cz": 1.0, "Cy": 1.0}.items():
+            getattr(cell, name).fill_(value)
+        for parameter, value in zip(cell.static.parameters(), (1.0, 0.0, 1.0, 0.0), strict=True):
+            parameter.fill_(value)
+        cell.state_covariance.fill_(4.0)
+    u, y = torch.zeros(2, 200, 1, dtype=torch.float64), torch.zeros(2, 200, 1, dtype=torch.float64)
+    y[0, :3], y[1, :3] = 2.6, simulate(cell, u[:1, :3], torch.full((1, 1), 2.2).double()).y[0]
+    weight = torch.zeros_like(y)
+    weight[:, :3] = 1.0
+    found = simulate_estimated(cell, u, y, weight)
+    assert found.x[0, 0].item() == 0.0
+    assert found.x[1, 0].item() == pytest.approx(2.2)  # comes to rest
+    whole = simulate_estimated(cell, u[:, :3], y[:, :3], weight[:, :3])
+    assert whole.x[0, 0].item() > 2.4  # of samples that all count
 
 
 def test_estimated_initial_state_of_one_record_does_not_hold_up_the_others():
