@@ -289,9 +289,9 @@ def _stable(
     rmse = found.rmse
     if found.constant is not None:
         model = replace(model, y_offset=model.y_offset + scaler.y_scale * found.constant)
-    elif records:
+    if records and refine != "prediction":
         errors = np.concatenate([(r.y - model.simulate(r))[r.skip :] for r in records])
-        if offset:  # the fit to spectra has eliminated the constant
+        if offset and found.constant is None:  # the fit to spectra has eliminated it
             model = replace(model, y_offset=model.y_offset + errors.mean(axis=0))
             errors = errors - errors.mean(axis=0)
         if refine == "simulation":

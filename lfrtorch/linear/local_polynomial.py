@@ -52,6 +52,21 @@ class WindowErrors(NamedTuple):
         weights = np.asarray(by_u)[..., :, None, None] * self.weights
         return WindowErrors(self.first, weights, factor * self.noise, self.sizes)
 
+    @property
+    def sharing(self) -> float:
+        """Lines for each independent one, to models that are smooth over a window.
+
+        It is the power of the sum of all errors, of unit variance each, over that if they were
+        independent.
+        """
+        F, _, _, width = self.weights.shape
+        power = np.sum(np.abs(self.weights) ** 2, axis=(2, 3), keepdims=True)
+        unit = self.weights / np.sqrt(power)
+        sums = np.zeros((int(self.first.max()) + width, *unit.shape[1:3]), dtype=complex)
+        for place in range(width):
+            np.add.at(sums, self.first + place, unit[..., place])
+        return float(np.sum(np.abs(sums) ** 2) / (F * unit.shape[1]))
+
     def covariance(self, linear: Callable[[Complex], Complex], K: int) -> Float[Array, "K K"]:
         """Covariance of Re Σ linear(δG)(k) over the lines k.
 

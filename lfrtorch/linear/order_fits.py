@@ -25,7 +25,7 @@ from lfrtorch.linear.frf import FRF, estimate_frf
 from lfrtorch.linear.minima import ALIKE, no_start, scaled, transformation
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Matrices, Refined, Search
-from lfrtorch.linear.requirements import check_spectral_data, of_response
+from lfrtorch.linear.requirements import check_spectral_data, of_response, steady_state
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.spectral_data import (
     spectral_data_of_parts,
@@ -56,6 +56,19 @@ SETTLED, STRIDE = 1e-4, 4
 
 SHORTEST = 4
 """Samples that a part has at least, in multiples of nx + 1."""
+
+
+def description_length(rmse: float, parameters: int, equations: float) -> float:
+    """The error times M^(p / 2M), for p parameters and M independent equations.
+
+    Its logarithm is the description length M ln V + p ln M of a mean square V, over 2M. (The usual
+    √(1 + p ln M / M) is the same for p ln M « M. Of 200 lines of local polynomials, which are 100
+    equations, it chose the true order in 13 of 20 cases as against 18.)
+
+    References:
+        Rissanen, "Modeling by shortest data description", Automatica 14, 1978.
+    """
+    return rmse * equations ** (parameters / (2.0 * equations))
 
 
 class OrderFits:
@@ -128,6 +141,7 @@ class OrderFits:
             problem = ResponseFit(spectra, known=known_, feedthrough=through)
             return cls(problem, scaler, about, "frequency", (), **common)
         records = [without_coordinates(record) for record in data]
+        records = steady_state(records) or records
         scaler = Scaler.of(records, offset=offset)
         spectra = spectral_data_of_records([scaler.normalise(r) for r in records], offset=offset)
         if spectra is None:
@@ -171,8 +185,10 @@ class OrderFits:
         )  # fmt: skip
 
     @spread_by_hand()
-    def fit(self, nx: int) -> LinearModel:
-        """The model of an order; if the ones below were fitted before, it starts from them, too.
+    def fit(self, nx: int) -> tuple[LinearModel, float]:
+        """The model of an order, and its description length.
+
+        If the ones below were fitted before, it starts from them, too.
 
         Raises:
             ValueError: fewer equations than unknowns, or no stable start.
@@ -194,7 +210,12 @@ class OrderFits:
         subspace = self._subspaces_for(nx)[0]
         assert model.fit is not None
         values = tuple(map(float, subspace.singular_values / subspace.size))
-        return replace(model, fit=replace(model.fit, singular_values=values))
+        model = replace(model, fit=replace(model.fit, singular_values=values))
+        data = self.problem.data
+        columns, ny = data.U.shape[1], data.Y.shape[1]  # each initial state has an input
+        p = nx * (columns + ny) + (columns - self.problem.starts) * ny
+        error = best.rmse * (float(np.sqrt(data.Y.size / ny)) if self._train else 1.0)
+        return model, description_length(error, p, data.independent)
 
     @spread_by_hand()
     def fit_near(self, model: LinearModel) -> tuple[LinearModel, list[Array]]:
@@ -286,22 +307,21 @@ class OrderFits:
         found = self._without_starts(found)
         model = physical(found, self._scaler, self._about)
         model = model.transformed(*transformation(self._driven, found.matrices, balanced=True))
-        rmse = error = found.rmse
+        rmse = found.rmse
         if self._train:
             model = replace(model, y_offset=y_offset)
         errors = [record.y - model.simulate(record) for record, _ in self._train]
-        if errors:  # the squares of all lines are those of a sample
-            rmse *= float(np.sqrt(self.problem.data.Y.size / len(model.outputs)))
+        if errors:
             pairs = zip(errors, self._train, strict=True)
             fitted = np.concatenate([e[a:b] for e, (_, windows) in pairs for a, b in windows])
             if self._offset:
                 mean = fitted.mean(axis=0)
                 model = replace(model, y_offset=model.y_offset + mean)
                 fitted, errors = fitted - mean, [each - mean for each in errors]
-            error = float(rms(fitted / self._scaler.y_scale))
+            rmse = float(rms(fitted / self._scaler.y_scale))
         spent = time.perf_counter() - clock
         fit = LinearFit(self._criterion, rmse, found.iterations, found.reason, spent)
-        return replace(model, fit=fit), errors, error
+        return replace(model, fit=fit), errors, rmse
 
     def _without_starts(self, found: Refined) -> Refined:
         """The system without the inputs that make its initial states."""

@@ -28,7 +28,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.order_fits import OrderFits, Window
+from lfrtorch.linear.order_fits import OrderFits, Window, description_length
 from lfrtorch.linear.requirements import check_length, check_signals, excited_directions
 from lfrtorch.metrics import rms
 from lfrtorch.paired_blocks import (
@@ -67,12 +67,14 @@ class OrderScan:
         models: one for each order; that of the order chosen is a full estimate.
         scores: of each order. With validation records the rms of the simulation error over them,
             each output relative to its rms; in a cross-validation over them and the training
-            records. Without them the error over the fitted data, times √(1 + p ln M / M) for p
-            parameters and M equations (minimum description length).
+            records. Without them the error of the fit, times M^(p / 2M) for p parameters,
+            initial states among them, and M independent equations (minimum description length).
+            The fit of periodic records is to their mean periods, whose error is less than that of
+            their samples.
         validated: whether validation records give the scores.
         chosen: the lowest order whose score is within one standard error of the best, 5 % at most,
             or within 1 %; without validation records the order of the best score.
-        lengths: the error over the fitted data with that factor, whatever the scores are.
+        lengths: the error of the fit with that factor, whatever the scores are.
         notes: why the scores are those of a cross-validation, and what orders were left out.
 
     Example:
@@ -161,7 +163,7 @@ def scan_orders(
         check_signals(records)
     given = data if isinstance(data, FRF) else records
     fits = OrderFits.of(given, max(orders), options)
-    fit = partial(estimate_bla, given, **options) if fits is None else fits.fit
+    fit = partial(_alone, given, options) if fits is None else fits.fit
     how = "validation" if judges else "MDL"
     models: list[LinearModel] = []
     lengths: list[float] = []
@@ -191,12 +193,13 @@ def scan_orders(
             if models and (narrow := _narrow(records, nx)):
                 notes.append(narrow)
                 break
-            models.append(fit(nx))
+            model, length = fit(nx)
+            models.append(model)
+            lengths.append(length)
         except ValueError:
             if not models:
                 raise
             break
-        lengths.append(_description_length(models[-1], given))
         if score(models[-1], clock):
             break
     doubt = ""
@@ -379,12 +382,18 @@ def _united(train: list[Record], judges: list[Record]) -> list[Record]:
     return found
 
 
-def _description_length(model: LinearModel, data: Record | Sequence[Record] | FRF) -> float:
+def _alone(
+    data: list[Record] | FRF, options: Mapping[str, Any], nx: int
+) -> tuple[LinearModel, float]:
+    """The full estimate of one order, and its description length."""
+    model = estimate_bla(data, nx, **options)
     assert model.fit is not None
-    nx, nu, ny = model.nx, len(model.inputs), len(model.outputs)
+    nu, ny = len(model.inputs), len(model.outputs)
     if isinstance(data, FRF):
-        M = 2 * data.G.size
+        M, starts = 2 * data.G.size / (1.0 if data.errors is None else data.errors.sharing), 0
     else:
-        M = sum(r.samples - r.skip for r in as_records(data)) * ny
-    p = nx * (nu + ny) + nu * ny
-    return model.fit.rmse * float(np.sqrt(1.0 + p * np.log(M) / M))
+        M = sum(r.samples - r.skip for r in data) * ny
+        starts = sum(r.start != "zero" for r in data)
+    gains = 0 if model.K is None else ny
+    p = nx * (nu + ny + gains + starts) + nu * ny
+    return model, description_length(model.fit.rmse, p, M)

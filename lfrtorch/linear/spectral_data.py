@@ -73,6 +73,11 @@ class SpectralData:
         return errors * root.reshape(*root.shape, *[1] * (errors.ndim - 3))
 
     @property
+    def independent(self) -> float:
+        """Real equations, those of lines that share windows as fewer independent ones."""
+        return self.equations / (1.0 if self.errors is None else self.errors.sharing)
+
+    @property
     def equations(self) -> int:
         """Real equations: two a line, one at 0 and fs / 2, for each output and excited column."""
         real = np.abs(self.z.imag) < 1e-12

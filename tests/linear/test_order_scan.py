@@ -16,7 +16,7 @@ from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.order_scan import FOLDS, PATIENCE, OrderScan, memory_of, scan_orders
 from lfrtorch.linear.subspace import SpectralSubspace
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Channel, Record, Start
 
 pytestmark = pytest.mark.numeric
 
@@ -116,7 +116,7 @@ def test_lowest_order_within_the_margin_of_the_best_is_chosen(scores, chosen, mo
 
     monkeypatch.setattr(order_scan, "_errors", errors)
     assert scan_orders(record, [1, 2, 3], validation=record).chosen == chosen
-    monkeypatch.setattr(order_scan, "_description_length", lambda model, _: model.fit.rmse)
+    monkeypatch.setattr(order_scan, "description_length", lambda rmse, *_: rmse)
     assert scan_orders(record, [1, 2, 3]).chosen == int(np.argmin(scores)) + 1
 
 
@@ -137,7 +137,7 @@ def test_order_within_one_standard_error_of_the_best_is_chosen(monkeypatch):
 
 
 def test_description_length_counts_parameters_and_equations(monkeypatch):
-    """√(1 + p ln M / M) times the error, by its numbers."""
+    """M^(p / 2M) times the error, by its numbers."""
     fake(monkeypatch, [model_of(3, 0.25, 2, 3)])
     p = 3 * (2 + 3) + 2 * 3  # an order has nx (nu + ny) beside its coordinates
     noise = np.random.default_rng(0).normal(size=(100, 5))
@@ -146,12 +146,62 @@ def test_description_length_counts_parameters_and_equations(monkeypatch):
         Record(noise[:70, :2], noise[:70, 2:], 10.0),
     ]
     M = (90 + 70) * 3
-    expected = 0.25 * np.sqrt(1 + p * np.log(M) / M)
+    expected = 0.25 * M ** (p / (2 * M))
     assert scan_orders(records, [3]).scores[0] == pytest.approx(expected, rel=1e-12)
+    free = [replace(record, start="estimated") for record in records]
+    more = p + 2 * 3  # a state of each record
+    expected = 0.25 * M ** (more / (2 * M))
+    assert scan_orders(free, [3]).scores[0] == pytest.approx(expected, rel=1e-12)
     lines = estimate_frf(Record(noise[:, :2], noise[:, 2:], 10.0))
-    M = 2 * len(lines.frequencies) * 3 * 2  # real and imaginary part of every entry
-    expected = 0.25 * np.sqrt(1 + p * np.log(M) / M)
-    assert scan_orders(lines, [3]).scores[0] == pytest.approx(expected, rel=1e-12)
+    apart = estimate_frf(Record(noise[:, :2], noise[:, 2:], 10.0), lines=[12, 37])
+    for frf, least, most in ((lines, 4, 8), (apart, 1, 1)):
+        M = 2 * len(frf.frequencies) * 3 * 2  # real and imaginary part of every entry
+        at = [0.25 * (M / s) ** (p * s / (2 * M)) for s in (most, least)]
+        # Windows of 21 lines share them; a line in 21 is independent.
+        assert at[1] * (1 - 1e-9) <= scan_orders(frf, [3]).scores[0] <= at[0] * (1 + 1e-9)
+
+
+def test_the_same_periods_again_change_no_length():
+    once = record_of(PLANTED, 0, T=128)
+    thrice = Record(np.tile(once.u, (3, 1)), np.tile(once.y, (3, 1)), 10.0, "periodic", period=128)
+    short, long = (scan_orders(record, [2, 3]).lengths for record in (once, thrice))
+    np.testing.assert_allclose(short, long, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("start", "skip"), [("periodic", 0), ("estimated", 100)])
+def test_noise_of_periods_is_fitted_in_all_models_of_a_scan(start: Start, skip: int):
+    """Of each order the error fitted is that of a full estimate, whose period is a mean."""
+    once = record_of(PLANTED, 0, noise=0.0, T=100)
+    u, y = (np.tile(signal, (3, 1)) for signal in (once.u, once.y))
+    y = y + 0.3 * y.std() * np.random.default_rng(1).normal(size=y.shape)
+    record = Record(u, y, 10.0, start, period=100, skip=skip)
+    fit, full = scan_orders(record, [2, 3]).models[0].fit, estimate_bla(record, 2).fit
+    assert fit is not None
+    assert full is not None
+    assert fit.rmse == pytest.approx(full.rmse, rel=1e-3)
+
+
+def test_start_states_count_as_parameters():
+    records = [replace(driven(seed, 60)[20:], start="estimated", skip=0) for seed in range(3)]
+    model, length = order_fits.OrderFits.of(records, 3, {}).fit(3)  # pyright: ignore[reportOptionalMemberAccess]
+    assert model.fit is not None
+    p, M = 3 * (1 + 1 + 3) + 1, 3 * 39  # of each record the mean is an offset
+    # The error that is shown is from the most probable states.
+    assert length == pytest.approx(model.fit.rmse * M ** (p / (2 * M)), rel=0.02)
+
+
+@pytest.mark.slow
+def test_start_states_of_short_records_count():
+    """Ten records, of which eight are fitted: without their states the highest order is chosen."""
+    records = [
+        replace(driven(seed, 150, 0.2)[100:], start="estimated", skip=0) for seed in range(10)
+    ]
+    assert scan_orders(records, range(2, 7)).chosen == 3
+
+
+@pytest.mark.slow
+def test_lines_that_share_windows_are_fewer_equations():
+    assert [scan_orders(estimate_frf(driven(s)), range(2, 6)).chosen for s in (0, 1)] == [3, 3]
 
 
 def test_response_can_be_scanned():
