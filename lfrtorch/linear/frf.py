@@ -25,6 +25,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array, Complex, Integers
 from lfrtorch.linear.local_polynomial import WindowErrors, fit_local_polynomials, half_width
+from lfrtorch.linear.realisations import united
 from lfrtorch.linear.regression import Regression, covariance, divided, outer, regress
 from lfrtorch.linear.spectra import (
     Removal,
@@ -110,8 +111,8 @@ class FRF:
         inputs, outputs: channel names and units.
         cov_noise: covariance due to the disturbing noise, ``None`` if not available.
         cov_total: covariance due to noise and stochastic nonlinear distortion together, likewise.
-        experiments: number of records.
-        periods: of the record with the fewest; 1 without periods.
+        experiments: number of records, those of one realisation together.
+        periods: of the experiment with the fewest; 1 without periods.
         method: ``"robust"``, ``"fast"`` or ``"local_polynomial"``.
         distortion: levels at the output, from the fast method alone.
         notes: what is not available, why, and what would give it.
@@ -233,6 +234,9 @@ def estimate_frf(
 
     ``"auto"``: robust if every record has periods, else local polynomials.
 
+    Records of one realisation of the input tell nothing of distortion, and count as periods of one
+    experiment. In records with periods it may begin anywhere.
+
     If the records have a ``reference`` r, G is the response from r to y over that from r to u, so
     that noise which a controller feeds back to the input, or that of the input's sensor, leaves no
     bias. Without a reference the mean over periods removes most of such noise, and its share in the
@@ -291,16 +295,17 @@ def estimate_frf(
         return _local_polynomial(data, lines, band, order, freedom)
     spectra = spectra_of_periods(data, Removal(order, freedom) if transient else None)
     chosen = in_band(excited_lines(spectra, data, lines), spectra.resolution, band)
-    frf = (_robust if method == "robust" else _fast)(spectra, data, chosen)
     at_once = [
         f"noise: record '{record.name}' is used from its first sample on; a transient there counts "
         "as noise (skip=N leaves it out, transient=True removes it)."
         for record, P in zip(data, spectra.P, strict=True)
         if record.start != "periodic" and record.samples == P * spectra.N
     ]
-    return (
-        frf if transient or not spectra.freedom else replace(frf, notes=(*frf.notes, *at_once[:1]))
-    )
+    if transient or not spectra.freedom:
+        at_once = []
+    spectra, data, notes = united(spectra, data, shifted=True)
+    frf = (_robust if method == "robust" else _fast)(spectra, data, chosen)
+    return replace(frf, notes=(*frf.notes, *notes, *at_once[:1]))
 
 
 def _robust(spectra: Spectra, data: list[Record], lines: Integers) -> FRF:
@@ -385,6 +390,8 @@ def _local_polynomial(
 ) -> FRF:
     """Noise and distortion together, from the residuals of smooth functions of frequency."""
     spectra = spectra_of_records(data)
+    cut = any(record.samples - record.skip > spectra.N for record in data)
+    spectra, data, repeated = united(spectra, data, shifted=False)
     last = (spectra.N - 1) // 2
     n = half_width(order, degrees_of_freedom, len(data[0].inputs), len(data))
     if 2 * n + 1 > last:
@@ -418,9 +425,10 @@ def _local_polynomial(
         )
     notes = [
         "noise: not told apart from nonlinear distortion without periods; two or more periods of "
-        "a multisine tell them apart (period=N)."
+        "a multisine tell them apart (period=N).",
+        *repeated,
     ]
-    if any(record.samples - record.skip > spectra.N for record in data):
+    if cut:
         notes.append(
             f"frequency response: the records were cut to the shortest one, {spectra.N} samples."
         )
