@@ -18,7 +18,7 @@ import numpy as np
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.tables import radius
+from lfrtorch._support.tables import number, radius
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
 from lfrtorch.linear.frf import FRF, estimate_frf
@@ -79,6 +79,10 @@ is without: few have one, and it costs precision at high frequencies."""
 COLOURED, CLOSER, ROUNDS = 0.3, 0.7, 4
 """A differenced output is fitted without a filter if its pole λ is below COLOURED. Others are fit
 again, ROUNDS times at most, while 1 - λ of the errors is below the part CLOSER of the last one."""
+
+FAR = 2.0
+"""A normalised residual above this is not explained by the variances: that of good fits to 50 lines
+or more was 1.3 at most."""
 
 BETTER = 0.25
 """The data come from an unstable system if its cost is below this part of a stable model's."""
@@ -279,6 +283,8 @@ def _stable(
     tried = candidates(problem, nx, given)
     estimate, found = best_minimum(problem, tried, max_iter, balanced=balanced)
     notes += _notes(problem, estimate, found)
+    if isinstance(problem, ResponseFit) and problem.data.weight is not None:
+        notes += _residual_notes(found.rmse, weight)
     if max_iter and found.iterations >= max_iter:
         notes.append(
             f"the search was stopped after {max_iter} iterations: "
@@ -434,6 +440,14 @@ def _notes(problem: LinearLeastSquares, estimate: SubspaceEstimate, found: Refin
             "one, or an order above what they carry; look at the data, or lower nx."
         )
     return notes
+
+
+def _residual_notes(rmse: float, weight: Weight | Array | None) -> list[str]:
+    """What a residual says that is far above what the variances explain."""
+    if rmse <= FAR or not isinstance(weight, str | None):
+        return []
+    cause = "nonlinear distortion or too low an order" if weight == "noise" else "too low an order"
+    return [f"the error is {number(rmse)} times its {weight or 'total'} deviation: {cause}."]
 
 
 def physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearModel:

@@ -285,8 +285,8 @@ def spectral_data_of_response(
         differences: how many differences of the inputs follow these.
 
     Returns:
-        The spectra, the scaling, whether the weights are inverse variances, and notes on the
-        choice of weights.
+        The spectra, the scaling, whether the weights are the inverse variances of the errors, and
+        notes on the choice of weights.
     """
     weights, known, notes = _weights(frf, weight)
     u_scale = 1.0 / rms_scale([np.abs(frf.G).reshape(-1, frf.G.shape[2])], np.zeros(1))
@@ -309,7 +309,10 @@ def spectral_data_of_response(
 
 
 def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, bool, list[str]]:
-    """Weights (F, ny, nu) of the errors of G, whether they are inverse variances, and notes."""
+    """Weights (F, ny, nu) of the errors of G, whether these have no other variance, and notes.
+
+    A noise variance is not that of the errors: nonlinear distortion adds to it.
+    """
     notes: list[str] = []
     if isinstance(weight, list | tuple):
         weight = np.asarray(weight, dtype=np.float64)
@@ -343,7 +346,7 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
         return None, False, notes
     freedom = frf.realisations - 1 if weight == "total" else frf.experiments * (frf.periods - 1)
     smooth = _smoothed(variance, 1 if frf.method == "local_polynomial" else freedom)
-    return 1.0 / np.maximum(smooth, VANISHING * smooth.max()), True, notes
+    return 1.0 / np.maximum(smooth, VANISHING * smooth.max()), weight == "total", notes
 
 
 def _smoothed(variance: Array, degrees_of_freedom: int) -> Array:

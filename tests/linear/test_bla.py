@@ -13,6 +13,7 @@ import scipy.linalg
 from reference import System, random_system
 
 from lfrtorch._support.types import Array
+from lfrtorch.excitation import multisine
 from lfrtorch.linear import minima
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import estimate_frf
@@ -663,3 +664,56 @@ def test_periods_after_the_transient_are_fitted_in_steady_state():
 def test_drift_is_no_steady_state():
     assert steady_state([settling_records()[0]]) is not None
     assert steady_state([settling_records(drift=30.0)[0]]) is None
+
+
+# --- weights --------------------------------------------------------------------------------
+
+
+def periods_of(system: System, distortion: float, seed: int) -> list[Record]:
+    """Two realisations of two periods, noise 1e-3, and a cubic of the output."""
+    design = multisine(128, realisations=2, seed=seed)
+    records = []
+    for u in design.u:
+        y = reference.periodic_response(system, u)
+        y = np.tile(y + distortion * y**3, (2, 1))
+        y += 1e-3 * np.random.default_rng(seed).normal(size=y.shape)
+        records.append(Record(np.tile(u, (2, 1)), y, 10.0, "periodic", period=128))
+    return records
+
+
+def test_deviation_of_a_fit_weighted_by_noise_counts_distortion():
+    """The square mean of 20 deviations over that of the errors; the noise alone explains 1e-2."""
+    system, f = random_system(2), np.array([0.5, 2.0, 4.0])
+    models = [
+        estimate_bla(estimate_frf(periods_of(system, 0.3, seed)), 2, weight="noise")
+        for seed in range(20)
+    ]
+    errors = np.array([model.frf(f) for model in models])
+    spread = np.mean(np.abs(errors - errors.mean(axis=0)) ** 2)
+    known = np.mean([model.frf_std(f) ** 2 for model in models])  # pyright: ignore[reportOptionalOperand]
+    assert 0.6 < np.sqrt(known / spread) < 1.6  # 60 numbers tell it to 0.15
+
+
+@pytest.mark.parametrize(
+    ("distortion", "nx", "weight", "cause"),
+    [
+        (0.3, 2, "noise", ": nonlinear distortion or too low an order"),
+        (0.0, 1, "total", "total deviation: too low an order"),
+        (0.0, 2, "noise", None),
+        (0.0, 2, "total", None),
+        (0.3, 2, "total", None),
+        (0.3, 2, None, None),
+    ],
+)
+def test_note_on_errors_far_above_their_deviation(distortion, nx, weight, cause):
+    frf = estimate_frf(periods_of(random_system(2), distortion, 0))
+    fit = estimate_bla(frf, nx, weight=weight).fit
+    assert fit is not None
+    notes = [note for note in fit.notes if "the error is" in note]
+    assert len(notes) == (cause is not None)
+    assert cause is None or cause in notes[0]
+
+
+def test_a_random_record_with_a_good_model_has_no_note():
+    frf = estimate_frf(record_of(random_system(3), "zero", noise=0.1))
+    assert estimate_bla(frf, 3).fit.notes == frf.notes  # pyright: ignore[reportOptionalMemberAccess]
