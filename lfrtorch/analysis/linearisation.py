@@ -12,8 +12,15 @@ from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import quantity
 from lfrtorch._support.types import Array
-from lfrtorch.engine.operating_point import StateSpace, double, equilibrium, linearised_at
+from lfrtorch.engine.operating_point import (
+    StateSpace,
+    double,
+    equilibrium,
+    linearised_at,
+    resting_input,
+)
 from lfrtorch.engine.operating_point import linear_part as linear_part_of
+from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
@@ -35,7 +42,8 @@ def linearise(
 
     Args:
         model: nonlinear.
-        u: constant input u0, physical units. Default: the inputs' offsets in the data.
+        u: constant input u0, physical units. Default: the inputs' offsets in the data, or of an
+            integrating model the inputs next to them that hold it at rest.
         x: state x0 in the model's coordinates, as ``model.signals(record).x[0, k]``. If u0 does not
             hold the model there, the result is of the deviations from the trajectory that passes
             through it. Default: the state at rest, by Newton's method; if there are several, the
@@ -58,12 +66,13 @@ def linearise(
     v: Tensor = torch.as_tensor((u0 - scaler.u_offset) / scaler.u_scale)
     if x is None:
         found = equilibrium(cell, v)
+        integrates = found is None and bool(integrating_states(cell).any())
+        still = resting_input(cell, v) if integrates else None
+        if u is None and still is not None:
+            v, found = still, equilibrium(cell, still)
+            u0 = scaler.u_offset + scaler.u_scale * still.numpy()
         if found is None:
-            raise InputError(
-                f"no state at rest was found under {_levels(model.inputs, u0)}; the offsets are "
-                f"{_levels(model.inputs, scaler.u_offset)}.\nGive an input nearer to these, or a "
-                "state: linearise(model, u, x=...)."
-            )
+            raise InputError(_no_rest(model, u0, still))
     else:
         found = torch.as_tensor(vector("x", x, cell.nx, "the model has {} states"))
     with torch.no_grad():
@@ -103,6 +112,17 @@ def vector(name: str, given: ArrayLike, size: int, expected: str) -> Array:
             f"{name} is {given!r}; {expected.format(size)}: give as many finite numbers."
         )
     return found
+
+
+def _no_rest(model: Model, u0: Array, still: Tensor | None) -> str:
+    scaler, missing = model.scaler, f"no state at rest was found under {_levels(model.inputs, u0)}"
+    if still is None:
+        offsets = _levels(model.inputs, scaler.u_offset)
+        near = f"; the offsets are {offsets}.\nGive an input nearer to these"
+    else:
+        at = _levels(model.inputs, scaler.u_offset + scaler.u_scale * still.numpy())
+        near = f": the model integrates.\nGive no input for where it stands still, {at}"
+    return f"{missing}{near}, or a state: linearise(model, u, x=...)."
 
 
 def _levels(channels: tuple[Channel, ...], values: Array) -> str:

@@ -94,6 +94,24 @@ def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] 
     return x
 
 
+@torch.no_grad()
+def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"] | None:
+    """The input next to u under which an integrating model is at rest; None if none is found.
+
+    Gauss-Newton for the gap in x and u together, by the least steps, from x = 0.
+    """
+    identity, x = torch.eye(cell.nx, dtype=u.dtype), u.new_zeros(cell.nx)
+    for _ in range(MAX_NEWTON):
+        gap = cell(u, x)[1] - x
+        if gap.abs().max() <= TOLERANCE * (1.0 + x.abs().max()):
+            return u
+        at = linearised_at(cell, u, x)
+        rows = torch.cat([identity - torch.as_tensor(at.A), -torch.as_tensor(at.B)], dim=1)
+        step = torch.linalg.pinv(rows, rtol=SINGULAR) @ gap
+        x, u = x + step[: cell.nx], u + step[cell.nx :]
+    return None
+
+
 def _newton(
     cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"]
 ) -> Float[Tensor, " nx"] | None:

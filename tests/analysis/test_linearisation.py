@@ -97,6 +97,21 @@ def test_single_precision_model_is_linearised_in_double_precision():
     assert linearise(single).A.dtype == np.float64
 
 
+def test_an_integrating_model_is_linearised_where_it_stands_still():
+    model = random_model(random_cell(1, 1, 2, 1, 1, 3, radius=0.5))
+    with torch.no_grad():
+        cell = model.lfr.cell
+        cell.A[:, 0], cell.Cz[:, 0] = torch.tensor([1.0, 0.0]), 0.0
+    local = linearise(model)
+    x = model.simulate(np.tile(local.u_offset, (300, 1)))
+    np.testing.assert_allclose(x[-1], x[-2], atol=1e-9)  # under the offset it runs away
+    assert abs(local.u_offset - model.scaler.u_offset) > 1e-3
+    with pytest.raises(
+        lfrtorch.InputError, match=r"integrates.\nGive no input for where it stands"
+    ):
+        linearise(model, model.scaler.u_offset)
+
+
 def test_points_that_do_not_exist_are_refused():
     cell = LFRCell(1, 1, 1, 1, 1, Polynomial(1, 1, 2)).double()
     assert isinstance(cell.static, Polynomial)
