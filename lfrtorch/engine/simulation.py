@@ -32,10 +32,14 @@ SETTLING_PERIODS = 3
 """Periods simulated forward before Newton's method takes over; a well damped model needs one."""
 
 CLOSER = 1e-2
-"""Newton's method keeps its matrix if a change below this part of the states shrinks by as much."""
+"""The monodromy is kept if it foretells a change to this part; for Newton's method the change has
+to be below this part of the states, too."""
 
 MAX_PERIODS = 30
 """Most passes over the record in search of the periodic steady state."""
+
+EXPLODED = 10.0
+"""States of an unstable trajectory beyond so many times those of the first pass are lost."""
 
 
 class Trajectory(NamedTuple):
@@ -107,9 +111,10 @@ def steady_state(
 
     In machine code the record is simulated again and again, each time from its end state, until the
     end state is the initial state. After a few passes Newton's method on x(T) - x(0) takes over.
-    Other cells try Newton's method over all of time first. A periodic solution that is not stable
-    counts as diverged (its record has NaN samples), unless the search begins right on it: no
-    simulation would settle to it.
+    Other cells try Newton's method over all of time first. While the trajectory is unstable, as it
+    is near a rest that it leaves, the passes go on. A periodic solution that is not stable counts
+    as diverged (its record has NaN samples), unless the search begins right on it: no simulation
+    would settle to it. So does a record that has not settled after ``MAX_PERIODS`` passes.
 
     Args:
         cell: the model.
@@ -126,11 +131,13 @@ def steady_state(
     x0 = x0[:, 0] if x0.ndim == 3 else x0
     # `settled` and `lost` tell for each record whether it is periodic, or will never be.
     identity = torch.eye(cell.nx, dtype=u.dtype, device=u.device)
-    tolerance = max(PERIODIC_TOLERANCE, PERIODIC_ROUNDING * torch.finfo(u.dtype).eps)
+    eps = torch.finfo(u.dtype).eps
+    tolerance = max(PERIODIC_TOLERANCE, PERIODIC_ROUNDING * eps)
     trajectory = simulate(cell, u, x0)
     lost = torch.zeros(len(u), dtype=torch.bool, device=u.device)  # diverged, or unstable
     settled, size = lost, u.new_ones(len(u))
-    transition, last = None, u.new_full((len(u),), torch.inf)
+    transition, unstable, last = None, lost.clone(), u.new_full((len(u),), torch.inf)
+    foretold = torch.zeros_like(x0)
     for passes in range(MAX_PERIODS + 1):
         end = trajectory.x[:, -1].clone()
         if passes == 0:
@@ -138,20 +145,28 @@ def steady_state(
         lost |= ~torch.isfinite(end).all(dim=1)
         change = (end - x0).abs().amax(dim=1)
         settled = change <= tolerance * size
+        lost |= settled & unstable  # no simulation would stay there
         if (settled | lost).all() or passes == MAX_PERIODS:
             break
         if passes < SETTLING_PERIODS:
             closer = end
         else:
-            # Near the solution it hardly changes: one that brought two digits is kept.
-            near = (change <= CLOSER * last) & (last <= CLOSER * size)
+            # Where it foretold the change to two digits, it is kept.
+            miss = (end - x0 - foretold).abs().amax(dim=1)
+            near = (miss <= CLOSER * last) & (unstable | (last <= CLOSER * size))
             if transition is None or not near[~settled & ~lost].all():
                 transition = monodromy(cell, trajectory.z)
-                lost |= ~settled & ~(spectral_radius(transition) < 1.0)  # False for NaN
+                radius = spectral_radius(transition)
+                unstable = ~settled & ~(radius < 1.0)  # comparisons with NaN are False
+                # A linear model stays unstable, and a large radius makes states of rounding errors.
+                lost |= unstable & ((cell.static is None) | ~(radius < 1.0 / eps))
+            lost |= unstable & (end.abs().amax(dim=1) > EXPLODED * size)
             last = change
             # x(T) = end + Φ d for the initial state x0 + d, and x(T) = x0 + d is wanted.
             gap = (end - x0).unsqueeze(-1)
-            closer = x0 + torch.linalg.solve_ex(identity - transition, gap).result.squeeze(-1)
+            newton = x0 + torch.linalg.solve_ex(identity - transition, gap).result.squeeze(-1)
+            closer = torch.where(unstable.unsqueeze(1), end, newton)
+            foretold = (transition @ gap).squeeze(-1) * unstable.unsqueeze(1)  # 0 by Newton
         x0 = torch.where((settled | lost).unsqueeze(1), x0, closer)
         if compiled:
             trajectory = _compiled(cell, u, x0, trajectory)

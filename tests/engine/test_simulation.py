@@ -12,6 +12,7 @@ from reference import SIZES, normal, polynomial_cell, random_cell
 from torch import Tensor
 from torch.testing import assert_close
 
+from lfrtorch.engine import simulation
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import monodromy
 from lfrtorch.engine.linearised import linearise, spectral_radius
@@ -266,6 +267,65 @@ def test_unstable_periodic_solution_counts_as_diverged():
             torch.tensor([1.05, 0.5])
         )  # (I - Φ) is regular, x(T) = x(0) solvable
     assert torch.isnan(steady_state(cell, normal(1, 10, 1)).y).all()
+
+
+def escaping(a: float, c: float) -> LFRCell:
+    """x+ = a x + c tanh x + u: beyond a + c = 1 the rest is unstable, between two that are not."""
+    cell = random_cell(1, 1, 1, 1, 1, 1)
+    with torch.no_grad():
+        for parameter in cell.parameters():
+            parameter.zero_()
+        for name in ("Bu", "Cz", "Cy", "static.Wz", "static.Ww"):
+            cell.get_parameter(name).fill_(1.0)
+        cell.A.fill_(a)
+        cell.Bw.fill_(c)
+    return cell
+
+
+def raised_sine(T: int, amplitude: float) -> Tensor:
+    time = torch.arange(T, dtype=torch.float64)
+    return amplitude * (1.0 + torch.sin(2 * torch.pi * time / T)).reshape(1, T, 1)
+
+
+@pytest.mark.parametrize(
+    ("a", "c", "T", "amplitude"),
+    [(0.5, 0.51, 20, 1e-3), (0.9, 0.2, 10, 1e-4), (0.95, 0.06, 10, 1e-3), (0.99, 0.03, 10, 1e-2)],
+)
+def test_model_that_leaves_an_unstable_rest_slowly_settles(
+    a: float, c: float, T: int, amplitude: float
+):
+    cell, u = escaping(a, c), raised_sine(T, amplitude)
+    x0 = u.new_zeros(1, 1)
+    for _ in range(500):
+        x0 = simulate(cell, u, x0).x[:, -1]
+    assert_same(steady_state(cell, u), simulate(cell, u, x0), 1e-8)
+
+
+def test_model_that_stays_at_an_unstable_rest_counts_as_diverged():
+    """Beside it is a mode that takes more passes to settle than Newton's method waits for."""
+    cell = random_cell(1, 1, 2, 1, 1, 1)
+    with torch.no_grad():
+        for parameter in cell.parameters():
+            parameter.zero_()
+        cell.A.copy_(torch.diag(torch.tensor([1.05, 0.5])))
+        cell.Bu[1], cell.Cy[:] = 1.0, 1.0
+    assert torch.isnan(steady_state(cell, normal(1, 5, 1)).y).all()
+
+
+@pytest.mark.parametrize(("radius", "nw", "most"), [(1.0001, 0, 5), (1.01, 1, 8), (1.1, 1, 6)])
+def test_few_passes_tell_that_a_model_diverges(
+    radius: float, nw: int, most: int, monkeypatch: pytest.MonkeyPatch
+):
+    passes = []
+
+    def counted(*arguments: Any) -> Trajectory:
+        passes.append(arguments)
+        return compiled(*arguments)
+
+    compiled = simulation._compiled
+    monkeypatch.setattr(simulation, "_compiled", counted)
+    assert torch.isnan(steady_state(lightly_damped(radius, nw), normal(1, 200, 1)).y).all()
+    assert len(passes) <= most
 
 
 # --- linearisation --------------------------------------------------------------------------
