@@ -31,20 +31,19 @@ class WindowErrors(NamedTuple):
         first: lowest line of each window, counted from the first one of the spectra.
         weights: of the lines in it.
         noise: covariance of V about each line.
-        sizes: variance of each column of G that noise of unit variance would make, if the inputs
-            followed the reference without noise.
+        sizes: with a reference the variance of each column of G that noise of unit variance would
+            make, if the inputs followed it without noise.
     """
 
     first: Int64[Integers, " F"]
     weights: Complex128[Complex, "F nu R lines"]
     noise: Complex128[Complex, "F ny ny"]
-    sizes: Float[Array, "F nu"]
+    sizes: Float[Array, "F nu"] | None
 
     def at(self, lines: Booleans) -> WindowErrors:
         """The errors at some of the lines."""
-        return WindowErrors(
-            self.first[lines], self.weights[lines], self.noise[lines], self.sizes[lines]
-        )
+        sizes = None if self.sizes is None else self.sizes[lines]
+        return WindowErrors(self.first[lines], self.weights[lines], self.noise[lines], sizes)
 
     def times(self, by_y: Array | Complex, by_u: Array | float) -> WindowErrors:
         """The errors of by_y G by_u; factors of every line are (F, 1)."""
@@ -165,5 +164,7 @@ def fit_local_polynomials(
         weights = fitted.weights.reshape(len(window), nu, records, -1) @ complement.T
         cov = covariance(C, fitted.weights)
         parts.append((fitted.G, cov, fitted.determined & determined, weights, C, alone))
-    G, cov, determined, *errors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return G, cov, determined, WindowErrors(first, *errors)
+    joined = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    G, cov, determined, weights, noise, alone = joined
+    errors = WindowErrors(first, weights, noise, None if outputs is None else alone)
+    return G, cov, determined, errors

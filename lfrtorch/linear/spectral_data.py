@@ -344,9 +344,33 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
     if not (variance > 0).any():
         notes.append("the variance is 0 at all lines, so that they count alike in the fit.")
         return None, False, notes
-    freedom = frf.realisations - 1 if weight == "total" else frf.experiments * (frf.periods - 1)
-    smooth = _smoothed(variance, 1 if frf.method == "local_polynomial" else freedom)
+    if frf.errors is not None and frf.errors.sizes is not None:
+        smooth = _of_other_windows(variance, frf.errors.sizes, frf.errors)
+    else:
+        freedom = frf.realisations - 1 if weight == "total" else frf.experiments * (frf.periods - 1)
+        smooth = _smoothed(variance, 1 if frf.method == "local_polynomial" else freedom)
     return 1.0 / np.maximum(smooth, VANISHING * smooth.max()), weight == "total", notes
+
+
+def _of_other_windows(variance: Array, sizes: Array, errors: WindowErrors) -> Array:
+    """Variances (F, ny, nu) by the nearest lines whose windows share no line with the own.
+
+    A variance with a reference is that of the residual, times ``sizes``, which are exact, times
+    what the reference drives through the input. Residual and input share the noise of G in the
+    window: weights that know it favour lines where it makes G small, a bias that does not fall with
+    the length of the records. So these factors are means over other windows.
+    """
+    variance = variance / sizes[:, None]
+    first, F, width = errors.first, len(variance), errors.weights.shape[3]
+    near = np.arange(DEGREES_OF_FREEDOM // 2)
+    below = np.searchsorted(first, first - width, side="right")[:, None] - 1 - near
+    above = np.searchsorted(first, first + width)[:, None] + near
+    total, count = np.zeros_like(variance), np.zeros((F, 1, 1))
+    for at in np.hstack([below, above]).T:
+        there = ((at >= 0) & (at < F))[:, None, None]
+        total += there * variance[np.clip(at, 0, F - 1)]
+        count += there
+    return sizes[:, None] * np.where(count > 0, total / np.maximum(count, 1), variance.mean(axis=0))
 
 
 def _smoothed(variance: Array, degrees_of_freedom: int) -> Array:

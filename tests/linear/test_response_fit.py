@@ -1,5 +1,6 @@
 """SpectralData: the same sum of squares as the simulation error, its slope, and its covariance."""
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -211,6 +212,31 @@ def under_feedback(seed: int, T: int) -> Record:
         u[k] = r[k] - y[k] / 2
         x = 0.7 * x + 0.3 * u[k]
     return Record(u, y, start="estimated", reference=r)
+
+
+def test_a_weight_does_not_know_the_noise_of_the_error_that_it_weighs():
+    """Noise in a window moves the variance of its line, and the weights of other windows."""
+
+    def variance_and_weight(record: Record) -> tuple[Array, Array]:
+        frf = estimate_frf(record)
+        data, scaler, _, _ = spectral_data_of_response(frf, None, offset=True)
+        assert frf.var_total is not None
+        assert data.weight is not None
+        size = scaler.y_scale / scaler.u_scale
+        return frf.var_total[:, 0, 0], data.weight[:, 0, 0] / size**2
+
+    record, line = under_feedback(0, 400), 100
+    errors = estimate_frf(record).errors
+    assert errors is not None
+    spectrum, lines = np.zeros(201, dtype=complex), errors.weights.shape[3]
+    within = errors.first[line] + 1 + np.arange(lines)
+    spectrum[within] = 20 * np.random.default_rng(1).normal(size=lines)
+    louder = np.fft.irfft(spectrum, 400)[:, None]
+    other = replace(record, y=record.y + louder, u=record.u - louder / 2)
+    (variance, weight), (changed, same) = variance_and_weight(record), variance_and_weight(other)
+    assert abs(np.log(changed[line] / variance[line])) > 0.5
+    assert same[line] == pytest.approx(weight[line], rel=1e-9)
+    assert abs(np.log(same[line + lines] / weight[line + lines])) > 0.5
 
 
 def test_errors_of_lines_that_share_a_window_are_known_together():
