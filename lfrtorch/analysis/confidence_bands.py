@@ -33,7 +33,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.analysis.gradients import Gradients, root
 from lfrtorch.analysis.linearisation import linear_part, linearise
 from lfrtorch.analysis.noise_model import LEAST, NoiseModel, Spectra, colours, innovations
-from lfrtorch.analysis.output_residuals import LEVEL, ROUNDING, SLIGHT
+from lfrtorch.analysis.output_residuals import LEVEL, ROUNDING, SLIGHT, OutputResiduals
 from lfrtorch.analysis.residual_analysis import SHORTEST, of_simulation
 from lfrtorch.analysis.training_reach import FARTHEST, TrainingReach
 from lfrtorch.engine.lfr import LFR
@@ -356,7 +356,7 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
         rank=rank,
         noise=deviations * model.scaler.y_scale,
         relative=np.sqrt(variance).mean(axis=0) / np.maximum(y.std(axis=0), 1e-300),
-        doubts=_doubts(every, model, rank, K, left),
+        doubts=_doubts(every, model, W, sizes, rank, left),
         colour=colour,
         reach=TrainingReach.of(np.concatenate(zs), variance),
     )
@@ -444,21 +444,36 @@ def _ratio(product: Float[Array, "ny ny"], left: Float[Array, " ny"]) -> Float[A
     return product / np.sqrt(np.outer(left, left))
 
 
-def _doubts(
-    every: Sequence[Gradients], model: Model, rank: int, K: int, left: tuple[float, float]
-) -> tuple[str, ...]:
-    """What speaks against the bands, in sentences."""
-    found = []
-    parts = [
-        part
-        for along in every
-        if along.record.samples - along.record.skip >= SHORTEST
-        for part in of_simulation(
-            along.record, along.record.shown(model.scaler.restore_y(along.trajectory.y[0].numpy()))
-        )
-    ]
+def _weighted_step(
+    every: Sequence[Gradients], W: Float[Tensor, "K K"], sizes: Sequence[NoiseModel]
+) -> Float[Tensor, " K"]:
+    """The Gauss-Newton step of a fit in which each record counts by one over its noise."""
+    K = len(W)
+    total = QRAccumulator()
+    for along, own in zip(every, sizes, strict=True):
+        power = torch.as_tensor(np.diag(own.covariance).copy())
+        by = torch.where(power > 0, power, torch.inf).rsqrt().unsqueeze(-1)
+        for _, rows, errors in along.weighted():
+            total.fold((torch.cat([rows @ W, -errors.unsqueeze(-1)], -1) * by).flatten(0, 1))
+    return W @ torch.linalg.pinv(total.R[:K, :K], rtol=TRUNCATION) @ total.R[:K, K]
+
+
+def _dependent(
+    every: Sequence[Gradients], model: Model, step: Float[Tensor, " K"] | None = None
+) -> list[tuple[OutputResiduals, str]]:
+    """Residuals that depend on the inputs, and how; those after a step of the parameters."""
+    parts = []
+    for along in every:
+        if along.record.samples - along.record.skip < SHORTEST:
+            continue
+        y = along.trajectory.y[0].clone()
+        if step is not None:
+            for time, rows in along.blocks():
+                y[time] += rows[..., : len(step)] @ step
+        y_hat = along.record.shown(model.scaler.restore_y(y.numpy()))
+        parts += of_simulation(along.record, y_hat)
     tests = 3 * len(parts)
-    wrong = [
+    return [
         (part, name)
         for part in parts
         for name, each in (("inputs", part.linear), ("even", part.even), ("odd", part.odd))
@@ -466,6 +481,22 @@ def _doubts(
         and max(abs(c.at(c.largest)[0]) for c in each) >= SLIGHT
         and not part.exact
     ]
+
+
+def _doubts(
+    every: Sequence[Gradients],
+    model: Model,
+    W: Float[Tensor, "K K"],
+    sizes: Sequence[NoiseModel],
+    rank: int,
+    left: tuple[float, float],
+) -> tuple[str, ...]:
+    """What speaks against the bands, in sentences."""
+    found = []
+    wrong = _dependent(every, model)
+    if wrong and len(every) > 1:
+        # Noise of a loud record, in the parameters, shows in the residuals of a quiet one.
+        wrong = _dependent(every, model, _weighted_step(every, W, sizes))
     if wrong:
         part, name = min(wrong, key=lambda pair: pair[0].p[pair[1]])
         what = {
@@ -482,10 +513,10 @@ def _doubts(
             f"the fit is not at its minimum: a step would be {number(left[0], 2)} standard errors "
             f"long and lower the squared error by {percent(left[1])}; bands are about the minimum."
         )
-    if rank < K:
+    if rank < len(W):
         found.append(
-            f"the data tell {rank} of {K} directions of the parameters; where the others matter, "
-            "surprise and bands are large."
+            f"the data tell {rank} of {len(W)} directions of the parameters; where the others "
+            "matter, surprise and bands are large."
         )
     return tuple(found)
 

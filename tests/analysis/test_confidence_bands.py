@@ -255,6 +255,18 @@ def test_a_model_that_is_too_small_is_doubted():
     assert not any("depend" in d for d in uncertainty(truth, record).doubts)
 
 
+def test_noise_of_a_loud_record_is_no_fault_of_a_model_in_a_quiet_one():
+    """A linear model is doubted there all the same: see the test above."""
+    truth = random_model(random_cell(nn=2, feedback=0.3))
+    with torch.no_grad():
+        truth.lfr.cell.Bw.mul_(3.0)
+    quiet, loud = noisy(measure(truth, 600), 0.01), noisy(measure(truth, 600, seed=2), 0.2, seed=2)
+    found = uncertainty(fitted(truth, [quiet, loud], 8), [quiet, loud])
+    assert not any("depend" in doubt for doubt in found.doubts)
+    linear = lfrtorch.estimate_bla([quiet, loud], nx=2).to_model()
+    assert any("depend" in doubt for doubt in uncertainty(linear, [quiet, loud]).doubts)
+
+
 def test_a_model_off_its_minimum_is_doubted(known: tuple[Model, Uncertainty]):
     model, found = known
     record = noisy(measure(model, 400), 0.05)
