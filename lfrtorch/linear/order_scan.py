@@ -55,8 +55,8 @@ MEMORIES = 20
 constants."""
 
 UNLIKE = 1.5
-"""Validation and training records are unlike if the errors of the linear model on them differ by
-more than this factor: what is seen on one says little of the other."""
+"""Validation and training records are unlike if the errors of the order that fits best differ by
+more than this factor between them: what is seen on one says little of the other."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,8 @@ def scan_orders(
             break
     doubt = ""
     if records and judges and fits is not None:
-        doubt = _doubt(models[_first(errors, lengths)], records, judges)
+        fittest = models[int(np.argmin(lengths))]
+        doubt = _doubt(models[_first(errors, lengths)], fittest, records, judges)
     if doubt:
         notes.append(f"{doubt}: the order is chosen by cross-validation over both.")
         how, errors = "cross-validation", []
@@ -286,8 +287,16 @@ def _errors(records: Sequence[Record], scale: Array, model: LinearModel) -> list
         return [((r.y - model.simulate(r)) / scale)[r.skip :] for r in records]
 
 
-def _doubt(model: LinearModel, train: list[Record], judges: list[Record]) -> str:
-    """Why the validation records say little of an order; empty if they say enough."""
+def _doubt(
+    model: LinearModel, fittest: LinearModel, train: list[Record], judges: list[Record]
+) -> str:
+    """Why the validation records say little of an order; empty if they say enough.
+
+    Args:
+        model: of the order that they choose.
+        fittest: of the order that the training records choose. A poor model errs alike on both.
+        train, judges: training and validation records.
+    """
     scored = sum(record.samples - record.skip for record in judges)
     memory = memory_of(model, max(record.samples for record in train))
     if scored < MEMORIES * memory:
@@ -296,7 +305,7 @@ def _doubt(model: LinearModel, train: list[Record], judges: list[Record]) -> str
             "of the linear model"
         )
     scale = Scaler.of(train).y_scale
-    here, there = _rms([_errors(some, scale, model) for some in (train, judges)])
+    here, there = _rms([_errors(some, scale, fittest) for some in (train, judges)])
     if not here / UNLIKE < there < here * UNLIKE:
         return f"the linear error on validation is {number(there / here)} times that on training"
     return ""

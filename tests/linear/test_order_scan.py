@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import reference
 from reference import System, random_system
+from scipy.signal import lfilter
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.linear import order_fits, order_scan
@@ -322,6 +323,17 @@ def test_a_poor_validation_part_is_replaced_by_folds_over_all(why: str):
     if why == "short":
         assert found.chosen == 3
         assert found.scores[2] == pytest.approx(0.05, rel=0.1)
+
+
+def test_parts_are_unlike_if_the_order_that_fits_best_says_so():
+    """A resonance turns its sign, and order 1, which does not follow it, errs on both alike."""
+    u = np.random.default_rng(0).normal(size=600)
+    slow, resonance = lfilter([0, 1], [1, -0.5], u), lfilter([0, 0, 0.6], [1, 0, 0.49], u)
+    y = slow + np.where(np.arange(600) < 300, 1.0, -0.6) * resonance
+    record = Record(u, y + 0.05 * np.random.default_rng(1).normal(size=600), 10.0)
+    train, validation = part(record, 300, 20), part(record, 600, 300)
+    note, *_ = scan_orders(train, [1, 3], validation=validation).notes
+    assert note.startswith("the linear error on validation is")
 
 
 def test_cross_validation_leaves_out_orders_that_fit_no_better():
