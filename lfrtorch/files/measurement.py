@@ -359,10 +359,11 @@ def _beside(
         columns: what is measured.
         named: look only at columns that are named as time is.
     """
+    known = set(columns)
     left = [
         column
         for column, channel in enumerate(table.columns)
-        if column not in columns
+        if column not in known
         and not (table.lengths and table.lengths[column] != table.lengths[columns[0]])
         and (is_time(channel) or not named)
     ]
