@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -209,9 +210,10 @@ class Model:
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters P; zeros of the model's structure are none."""
-        zeros = sum(int(each.sum()) for each in zeros_of(self.lfr.cell).values())
-        return sum(p.numel() for p in self.lfr.parameters()) - zeros
+        """Number of parameters P; zeros of the structure, and feedthrough held at 0, are none."""
+        zeros = zeros_of(self.lfr.cell)
+        free = [(name, p) for name, p in self.lfr.cell.named_parameters() if not _zero(p)]
+        return sum(p.numel() - int(zeros[n].sum() if n in zeros else 0) for n, p in free)
 
     @property
     def net_parameter_count(self) -> int:
@@ -220,20 +222,27 @@ class Model:
         nx² for the coordinates of x, nz² and nw² for those of z and w (a network and a polynomial
         absorb them), max(0, nw - ny) for a constant w that hides in the origin of the state, and
         nz nw for the linear terms of a polynomial, which A, Bu, Cy and Dyu hold as well. States in
-        two halves have coordinates of their own, and branches scales alone.
+        two halves have coordinates of their own, and branches scales alone. Where only n < nz
+        signals enter z (the inputs, or the states without feedthrough), the map is one of n.
         """
         cell = self.lfr.cell
         halves = 2 if cell.structure in IN_SERIES else 1
-        predicting = cell.past_outputs * (cell.nz + cell.ny)  # zeros of a predictor
+        z_free, y_free = not _zero(cell.Dzu), not _zero(cell.Dyu)
+        predicting = cell.past_outputs * (cell.nz * z_free + cell.ny * y_free)  # its zeros
         gauge = cell.nx**2 // halves + predicting
         if cell.structure == "parallel":
             return self.parameter_count - gauge - cell.nz - cell.nw
         static = base_of(cell.static)
-        if isinstance(static, Network | Polynomial):
-            gauge += cell.nz**2 + cell.nw**2 + max(0, cell.nw - cell.ny)
+        if not isinstance(static, Network | Polynomial):
+            return self.parameter_count - gauge
+        fed = cell.nx // halves * (cell.structure != "hammerstein")
+        fed += (cell.nu - cell.past_outputs) * z_free
+        nz = min(cell.nz, fed)
+        gauge += (cell.nz - nz) * fed + nz**2 + cell.nw**2 + max(0, cell.nw - cell.ny)
         if isinstance(static, Polynomial):
-            gauge += cell.nz * cell.nw
-        return self.parameter_count - gauge
+            terms = [math.comb(n + static.degree, n) for n in (nz, cell.nz)]
+            return self.parameter_count - gauge - cell.nw * (terms[1] - terms[0] + nz)
+        return self.parameter_count - gauge - len(static.bz) * (cell.nz - nz)
 
     @typed()
     def simulate(
@@ -496,9 +505,9 @@ class Model:
             "inputs": [c._asdict() for c in self.inputs],
             "outputs": [c._asdict() for c in self.outputs],
         }
-        if not (cell.Dzu.requires_grad or cell.Dzu.any()):
+        if _zero(cell.Dzu):
             description["z_feedthrough"] = False
-        if not (cell.Dyu.requires_grad or cell.Dyu.any()):
+        if _zero(cell.Dyu):
             description["feedthrough"] = False
         if cell.structure != "free":
             description["structure"] = cell.structure
@@ -677,6 +686,11 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         raise InputError(
             f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."
         ) from None
+
+
+def _zero(weight: Tensor) -> bool:
+    """Whether a fit holds the weight at 0."""
+    return not (weight.requires_grad or weight.any())
 
 
 def check_channels(model: Model, record: Record) -> None:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch._support.tables import UNKNOWN
+from lfrtorch.engine.block_form import zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.newton import newton_states
 from lfrtorch.engine.nonlinearity import Network, Polynomial
@@ -114,6 +116,40 @@ def test_net_parameters_of_a_polynomial_are_the_rank_as_well(nu, ny, nx, nz, nw,
     J = output_jacobian(linearisation).flatten(0, 2)
     s = torch.linalg.svdvals(J / J.norm(dim=0))
     # Directions that are seen have 6e-7 or more, those of the gauge rounding errors of 5e-16.
+    assert model.net_parameter_count == int((s > 1e-11 * s[0]).sum())
+
+
+@pytest.mark.parametrize(
+    ("static", "structure", "sizes", "z", "y", "frozen"),
+    [
+        (Network(1, 2, 4), "free", (1, 2), False, True, 2),
+        (Polynomial(1, 2, 3), "free", (1, 2), True, False, 2 + 2),
+        (Polynomial(3, 1, 3), "free", (3, 1), False, True, 6),  # 3 combinations of 2 states
+        (Network(2, 1, 4), "hammerstein", (2, 1), True, True, 0),  # 2 of 1 input
+    ],
+)
+def test_zeros_that_stay_zeros_are_no_parameters(static, structure, sizes, z, y, frozen):
+    nu = 1 if structure == "hammerstein" else 2
+    cell = random_cell(nu, 1, 2, *sizes, static=deepcopy(static).double())
+    cell.structure = structure
+    with torch.no_grad():
+        for name, zeros in zeros_of(cell).items():
+            cell.get_parameter(name)[zeros] = 0.0
+        if isinstance(static, Polynomial):
+            cell.get_parameter("static.C").mul_(0.1)
+        else:  # neurons that are not alike
+            cell.get_parameter("static.Wz").mul_(2.0)
+    every = random_model(cell).parameter_count
+    cell.free_feedthrough(z=z, y=y)
+    with torch.no_grad():
+        for weight in (cell.Dzu, cell.Dyu, cell.Dyw):
+            weight.mul_(weight.requires_grad)
+    model = random_model(cell, fs=1.0)
+    assert model.parameter_count == every - frozen
+    u = model.scaler.u_offset + model.scaler.u_scale * normal(300, nu).numpy()
+    record = Record(u, normal(300, 1).numpy(), start="periodic")
+    problem = SimulationProblem.of(model, record)
+    s = torch.linalg.svdvals(problem.jacobian(problem.theta))
     assert model.net_parameter_count == int((s > 1e-11 * s[0]).sum())
 
 
