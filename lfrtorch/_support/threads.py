@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
 from typing import TypeVar
@@ -33,16 +34,35 @@ def spread_by_hand() -> Iterator[None]:
     Jacobian that takes 3 ms to set up took 73, and an iteration of 27 ms up to 630. The same holds
     for the linear algebra of numpy and scipy: a decomposition of 15 ms took 80.
     """
-    count, outermost = workers(), _workers.get() is None
+    count = workers()
     token = _workers.set(count)
     torch.set_num_threads(1)
     try:
-        with _blas().limit(limits=1, user_api="blas") if outermost else nullcontext():
+        with _one_blas_thread():
             yield
     finally:
         _workers.reset(token)
         if _workers.get() is None:
             torch.set_num_threads(count)
+
+
+_limiting = threading.Lock()
+
+
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """BLAS, which all threads of the program share, on one thread; inside of another, nothing.
+
+    Of two that overlap the second would find the limit of the first, and leave it for good.
+    """
+    if not _limiting.acquire(blocking=False):
+        yield
+        return
+    try:
+        with _blas().limit(limits=1, user_api="blas"):
+            yield
+    finally:
+        _limiting.release()
 
 
 def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:

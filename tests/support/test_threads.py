@@ -5,6 +5,7 @@ import signal
 import time
 import warnings
 from contextlib import nullcontext
+from threading import Event, Thread
 
 import numpy as np
 import pytest
@@ -12,6 +13,10 @@ import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from lfrtorch._support.threads import spread, spread_by_hand, workers
+
+
+def blas_threads() -> set[int]:
+    return {lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"}
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
@@ -60,6 +65,36 @@ def test_torch_works_on_one_thread_inside_and_on_as_many_as_before_outside(by_ha
         torch.set_num_threads(before)
 
 
+def test_two_threads_of_a_program_leave_the_linear_algebra_as_it_was():
+    """The second begins before the first ends, and ends after it."""
+    begun, entered, left = Event(), Event(), Event()
+
+    def first():
+        with spread_by_hand():
+            begun.set()
+            entered.wait(10)
+
+    def second():
+        begun.wait(10)
+        with spread_by_hand():
+            entered.set()
+            left.wait(10)
+
+    limits = threadpool_limits(2, user_api="blas")
+    try:
+        with threadpool_limits(2, user_api="blas"):
+            pass  # from here on any thread may set limits
+        threads = [Thread(target=first), Thread(target=second)]
+        for thread in threads:
+            thread.start()
+        threads[0].join()
+        left.set()
+        threads[1].join()
+        assert blas_threads() == {2}
+    finally:
+        limits.restore_original_limits()
+
+
 def test_threads_are_given_back_after_an_error():
     before = torch.get_num_threads()
     with pytest.raises(ZeroDivisionError), spread_by_hand():
@@ -91,15 +126,12 @@ def test_forked_process_does_not_wait_for_threads_of_its_parent(monkeypatch: pyt
 def test_linear_algebra_of_numpy_works_on_one_thread_inside():
     np.linalg.qr(np.eye(3))  # its library is loaded
 
-    def threads() -> set[int]:
-        return {lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"}
-
     with threadpool_limits(limits=2, user_api="blas"):
-        before = threads()
+        before = blas_threads()
         assert before == {2}
         with spread_by_hand():
-            assert threads() == {1}
+            assert blas_threads() == {1}
             with spread_by_hand():
-                assert threads() == {1}
-            assert threads() == {1}
-        assert threads() == before
+                assert blas_threads() == {1}
+            assert blas_threads() == {1}
+        assert blas_threads() == before
