@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from reference import random_cell, random_model
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -36,11 +37,14 @@ class Allocations(TorchDispatchMode):
         return made
 
 
-def peak_of_an_iteration(T: int, start: Start, nn: int = 15) -> tuple[int, int]:
+def peak_of_an_iteration(
+    T: int, start: Start, nn: int = 15, lines: NDArray | None = None
+) -> tuple[int, int]:
     """Bytes, and parameters of the model: Bouc-Wen's sizes."""
     model = random_model(random_cell(1, 1, 3, 2, 1, nn))
     noise = np.random.default_rng(0).normal(size=(2, T, 1))
-    problem = SimulationProblem.of(model, Record(noise[0], noise[1], model.fs, start))
+    record = Record(noise[0], noise[1], model.fs, start, line_weight=lines)
+    problem = SimulationProblem.of(model, record)
     optimiser = LevenbergMarquardt()
     state = optimiser.init(problem, problem.theta)
     with Allocations() as allocations:
@@ -76,6 +80,14 @@ def test_memory_of_a_long_record_does_not_depend_on_the_number_of_neurons(blocks
     assert max(jacobian.CACHED_BYTES, SIGNALS + blocks) < ROWS  # which are too many to be kept
     assert many - few < blocks
     assert few < SIGNALS + blocks
+
+
+def test_rows_by_spectral_line_are_held_once(blocks: int):
+    samples = 8192
+    plain, _ = peak_of_an_iteration(samples, "periodic")
+    peak, _ = peak_of_an_iteration(samples, "periodic", lines=np.ones(samples // 2 + 1))
+    copies = 4 * 8 * samples * jacobian.SPECTRA  # the columns, their spectra, and real again
+    assert peak < plain + copies
 
 
 @pytest.mark.slow

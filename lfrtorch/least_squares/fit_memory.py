@@ -10,19 +10,21 @@ SQUARES, TALL = 4, 3
 and of P x gauge directions."""
 
 
-def check_fit_memory(cell: LFRCell, states: int = 0) -> None:
+def check_fit_memory(cell: LFRCell, states: int = 0, rows: int = 0) -> None:
     """Refuse a model whose fit takes more memory than its device has with a ValueError.
 
     Args:
         cell: the model; its weights may be on torch's ``meta`` device, where they have none.
         states: estimated start states, all entries together.
+        rows: errors of records with ``line_weight``, whose rows are all held.
     """
     P = sum(p.numel() for p in cell.parameters() if p.requires_grad) + states
     squares = [n**2 for n in (cell.nx, cell.nz, cell.nw)]  # coordinates of x, z and w
-    numbers = SQUARES * P**2 + TALL * P * sum(squares) + max(squares) ** 2
+    numbers = SQUARES * P**2 + TALL * P * sum(squares) + max(squares) ** 2 + rows * P
     check_memory(
         numbers * cell.A.element_size(),
-        f"a fit of {P} parameters with nx={cell.nx}, nz={cell.nz} and nw={cell.nw}",
-        "give smaller sizes",
+        f"a fit of {P} parameters with nx={cell.nx}, nz={cell.nz} and nw={cell.nw}"
+        + f" to {rows} samples with line_weight" * (rows > 0),
+        "give smaller sizes" + " or fewer periods" * (rows > 0),
         cell.A.device,
     )

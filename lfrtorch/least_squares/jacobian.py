@@ -41,6 +41,9 @@ from lfrtorch.least_squares.start_states import EliminatedSystem, Eliminator, St
 NORMAL = 1e4
 """Relative damping, in rounding errors, above which the normal equations are as good as QR."""
 
+SPECTRA = 16
+"""Columns that are turned into spectra at once, which need copies."""
+
 CACHED_BYTES = 1 << 27
 """Rows are cached up to this size, all groups together."""
 
@@ -166,7 +169,7 @@ class Jacobian:
         reduced = gradient.new_zeros(len(self._reduced.kept))
         first = 0
         for part in self.parts:
-            shape = part.group.residual_shape
+            shape = part.group.y.shape
             own = residual[first : first + shape.numel()].reshape(shape)
             first += own.numel()
             part.adjoint(own, gradient, reduced)
@@ -213,7 +216,7 @@ class _Cached(NamedTuple):
     nx; otherwise C = n.
     """
 
-    rows: Float[Tensor, "R m*ny C"]
+    rows: Float[Tensor, "R T*ny C"]
     places: Int[Tensor, "R n"]
     initial: Float[Tensor, "R nx n"] | None
 
@@ -268,7 +271,7 @@ class Part:
         errors = linearisation.trajectory.y - group.y
         shape = (*errors.shape, len(own) + nx * self.has_initial_state + 1)
         size = math.prod(shape) * errors.element_size()
-        cache = size <= room and not group.spectral
+        cache = size <= room
         among_kept = torch.arange(len(own), device=own.device)
         direct = None
         computed = size <= room or self.computed is not None
@@ -291,8 +294,11 @@ class Part:
         for block in blocks:
             rows, records = block.rows, block.records
             rows[..., -1] = errors[records, block.time]
-            weighted = group.weigh(rows, records, block.time)
-            if cache and not group.plain:
+            if group.spectral:
+                for columns in rows.split(SPECTRA, -1):
+                    columns.copy_(group.weigh(columns, records))
+            weighted = rows if group.spectral else group.weigh(rows, records, block.time)
+            if cache and not group.plain and not group.spectral:
                 rows.copy_(weighted)
             if eliminator is not None:
                 eliminator.fold(weighted.flatten(1, 2), block.time)
@@ -362,7 +368,7 @@ class Part:
 
     def tangent(
         self, d_theta: Float[Tensor, " P"], reduced: Float[Tensor, " K"]
-    ) -> Float[Tensor, "R m ny"]:
+    ) -> Float[Tensor, "R T ny"]:
         """Weighted changes of the outputs: J dθ, given as well in the kept columns."""
         if self._cached is not None:
             rows, places, initial = self._cached
@@ -374,7 +380,7 @@ class Part:
                 by_column = torch.cat([by_column, d_theta[self.x0]], dim=1)
             d_y = rows.new_empty(rows.shape[:2])
             spread(_product, len(rows), rows, by_column, d_y)
-            return d_y.reshape(self.group.residual_shape)
+            return d_y.reshape(self.group.y.shape)
         linearisation = self.linearisation
         d_x0 = None if self.x0 is None else d_theta[self.x0]
         if self._tied is not None:
@@ -387,7 +393,7 @@ class Part:
 
     def adjoint(
         self,
-        residual: Float[Tensor, "R m ny"],
+        residual: Float[Tensor, "R T ny"],
         gradient: Float[Tensor, " P"],
         reduced: Float[Tensor, " K"],
     ) -> None:
@@ -409,7 +415,7 @@ class Part:
         if self.x0 is not None:
             gradient[self.x0] += adjoint.x0
 
-    def whole(self, parameters: int) -> Float[Tensor, "R m ny P"]:
+    def whole(self, parameters: int) -> Float[Tensor, "R T ny P"]:
         """All weighted rows, with as many columns as θ has parameters."""
         rows, P = output_jacobian(self.linearisation), self.linearisation.parameters
         J = rows.new_zeros(*rows.shape[:3], parameters)

@@ -64,7 +64,7 @@ class PredictionProblem(SimulationProblem):
     @property
     def _simulations(self) -> int:
         """Number of errors of the simulation."""
-        return sum(math.prod(group.residual_shape) for group in self._simulated.groups)
+        return sum(group.y.numel() for group in self._simulated.groups)
 
     def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """r at θ: of the predictions, and w times those of the simulations."""

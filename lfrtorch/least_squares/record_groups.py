@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
@@ -70,18 +71,19 @@ class RecordGroup:
         errors: Float[Tensor, "R T ny *columns"],
         records: slice = EVERY,
         time: slice = EVERY,
-    ) -> Float[Tensor, "R m ny *columns"]:
+    ) -> Float[Tensor, "R T ny *columns"]:
         """Weighted errors, or weighted rows of their Jacobian.
 
-        A spectrum needs all samples. Its real and imaginary parts follow each other in m.
+        A spectrum needs all samples. Its T real numbers are the real parts of all lines, and the
+        imaginary parts of those between 0 and fs / 2.
         """
         weight = self.weight[records]
         if not self.spectral:
             weight = weight[:, time]
             return errors if self.plain else _columns(weight, errors) * errors
         spectrum = torch.fft.rfft(errors, dim=1)
-        spectrum = _columns(weight, spectrum) * spectrum
-        return torch.cat([spectrum.real, spectrum.imag], dim=1)
+        spectrum *= _columns(weight, spectrum)
+        return torch.cat([spectrum.real, spectrum.imag[:, 1 : (errors.shape[1] + 1) // 2]], dim=1)
 
     @cached_property
     def plain(self) -> bool:
@@ -90,16 +92,16 @@ class RecordGroup:
 
     @property
     def residual_shape(self) -> torch.Size:
-        """(R, m, ny)."""
-        R, m, ny = self.weight.shape
-        return torch.Size((R, 2 * m if self.spectral else m, ny))
+        """(R, T, ny)."""
+        return self.y.shape
 
-    def unweigh(self, r: Float[Tensor, "R m ny"]) -> Float[Tensor, "R T ny"]:
+    def unweigh(self, r: Float[Tensor, "R T ny"]) -> Float[Tensor, "R T ny"]:
         """The adjoint of ``weigh``."""
         if not self.spectral:
             return self.weight * r
-        T = self.u.shape[1]
-        spectrum = self.weight * torch.complex(*r.chunk(2, dim=1))
+        T, m = self.u.shape[1], self.weight.shape[1]
+        imag = pad(r[:, m:], (0, 0, 1, 2 * m - 1 - T))
+        spectrum = self.weight * torch.complex(r[:, :m], imag)
         # irfft counts the lines between 0 and fs / 2 twice.
         spectrum[:, 1 : (T + 1) // 2] /= 2
         return T * torch.fft.irfft(spectrum, T, dim=1)

@@ -208,7 +208,8 @@ class SimulationProblem(LeastSquares):
         states = self._initial_states.numel()
         parts, P = [], len(theta) - states
         eliminate = eliminate and states > P and self.ranks.world == 1
-        check_fit_memory(self.lfr.cell, 0 if eliminate else states)
+        spectral = sum(group.y.numel() for group in self.groups if group.spectral)
+        check_fit_memory(self.lfr.cell, 0 if eliminate else states, spectral)
         trajectories = self.trajectories(theta)
         self.write(theta)  # the module may hold a trial that came after the trajectories
         self.guesses = [t.x for t in trajectories]

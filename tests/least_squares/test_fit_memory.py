@@ -25,6 +25,12 @@ def test_start_states_count_as_parameters():
         check_fit_memory(planned(2, 20), states=100_000_000)
 
 
+def test_rows_of_spectra_are_held():
+    check_fit_memory(planned(2, 20), rows=100_000)
+    with pytest.raises(ValueError, match=r"to 100000000000 samples with line_weight takes .*TB"):
+        check_fit_memory(planned(2, 20), rows=100_000_000_000)
+
+
 def test_a_polynomial_of_too_many_terms():
     with pytest.raises(ValueError, match="a polynomial with nz=60, nw=1 and degree=30 takes"):
         Polynomial(60, 1, 30)

@@ -233,10 +233,9 @@ def test_adjoint_of_the_weights_is_that_of_their_product(model: Model, T: int, b
     weights = {"line_weight": rng.uniform(0.5, 2.0, (F, 2))} if by_line else {"weight": [0.5, 3.0]}
     problem = SimulationProblem.of(model, [replace(record, **weights)] * 2)
     (group,) = problem.groups
-    e, r = normal(2, T, 2), normal(*group.residual_shape, seed=1)
-    assert group.residual_shape == (2, 2 * F if by_line else T, 2)
+    e, r = normal(2, T, 2), normal(2, T, 2, seed=1)
     weighed, unweighed = group.weigh(e), group.unweigh(r)
-    assert unweighed.shape == e.shape
+    assert weighed.shape == unweighed.shape == e.shape
     # Sums of some hundred products of size 1.
     assert_close((weighed * r).sum(), (e * unweighed).sum(), rtol=0, atol=1e-11)
 
