@@ -140,11 +140,12 @@ def test_estimated_initial_state_of_a_diverging_model_is_not_finite():
 
 def test_no_initial_state_is_taken_from_which_the_model_runs_away_and_not_from_rest():
     """x+ = 1.2 x - 0.5 tanh x + u is unstable beyond |x| = 2.47, where noise puts the state."""
-    cell = LFRCell(1, 1, 1, 1, 1, Network(1, 1, 1, dtype=torch.float64), dtype=torch.float64)
+    network = Network(1, 1, 1, dtype=torch.float64)
+    cell = LFRCell(1, 1, 1, 1, 1, network, dtype=torch.float64)
     with torch.no_grad():
         for name, value in {"A": 1.2, "Bu": 1.0, "Bw": -0.5, "Cz": 1.0, "Cy": 1.0}.items():
             getattr(cell, name).fill_(value)
-        for parameter, value in zip(cell.static.parameters(), (1.0, 0.0, 1.0, 0.0), strict=True):
+        for parameter, value in zip(network.parameters(), (1.0, 0.0, 1.0, 0.0), strict=True):
             parameter.fill_(value)
         cell.state_covariance.fill_(4.0)
     u, y = torch.zeros(2, 200, 1, dtype=torch.float64), torch.zeros(2, 200, 1, dtype=torch.float64)
