@@ -63,7 +63,7 @@ class Score:
         rmse_by_output, lti_rmse_by_output: errors of each output.
         records: how many the score is of.
         start_error: what the uncertainty of an estimated start state adds to ``rmse``, see
-            :func:`lfrtorch.analysis.start_uncertainty.start_error`.
+            ``lfrtorch.analysis.start_uncertainty.start_error``.
     """
 
     rmse: float
