@@ -6,7 +6,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from functools import cache
 from typing import TypeVar
@@ -46,23 +46,24 @@ def spread_by_hand() -> Iterator[None]:
             torch.set_num_threads(count)
 
 
-_limiting = threading.Lock()
+_changing, _limited, _inside = threading.Lock(), ExitStack(), set[object]()
 
 
 @contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    """BLAS, which all threads of the program share, on one thread; inside of another, nothing.
-
-    Of two that overlap the second would find the limit of the first, and leave it for good.
-    """
-    if not _limiting.acquire(blocking=False):
-        yield
-        return
+    """BLAS, which all threads of the program share, on one thread until the last one has left."""
+    own = object()
+    with _changing:
+        if not _inside:
+            _limited.enter_context(_blas().limit(limits=1, user_api="blas"))
+        _inside.add(own)
     try:
-        with _blas().limit(limits=1, user_api="blas"):
-            yield
+        yield
     finally:
-        _limiting.release()
+        with _changing:
+            _inside.remove(own)
+            if not _inside:
+                _limited.close()
 
 
 def spread(kernel: Callable[..., None], jobs: int, *arguments: object) -> None:

@@ -88,6 +88,7 @@ def test_two_threads_of_a_program_leave_the_linear_algebra_as_it_was():
         for thread in threads:
             thread.start()
         threads[0].join()
+        assert blas_threads() == {1}  # the second is at work
         left.set()
         threads[1].join()
         assert blas_threads() == {2}
