@@ -90,11 +90,6 @@ class RecordGroup:
         """Whether every sample counts alike."""
         return not self.spectral and bool((self.weight == 1).all())
 
-    @property
-    def residual_shape(self) -> torch.Size:
-        """(R, T, ny)."""
-        return self.y.shape
-
     def unweigh(self, r: Float[Tensor, "R T ny"]) -> Float[Tensor, "R T ny"]:
         """The adjoint of ``weigh``."""
         if not self.spectral:

@@ -193,7 +193,7 @@ class SignalFit:
         rows, errors = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
         found, first = np.zeros_like(inverse), 0
         for group in problem.groups:
-            shape = group.residual_shape
+            shape = group.y.shape
             last = first + shape.numel()
             if group.spectral:  # lines already
                 scores = (rows[first:last] * errors[first:last, None]).reshape(*shape, -1).sum(2)
