@@ -29,8 +29,6 @@ RIDGE = 1e-3
 """Ridge of conf/bench/boucwen.yaml."""
 CUTS = (0, 1024, 2048, 3072, 5120, 8192)
 """Where the Bouc-Wen record is cut: three records of one length and two of others."""
-TRAINER = "trainer" if hasattr(lfrtorch, "infer") else "optimiser"
-"""What ``fit`` calls the search; it was renamed together with ``inference``."""
 ONE_TRIAL: dict = {name: 1.0 for name in ("least_damping",) if hasattr(LevenbergMarquardt, name)}
 """Older searches do not lower the damping within the first iteration; nor does ours then."""
 
@@ -74,7 +72,7 @@ def iterations(folder: Path, name: str, count: int, *, cut: bool = False) -> Tim
         whole = data[0]
         data = [replace(whole[first:last], start="estimated") for first, last in pairwise(CUTS)]
     model = lfrtorch.load(folder / name)
-    trainer: dict = {TRAINER: LevenbergMarquardt(max_iter=count, tolerance=0.0, **ONE_TRIAL)}
+    trainer: dict = {"trainer": LevenbergMarquardt(max_iter=count, tolerance=0.0, **ONE_TRIAL)}
     begin = time.process_time()
     result = lfrtorch.fit(model, data, ridge=RIDGE, **trainer)
     return (time.process_time() - begin) / count, result.history[-1].score

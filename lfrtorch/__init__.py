@@ -1,7 +1,7 @@
 """Identification of nonlinear LFR state-space models from input-output data.
 
 dataset, settings -> identify -> run: the whole job in one call, or step by step:
-records -> estimate_bla -> initialise or infer -> fit -> simulate, save, load
+records -> estimate_bla -> initialise -> fit -> simulate, save, load
 records -> estimate_frf, scan_orders -> estimate_bla -> simulate, save, to_scipy
 """
 
@@ -15,7 +15,7 @@ if _typing.TYPE_CHECKING:
 
 __version__ = _version("lfrtorch")
 
-_RENAMED = {"average": "mean_model", "fit_starts": "fit", "inference": "infer"}
+_RENAMED = {"average": "mean_model", "fit_starts": "fit"}
 
 
 if not _typing.TYPE_CHECKING:  # a checker would take every name for one of these

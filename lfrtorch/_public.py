@@ -23,7 +23,6 @@ from lfrtorch.model import Model, load, simulate_blocks
 
 # fits
 from lfrtorch.fitting.distillation import distil
-from lfrtorch.fitting.inference import infer
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.noise_estimate import estimate_noise
@@ -87,7 +86,6 @@ __all__ = [
     "export",
     "fit",
     "identify",
-    "infer",
     "initialise",
     "load",
     "load_records",

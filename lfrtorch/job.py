@@ -21,7 +21,6 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.first_fit import begun_on_part, part_of
-from lfrtorch.fitting.inference import infer
 from lfrtorch.fitting.last_fits import distilled, refitted
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.observer import LineObserver, Observer
@@ -433,20 +432,21 @@ def starting_model(
     train: Sequence[Record], settings: Settings, linear: LinearModel, seed: int
 ) -> Model:
     """The model that one start begins with."""
-    begin = infer
-    if settings.init != "inference":
-        begin = partial(
-            initialise,
-            method=settings.init,
-            minor=settings.minor,
-            relaxations=settings.relaxations,
-            modes=settings.modes,
-            z_feedthrough=settings.z_feedthrough,
-            feedthrough=settings.feedthrough,
-            structure=settings.structure,
-        )
-    nz, nw = cast(int, settings.nz), cast(int, settings.nw)
-    model = begin(linear, train, nz=nz, nw=nw, seed=seed, **settings.static_map())
+    model = initialise(
+        linear,
+        train,
+        nz=cast(int, settings.nz),
+        nw=cast(int, settings.nw),
+        method=settings.init,
+        seed=seed,
+        minor=settings.minor,
+        relaxations=settings.relaxations,
+        modes=settings.modes,
+        z_feedthrough=settings.z_feedthrough,
+        feedthrough=settings.feedthrough,
+        structure=settings.structure,
+        **settings.static_map(),
+    )
     model.lfr.to(device=settings.device, dtype=settings.dtype)
     return model
 

@@ -104,7 +104,7 @@ def of_functions(folder: Path) -> list[Case]:
         y[t] = np.tanh(x[0]) + 0.01 * rng.standard_normal()
         x = np.array([0.6 * x[0] + 0.3 * x[1] + value, -0.3 * x[0] + 0.8 * x[1]])
     record = Record(u, y, fs=1.0)
-    short, periodic = Record(u[:100], y[:100], fs=1.0), Record(u, y, fs=1.0, start="periodic")
+    short = Record(u[:100], y[:100], fs=1.0)
     path = folder / "short.csv"
     np.savetxt(path, np.c_[u, y], delimiter=",", header="u,y", comments="")
     bla = lfrtorch.estimate_bla(record, 2, max_iter=3)
@@ -128,7 +128,6 @@ def of_functions(folder: Path) -> list[Case]:
         (lfrtorch.estimate_noise, {"model": model, "records": record}),
         (lfrtorch.scan_orders, {"data": record, "orders": [1, 2], "max_iter": 2}),
         (lfrtorch.initialise, {"bla": bla, "records": record, "nz": 1, "nw": 1, "nn": 2}),
-        (lfrtorch.infer, {"bla": bla, "records": periodic, "nz": 1, "nw": 1, "nn": 2}),
         (lfrtorch.fit, {"models": model, **fitted}),
         (lfrtorch.refit, {"result": one, "held_out": short, **fitted}),
         (lfrtorch.distil, {"result": mean, "validation": short, **fitted}),

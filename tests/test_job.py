@@ -395,7 +395,6 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
         ({"minor": -1.0}, "minor is -1"),
         ({"modes": -1}, "modes is -1"),
         ({"relaxations": -1}, "relaxations is -1"),
-        ({"modes": 2, "init": "inference"}, "init='inference' has no use for"),
         ({"first_part": 0}, "first_part is 0"),
         ({"first_part": 1.5}, "first_part is 1.5"),
         ({"first_part": 0.5, "average": 2}, "keeps one start"),

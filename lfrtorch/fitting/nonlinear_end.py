@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from lfrtorch._support.types import Array
 from lfrtorch.engine.simulation import Trajectory
-from lfrtorch.fitting.chebyshev import REACH
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -19,6 +18,9 @@ AT_ONE_END, DEGREE = 0.85, 7
 """The nonlinearity is at the input or the output if a polynomial of this degree there explains this
 part of the linear model's squared error. Wiener and Hammerstein systems, simulated: 0.96 and more
 without noise, less by a third degree; the benchmarks (benchmarks/starts.md): 0.80 and less."""
+
+REACH = 3.0
+"""Signal that is mapped to 1, in standard deviations: the polynomials grow beyond it."""
 
 LEAST_ROWS, SAMPLES = 20, 1 << 16
 """Errors for each coefficient of that polynomial, as fewer do not tell; and most samples that

@@ -100,8 +100,7 @@ class Settings:
         static: ``"network"``, ``"polynomial"``, or what makes a map of one's own: called with the
             keywords nz and nw it returns a module from (..., nz) to (..., nw), for example the
             module's class.
-        init: where the fit starts, see :func:`lfrtorch.initialise`; ``"inference"``, for periodic
-            records, is :func:`lfrtorch.infer`.
+        init: where the fit starts, see :func:`lfrtorch.initialise`.
         minor: see :func:`lfrtorch.initialise`. Default: its own.
         relaxations, modes: that w alone drives, one and two states each beside the ``nx`` of the
             linear model, see :func:`lfrtorch.initialise`.
@@ -152,7 +151,7 @@ class Settings:
     layers: int = 1
     degree: Size = 3
     static: Literal["network", "polynomial"] | Callable[..., Module] = "network"
-    init: Literal["zero_output", "paper", "inference"] = "zero_output"
+    init: Literal["zero_output", "paper"] = "zero_output"
     minor: float | None = None
     relaxations: int = 0
     modes: int = 0
@@ -222,19 +221,6 @@ class Settings:
         integer("first_iterations", self.first_iterations, 1)
         for name in ("relaxations", "modes"):
             integer(name, getattr(self, name), 0)
-        unused_ones = (
-            ("relaxations", 0),
-            ("modes", 0),
-            ("z_feedthrough", True),
-            ("feedthrough", True),
-            ("structure", "free"),
-        )
-        for name, unused in unused_ones:
-            if self.init == "inference" and getattr(self, name) != unused:
-                raise InputError(
-                    f"{name} is {getattr(self, name)}, which init='inference' has no use for; give "
-                    f"{name}={unused}, or init='zero_output'."
-                )
         if self.structure != "free" and (self.noise != "output" or self.searched):
             raise InputError(
                 f"structure is {self.structure!r}, which is for noise='output' and given sizes; "

@@ -86,16 +86,11 @@ def test_every_bench_composes(bench: str):
 
 
 ADAM = "init=paper trainer=adam trainer.max_iter=2"
-INFERENCE = "init=inference trainer.max_iter=2"
 
 
 @pytest.mark.parametrize(
     ("bench", "choice"),
-    [
-        *((bench, "trainer.max_iter=2") for bench in BENCHES),
-        ("boucwen", ADAM),
-        ("boucwen", INFERENCE),
-    ],
+    [*((bench, "trainer.max_iter=2") for bench in BENCHES), ("boucwen", ADAM)],
 )
 @pytest.mark.numeric
 @pytest.mark.usefixtures("short", "coarse")
