@@ -1,8 +1,7 @@
-"""Which way finds the sizes of planted systems: a race of models, or group lasso?
+"""Does the search find the sizes of planted systems?
 
     python benchmarks/planted_sizes.py --first 12 --systems 8
 
-The penalties of group lasso were settled on systems 0 to 11: those from 12 on are the comparison.
 Each system has nx = 3, nz = nw = 1 and four neurons; 1024 samples in steady state train and
 validate, with noise of 1 % of the output. Sizes tried: nx 3, 4, 5, nz and nw 1, 2, 3, with eight
 neurons. Iterations are those of all models.
@@ -30,10 +29,8 @@ from reference import (  # pyright: ignore[reportMissingImports]
     random_model,
 )
 
-WAYS = {"race": lfrtorch.search_sizes, "group_lasso": lfrtorch.shrink_sizes}
 
-
-def searched(way: str, seed: int) -> tuple[lfrtorch.SizeSearch, float]:
+def searched(seed: int) -> tuple[lfrtorch.SizeSearch, float]:
     """The search of one system, and its seconds of the processor."""
     system = random_model(random_cell(1, 1, 3, 1, 1, 4, radius=0.8, feedback=1.0, seed=seed))
 
@@ -50,7 +47,7 @@ def searched(way: str, seed: int) -> tuple[lfrtorch.SizeSearch, float]:
         return lfrtorch.initialise(linear(sizes["nx"]), train, **own, seed=seed)
 
     clock = time.process_time()
-    found = WAYS[way](
+    found = lfrtorch.search_sizes(
         start, train, validation, nx=(3, 4, 5), nn=8, linear=linear(3), monitor=lambda *_: None
     )
     return found, time.process_time() - clock
@@ -63,22 +60,20 @@ def main() -> None:
     )
     parser.add_argument("--first", type=int, default=12, help="number of the first system")
     parser.add_argument("--systems", type=int, default=8, help="how many")
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
     args = parser.parse_args()
-    for way in args.ways:
-        exact = 0
-        for seed in range(args.first, args.first + args.systems):
-            search, seconds = searched(way, seed)
-            sizes = search.chosen.sizes
-            exact += sizes == {"nx": 3, "nz": 1, "nw": 1, "nn": 8}
-            iterations = sum(each.iterations for each in search.candidates)
-            text = ", ".join(f"{name} {size}" for name, size in sizes.items())
-            print(
-                f"{way} {seed}: {text}, validation {search.chosen.error:.5f}, {iterations} "
-                f"iterations, {seconds:.0f} s",
-                flush=True,
-            )
-        print(f"{way}: {exact} of {args.systems}")
+    exact = 0
+    for seed in range(args.first, args.first + args.systems):
+        search, seconds = searched(seed)
+        sizes = search.chosen.sizes
+        exact += sizes == {"nx": 3, "nz": 1, "nw": 1, "nn": 8}
+        iterations = sum(each.iterations for each in search.candidates)
+        text = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        print(
+            f"{seed}: {text}, validation {search.chosen.error:.5f}, {iterations} "
+            f"iterations, {seconds:.0f} s",
+            flush=True,
+        )
+    print(f"{exact} of {args.systems}")
 
 
 if __name__ == "__main__":

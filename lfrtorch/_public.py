@@ -27,7 +27,6 @@ from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.noise_estimate import estimate_noise
 from lfrtorch.fitting.refit import refit
-from lfrtorch.fitting.shrunk_sizes import shrink_sizes
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
@@ -97,6 +96,5 @@ __all__ = [
     "rmse",
     "scan_orders",
     "search_sizes",
-    "shrink_sizes",
     "simulate_blocks",
 ]

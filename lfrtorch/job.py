@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from copy import deepcopy
 from dataclasses import replace
@@ -25,7 +25,6 @@ from lfrtorch.fitting.last_fits import distilled, refitted
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.shrunk_sizes import shrink_sizes
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
@@ -141,12 +140,6 @@ def _identified(
             linear = estimate_bla(approximated, cast(int, settings.nx), **settings.linear)
             tell(linear, observer)
     models = starting_models(dataset.train, settings, linear)
-    shrunk = None if sizes is None else sizes.chosen.model
-    if snapshots is not None:
-        shrunk = snapshots.begun(shrunk)
-    if shrunk is not None:
-        models[0] = deepcopy(shrunk)
-        models[0].lfr.to(device=settings.device, dtype=settings.dtype)
     if settings.init_from is not None and settings.starts > 1:
         observer.say("note: starts is 1: the fit starts from the model of init_from alone")
     if settings.first_part < 1.0:
@@ -373,28 +366,22 @@ def choose_sizes(
     }
     if settings.nx == "auto":
         tried["nx"] = list(linears)
-    search_by: Callable[..., SizeSearch] = search_sizes
-    own: dict[str, Any] = {"finalists": grid.finalists, "folds": grid.folds}
-    own |= {"noise": settings.noise, "horizon": settings.window, "ranks": ranks}
-    if grid.method == "group_lasso":
-        if ranks.world > 1:
-            raise InputError(
-                f"sizes_search.method is 'group_lasso', which is for one process, not "
-                f"{ranks.world}; give 'race', or numbers for the sizes."
-            )
-        search_by, own = shrink_sizes, {}
-    search = search_by(
+    search = search_sizes(
         start,
         part_of(dataset.train, settings.first_part),
         dataset.validation,
         **tried,
-        **own,
         linear=linear,
         seeds=settings.first_seeds(grid.starts),
+        finalists=grid.finalists,
+        folds=grid.folds,
         trainer=replace(trainer, max_iter=math.ceil(grid.iterations * trainer.limit)),
         ridge=settings.ridge,
+        noise=settings.noise,
+        horizon=settings.window,
         monitor=observer.searching(),
         watch=lambda ended: observer.say(str(ended)),
+        ranks=ranks,
         stop=stop,
     )
     observer.say(search.table())

@@ -133,7 +133,6 @@ def of_functions(folder: Path) -> list[Case]:
         (lfrtorch.distil, {"result": mean, "validation": short, **fitted}),
         (lfrtorch.mean_model, {"models": several}),
         (lfrtorch.search_sizes, {"start": start, "train": record, "validation": short, **sizes}),
-        (lfrtorch.shrink_sizes, {"start": start, "train": record, "validation": short, **sizes}),
         (lfrtorch.rmse, {"record": record, "y_hat": flat}),
         (lfrtorch.nrmse, {"record": record, "y_hat": flat}),
         (lfrtorch.Settings, {"nx": 2}),

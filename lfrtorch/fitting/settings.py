@@ -38,8 +38,6 @@ class SizesSearch:
     """What is tried for the sizes that are ``"auto"``, see :func:`lfrtorch.search_sizes`.
 
     Args:
-        method: ``"race"`` of models of random sizes, or ``"group_lasso"``, by which a model of the
-            largest sizes shrinks, see :func:`lfrtorch.shrink_sizes`.
         nx: the numbers of states to try above the linear model's order, up to ``nx_max``, if nx and
             another size are ``"auto"``.
         nz, nw, nn, degree: the numbers to try.
@@ -47,15 +45,13 @@ class SizesSearch:
         finalists: models that get all iterations of the search; 8 times as many begin it.
         iterations: part of the iterations of the fit that they get.
         folds: if not 0, the finalists are compared by cross-validation over so many stretches of
-            the training and validation records: for short records. Neither finalists nor folds are
-            of use with ``"group_lasso"``.
+            the training and validation records: for short records.
 
     Example:
         >>> lfrtorch.SizesSearch(nn=(5, 10), starts=2).nn
         (5, 10)
     """
 
-    method: Literal["race", "group_lasso"] = "race"
     nx: Sequence[int] = (2, 3, 4, 6, 8, 10, 12)
     nz: Sequence[int] = (1, 2, 3)
     nw: Sequence[int] = (1, 2, 3)
@@ -67,15 +63,6 @@ class SizesSearch:
     folds: int = 0
 
     def __post_init__(self) -> None:
-        if self.method not in ("race", "group_lasso"):
-            raise InputError(
-                f"sizes_search.method is {self.method!r}; use 'race' or 'group_lasso'."
-            )
-        if self.method == "group_lasso" and self.folds:
-            raise InputError(
-                f"sizes_search.folds is {self.folds}, which group_lasso has no use for; give 0, or "
-                "sizes_search.method='race'."
-            )
         integer("sizes_search.starts", self.starts, 1)
         integer("sizes_search.finalists", self.finalists, 1)
         integer("sizes_search.folds", self.folds, 0)
@@ -225,17 +212,6 @@ class Settings:
             raise InputError(
                 f"structure is {self.structure!r}, which is for noise='output' and given sizes; "
                 "give numbers for the sizes that are 'auto', or structure='free'."
-            )
-        shrinks = self.searched and self.sizes_search.method == "group_lasso"
-        if shrinks and (self.static != "network" or self.noise != "output"):
-            raise InputError(
-                "sizes_search.method is 'group_lasso', which is for static='network' and "
-                f"noise='output', not {self.static!r} and {self.noise!r}; use 'race'."
-            )
-        if shrinks and self.window is not None:
-            raise InputError(
-                "sizes_search.method is 'group_lasso', which is for whole records, and horizon is "
-                f"{self.horizon}; use 'race', or horizon=None."
             )
         if self.structure != "free" and self.average > 1:
             raise InputError(

@@ -46,7 +46,7 @@ from lfrtorch.fitting.multistart import iterations_of
 from lfrtorch.fitting.prediction import SIMULATION, Noise, predicting
 from lfrtorch.fitting.refit import all_records
 from lfrtorch.fitting.side_by_side import Together, any_of
-from lfrtorch.fitting.trainer import Fit, FitResult, Monitor, Stop, StoppedError, Trainer
+from lfrtorch.fitting.trainer import Fit, Monitor, Stop, StoppedError, Trainer
 from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
@@ -101,7 +101,6 @@ class Candidate:
             relative to its rms, and its standard error; infinite if the model diverges.
         ratio: of this error to the linear model's; NaN if there is none to compare with.
         squares: the sum of the squared errors in each block of time, (B,).
-        model: as it was fitted, if the search keeps it.
     """
 
     sizes: Sizes
@@ -115,7 +114,6 @@ class Candidate:
     error_std: float
     ratio: float
     squares: Array = field(repr=False)
-    model: Model | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
         text = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
@@ -487,15 +485,12 @@ class Judge:
 
     def candidate(self, runner: _Runner, rounds: int) -> Candidate:
         """What is known of a model that took part in some rounds."""
-        return self.scored(runner.sizes, runner.seed, rounds, runner.fit.result())
-
-    def scored(self, sizes: Sizes, seed: int, rounds: int, found: FitResult) -> Candidate:
-        """The result of a fit of a model of these sizes."""
+        found = runner.fit.result()
         squares = self.squares(found.model)
         error, error_std = _relative(squares, self.counts)
         ratio = _ratio(error, self.linear, self.counts)
         return Candidate(
-            sizes, seed, rounds, found.iterations, found.model.parameter_count,
+            runner.sizes, runner.seed, rounds, found.iterations, found.model.parameter_count,
             found.model.net_parameter_count, found.seconds, error, error_std, ratio, squares,
         )  # fmt: skip
 

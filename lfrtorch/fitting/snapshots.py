@@ -12,12 +12,11 @@ from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.trainer import Fit, Keep, nothing
-from lfrtorch.model import Model, load
 
 EVERY = 10.0
 """Least seconds between two files of one start."""
 
-ROUNDS, BEGUN = "rounds.json", "begun"
+ROUNDS = "rounds.json"
 
 
 class Snapshots:
@@ -70,20 +69,6 @@ class Snapshots:
         files = [self._file(number) for number in range(self._count or 0)]
         found = [state_file.read(file)[0]["best"] for file in files if file.is_file()]
         return min(found, default=math.inf)
-
-    def begun(self, model: Model | None) -> Model | None:
-        """The model that the first start begins with, if its weights are not drawn: it is kept.
-
-        Args:
-            model: what a search for sizes found. Default: that of the run that is to go on, if any.
-        """
-        if self.folder is None:
-            return model
-        if model is None:
-            return load(self.folder / BEGUN) if (self.folder / BEGUN).is_dir() else None
-        if self._writes:
-            model.save(self.folder / BEGUN)
-        return model
 
     def restore(self, fits: Sequence[Fit]) -> None:
         """Restore the fits that had begun.

@@ -20,7 +20,6 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.windows import windows
-from lfrtorch.least_squares.group_lasso import GroupLassoProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.prediction_problem import PredictionProblem
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
@@ -245,8 +244,6 @@ class Fit:
         model, train, validation, trainer, ridge, ranks: see :func:`lfrtorch.fit`.
         simulation: weight of simulation errors beside those of predictions, of a predictor; see
             ``PredictionProblem``.
-        group_lasso: names of sizes that shall become smaller and the weight of their groups, see
-            ``GroupLassoProblem``. Default: there is no such penalty.
         horizon: samples of the windows that the records are cut into, see
             ``lfrtorch.fitting.windows``. Default: they are whole.
         keep: called with the fit after every iteration, when it may be saved, and with True when
@@ -267,7 +264,6 @@ class Fit:
         trainer: Trainer | None = None,
         ridge: Ridge = 0.0,
         simulation: float = 0.0,
-        group_lasso: tuple[Sequence[str], float] | None = None,
         horizon: int | None = None,
         ranks: Ranks | None = None,
         keep: Keep = nothing,
@@ -295,9 +291,6 @@ class Fit:
         if simulation:
             kind = PredictionProblem
             options["simulation"] = simulation
-        elif group_lasso is not None:
-            kind = GroupLassoProblem
-            options |= {"names": group_lasso[0], "weight": group_lasso[1]}
         self.problem = kind.of(model, train, **options)
         self.judge = self.judge_of(model, validation) if validation else None
         self.state: Any = None

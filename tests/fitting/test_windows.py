@@ -22,8 +22,6 @@ from lfrtorch.records import Record
 
 numeric = pytest.mark.numeric
 
-LASSO = lfrtorch.SizesSearch(method="group_lasso")
-
 
 @pytest.fixture
 def model() -> Model:
@@ -112,7 +110,6 @@ def test_windows_that_cannot_be_say_so(horizon, options, message):
         ({"horizon": 1}, "horizon is 1; give a whole number of at least 2, or grow"),
         ({"horizon": "all"}, "horizon is 'all'"),
         ({"horizon": 50, "noise": "innovation"}, "predictions one sample"),
-        ({"horizon": 50, "nz": "auto", "sizes_search": LASSO}, "which is for whole records"),
     ],
 )
 def test_horizons_that_cannot_be_say_so(given, message):
