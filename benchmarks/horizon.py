@@ -1,6 +1,6 @@
 """Fits over windows against fits of whole records, where these may end in a poor minimum.
 
-    python benchmarks/horizon.py [--runs 10] [--horizons 50 200 grow] [--only wells cycle start]
+    python benchmarks/horizon.py [--runs 10] [--horizons 50 200] [--only wells cycle start]
 
 Three systems with two states, sampled at 0.1 s, with noise of 1 % of the output's rms:
 
@@ -30,7 +30,6 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.types import Array
-from lfrtorch.fitting.windows import Horizon
 from lfrtorch.metrics import rms
 
 STEP, NOISE = 0.1, 0.01
@@ -104,13 +103,12 @@ def main() -> None:
     )
     parser.add_argument("--runs", type=int, default=10, help="realisations of each system")
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
-    parser.add_argument("--horizons", nargs="+", default=["50", "200", "grow"])
+    parser.add_argument("--horizons", nargs="+", type=int, default=[50, 200])
     parser.add_argument("--only", nargs="+", choices=SYSTEMS, default=list(SYSTEMS))
     args = parser.parse_args()
     torch.set_num_threads(1)
-    given: list[Horizon] = [None, *("grow" if h == "grow" else int(h) for h in args.horizons)]
     for system in args.only:
-        errors: dict[Horizon, list[tuple[float, ...]]] = {horizon: [] for horizon in given}
+        errors: dict[int | None, list[tuple[float, ...]]] = {h: [] for h in (None, *args.horizons)}
         for seed in range(args.first, args.first + args.runs):
             rng = np.random.default_rng(seed)
             train, validation, test = (measured(system, n, rng) for n in (TRAIN, VALIDATION, TEST))

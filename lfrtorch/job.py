@@ -378,7 +378,7 @@ def choose_sizes(
         trainer=replace(trainer, max_iter=math.ceil(grid.iterations * trainer.limit)),
         ridge=settings.ridge,
         noise=settings.noise,
-        horizon=settings.window,
+        horizon=settings.horizon,
         monitor=observer.searching(),
         watch=lambda ended: observer.say(str(ended)),
         ranks=ranks,

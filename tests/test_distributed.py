@@ -221,7 +221,6 @@ def everything(ranks: Ranks) -> None:
     found["averaged"] = averaged(ranks)
     found["spread"] = spread(ranks, Path("starts"))
     found["stopped"] = stopped(ranks)
-    found["grown"] = grown(ranks)
     found["slope"] = slope(ranks)
     rows = normal(2 * ranks.rank, 3, seed=ranks.rank)
     found["stacked"] = ranks.stack(rows), ranks.first(normal(3 - ranks.rank, 2))
@@ -245,13 +244,6 @@ def stopped(ranks: Ranks) -> tuple[str, int]:
     models, train, validation = starts()
     result = fit(models, train, validation, stop=stop, ranks=ranks, monitors=[[]] * 5)
     return result.reason, len(result.starts)
-
-
-def grown(ranks: Ranks) -> Tensor:
-    """A fit whose first iterations are over windows."""
-    models, train, _ = starts()
-    trainer = LevenbergMarquardt(max_iter=3)
-    return theta(fit(models, train, horizon="grow", trainer=trainer, ranks=ranks).model)
 
 
 def losing(ranks: Ranks) -> Any:
@@ -321,12 +313,6 @@ def test_one_process_that_stops_ends_all_starts(both: list[dict[str, Any]]):
     assert other == (reason, count)
     assert reason == Reason.INTERRUPTED
     assert count == 5
-
-
-@pytest.mark.numeric
-def test_horizons_of_shared_starts_grow_as_on_one(both: list[dict[str, Any]]):
-    for found in both:
-        np.testing.assert_allclose(found["grown"], grown(Ranks()), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.numeric

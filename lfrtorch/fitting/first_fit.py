@@ -74,7 +74,7 @@ def begun_on_part(
         f"{quantity(result.seconds, 's')}, error {quantity(chosen.train, unit)}, "
         f"seed {seed}"
     )
-    return replace(settings, seed=seed, starts=1, horizon=settings.window), [result.model]
+    return replace(settings, seed=seed, starts=1), [result.model]
 
 
 def part_of(records: Sequence[Record], part: float) -> list[Record]:

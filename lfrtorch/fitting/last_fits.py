@@ -106,7 +106,7 @@ def refitted(
             trainer=settings.trainer,
             ridge=settings.ridge,
             noise=settings.noise,
-            horizon=settings.window,
+            horizon=settings.horizon,
             iterations=iterations,
             monitor=observer.searching(),
             ranks=ranks,

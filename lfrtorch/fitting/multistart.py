@@ -37,7 +37,6 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
-from lfrtorch.fitting.growing_horizon import grow
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.over_processes import OverProcesses, are_spread, same_weights
@@ -62,7 +61,7 @@ from lfrtorch.fitting.trainer import (
     StoppedError,
     Trainer,
 )
-from lfrtorch.fitting.windows import Horizon, check_horizon
+from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
 from lfrtorch.model import Model
@@ -93,7 +92,7 @@ def fit(
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
     noise: Noise = "output",
-    horizon: Horizon = None,
+    horizon: int | None = None,
     average: int = 1,
     monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None = None,
     watch: Callable[[Round], None] = lambda _: None,
@@ -144,10 +143,8 @@ def fit(
         horizon: samples of the windows that training records are cut into, each simulated from a
             start state of its own that is fitted with the parameters
             (``lfrtorch.fitting.windows``). Errors of training and validation are then those in
-            windows, of validation from states that are fitted to samples before them. ``"grow"``:
-            the fit of whole records comes after fits over windows of 20 samples for each state, of
-            4 times as many, and so on, each until the cost settles or half of the iterations are
-            spent. Default: whole records.
+            windows, of validation from states that are fitted to samples before them. Default:
+            whole records.
         average: most starts that the model of the result is the mean of
             (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
             averaged as bring the mean within 1 % of the least error on validation and selection,
@@ -237,7 +234,7 @@ def _fitted(
     *,
     trainer: Trainer | None,
     ridge: Ridge,
-    horizon: Horizon,
+    horizon: int | None,
     average: int,
     monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None,
     watch: Callable[[Round], None],
@@ -265,15 +262,10 @@ def _fitted(
     sharing = Ranks() if spread else ranks  # the processes that share the records of each start
     options: dict[str, Any] = {"trainer": search, "ridge": ridge, "ranks": sharing}
     options["simulation"] = simulation
-    options["horizon"] = None if horizon == "grow" else horizon
+    options["horizon"] = horizon
     options["stop"] = any_of(halt, stop) if sharing.world == 1 else stop
     if spread:
         same_weights(starts, ranks)
-    if horizon == "grow":
-        own = ranks.share(starts) if spread else starts
-        grow(own, train, trainer=search, ridge=ridge, ranks=sharing, stop=stop)
-        if spread:
-            same_weights(starts, ranks, owners=True)
     fits = [
         Fit(model, train, validation, **options, keep=snapshots.keeper(number))
         for number, model in enumerate(starts)

@@ -49,15 +49,10 @@ def are_spread(finalists: int, starts: int, records: int, ranks: Ranks) -> bool:
     return ranks.world > 1 and starts > 1 and (finalists >= ranks.world or records < ranks.world)
 
 
-def same_weights(models: Sequence[Model], ranks: Ranks, owners: bool = False) -> None:
-    """Give all processes the weights of the first one's models, or those of each model's owner."""
-    for number, model in enumerate(models):
-        weights = parameters_to_vector(model.lfr.parameters()).detach()
-        if owners:
-            mine = number % ranks.world == ranks.rank
-            weights = ranks.sum(weights if mine else torch.zeros_like(weights))
-        else:
-            weights = ranks.first(weights)
+def same_weights(models: Sequence[Model], ranks: Ranks) -> None:
+    """Give all processes the weights of the first one's models."""
+    for model in models:
+        weights = ranks.first(parameters_to_vector(model.lfr.parameters()))
         vector_to_parameters(weights, model.lfr.parameters())
 
 

@@ -17,7 +17,7 @@ from lfrtorch.engine.cell import check_dtype
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.prediction import Noise, check_noise
 from lfrtorch.fitting.trainer import Trainer
-from lfrtorch.fitting.windows import Horizon, check_horizon
+from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_problem import Ridge
 from lfrtorch.linear.bla import estimate_bla
@@ -103,7 +103,7 @@ class Settings:
             latter case the linear model has ``refine="prediction"``, too, and validation errors
             are those of predictions one sample ahead.
         horizon: samples of the windows that training and validation records are cut into in a
-            fit, or ``"grow"``, see :func:`lfrtorch.fit`. Default: records are simulated whole.
+            fit, see :func:`lfrtorch.fit`. Default: records are simulated whole.
         distil: whether one model takes the place of a mean of several if it does as well, see
             :func:`lfrtorch.distil`.
         refit: whether the model that validation chose is fitted to all estimation records at last,
@@ -149,7 +149,7 @@ class Settings:
     trainer: Trainer = field(default_factory=LevenbergMarquardt)
     ridge: Ridge = 0.0
     noise: Noise = "output"
-    horizon: Horizon = None
+    horizon: int | None = None
     average: int = 1
     distil: bool = False
     refit: bool = False
@@ -267,11 +267,6 @@ class Settings:
     def sizes(self) -> dict[str, Size | None]:
         """nx, and the sizes of the static nonlinearity."""
         return {name: getattr(self, name) for name in ("nx", *self.size_names)}
-
-    @property
-    def window(self) -> int | None:
-        """Samples of the windows to the end of a fit; None: whole records."""
-        return None if self.horizon == "grow" else self.horizon
 
     @property
     def seeds(self) -> tuple[int, ...]:

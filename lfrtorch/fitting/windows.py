@@ -32,7 +32,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
@@ -45,16 +44,12 @@ BEFORE = 20
 ``benchmarks/horizon.py``, with two states, 40 samples told the start of 81 of 81 windows, 50 of 78,
 and 100 of 61 of 84: where small changes grow, the error over more samples has many minima."""
 
-Horizon = int | Literal["grow"] | None
-"""Samples of a window; ``"grow"``: of more and more, up to whole records. None: whole records."""
 
-
-def check_horizon(horizon: Horizon, noise: str = "output") -> None:
+def check_horizon(horizon: int | None, noise: str = "output") -> None:
     """Refuse what is no horizon, or one for predictions, with a ValueError."""
     if horizon is None:
         return
-    if horizon != "grow":
-        integer("horizon", horizon, 2, word="grow")
+    integer("horizon", horizon, 2)
     if noise != "output":
         raise InputError(
             f"horizon is {horizon!r}, and noise is {noise!r}, which fits predictions one sample "

@@ -1,4 +1,4 @@
-"""Fits over windows of records, and over longer and longer ones."""
+"""Fits over windows of records."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 import lfrtorch
 from lfrtorch._support.errors import InputError
-from lfrtorch.fitting.growing_horizon import horizons
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.trainer import Fit, StoppedError
+from lfrtorch.fitting.trainer import Fit
 from lfrtorch.fitting.windows import windows
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -107,7 +106,7 @@ def test_windows_that_cannot_be_say_so(horizon, options, message):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"horizon": 1}, "horizon is 1; give a whole number of at least 2, or grow"),
+        ({"horizon": 1}, "horizon is 1; give a whole number of at least 2."),
         ({"horizon": "all"}, "horizon is 'all'"),
         ({"horizon": 50, "noise": "innovation"}, "predictions one sample"),
     ],
@@ -115,12 +114,6 @@ def test_windows_that_cannot_be_say_so(horizon, options, message):
 def test_horizons_that_cannot_be_say_so(given, message):
     with pytest.raises(InputError, match=message):
         Settings(nx=2, **given)
-
-
-def test_horizons_grow_up_to_whole_records():
-    assert horizons([counted(1000), counted(80)], nx=2) == [40, 160, 640]
-    assert horizons([counted(1000, skip=360)], nx=2) == [40, 160]
-    assert horizons([counted(30)], nx=2) == []
 
 
 def moved(model: Model) -> Model:
@@ -132,11 +125,10 @@ def moved(model: Model) -> Model:
 
 
 @numeric
-@pytest.mark.parametrize("horizon", [20, "grow"])
-def test_a_fit_over_windows_finds_the_system(model: Model, horizon):
+def test_a_fit_over_windows_finds_the_system(model: Model):
     train, test = (measure(model, T, seed=T) for T in (400, 300))
     trainer = lfrtorch.LevenbergMarquardt(max_iter=60)
-    result = lfrtorch.fit(moved(model), train, trainer=trainer, horizon=horizon, monitors=[])
+    result = lfrtorch.fit(moved(model), train, trainer=trainer, horizon=20, monitors=[])
     error = lfrtorch.rmse(test, result.model.simulate(test))
     assert error < 1e-4 * lfrtorch.rmse(test, moved(model).simulate(test))
 
@@ -159,25 +151,6 @@ def test_poles_of_a_fit_over_windows_stay_within_the_limit_of_whole_records(mode
     slow = problem.theta
     slow[:4] = torch.diag(slow.new_tensor([0.99, 0.5])).flatten()
     assert torch.equal(problem.admissible(slow), slow)
-
-
-@numeric
-def test_a_fit_that_grows_begins_where_the_last_windows_end(model: Model):
-    record = measure(model, 200, seed=1)
-    trainer = lfrtorch.LevenbergMarquardt(max_iter=6)
-    options = {"trainer": trainer, "monitors": []}
-    whole, grown = (
-        lfrtorch.fit(moved(model), record, horizon=horizon, **options) for horizon in (None, "grow")
-    )
-    assert grown.history[0].train < 0.5 * whole.history[0].train
-    assert grown.history[0].iteration == 0
-
-
-@numeric
-def test_growing_that_ends_early_says_so(model: Model):
-    record = measure(model, 200, seed=1)
-    with pytest.raises(StoppedError, match="horizon grew"):
-        lfrtorch.fit(moved(model), record, horizon="grow", stop=lambda: True, monitors=[])
 
 
 @numeric
