@@ -15,19 +15,16 @@ if _typing.TYPE_CHECKING:
 
 __version__ = _version("lfrtorch")
 
-_RENAMED = {"average": "mean_model", "fit_starts": "fit"}
-
 
 if not _typing.TYPE_CHECKING:  # a checker would take every name for one of these
 
     def __getattr__(name: str) -> object:
-        """A public name, imported with all others; for an old one, an error that says the new."""
+        """Import the public names with the first that is asked for."""
         if name == "__all__" or not name.startswith("_"):
             public = _import_module("lfrtorch._public")
             if name == "__all__" or name in getattr(public, "__all__", ()):
                 return getattr(public, name)
-        now = f"; it is called lfrtorch.{_RENAMED[name]} now" if name in _RENAMED else ""
-        raise AttributeError(f"module 'lfrtorch' has no attribute '{name}'{now}")
+        raise AttributeError(f"module 'lfrtorch' has no attribute '{name}'")
 
     def __dir__() -> list[str]:
         own = (name for name in globals() if name.startswith("__"))

@@ -195,20 +195,6 @@ class Model:
         return self.lfr.cell.state_covariance.double().cpu().numpy()
 
     @property
-    def parameters(self) -> int:
-        """Old name of ``parameter_count``.
-
-        Raises:
-            AttributeError: always.
-        """
-        raise AttributeError(
-            "Model.parameters is called parameter_count now, and parameters_net "
-            "net_parameter_count; the tensors are model.lfr.parameters()."
-        )
-
-    parameters_net = parameters
-
-    @property
     def parameter_count(self) -> int:
         """Number of parameters P; zeros of the structure, and feedthrough held at 0, are none."""
         zeros = zeros_of(self.lfr.cell)

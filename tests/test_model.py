@@ -314,12 +314,6 @@ def test_parts_of_other_sizes_make_no_model(
         replace(model, **change(model))
 
 
-def test_the_old_name_of_the_count_says_the_new_one():
-    for name in ("parameters", "parameters_net"):
-        with pytest.raises(AttributeError, match="parameter_count"):
-            getattr(random_model(random_cell()), name)
-
-
 # --- what print shows ------------------------------------------------------------------------
 
 

@@ -4,43 +4,15 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Sequence
-from functools import wraps
+from collections.abc import Sequence
 from numbers import Integral, Real
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Integers
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def renamed(**new: str) -> Callable[[Function], Function]:
-    """Let the old names of a function's or class's arguments end in a TypeError with the new one.
-
-    Args:
-        new: the present name of each old one.
-    """
-
-    def decorate(function: Function) -> Function:
-        name = function.__name__
-        inner = function.__init__ if isinstance(function, type) else function
-
-        @wraps(inner)
-        def checked(*args: Any, **kwargs: Any) -> Any:
-            for old in new.keys() & kwargs.keys():
-                raise TypeError(f"the argument '{old}' of {name} is called '{new[old]}' now.")
-            return inner(*args, **kwargs)
-
-        if not isinstance(function, type):
-            return cast(Function, checked)
-        function.__init__ = checked
-        return cast(Function, function)
-
-    return decorate
 
 
 def integer(name: str, value: Any, least: int, *, word: str = "") -> None:

@@ -73,7 +73,7 @@ USES = {
     "data.fs": "fs",
     "data.time": "time",
 }
-"""Options by the words that other commands have for them."""
+"""Where the words of other commands are kept."""
 
 SETTING = re.compile(r"[a-z_.]+=")
 """What a word NAME=VALUE begins with."""
@@ -103,7 +103,7 @@ def take(word: str, options: argparse.Namespace) -> None:
     """Read a word of other commands into the options.
 
     Raises:
-        ValueError: one that is none of ``USES``, or whose option is given already.
+        ValueError: one that is none of ``USES``, or is given already.
     """
     read = parsed(word)
     name = read.key_or_group
@@ -112,7 +112,7 @@ def take(word: str, options: argparse.Namespace) -> None:
     if read.is_sweep_override():
         raise InputError(f"for several values write {name}=[{read.get_value_string()}].")
     if getattr(options, USES[name]):
-        raise InputError(f"{name} is given twice, the other time as an option or a path.")
+        raise InputError(f"{name} is given twice; a path alone is data.path, too.")
     value: Any = read.value()
     if value is not None:
         listed = value if isinstance(value, list) else [value]

@@ -26,17 +26,8 @@ def parser() -> argparse.ArgumentParser:
         prog=sys.argv[0], description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     found.add_argument("paths", nargs="*", metavar="PATH", help="file, or pattern in quotes")
-    # Their names before they were words of data.
-    for option in ("--inputs", "--outputs"):
-        found.add_argument(option, nargs="+", default=[], type=column, help=argparse.SUPPRESS)
-    found.add_argument("--fs", type=float, help=argparse.SUPPRESS)
-    found.add_argument("--time", type=column, help=argparse.SUPPRESS)
+    found.set_defaults(inputs=[], outputs=[], fs=None, time=None)  # words of data set them
     found.add_argument(
         "--out", type=Path, metavar="FIGURE.png", help="default: FOLDER_FILE_preview.png"
     )
     return found
-
-
-def column(word: str) -> str | int:
-    """A column's name or number."""
-    return int(word) if word.isdecimal() else word

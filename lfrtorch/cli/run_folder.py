@@ -18,7 +18,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.paths import expanded
-from lfrtorch.cli.words import now
 from lfrtorch.distributed import Ranks
 
 WORLD = int(os.environ.get("WORLD_SIZE", "1"))
@@ -56,14 +55,11 @@ def arguments(given: Sequence[str]) -> list[str]:
         before = [word for word in words_of(folder, given) if word not in given]
         escaped = folder.replace("\\", "\\\\").replace("'", "\\'")
         return [*before, *given, f"hydra.run.dir='{escaped}'"]
-    for word in given:
-        if now(word) != word:
-            raise InputError(f"{word} is called {now(word)} now.")
     return list(given)
 
 
 def words_of(folder: str | Path, given: Sequence[str] = ()) -> list[str]:
-    """The words that made the run in a folder, by their present names.
+    """The words that made the run in a folder.
 
     Args:
         folder: of the run.
@@ -82,7 +78,7 @@ def words_of(folder: str | Path, given: Sequence[str] = ()) -> list[str]:
                 f"the run in '{folder}' names code: {brief(word)}; add that word to the "
                 "command line if you know where the run comes from."
             )
-    return [now(word) for word in listed if not word.startswith("resume=")]
+    return [word for word in listed if not word.startswith("resume=")]
 
 
 def read_settings(path: Path) -> Any:

@@ -1,4 +1,4 @@
-"""Words of the command line: those that have other names now, and those for Python's arguments."""
+"""Words of the command line for Python's arguments."""
 
 from __future__ import annotations
 
@@ -8,22 +8,8 @@ from omegaconf import DictConfig
 
 from lfrtorch.reporting.console import Console
 
-OLD_WORDS = {
-    "init=polynomial": "static=polynomial",
-    "trainer.epochs": "trainer.max_iter",
-}
-"""Words that have other names now; saved runs may have them."""
-
 GROUPS = ("bla", "frf", "data", "trainer")
 """Groups whose words are arguments of functions. Of a name in several, the last one is meant."""
-
-
-def now(word: str) -> str:
-    """The word of the command line by its present name."""
-    for old, new in OLD_WORDS.items():
-        if word == old or word.startswith(f"{old}="):
-            return new + word.removeprefix(old)
-    return word
 
 
 def translated(text: str, cfg: DictConfig) -> str:

@@ -30,7 +30,7 @@ from typing import Any, cast
 import torch
 
 from lfrtorch._support.arguments import typed
-from lfrtorch._support.checks import integer, renamed
+from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import CUT_SHORT, Reason, told
 from lfrtorch._support.threads import spread_by_hand
@@ -80,7 +80,6 @@ AS_GOOD = 1.01
 starts is so by luck, too, on the records that chose it."""
 
 
-@renamed(optimiser="trainer", model="models")
 @typed("models")
 @spread_by_hand()
 def fit(

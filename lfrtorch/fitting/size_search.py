@@ -33,7 +33,7 @@ import torch
 
 from lfrtorch._support import tables
 from lfrtorch._support.arguments import typed
-from lfrtorch._support.checks import integer, renamed
+from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.reasons import Reason
 from lfrtorch._support.tables import number, quantity
@@ -254,7 +254,6 @@ def _known(error: float | None) -> bool:
     return error is not None and isfinite(error)
 
 
-@renamed(optimiser="trainer")
 @typed()
 @spread_by_hand()
 def search_sizes(

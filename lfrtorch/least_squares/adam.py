@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.arguments import typed
-from lfrtorch._support.checks import integer, number, renamed
+from lfrtorch._support.checks import integer, number
 from lfrtorch._support.reasons import Reason
 
 
@@ -45,7 +45,6 @@ class AdamState:
         return {"gradient_norm": float(self.gradient.norm())}
 
 
-@renamed(epochs="max_iter")
 @typed()
 @dataclass(frozen=True)
 class Adam:

@@ -163,12 +163,12 @@ class Cubic(torch.nn.Linear):
         return super().forward(self.scale * input**3)
 
 
-def test_the_words_of_a_run_are_read_by_their_new_names(tmp_path: Path):
+def test_the_words_of_a_run_are_read(tmp_path: Path):
     (tmp_path / ".hydra").mkdir()
-    saved = ["init=polynomial", "trainer=adam", "trainer.epochs=30", "resume=x", "init=paper"]
+    saved = ["trainer=adam", "trainer.max_iter=30", "resume=x", "init=paper"]
     OmegaConf.save(OmegaConf.create(saved), tmp_path / ".hydra" / "overrides.yaml")
     words = run_folder.arguments([f"resume={tmp_path}"])
-    assert words[:4] == ["static=polynomial", "trainer=adam", "trainer.max_iter=30", "init=paper"]
+    assert words[:3] == ["trainer=adam", "trainer.max_iter=30", "init=paper"]
 
 
 def test_the_paper_cases_are_one_override():
@@ -661,21 +661,6 @@ def test_a_search_for_sizes_that_is_ended_says_so(
         launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words)
     assert stop.value.code == code
     assert capsys.readouterr().err == f"{message}\n"
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["trainer.epochs=5"], "trainer.epochs=5 is called trainer.max_iter=5 now"),
-        (["init=polynomial"], "init=polynomial is called static=polynomial now"),
-    ],
-)
-def test_old_words_name_the_new_ones(
-    words: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys
-):
-    with pytest.raises(SystemExit, match="1"):
-        launched(monkeypatch, "+bench=boucwen", *words)
-    assert capsys.readouterr().err == f"error: {message}.\n"
 
 
 @pytest.mark.parametrize(

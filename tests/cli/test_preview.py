@@ -256,10 +256,10 @@ def test_only_the_beginning_of_a_long_file_is_read(file: Path, run, monkeypatch)
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_words_of_other_commands_are_understood(file: Path, signals, run, capsys):
-    expected = run(file, "--inputs", "force", "--outputs", "level", "--fs", 50, "--time", "time")
     words = ["data.inputs=[force]", "data.outputs=level", "data.fs=50", "data.time=time"]
-    assert run("data=file", f"data.path={file}", *words) == expected
-    assert run(file, "--inputs", 1, *words[1:]) == expected
+    expected = run("data=file", f"data.path={file}", *words)
+    assert "force" in expected
+    assert run(file, "data.inputs=1", *words[1:]) == expected
     other = written(file.parent / "ü.csv", {"Füllstand (a)": signals["force"]})
     assert "Füllstand" in run(f"data.path=[{other}]", "data.outputs=[Füllstand (a)]")
     for word, message in (
@@ -283,14 +283,13 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--inputs", "mass"], "has no column 'mass', named in data.inputs"),
-        (["--inputs", "force", "--outputs", "force"], "'force (N)' stands for several"),
+        (["data.inputs=mass"], "has no column 'mass', named in data.inputs"),
+        (["data.inputs=force", "data.outputs=force"], "'force (N)' stands for several"),
         (
-            ["--inputs", "force", "level", "--time", "time"],
+            ["data.inputs=[force,level]", "data.time=time"],
             "no column is left for the outputs; it has",
         ),
         (["--out", "x.csv"], "--out is 'x.csv'; give a name that ends with .png"),
-        (["--fs", "-3"], "data.fs is -3.0; give a positive number"),
         (["nothing*.csv"], "no file matches 'nothing*.csv'"),
         (["gone.csv"], "there is no file 'gone.csv'"),
     ],

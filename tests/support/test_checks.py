@@ -42,12 +42,6 @@ def test_zero_is_not_positive():
         number("damping", 0, positive=True)
 
 
-def test_old_names_end_in_an_error_that_says_the_new_one():
-    with pytest.raises(TypeError, match="'epochs' of Adam is called 'max_iter' now"):
-        lfrtorch.Adam(epochs=3)  # pyright: ignore[reportCallIssue]
-    with pytest.raises(TypeError, match="'optimiser' of fit is called 'trainer' now"):
-        lfrtorch.fit(optimiser=lfrtorch.Adam())  # pyright: ignore[reportCallIssue]
-    with pytest.raises(AttributeError, match=r"it is called lfrtorch\.fit now"):
-        _ = lfrtorch.fit_starts  # pyright: ignore[reportAttributeAccessIssue]
+def test_a_name_that_is_not_there_is_an_error():
     with pytest.raises(AttributeError, match=r"no attribute 'nothing'$"):
         _ = lfrtorch.nothing  # pyright: ignore[reportAttributeAccessIssue]
