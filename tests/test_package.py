@@ -151,6 +151,12 @@ def test_import_takes_what_it_needs_and_no_more():
     assert loaded("import lfrtorch; lfrtorch.identify").isdisjoint(HEAVY)
 
 
+def test_the_memory_of_a_fit_is_checked_without_the_compiler_of_torch():
+    code = "import torch; from lfrtorch.engine.cell import LFRCell; "
+    code += "torch.set_default_device('meta'); LFRCell(1, 1, 2)"
+    assert "torch._dynamo" not in loaded(code)
+
+
 def test_the_package_shows_its_public_names_and_no_others():
     shown = {name for name in dir(lfrtorch) if not name.startswith("__")}
     assert shown == set(lfrtorch.__all__)

@@ -79,7 +79,9 @@ class LFRCell(nn.Module):
         self.static = static
         self.state_covariance: Tensor
         """E x xᵀ (nx, nx) over the training data, about 0; before a fit 1."""
-        self.register_buffer("state_covariance", torch.eye(nx, device=device, dtype=dtype))
+        # Not torch.eye: on the device "meta" it imports torch's compiler, which takes a second.
+        identity = torch.zeros(nx, nx, device=device, dtype=dtype).fill_diagonal_(1.0)
+        self.register_buffer("state_covariance", identity)
         self.structure = "free"
         """Of which blocks the model is made, see ``block_form``; a fit keeps to it."""
         self.past_outputs = 0
