@@ -1,11 +1,11 @@
-"""Several processes that share one fit, its records or its starts, by ``torch.distributed``.
+"""Several processes that share one fit, its starts or its records, by ``torch.distributed``.
 
     torchrun --nproc-per-node 2 script.py
 
 with ``with connect() as ranks: fit(..., ranks=ranks)`` in the script: gloo between CPUs, NCCL
-between GPUs. All processes take the same steps, for what decides is a sum over all of them or the
-first one's: rounding errors differ from one kind of processor to another, and a search lets them
-grow.
+between GPUs. ``Ranks.sharing_records`` decides what is shared. All processes take the same steps,
+for what decides is a sum over all of them or the first one's: rounding errors differ from one kind
+of processor to another, and a search lets them grow.
 """
 
 from __future__ import annotations
@@ -57,6 +57,14 @@ class Ranks:
     def share(self, items: list[Shared]) -> list[Shared]:
         """The items that this process holds: every ``world``-th."""
         return items[self.rank :: self.world]
+
+    def sharing_records(self, starts: int) -> Ranks:
+        """The processes that share the records of each start.
+
+        If there are as many starts as processes, these share the starts: each start then has all
+        records, and one process alone.
+        """
+        return Ranks() if 1 < self.world <= starts else self
 
     def enough_for(self, items: int) -> Ranks:
         """These processes; this one alone, as each of them, if there are fewer items than they."""

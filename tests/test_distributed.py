@@ -102,9 +102,10 @@ def start(task: Callable[[Ranks], Any], folder: Path, train: bool = False) -> li
             free = taken.enter_context(socket.socket())
             free.bind(("127.0.0.1", 0))
             ports.append(free.getsockname()[1])
-    spawn = multiprocessing.get_context("spawn")
+    server = multiprocessing.get_context("forkserver")  # what both need is imported once
+    server.set_forkserver_preload(["lfrtorch._public", "hydra.main", "torch.utils.tensorboard"])
     processes = [
-        spawn.Process(target=_work, args=(task, folder, rank, ports, train)) for rank in range(2)
+        server.Process(target=_work, args=(task, folder, rank, ports, train)) for rank in range(2)
     ]
     for process in processes:
         process.start()
@@ -356,6 +357,14 @@ def test_parts_of_other_shapes(both: list[dict[str, Any]]):
         stacked, first = found["stacked"]
         assert torch.equal(stacked, normal(2, 3, seed=1))
         assert torch.equal(first, normal(3, 2))
+
+
+@pytest.mark.parametrize(("starts", "sharing"), [(2, 3), (3, 1), (16, 1)])
+def test_as_many_starts_as_processes_are_shared_and_else_the_records(starts: int, sharing: int):
+    ranks = Ranks()
+    ranks.world = 3
+    assert ranks.sharing_records(starts).world == sharing
+    assert Ranks().sharing_records(starts).world == 1
 
 
 def test_more_processes_than_records(both: list[dict[str, Any]]):

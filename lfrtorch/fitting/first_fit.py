@@ -42,7 +42,7 @@ def begun_on_part(
     train = dataset.train
     part = part_of(train, settings.first_part)
     samples, all_samples = (sum(r.samples for r in records) for records in (part, train))
-    if len(part) < ranks.world or samples == all_samples:
+    if max(len(models), len(part)) < ranks.world or samples == all_samples:
         observer.say(
             f"note: first_part is {settings.first_part}, and there are {len(train)} training "
             "record(s): all are fitted from the first iteration"

@@ -39,7 +39,7 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.over_processes import OverProcesses, are_spread, same_weights
+from lfrtorch.fitting.over_processes import OverProcesses, same_weights
 from lfrtorch.fitting.prediction import (
     SIMULATION,
     Noise,
@@ -113,9 +113,8 @@ def fit(
     has a start state x0, which is given in these, or where a matrix is frozen
     (``requires_grad_(False)``).
 
-    Several processes share the starts, if each has one up to the last round or there are fewer
-    records than processes; else they share the records, and fit one start after another. Starts
-    that are shared come to the same end as on one process.
+    Several processes share the starts if there are as many, else the records of one start after
+    another. Starts that are shared come to the same end as on one process.
 
     Args:
         models: where to start: a model, or several of which the best is kept. Their weights are
@@ -169,7 +168,7 @@ def fit(
 
     Raises:
         ValueError: no model, none that is stable on the training records at the start, validation
-            records that all have too few samples, one start and fewer records than processes,
+            records that all have too few samples, fewer starts and records than processes,
             another number of lists of monitors, models to average that have no network, or another
             ``noise`` than ``"output"`` and a trainer that is ``stable`` or ``contracting``.
         ProcessLostError, StoppedError: before there was an iterate to keep.
@@ -257,8 +256,8 @@ def _fitted(
     search = LevenbergMarquardt() if trainer is None else trainer
     planned = schedule(len(starts), search.limit, average)
     ranks, train = Ranks() if ranks is None else ranks, as_records(train)
-    spread = are_spread(planned[-1][0], len(starts), len(train), ranks)
-    sharing = Ranks() if spread else ranks  # the processes that share the records of each start
+    sharing = ranks.sharing_records(len(starts))
+    spread = sharing.world < ranks.world
     options: dict[str, Any] = {"trainer": search, "ridge": ridge, "ranks": sharing}
     options["simulation"] = simulation
     options["horizon"] = horizon

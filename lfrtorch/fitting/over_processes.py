@@ -31,24 +31,6 @@ Take = Callable[[int, bytes], None]
 """Called with the number of a start and the state of its fit, as ``Fit.save`` writes it."""
 
 
-def are_spread(finalists: int, starts: int, records: int, ranks: Ranks) -> bool:
-    """Whether processes share the starts of a fit, and not its records.
-
-    They do if each has a start up to the end, or if the records do not go round.
-
-    Args:
-        finalists: starts of the last round.
-        starts, records: of the whole fit.
-        ranks: the processes.
-
-    Example:
-        >>> from lfrtorch.fitting.over_processes import are_spread
-        >>> are_spread(4, 16, 20, lfrtorch.distributed.Ranks())
-        False
-    """
-    return ranks.world > 1 and starts > 1 and (finalists >= ranks.world or records < ranks.world)
-
-
 def same_weights(models: Sequence[Model], ranks: Ranks) -> None:
     """Give all processes the weights of the first one's models."""
     for model in models:

@@ -82,8 +82,8 @@ def refit(
     limit = min(ceil(chosen * new / seen), base.limit)
     models = [deepcopy(model) for model in result.members or (result.model,)]
     records = all_records(train, held_out)
-    if ranks is not None and len(models) == 1:
-        ranks = ranks.enough_for(len(records))
+    if ranks is not None:
+        ranks = ranks.enough_for(max(len(models), len(records)))
     return fit(
         models,
         records,
