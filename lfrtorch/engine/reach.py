@@ -228,5 +228,5 @@ def _check(cell: LFRCell) -> None:
     if largest >= 1.0:
         raise InputError(
             f"A is not stable, |eigenvalue| {largest:.6g}: a small input may make the states grow "
-            "without bound.\nA fit with trainer.stable=true keeps the eigenvalues within 1."
+            "without bound.\nA fit with trainer.guarantee=stable keeps the eigenvalues within 1."
         )

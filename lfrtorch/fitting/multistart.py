@@ -170,7 +170,7 @@ def fit(
         ValueError: no model, none that is stable on the training records at the start, validation
             records that all have too few samples, fewer starts and records than processes,
             another number of lists of monitors, models to average that have no network, or another
-            ``noise`` than ``"output"`` and a trainer that is ``stable`` or ``contracting``.
+            ``noise`` than ``"output"`` and a trainer with a ``guarantee``.
         ProcessLostError, StoppedError: before there was an iterate to keep.
 
     Example:

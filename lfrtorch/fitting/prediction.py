@@ -20,15 +20,15 @@ SIMULATION: dict[str, float] = {"innovation": 0.0, "both": 3.0}
 
 
 def check_noise(noise: str, trainer: Trainer | None = None) -> None:
-    """Refuse an unknown kind of noise, or one that the trainer's bounds are not for: ValueError."""
+    """Refuse an unknown kind of noise, or one that the trainer's guarantee is not for."""
     if noise not in get_args(Noise):
         raise InputError(f"noise is {noise!r}; use 'output', 'innovation' or 'both'.")
-    for name in ("stable", "contracting"):
-        if noise != "output" and getattr(trainer, name, False):
-            raise InputError(
-                f"trainer.{name} is True and noise is {noise!r}: what is bounded is the predictor, "
-                f"and the model could run away. Give {name}=False, or noise='output'."
-            )
+    if noise != "output" and trainer is not None and trainer.guarantee is not None:
+        raise InputError(
+            f"trainer.guarantee is {trainer.guarantee!r} and noise is {noise!r}: what it holds for "
+            "is the predictor, and the model could run away. Give guarantee=None, or "
+            "noise='output'."
+        )
 
 
 def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
@@ -47,8 +47,8 @@ def predicting(
     """The predictors of models, and the records that drive them.
 
     Raises:
-        ValueError: an unknown kind of noise, a trainer that keeps A stable or the model
-            contracting, a model without K, or one with exact integrators.
+        ValueError: an unknown kind of noise, a trainer with a guarantee, a model
+            without K, or one with exact integrators.
     """
     check_noise(noise, trainer)
     given = [models] if isinstance(models, Model) else list(models)

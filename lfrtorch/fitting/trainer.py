@@ -20,6 +20,7 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
 from lfrtorch.fitting.windows import windows
+from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.prediction_problem import PredictionProblem
 from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
@@ -75,13 +76,8 @@ class Trainer(Protocol):
         ...
 
     @property
-    def stable(self) -> bool:
-        """Whether A's eigenvalues stay within the unit circle."""
-        ...
-
-    @property
-    def contracting(self) -> bool:
-        """Whether every model on the way is proven to contract."""
+    def guarantee(self) -> Name | None:
+        """What every model on the way keeps: a stable A, or contraction."""
         ...
 
     def init(self, problem: Any, theta: Tensor) -> Any:
@@ -277,8 +273,7 @@ class Fit:
             vector_to_parameters(ranks.first(weights), model.lfr.parameters())
         options: dict[str, Any] = {
             "ridge": ridge,
-            "stable": self.trainer.stable,
-            "contracting": self.trainer.contracting,
+            "guarantee": self.trainer.guarantee,
             "longest": max(record.samples for record in as_records(train)),
             "ranks": ranks,
         }

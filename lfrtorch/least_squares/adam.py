@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from jaxtyping import Float
@@ -53,11 +53,11 @@ class Adam:
     Args:
         max_iter: most steps; each sees all the data.
         learning_rate: step size, in normalised units.
-        stable: whether A's eigenvalues stay within the unit circle. Then no bounded input makes a
-            model with a bounded static map run away. If they are not inside at the start, they stay
-            within the circle that they are in.
-        contracting: whether every model on the way is proven to contract, for all inputs, see
-            ``lfrtorch.analysis.contraction``. The start must be.
+        guarantee: what every model on the way keeps. ``"stable"``: A's eigenvalues stay within the
+            unit circle, so that no bounded input makes a model with a bounded static map run away;
+            if they are not inside at the start, they stay within the circle that they are in.
+            ``"contracting"``: the model is proven to contract, for all inputs, see
+            ``lfrtorch.analysis.contraction``; the start must be. Default: nothing.
 
     Example:
         >>> trainer = lfrtorch.Adam(max_iter=20, learning_rate=1e-2)
@@ -68,8 +68,7 @@ class Adam:
 
     max_iter: int = 2000
     learning_rate: float = 1e-3
-    stable: bool = False
-    contracting: bool = False
+    guarantee: Literal["stable", "contracting"] | None = None
 
     def __post_init__(self) -> None:
         number("learning_rate", self.learning_rate, positive=True)

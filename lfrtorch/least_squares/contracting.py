@@ -25,6 +25,7 @@ from lfrtorch.engine.linearised import of_static
 from lfrtorch.engine.nonlinearity import Network, is_network
 from lfrtorch.engine.static_enclosure import enclosure, everywhere
 from lfrtorch.engine.static_jacobian import linearise_static
+from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.certificate import (
     SLOWEST,
     Certificate,
@@ -44,12 +45,6 @@ HALVINGS = 6
 KEPT = 0.1
 """Part of t that a step should leave for the next one."""
 
-CORRECTIONS = 4
-"""Most rounds in which a step's bound is tightened by what it passes t = 0 by."""
-
-TINY = 1e-300
-"""Smallest divisor."""
-
 
 class Contracting:
     """Certificates on the way of a search.
@@ -64,8 +59,8 @@ class Contracting:
     def __init__(self, cell: LFRCell) -> None:
         if not is_network(cell.static):
             raise InputError(
-                "contracting=true needs a network as the static map, whose slopes are bounded, not "
-                f"a {type(cell.static).__name__}."
+                "guarantee=contracting needs a network as the static map, whose slopes are "
+                f"bounded, not a {type(cell.static).__name__}."
             )
         self._cell = deepcopy(cell).to(device="cpu", dtype=torch.float64)
         self._free = [p for p in self._cell.parameters() if p.requires_grad]
@@ -74,8 +69,8 @@ class Contracting:
         self._last, self._found = start, self._certified(start, None)
         if self._found is None:
             raise InputError(
-                "contracting=true needs a start that is proven to contract: init=zero_output, a "
-                "linear model with its poles inside the unit circle, and no integrators."
+                "guarantee=contracting needs a start that is proven to contract: init=zero_output, "
+                "a linear model with its poles inside the unit circle, and no integrators."
             )
 
     @property
@@ -123,12 +118,12 @@ class Contracting:
                 low = part
         return last + low * (theta - last)
 
-    def begin(self, theta: Float[Tensor, " P"]) -> None:
-        """Note where the next step begins; θ has a certificate."""
+    def bounded(self, theta: Float[Tensor, " P"]) -> Callable[[System], System]:
+        """Let the steps from θ, which has a certificate, keep one."""
         self._last = theta.detach().cpu().double()
+        return self._bounded
 
-    def bounded(self, system: System) -> System:
-        """A system of steps from there that keep the certificate."""
+    def _bounded(self, system: System) -> System:
         found = self._certified(self._last, None) or self._certified(self._last, self._found)
         if found is None:  # rounding of θ to single precision
             return system
@@ -141,15 +136,16 @@ class Contracting:
         if start is None or not own.C.size:
             return system
 
-        def room(step: Float[Tensor, " P"]) -> float:
+        def after(step: Float[Tensor, " P"]) -> float:
             """t after a step."""
-            for after in self._systems(self._last + step.detach().cpu().double()):
-                if after.neurons == own.neurons and after.B.shape == own.B.shape:
-                    found = margin(after.moved(L, s)[0], SLOWEST)
+            for there in self._systems(self._last + step.detach().cpu().double()):
+                if there.neurons == own.neurons and there.B.shape == own.B.shape:
+                    found = margin(there.moved(L, s)[0], SLOWEST)
                     return -np.inf if found is None else found.t
             return -np.inf
 
-        return HeldSystem(system, self._slope(own, start, L, s), start.t, room)
+        slope = self._slope(own, start, L, s)
+        return BoundedSystem(system, MarginBound(slope, start.t, after))
 
     def _slope(
         self, system: Differences, found: Margin, L: Array, s: Array
@@ -190,45 +186,30 @@ class Contracting:
         return cell.A + cell.Bw @ J @ cell.Cz, cell.Bw @ left, right @ cell.Cz
 
 
-class HeldSystem:
-    """A system whose steps keep a number t(δ) positive.
-
-    Where a step would not, it is replaced by the minimum of |r + J δ|² + λ|δ|² under slope δ =
-    room, with the room such that t is nearly 0 where the step ends.
+class MarginBound:
+    """The bound of a step that leaves a number t(δ) positive.
 
     Args:
-        system: without the bound.
         slope: the derivative of -t by the first entries of a step.
         t: at 0.
         after: t after a step.
     """
 
-    def __init__(
-        self,
-        system: System,
-        slope: Float[Tensor, " own"],
-        t: float,
-        after: Callable[[Tensor], float],
-    ) -> None:
-        self._system, self.scale, self.rank = system, system.scale, system.rank
-        self.slope, self.t, self.after = slope, t, after
+    trusted, corrections = False, 4
 
-    def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
-        """-(JᵀJ + λI)⁻¹ gradient, within the bound."""
-        free = step = self._system.solve(gradient, damping)
-        if not torch.isfinite(free).all():
-            return free
-        slope = torch.zeros_like(free)
-        slope[: len(self.slope)] = self.slope.to(free)
-        across = -self._system.solve(slope, damping)
-        curvature = float(slope @ across)
-        room = (1.0 - KEPT) * self.t
-        for _ in range(CORRECTIONS):
-            excess = float(slope @ free) - room
-            step = free - max(0.0, excess) / max(curvature, TINY) * across
-            left = self.after(step)
-            if left > 0.0:
-                break
-            # t is left less than the bound says; half of it is tried to be kept.
-            room = min(room, float(slope @ step)) - (KEPT * self.t - left)
-        return step
+    def __init__(
+        self, slope: Float[Tensor, " own"], t: float, after: Callable[[Tensor], float]
+    ) -> None:
+        self.slopes, self.t, self.after = slope.unsqueeze(0), t, after
+        self.room = slope.new_tensor([(1.0 - KEPT) * t])
+
+    def tightened(
+        self, step: Float[Tensor, " P"], room: Float[Tensor, " 1"]
+    ) -> Float[Tensor, " 1"] | None:
+        """The room to try next if t is not positive after a step; else None."""
+        left = self.after(step)
+        if left > 0.0:
+            return None
+        used = self.slopes.to(step) @ step[: self.slopes.shape[1]]
+        # t is left less than the bound says; half of it is tried to be kept.
+        return torch.minimum(room, used) - (KEPT * self.t - left)

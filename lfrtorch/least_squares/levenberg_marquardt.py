@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -199,11 +199,11 @@ class LevenbergMarquardt:
         max_damping: λ relative to the largest squared singular value that ends the search.
         least_damping: to which the first step may lower λ, in trials from the same Jacobian; with
             ``damping`` or more it does not.
-        stable: whether A's eigenvalues stay within the unit circle. Then no bounded input makes a
-            model with a bounded static map run away. If they are not inside at the start, they stay
-            within the circle that they are in.
-        contracting: whether every model on the way is proven to contract, for all inputs, see
-            ``lfrtorch.analysis.contraction``. The start must be.
+        guarantee: what every model on the way keeps. ``"stable"``: A's eigenvalues stay within the
+            unit circle, so that no bounded input makes a model with a bounded static map run away;
+            if they are not inside at the start, they stay within the circle that they are in.
+            ``"contracting"``: the model is proven to contract, for all inputs, see
+            ``lfrtorch.analysis.contraction``; the start must be. Default: nothing.
 
     Example:
         >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=10, acceleration=False)
@@ -223,8 +223,7 @@ class LevenbergMarquardt:
     acceleration_limit: float = 0.75
     max_damping: float = 1e12
     least_damping: float = 1e-8
-    stable: bool = False
-    contracting: bool = False
+    guarantee: Literal["stable", "contracting"] | None = None
 
     def __post_init__(self) -> None:
         for name in ("damping", "truncation", "finite_step", "acceleration_limit", "max_damping"):

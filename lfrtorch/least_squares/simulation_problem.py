@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, Self
 
 import torch
@@ -15,20 +14,17 @@ from lfrtorch._support.checks import number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
-from lfrtorch.engine.block_form import zeros_of
 from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.sensitivity import Linearisation
 from lfrtorch.engine.simulation import Trajectory, is_compiled
-from lfrtorch.least_squares.contracting import Contracting
-from lfrtorch.least_squares.exact_integrators import fixed_parameters, integrating_states
+from lfrtorch.least_squares.exact_integrators import fixed_parameters
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
+from lfrtorch.least_squares.guarantee import Name, guarantee_of
 from lfrtorch.least_squares.jacobian import Jacobian, Memory, Part
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
 from lfrtorch.least_squares.record_groups import group_records
-from lfrtorch.least_squares.stable_states import StableSystem, fading, largest_modulus, stabilised
 from lfrtorch.model import Model
 from lfrtorch.records import NormalisedRecord, Record, as_records
 
@@ -54,12 +50,10 @@ class SimulationProblem(LeastSquares):
             variance over prior variance, both normalised. One number, or one for each group of
             parameters by the beginning of their names: ``{"static": 1e-3, "A": 1e-2, "x0": 0}``;
             other groups get 0.
-        stable: whether a search keeps A's eigenvalues within the unit circle, or, if they are not
-            at θ_0, within the circle that they are in.
-        contracting: whether a search stays among models that are proven to contract; A is then
-            stable, too.
-        longest: samples of the longest record before they were cut into windows, which ``stable``
-            goes by. Default: of these records.
+        guarantee: what every model on the way of a search keeps: ``"stable"`` or
+            ``"contracting"``, see ``lfrtorch.least_squares.guarantee``. Default: nothing.
+        longest: samples of the longest record before they were cut into windows, which
+            ``"stable"`` goes by. Default: of these records.
         solve_initial_states: estimated initial states are no part of θ, but solved for at every θ,
             and outputs end at the limits of a record, as in a score.
         ranks: the processes that share the records. All have the same θ, cost and gradient; each
@@ -77,8 +71,7 @@ class SimulationProblem(LeastSquares):
         y_scale: Array | float = 1.0,
         *,
         ridge: Ridge = 0.0,
-        stable: bool = False,
-        contracting: bool = False,
+        guarantee: Name | None = None,
         longest: int | None = None,
         solve_initial_states: bool = False,
         ranks: Ranks | None = None,
@@ -105,19 +98,8 @@ class SimulationProblem(LeastSquares):
         self._ridge = self._ridge_of(ridge)
         self.fixed: Bool[Tensor, " free"] | None = fixed_parameters(lfr.cell)
         """Which entries of the module's free parameters are constants: columns of zeros in J."""
-        if (stable or contracting) and zeros_of(lfr.cell):
-            option = "stable" if stable else "contracting"
-            raise InputError(
-                f"a fit with trainer.{option}=true does not keep the structure "
-                f"'{lfr.cell.structure}'; give structure=free, or trainer.{option}=false."
-            )
-        self._contracting = Contracting(lfr.cell) if contracting else None
-        self._largest_pole = math.inf
-        self._integrating = integrating_states(lfr.cell)
-        if stable and lfr.cell.A.requires_grad and not self._integrating.all():
-            radius = spectral_radius(fading(lfr.cell.A, self._integrating)).double()
-            limit = largest_modulus(longest or max((r.samples for r in data), default=1))
-            self._largest_pole = max(limit, float(self.ranks.first(radius)))
+        samples = longest or max((record.samples for record in data), default=1)
+        self._guarantee = guarantee_of(guarantee, lfr.cell, samples, self.ranks)
         self._reduced: Reduction | None = None
         self._memory = Memory()
         self.guesses: list[Tensor | None] = [None] * len(self.groups)
@@ -184,15 +166,10 @@ class SimulationProblem(LeastSquares):
         return torch.cat(errors)
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-        """θ with A's eigenvalues within the limit, or with a certificate, if there shall be one."""
-        if self._contracting is not None:
-            return self.ranks.first(self._contracting.admissible(theta))
-        if not math.isfinite(self._largest_pole) or not torch.isfinite(theta).all():
+        """θ, or one near it that keeps the guarantee."""
+        if self._guarantee is None:
             return theta
-        nx = self.lfr.cell.nx
-        A = theta[: nx**2].view(nx, nx)
-        found = self.ranks.first(stabilised(A, self._integrating, self._largest_pole))
-        return theta if found is A else torch.cat([found.flatten(), theta[nx**2 :]])
+        return self.ranks.first(self._guarantee.admissible(theta))
 
     def linearise(
         self, theta: Float[Tensor, " P"], *, reduce: bool = True, eliminate: bool = True
@@ -243,18 +220,9 @@ class SimulationProblem(LeastSquares):
         else:
             reduced = everything(theta)
         penalty, ridge = theta - self._theta_0, self._ridge.sqrt()
-        if self._contracting is not None:
-            self._contracting.begin(theta)
-            bounded = self._contracting.bounded
-            return Jacobian(parts, reduced, ridge, penalty, self.ranks, fixed, bounded)
-        if not math.isfinite(self._largest_pole):
+        if self._guarantee is None:
             return Jacobian(parts, reduced, ridge, penalty, self.ranks, fixed)
-        bounded = partial(
-            StableSystem,
-            A=cell.A.detach(),
-            integrating=self._integrating,
-            limit=self._largest_pole,
-        )
+        bounded = self._guarantee.bounded(theta)
         return Jacobian(parts, reduced, ridge, penalty, self.ranks, fixed, bounded)
 
     def jacobian(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "M P"]:

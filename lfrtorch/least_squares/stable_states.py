@@ -3,10 +3,12 @@
 If all eigenvalues of A are inside the unit circle and the static map is bounded, no bounded input
 makes the model run away: x is the response of a stable linear system to u and w. Exact integrators
 stay as they are. A step of a search is held within the limit to first order, at the least cost
-(``StableSystem``); what it passes the limit by to second order is taken back (``stabilised``).
+(``PoleBounds``); what it passes the limit by to second order is taken back (``stabilised``).
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import scipy
@@ -14,7 +16,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lfrtorch.distributed import Ranks
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import spectral_radius
+from lfrtorch.least_squares.bounded_system import ROUNDING, BoundedSystem
+from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.least_squares.linear_systems import System
 
 
@@ -32,12 +38,6 @@ def largest_modulus(samples: int) -> float:
 NEAR = 0.9
 """Moduli below this part of the limit are left out of a step's bounds: no step goes so far, and
 eigenvalues at 0, those of delays, have no derivative."""
-
-CORRECTIONS = 5
-"""Most rounds in which a step's bounds are tightened by what it passes the limit by."""
-
-ROUNDING = 1e-12
-"""A modulus at the limit is not beyond it."""
 
 
 def fading(A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"]) -> Float[Tensor, "n n"]:
@@ -81,28 +81,54 @@ def stabilised(
     return found
 
 
-class StableSystem:
-    """A system whose steps keep the eigenvalues of A within a limit, to first order.
+class Stable:
+    """A's eigenvalues on the way of a search, which fade within a record.
 
-    A step that would take the modulus of some eigenvalues beyond the limit is replaced by the best
-    one that takes them there: the minimum of |r + J δ|² + λ|δ|² under these bounds, which are
-    tightened until the step keeps them to all orders.
+    If they are not within the unit circle at the start, they stay within the circle that they are
+    in.
 
     Args:
-        system: without the limit.
+        cell: the model at the start; A is the first part of θ.
+        samples: of the longest record.
+        ranks: the processes that share the records.
+    """
+
+    def __init__(self, cell: LFRCell, samples: int, ranks: Ranks) -> None:
+        self._nx, self._integrating = cell.nx, integrating_states(cell)
+        radius = spectral_radius(fading(cell.A, self._integrating)).double()
+        self._limit = max(largest_modulus(samples), float(ranks.first(radius)))
+
+    def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+        """θ with A's eigenvalues within the limit."""
+        if not torch.isfinite(theta).all():
+            return theta
+        A = self._matrix(theta)
+        found = stabilised(A, self._integrating, self._limit)
+        return theta if found is A else torch.cat([found.flatten(), theta[self._nx**2 :]])
+
+    def bounded(self, theta: Float[Tensor, " P"]) -> Callable[[System], System]:
+        """Let the steps from θ keep A's eigenvalues within the limit."""
+        A = self._matrix(theta)
+        return lambda system: BoundedSystem(system, PoleBounds(A, self._integrating, self._limit))
+
+    def _matrix(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "nx nx"]:
+        return theta[: self._nx**2].view(self._nx, self._nx)
+
+
+class PoleBounds:
+    """Bounds of steps that keep the eigenvalues of A within a limit.
+
+    Args:
         A: where the step begins; its entries are the first ones of θ.
         integrating: its exact integrators.
         limit: of the moduli.
     """
 
+    trusted, corrections = True, 5
+
     def __init__(
-        self,
-        system: System,
-        A: Float[Tensor, "nx nx"],
-        integrating: Bool[Tensor, " nx"],
-        limit: float,
+        self, A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"], limit: float
     ) -> None:
-        self._system, self.scale, self.rank = system, system.scale, system.rank
         self._own = torch.nonzero(~integrating).flatten().cpu().numpy()
         self._A = fading(A, integrating).double().cpu().numpy()
         self._limit = limit
@@ -116,38 +142,17 @@ class StableSystem:
             slope[np.ix_(self._own, self._own)] = np.outer(y, x) / (y @ x)
         self._changes = slopes.reshape(len(near), A.numel())
         along = np.conj(self._values) / np.abs(self._values)
-        self._slopes = torch.as_tensor((along[:, None] * self._changes).real).to(A)
+        self.slopes = torch.as_tensor((along[:, None] * self._changes).real).to(A)
+        self.room = torch.as_tensor(limit - np.abs(self._values))
 
-    def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
-        """-(JᵀJ + λI)⁻¹ gradient, within the limit."""
-        free = self._system.solve(gradient, damping)
-        C = free.new_zeros(len(self._slopes), len(free))
-        C[:, : self._slopes.shape[1]] = self._slopes
-        room = torch.as_tensor(self._limit - np.abs(self._values)).to(free)
-        if not (C @ free - room > ROUNDING).any():  # also if the step is NaN
-            return free
-        across = torch.stack([-self._system.solve(c, damping) for c in C])
-        # Multipliers μ >= 0 of the bounds: the least |Lᵀμ - L⁻¹ excess|² for L Lᵀ = C across.
-        G = C @ across.mT
-        G.diagonal().add_(ROUNDING * G.diagonal().max())
-        L = torch.linalg.cholesky(G)
-        step = free
-        for _ in range(CORRECTIONS):
-            excess = (C @ free - room).unsqueeze(-1)
-            rest = torch.linalg.solve_triangular(L, excess, upper=False).squeeze(-1)
-            multipliers, _ = scipy.optimize.nnls(L.mT.cpu().numpy(), rest.cpu().numpy())
-            step = free - across.mT @ torch.as_tensor(multipliers).to(free)
-            beyond = self._beyond(step)
-            if beyond.max() < ROUNDING:
-                break
-            room -= torch.as_tensor(beyond).to(room)
-        return step
-
-    def _beyond(self, step: Float[Tensor, " P"]) -> Float[np.ndarray, " near"]:
-        """How far a step takes each pole beyond the limit, to all orders."""
-        dA = step[: self._slopes.shape[1]].double().cpu().numpy()
+    def tightened(
+        self, step: Float[Tensor, " P"], room: Float[Tensor, " near"]
+    ) -> Float[Tensor, " near"] | None:
+        """The room less what a step takes each pole beyond the limit; None if it takes none."""
+        dA = step[: self.slopes.shape[1]].double().cpu().numpy()
         size = round(len(dA) ** 0.5)
         after = np.linalg.eigvals(self._A + dA.reshape(size, size)[np.ix_(self._own, self._own)])
         expected = self._values + self._changes @ dA
         which = scipy.optimize.linear_sum_assignment(np.abs(expected[:, None] - after))[1]
-        return np.maximum(np.abs(after[which]) - self._limit, 0.0)
+        beyond = np.maximum(np.abs(after[which]) - self._limit, 0.0)
+        return None if beyond.max() < ROUNDING else room - torch.as_tensor(beyond).to(room)

@@ -108,7 +108,7 @@ def test_what_a_structure_has_no_place_for_is_refused(record: Record):
         lfrtorch.Settings(nx=2, nz="auto", structure="wiener")
     with pytest.raises(lfrtorch.InputError, match="average"):
         lfrtorch.Settings(nx=2, structure="wiener", average=2)
-    trainer = lfrtorch.LevenbergMarquardt(stable=True)
+    trainer = lfrtorch.LevenbergMarquardt(guarantee="stable")
     with pytest.raises(lfrtorch.InputError, match="does not keep the structure"):
         lfrtorch.fit(begun("wiener", record), record, trainer=trainer)
     models = [begun("wiener", record, seed=seed) for seed in range(2)]

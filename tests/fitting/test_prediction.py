@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -259,8 +260,8 @@ def test_a_run_predicts():
             lambda m, r: Settings(nx=1, noise="innovation", distil=True),
         ),
         *(
-            ("what is bounded is the predictor, and the model could run away", act)
-            for trainer in (lfrtorch.Adam(stable=True), lfrtorch.Adam(contracting=True))
+            ("what it holds for is the predictor, and the model could run away", act)
+            for trainer in map(partial(lfrtorch.Adam, 20, 1e-2), ("stable", "contracting"))
             for act in (
                 lambda m, r, t=trainer: lfrtorch.fit(m, r, noise="innovation", trainer=t),
                 lambda m, r, t=trainer: Settings(nx=1, noise="both", trainer=t),

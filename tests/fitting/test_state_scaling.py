@@ -137,7 +137,7 @@ def test_frozen_matrices_keep_their_coordinates():
 def test_a_contracting_fit_still_contracts():
     truth, start = far_off(), far_off(1, radius=0.5, feedback=0.05)
     train = measure(replace(truth, scaler=start.scaler), 200)
-    trainer = replace(FEW, contracting=True, max_iter=4)
+    trainer = replace(FEW, guarantee="contracting", max_iter=4)
     result = lfrtorch.fit(start, train, trainer=trainer, monitors=[])
     assert analysis.contraction(result.model).rate < 1.0
     kept = result.history[result.chosen_iteration]

@@ -82,12 +82,8 @@ class Walk:
         )
 
     @property
-    def stable(self) -> bool:
-        return True
-
-    @property
-    def contracting(self) -> bool:
-        return False
+    def guarantee(self) -> Any:
+        return "stable"
 
     def prolonged(self, state: State) -> State:
         return state

@@ -146,7 +146,7 @@ def test_validation_in_windows_compares_with_whole_records_and_training_does_not
 
 @numeric
 def test_poles_of_a_fit_over_windows_stay_within_the_limit_of_whole_records(model: Model):
-    trainer = lfrtorch.LevenbergMarquardt(stable=True)
+    trainer = lfrtorch.LevenbergMarquardt(guarantee="stable")
     problem = Fit(model, measure(model, 400), trainer=trainer, horizon=20).problem
     slow = problem.theta
     slow[:4] = torch.diag(slow.new_tensor([0.99, 0.5])).flatten()

@@ -11,7 +11,8 @@ from lfrtorch import analysis
 from lfrtorch.engine.nonlinearity import Network
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.least_squares.adam import Adam
-from lfrtorch.least_squares.contracting import Contracting, HeldSystem
+from lfrtorch.least_squares.bounded_system import BoundedSystem
+from lfrtorch.least_squares.contracting import Contracting, MarginBound
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
@@ -21,17 +22,16 @@ from lfrtorch.records import Record
 pytestmark = pytest.mark.numeric
 
 
-def held(sizes: dict[str, Any]) -> tuple[HeldSystem, int]:
+def held(sizes: dict[str, Any]) -> tuple[BoundedSystem, MarginBound, int]:
     """Steps of |δ - free|² from a random model, by the unit matrix, and its parameters."""
     default: dict[str, Any] = {"nx": 3, "feedback": 0.15}
     cell = random_cell(**default | sizes)
     theta = torch.cat([p.detach().flatten() for p in cell.parameters()])
     system = CholeskySystem(torch.eye(len(theta), dtype=theta.dtype), len(theta))
-    keeper = Contracting(cell)
-    keeper.begin(theta)
-    found = keeper.bounded(system)
-    assert isinstance(found, HeldSystem)
-    return found, len(theta)
+    found = Contracting(cell).bounded(theta)(system)
+    assert isinstance(found, BoundedSystem)
+    assert isinstance(found.bounds, MarginBound)
+    return found, found.bounds, len(theta)
 
 
 @pytest.mark.parametrize(
@@ -39,25 +39,24 @@ def held(sizes: dict[str, Any]) -> tuple[HeldSystem, int]:
     [{}, {"nz": 2, "nw": 2, "nn": 6}, {"nz": 3, "nw": 3, "nn": 4}, {"layers": 2, "nn": 4}],
 )
 def test_the_slope_is_that_of_the_margin(sizes: dict[str, Any]):
-    system, size = held(sizes)
+    _, bound, size = held(sizes)
     step = 1e-5 * normal(size, seed=3)
-    change = system.after(step) - system.after(-step)
-    assert float(-2.0 * system.slope @ step) == pytest.approx(change, rel=0.05)
+    change = bound.after(step) - bound.after(-step)
+    assert float(-2.0 * bound.slopes[0] @ step) == pytest.approx(change, rel=0.05)
 
 
 def test_a_step_keeps_a_margin():
-    system, size = held({"nz": 2, "nw": 2, "nn": 6})
-    inside = -0.01 * system.slope
+    system, bound, size = held({"nz": 2, "nw": 2, "nn": 6})
+    slope = bound.slopes[0]
+    inside = -0.01 * slope
     assert torch.equal(system.solve(-inside, 0.0), inside)
     for far in (2.0, 20.0):
-        beyond = far * system.slope / system.slope.norm() + 0.1 * normal(size)
-        assert system.after(beyond) <= 0.0
+        beyond = far * slope / slope.norm() + 0.1 * normal(size)
+        assert bound.after(beyond) <= 0.0
         step = system.solve(-beyond, 0.0)
-        assert system.after(step) > 0.0
+        assert bound.after(step) > 0.0
         across = beyond - step  # what the bound takes away is along its slope
-        assert float(across @ system.slope) == pytest.approx(
-            float(across.norm() * system.slope.norm())
-        )
+        assert float(across @ slope) == pytest.approx(float(across.norm() * slope.norm()))
 
 
 def bistable() -> tuple[Model, Record]:
@@ -90,7 +89,7 @@ def test_every_model_on_the_way_contracts(trainer):
             Contracting(model.lfr.cell)  # refuses a model without a certificate
             proofs.append(True)
 
-        options = replace(trainer, contracting=contracting)
+        options = replace(trainer, guarantee="contracting" if contracting else None)
         result = fit(model, record, trainer=options, monitors=[watch] if contracting else [])
         assert result.history[-1].train < 0.8 * result.history[0].train
         assert len(proofs) == (len(result.history) if contracting else 0)
@@ -100,7 +99,7 @@ def test_every_model_on_the_way_contracts(trainer):
 
 def test_what_has_no_certificate_is_not_admitted():
     model, record = bistable()
-    problem = SimulationProblem.of(model, record, contracting=True)
+    problem = SimulationProblem.of(model, record, guarantee="contracting")
     theta = problem.theta
     assert problem.admissible(theta) is theta
     problem.linearise(theta)
@@ -115,9 +114,8 @@ def test_a_start_without_a_certificate_is_refused():
     with torch.no_grad():
         model.lfr.cell.A.fill_(1.1)
     with pytest.raises(ValueError, match="needs a start that is proven to contract"):
-        SimulationProblem.of(model, record, contracting=True)
+        SimulationProblem.of(model, record, guarantee="contracting")
     polynomial = random_model(polynomial_cell(1, 1, 2))
+    trainer = LevenbergMarquardt(guarantee="contracting")
     with pytest.raises(ValueError, match=r"needs a network .* not a Polynomial"):
-        fit(polynomial, measure(polynomial, 50), trainer=LevenbergMarquardt(contracting=True))
-    with pytest.raises(ValueError, match="contracting is 'yes'; give True or False"):
-        LevenbergMarquardt(contracting="yes")  # pyright: ignore[reportArgumentType]
+        fit(polynomial, measure(polynomial, 50), trainer=trainer)

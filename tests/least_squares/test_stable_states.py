@@ -11,10 +11,11 @@ from torch import Tensor
 from lfrtorch.engine.nonlinearity import Network
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.least_squares.adam import Adam
+from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.linear_systems import CholeskySystem
+from lfrtorch.least_squares.linear_systems import CholeskySystem, System
 from lfrtorch.least_squares.simulation_problem import SimulationProblem
-from lfrtorch.least_squares.stable_states import StableSystem, fading, largest_modulus, stabilised
+from lfrtorch.least_squares.stable_states import PoleBounds, fading, largest_modulus, stabilised
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -72,11 +73,14 @@ def test_exact_integrators_stay():
 # --- steps within it ------------------------------------------------------------------------
 
 
+def bounded(system: System, A: Tensor) -> BoundedSystem:
+    return BoundedSystem(system, PoleBounds(A, NONE, LIMIT))
+
+
 def test_a_step_within_the_limit_is_that_of_the_system():
     A, J, gradient = matrix(0.5, 0.3, 0.2 + 0.4j), normal(30, 20), 1e-3 * normal(20, seed=1)
     system = CholeskySystem(J.mT @ J, 20)
-    bounded = StableSystem(system, A, NONE, LIMIT)
-    assert torch.equal(bounded.solve(gradient, 0.1), system.solve(gradient, 0.1))
+    assert torch.equal(bounded(system, A).solve(gradient, 0.1), system.solve(gradient, 0.1))
 
 
 @pytest.mark.parametrize("poles", [(0.999, 0.3, 0.2 + 0.4j), (0.1, 0.3, 0.7 + 0.714j)])
@@ -91,7 +95,7 @@ def test_a_step_beyond_the_limit_is_the_best_one_that_ends_there(poles: tuple[co
     G = J.mT @ J
     H = G + damping * torch.eye(20)
     gradient = -0.02 / slope.square().sum() * (H @ slope)  # the free step takes the pole to > 1
-    step = StableSystem(CholeskySystem(G, 20), A, NONE, LIMIT).solve(gradient, damping)
+    step = bounded(CholeskySystem(G, 20), A).solve(gradient, damping)
     room = LIMIT - moduli(A)[-1]
     assert LIMIT - 1e-5 < moduli(A + step[:16].view(4, 4))[-1] < LIMIT + 1e-9
     first = room * slope / slope.square().sum()
@@ -106,7 +110,7 @@ def test_a_bound_that_others_make_needless_holds_no_step_back():
     A = torch.diag(torch.tensor([0.9995, 0.9994, 0.3, 0.2], dtype=torch.float64))
     J, gradient = torch.eye(16, dtype=torch.float64), torch.zeros(16, dtype=torch.float64)
     gradient[0], gradient[5] = -0.01, 0.01
-    step = StableSystem(CholeskySystem(J, 16), A, NONE, LIMIT).solve(gradient, 0.0)
+    step = bounded(CholeskySystem(J, 16), A).solve(gradient, 0.0)
     assert float(step[0]) == pytest.approx(LIMIT - 0.9995, abs=1e-9)
     assert float(step[5]) == pytest.approx(-0.01)
 
@@ -117,7 +121,7 @@ def test_poles_of_delays_bound_no_step():
     A[3, 3] = 0.999
     J, gradient = normal(30, 20), 1e-6 * normal(20, seed=1)
     system = CholeskySystem(J.mT @ J, 20)
-    step = StableSystem(system, A, NONE, LIMIT).solve(gradient, 0.1)
+    step = bounded(system, A).solve(gradient, 0.1)
     assert torch.equal(step, system.solve(gradient, 0.1))
 
 
@@ -156,7 +160,8 @@ def test_a_fit_keeps_A_stable_unless_told(trainer):
         def watch(model: Model, _, radius: list[float] = radius) -> None:
             radius.append(moduli(model.lfr.cell.A.detach())[-1])
 
-        result = fit(model, record, trainer=replace(trainer, stable=stable), monitors=[watch])
+        options = replace(trainer, guarantee="stable" if stable else None)
+        result = fit(model, record, trainer=options, monitors=[watch])
         assert result.history[-1].train < result.history[0].train
         radii[stable] = max(radius)
     assert radii[True] <= largest_modulus(400) * (1 + 1e-9)
@@ -167,13 +172,15 @@ def test_a_start_that_is_not_stable_stays_within_its_own_circle():
     model, record = unstable_data()
     with torch.no_grad():
         model.lfr.cell.A[0, 0] = 1.01
-    problem = SimulationProblem.of(model, record, stable=True)
+    problem = SimulationProblem.of(model, record, guarantee="stable")
     theta = problem.theta.clone()
     assert problem.admissible(theta) is theta
     theta[0] = 1.3
     assert float(problem.admissible(theta)[0]) == pytest.approx(1.01)
 
 
-def test_stable_is_true_or_false():
-    with pytest.raises(ValueError, match="stable is 'yes'; give True or False"):
-        LevenbergMarquardt(stable="yes")  # pyright: ignore[reportArgumentType]
+def test_a_guarantee_is_one_of_two():
+    with pytest.raises(
+        ValueError, match="guarantee is 'yes'; give 'stable', 'contracting' or None"
+    ):
+        LevenbergMarquardt(guarantee="yes")  # pyright: ignore[reportArgumentType]

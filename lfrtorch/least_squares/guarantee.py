@@ -1,0 +1,57 @@
+"""What a search guarantees of every model on its way: a stable linear part, or contraction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lfrtorch._support.errors import InputError
+from lfrtorch.distributed import Ranks
+from lfrtorch.engine.block_form import zeros_of
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.least_squares.contracting import Contracting
+from lfrtorch.least_squares.exact_integrators import integrating_states
+from lfrtorch.least_squares.linear_systems import System
+from lfrtorch.least_squares.stable_states import Stable
+
+Name = Literal["stable", "contracting"]
+"""``"stable"``: A's eigenvalues stay within the unit circle. ``"contracting"``: every model is
+proven to contract."""
+
+
+class Guarantee(Protocol):
+    """A guarantee, of which a search asks two things."""
+
+    def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+        """θ, or one near it that keeps the guarantee."""
+        ...
+
+    def bounded(self, theta: Float[Tensor, " P"]) -> Callable[[System], System]:
+        """What lets the system of a step from θ keep the guarantee, to first order at least."""
+        ...
+
+
+def guarantee_of(name: Name | None, cell: LFRCell, samples: int, ranks: Ranks) -> Guarantee | None:
+    """The guarantee of a name; None if there is none, or nothing that could break it.
+
+    Args:
+        name: of the guarantee.
+        cell: the model at the start; its free parameters are the first entries of θ.
+        samples: of the longest record.
+        ranks: the processes that share the records.
+
+    Raises:
+        ValueError: a model that cannot keep it.
+    """
+    if name is not None and zeros_of(cell):
+        raise InputError(
+            f"a fit with trainer.guarantee={name} does not keep the structure "
+            f"'{cell.structure}'; give structure=free, or trainer.guarantee=null."
+        )
+    if name == "contracting":
+        return Contracting(cell)
+    moves = cell.A.requires_grad and not integrating_states(cell).all()
+    return Stable(cell, samples, ranks) if name == "stable" and moves else None
