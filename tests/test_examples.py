@@ -4,7 +4,11 @@ import re
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+
+import lfrtorch
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -30,3 +34,41 @@ def test_is_many_times_better_than_the_linear_model(
     errors = [float(e) for e in re.findall(r"([\d.]+) .*rms on the test", printed)]
     assert len(errors) == 4
     assert errors[0] > ratio * errors[1]
+
+
+@pytest.mark.numeric
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # of torch.func itself
+def test_one_page_comes_to_the_cost_of_the_package_from_the_same_start():
+    page = runpy.run_path(str(EXAMPLES / "minimal.py"))
+    torch.manual_seed(0)
+    records = [page["measured"](125, seed) for seed in range(8)]
+    signals = [np.stack([r.u for r in records]), np.stack([r.y for r in records])]
+    (u_mean, u_std), (y_mean, y_std) = ((s.mean((0, 1)), s.std((0, 1))) for s in signals)
+    u = torch.as_tensor((signals[0] - u_mean) / u_std)
+    y = torch.as_tensor((signals[1] - y_mean) / y_std)
+    weights = page["embedded"](*page["subspace"](u, y, nx=2), nu=1, nz=1, nw=1, nn=6)
+    weights, _ = page["fit"](weights, ["Bu", "Dyu"], u, y, iterations=3)
+    weights, linear = page["fit"](weights, ["A", "Bu", "Cy", "Dyu"], u, y, iterations=8)
+    start = page["scaled"](weights, u)
+    _, errors = page["fit"](start, list(start), u, y, iterations=30)
+
+    static = lfrtorch.Network(1, 1, 6, dtype=torch.float64)
+    cell = lfrtorch.LFRCell(1, 1, 2, 1, 1, static, dtype=torch.float64)
+    with torch.no_grad():
+        for name, weight in start.items():
+            (static if hasattr(static, name) else cell).get_parameter(name).copy_(weight)
+    scaler = lfrtorch.Scaler(u_mean, u_std, y_mean, y_std)
+    model = lfrtorch.Model(
+        lfrtorch.LFR(cell), scaler, records[0].fs, records[0].inputs, records[0].outputs
+    )
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=30)
+    history = lfrtorch.fit(model, records, trainer=trainer).history
+    # The start has the output of the best linear approximation, and that is the package's, too.
+    bla = lfrtorch.estimate_bla(records, nx=2)
+    bla_rmse = np.sqrt(np.mean([lfrtorch.rmse(r, bla.simulate(r)) ** 2 for r in records]))
+    assert linear[-1] * y_std[0] == pytest.approx(bla_rmse, rel=1e-2)
+    assert errors[0] == pytest.approx(linear[-1], rel=1e-9)
+    assert errors[0] * y_std[0] == pytest.approx(history[0].train, rel=1e-9)
+    # The costs, 1/144 of the start's, are 0.1 % apart: the package accelerates its steps.
+    assert errors[-1] < 0.1 * errors[0]
+    assert (errors[-1] * y_std[0]) ** 2 == pytest.approx(history[-1].train ** 2, rel=1e-2)
