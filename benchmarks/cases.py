@@ -29,7 +29,7 @@ from lfrtorch.engine.parameter_layout import layout
 from lfrtorch.least_squares.gauge import reduction
 from lfrtorch.least_squares.jacobian import CACHED_BYTES
 from lfrtorch.least_squares.levenberg_marquardt import LMState
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 
 NEARBY = (1.0 + 1e-12 * i for i in itertools.count())
 """Factors of what is kept from one call to the next if it is the same."""
@@ -164,7 +164,7 @@ def scaling(folder: Path, axis: str, values: list[int], sizes: dict[str, int]) -
         begin = clock()
         while not one_trials(steps) or (clock() - begin < LONG_ENOUGH and len(steps) < 40):
             steps += search(problem, RESTART, theta)[1]
-        cell, rows = model.lfr.cell, sum(group.y.numel() for group in problem.groups)
+        cell, rows = model.lfr.cell, sum(group.y.numel() for group in problem.errors.groups)
         kept = reduction(cell, torch.zeros(0, cell.nx).to(cell.A)).kept
         by_x, _, by_y = layout(cell).columns(kept)[:3]
         shape = {"P": model.parameter_count, "K": len(kept), "Kx": len(by_x)}
@@ -193,14 +193,14 @@ def first_call(folder: Path) -> dict:
         stage("estimate_bla")
         model = lfrtorch.initialise(bla, data, nz=2, nw=1, nn=15)
         stage("initialise")
-        search(SimulationProblem.of(model, data, ridge=problems.RIDGE), 1)
+        search(Problem.of(model, data, ridge=problems.RIDGE), 1)
         stage("first iteration")
         runs.append(stages)
     return {"first_s": runs[0], "again_s": runs[1]}
 
 
 def search(
-    problem: SimulationProblem, count: int, theta: torch.Tensor | None = None
+    problem: Problem, count: int, theta: torch.Tensor | None = None
 ) -> tuple[LMState, list[tuple[float, int]]]:
     """State of the search after ``count`` iterations, and seconds and trials of each."""
     state = ENDLESS.init(problem, problem.theta if theta is None else theta.clone())

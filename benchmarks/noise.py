@@ -46,7 +46,7 @@ import torch
 import lfrtorch
 from lfrtorch._support.types import Array
 from lfrtorch.fitting.prediction import Noise
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.bla import Criterion
 from lfrtorch.metrics import rms
 from lfrtorch.records import Scaler, with_past_outputs
@@ -236,14 +236,14 @@ def iteration_seconds(nx: int, turns: int = 9) -> list[float]:
     model = lfrtorch.initialise(linear, records, nz=1, nw=1, nn=15)
     driven = [with_past_outputs(record) for record in records]
     problems = [
-        SimulationProblem.of(model, records),
-        SimulationProblem.of(model.predictor(), driven),
+        Problem.of(model, records),
+        Problem.of(model.predictor(), driven),
     ]
     found = np.array([[_seconds(problem, turn) for problem in problems] for turn in range(turns)])
     return np.median(found[1:], axis=0).tolist()
 
 
-def _seconds(problem: SimulationProblem, turn: int) -> float:
+def _seconds(problem: Problem, turn: int) -> float:
     """Of one iteration of one trial, near the start."""
     theta = problem.theta + 1e-9 * turn
     clock = time.perf_counter()

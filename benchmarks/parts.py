@@ -21,8 +21,8 @@ from scaling import operations
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.engine import simulation
 from lfrtorch.engine.nonlinearity import Network
-from lfrtorch.least_squares.jacobian import CACHED_BYTES
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.jacobian import CACHED_BYTES, OutputRows
+from lfrtorch.least_squares.problem import Problem
 
 NAMES = {"boucwen": "Bouc-Wen", problems.AIRCRAFT: "aircraft", problems.MIRROR: "mirror"}
 REPETITIONS = 5
@@ -50,7 +50,7 @@ def main() -> None:
                 + measured["adjoint"]
             )
             cell = problem.lfr.cell
-            samples = sum(group.u.shape[0] * group.u.shape[1] for group in problem.groups)
+            samples = sum(group.u.shape[0] * group.u.shape[1] for group in problem.errors.groups)
             sizes.append(
                 f"{short}: {cell.nx} states, {cell.ny} outputs, {samples} samples, "
                 f"{len(problem.theta)} parameters"
@@ -67,17 +67,17 @@ def main() -> None:
         print(f"| {part} | " + " | ".join(cells) + " |")
 
 
-def counts(problem: SimulationProblem) -> dict[str, float]:
+def counts(problem: Problem) -> dict[str, float]:
     """Operations of each part that ``cases.parts`` measures, and of an iteration."""
     state, _ = search(problem, RESTART)
     with mock.patch.object(simulation, "_compiled", wraps=simulation._compiled) as passes:
         problem.residual(state.theta * next(NEARBY))
         problem.residual(ENDLESS.step(problem, state).theta * next(NEARBY))
     cell, reduced = problem.lfr.cell, problem.linearise(state.theta)._reduced
-    by_x, _, by_y = (
-        problem.linearise(state.theta).parts[0].linearisation.layout.columns(reduced.kept)[:3]
-    )
-    rows = sum(group.y.numel() for group in problem.groups)
+    part = problem.linearise(state.theta).parts[0]
+    assert isinstance(part, OutputRows)
+    by_x, _, by_y = part.linearisation.layout.columns(reduced.kept)[:3]
+    rows = sum(group.y.numel() for group in problem.errors.groups)
     K, nx = len(reduced.kept), cell.nx
     assert isinstance(cell.static, Network)
     about = {

@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 import lfrtorch
 from lfrtorch import Channel, LinearModel, Model, Record
 from lfrtorch._support.types import Array
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 
 SIZES = {
     "boucwen": {"nx": 3, "nz": 2, "nw": 1, "nn": 15},
@@ -140,11 +140,11 @@ def problem(
     start: Literal["periodic", "zero"] = "periodic",
     periods: int = 1,
     count: int | None = None,
-) -> SimulationProblem:
+) -> Problem:
     """The residual that a fit of the problem minimises."""
     model = lfrtorch.load(folder / name)
     data = records(folder, name, start=start, periods=periods, count=count)
-    return SimulationProblem.of(model, data, ridge=ridge)
+    return Problem.of(model, data, ridge=ridge)
 
 
 def synthetic(
@@ -156,7 +156,7 @@ def synthetic(
     nz: int = 2,
     nw: int = 1,
     nn: int = 15,
-) -> tuple[Model, SimulationProblem]:
+) -> tuple[Model, Problem]:
     """A fit of any size: a random linear system with quadratic outputs, records from rest.
 
     It has as many inputs as outputs.
@@ -170,13 +170,13 @@ def synthetic(
         linear = system.simulate(u)
         data.append(Record(u, linear + 0.1 * linear**2))
     model = lfrtorch.initialise(system, data, nz=nz, nw=nw, nn=nn)
-    return model, SimulationProblem.of(model, data)
+    return model, Problem.of(model, data)
 
 
-def plain_gradient(problem: SimulationProblem, theta: torch.Tensor) -> torch.Tensor:
+def plain_gradient(problem: Problem, theta: torch.Tensor) -> torch.Tensor:
     """The gradient (P,) of the mean square by autograd through a loop in Python, from rest."""
     problem.write(theta)
-    cell, (group,) = problem.lfr.cell, problem.groups
+    cell, (group,) = problem.lfr.cell, problem.errors.groups
     x, outputs = group.u.new_zeros(len(group.u), cell.nx), []
     for u in group.u.unbind(1):
         y, x = cell(u, x)

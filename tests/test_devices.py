@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from lfrtorch.engine.nonlinearity import ACTIVATIONS
 from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.model import Model
 
 pytestmark = pytest.mark.numeric
@@ -24,7 +24,7 @@ def some_model(activation: str = "tanh", dtype: torch.dtype = torch.float64) -> 
     return random_model(cell)
 
 
-def some_problem(model: Model, made_by: Model | None = None) -> SimulationProblem:
+def some_problem(model: Model, made_by: Model | None = None) -> Problem:
     made_by, noise = made_by or model, np.random.default_rng(0)
     records = [
         replace(measure(made_by, 60), start="zero", skip=2),
@@ -32,10 +32,10 @@ def some_problem(model: Model, made_by: Model | None = None) -> SimulationProble
         replace(measure(made_by, 40, seed=2), start="estimated"),
     ]
     noisy = [replace(r, y=r.y + 0.1 * noise.normal(size=r.y.shape)) for r in records]
-    return SimulationProblem.of(model, noisy, ridge=0.1)
+    return Problem.of(model, noisy, ridge=0.1)
 
 
-def searched(problem: SimulationProblem, steps: int = 4) -> LMState:
+def searched(problem: Problem, steps: int = 4) -> LMState:
     optimiser = LevenbergMarquardt()
     state = optimiser.init(problem, problem.theta)
     for _ in range(steps):

@@ -35,7 +35,7 @@ from lfrtorch.fitting.trainer import FitResult, Progress
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.model import Model, load
 from lfrtorch.records import Record
 from lfrtorch.reporting.monitor import Checkpoint
@@ -167,7 +167,7 @@ def fitted(name: str, ranks: Ranks) -> tuple[Tensor, FitResult]:
 def slope(ranks: Ranks) -> dict[str, Any]:
     """Cost, gradients and error of the start."""
     model, train, _ = case()
-    problem = SimulationProblem.of(model, train, ridge=1e-2, ranks=ranks)
+    problem = Problem.of(model, train, ridge=1e-2, ranks=ranks)
     at = problem.theta + 0.01
     r, gradient = problem.gradient(at)
     system, product = problem.linearise(at).system(0.0, 1e-12)

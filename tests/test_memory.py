@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from lfrtorch.engine import linearised, sensitivity
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.records import Record, Start
 
 pytestmark = pytest.mark.numeric
@@ -44,7 +44,7 @@ def peak_of_an_iteration(
     model = random_model(random_cell(1, 1, 3, 2, 1, nn))
     noise = np.random.default_rng(0).normal(size=(2, T, 1))
     record = Record(noise[0], noise[1], model.fs, start, line_weight=lines)
-    problem = SimulationProblem.of(model, record)
+    problem = Problem.of(model, record)
     optimiser = LevenbergMarquardt()
     state = optimiser.init(problem, problem.theta)
     with Allocations() as allocations:

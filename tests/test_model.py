@@ -22,7 +22,7 @@ from lfrtorch.engine.newton import newton_states
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation import simulate, steady_state
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model, load
@@ -148,7 +148,7 @@ def test_zeros_that_stay_zeros_are_no_parameters(static, structure, sizes, z, y,
     assert model.parameter_count == every - frozen
     u = model.scaler.u_offset + model.scaler.u_scale * normal(300, nu).numpy()
     record = Record(u, normal(300, 1).numpy(), start="periodic")
-    problem = SimulationProblem.of(model, record)
+    problem = Problem.of(model, record)
     s = torch.linalg.svdvals(problem.jacobian(problem.theta))
     assert model.net_parameter_count == int((s > 1e-11 * s[0]).sum())
 
@@ -282,7 +282,7 @@ def test_scored_samples_have_no_part_in_the_start(model: Model):
     other = replace(part, y=np.concatenate([part.y[:100], -part.y[100:]]))
     for record in (part, other):
         np.testing.assert_allclose(model.simulate(record), part.y, rtol=0, atol=1e-8)
-    judge = SimulationProblem.judge(model, other)
+    judge = Problem.judge(model, other)
     assert judge.rmse(judge.theta) == pytest.approx(rmse(other, part.y), rel=1e-8)
 
 

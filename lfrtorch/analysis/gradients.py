@@ -15,10 +15,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lfrtorch.analysis.noise_model import NoiseModel
+from lfrtorch.distributed import Ranks
 from lfrtorch.engine.sensitivity import Linearisation, fixed_point
 from lfrtorch.least_squares.linear_systems import GramAccumulator, QRAccumulator
 from lfrtorch.least_squares.record_groups import RecordGroup
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -53,10 +54,16 @@ class Gradients:
         fitted: bool,
         hold: bool = False,
     ) -> None:
-        problem = SimulationProblem.of(model, [record], solve_initial_states=not fitted)
+        errors = SimulationErrors(
+            model.lfr.cell,
+            [model.scaler.normalise(record)],
+            Ranks(),
+            solve_initial_states=not fitted,
+        )
         self.record, self.kept = record, kept
-        (self.trajectory,) = problem.trajectories(problem.theta)
-        group: RecordGroup = problem.groups[0].counted(self.trajectory.y)
+        theta = errors.parameters.of(model.lfr.cell, errors.first_initial_states())
+        (self.trajectory,) = errors.trajectories(theta)
+        group: RecordGroup = errors.groups[0].counted(self.trajectory.y)
         self.group = group
         periodic, self.estimated = group.start == "periodic", group.start == "estimated"
         self._along = Linearisation(model.lfr.cell, group.u, self.trajectory, periodic=periodic)

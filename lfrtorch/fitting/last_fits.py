@@ -19,7 +19,7 @@ from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import FitResult, Stop, StoppedError
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.records import common_unit
 
 
@@ -55,7 +55,7 @@ def distilled(
     if one.reason in CUT_SHORT:
         return one
     judged = dataset.validation or dataset.train
-    problems = [SimulationProblem.judge(m, judged) for m in (one.model, result.model)]
+    problems = [Problem.judge(m, judged) for m in (one.model, result.model)]
     costs = [problem.cost(problem.residual(problem.theta)) for problem in problems]
     found, mean = ranks.first(torch.tensor(costs, dtype=torch.float64)).sqrt().tolist()
     taken = found <= AS_GOOD * mean or not dataset.validation

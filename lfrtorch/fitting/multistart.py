@@ -63,7 +63,8 @@ from lfrtorch.fitting.trainer import (
 )
 from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
+from lfrtorch.least_squares.parameters import Ridge
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, common_unit
 from lfrtorch.score_window import with_window
@@ -130,7 +131,7 @@ def fit(
             by up to 6 %.)
             Starts are judged on validation and selection, and without both on training.
         trainer: the search. Default: Levenberg-Marquardt.
-        ridge: weight of |θ - θ_start|², see ``SimulationProblem``.
+        ridge: weight of |θ - θ_start|², see ``lfrtorch.least_squares.problem``.
         noise: where it acts. ``"output"``: on the outputs, and the simulation error is minimised.
             ``"innovation"``: inside the system, too, and the error of the prediction one sample
             ahead is minimised; all errors are those of predictions, and the model of the result
@@ -455,7 +456,7 @@ class _Judge:
         count = 1 + int((scores <= AS_GOOD**2 * scores.nan_to_num(math.inf).min()).nonzero().max())
         return (means[count - 2], count) if count > 1 else (None, 1)
 
-    def _error(self, model: Model) -> SimulationProblem:
+    def _error(self, model: Model) -> Problem:
         """The same error for starts and means."""
         one = next(fit for fit in self.fits if not fit.diverges)
         return one.judge_of(model, self._records)

@@ -22,8 +22,8 @@ from lfrtorch.fitting import state_file
 from lfrtorch.fitting.windows import windows
 from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.prediction_problem import PredictionProblem
-from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
+from lfrtorch.least_squares.parameters import Ridge
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
@@ -239,7 +239,7 @@ class Fit:
     Args:
         model, train, validation, trainer, ridge, ranks: see :func:`lfrtorch.fit`.
         simulation: weight of simulation errors beside those of predictions, of a predictor; see
-            ``PredictionProblem``.
+            ``Problem.of_predictor``.
         horizon: samples of the windows that the records are cut into, see
             ``lfrtorch.fitting.windows``. Default: they are whole.
         keep: called with the fit after every iteration, when it may be saved, and with True when
@@ -271,22 +271,23 @@ class Fit:
         if ranks.world > 1:
             weights = parameters_to_vector(model.lfr.parameters())
             vector_to_parameters(ranks.first(weights), model.lfr.parameters())
-        options: dict[str, Any] = {
-            "ridge": ridge,
-            "guarantee": self.trainer.guarantee,
-            "longest": max(record.samples for record in as_records(train)),
-            "ranks": ranks,
-        }
+        longest = max(record.samples for record in as_records(train))
         if horizon is not None:
             nx = model.lfr.cell.nx
             train = windows(as_records(train), horizon, nx)
             if validation:
                 validation = windows(as_records(validation), horizon, nx, fitted=False)
-        kind: type[SimulationProblem] = SimulationProblem
         if simulation:
-            kind = PredictionProblem
-            options["simulation"] = simulation
-        self.problem = kind.of(model, train, **options)
+            self.problem = Problem.of_predictor(model, train, simulation, ridge=ridge, ranks=ranks)
+        else:
+            self.problem = Problem.of(
+                model,
+                train,
+                ridge=ridge,
+                guarantee=self.trainer.guarantee,
+                longest=longest,
+                ranks=ranks,
+            )
         self.judge = self.judge_of(model, validation) if validation else None
         self.state: Any = None
         """The trainer's; None before the first call of ``advance``."""
@@ -304,11 +305,9 @@ class Fit:
                 Progress(0, self.trainer.limit, math.inf, math.nan, 0.0, False, {}, math.inf)
             )
 
-    def judge_of(self, model: Model, records: Record | Sequence[Record]) -> SimulationProblem:
+    def judge_of(self, model: Model, records: Record | Sequence[Record]) -> Problem:
         """The errors of any model on records that are not fitted, as those of validation."""
-        if isinstance(self.problem, PredictionProblem):
-            return self.problem.judge(model, records, weight=self.problem.weight)
-        return SimulationProblem.judge(model, records)
+        return Problem.judge(model, records, like=self.problem)
 
     @property
     def seconds(self) -> float:
@@ -400,7 +399,10 @@ class Fit:
         device = self.problem.theta.device
         like = self.trainer.init(self.problem, self.problem.theta)
         # After init, which may evaluate gradients and leave guesses of periodic orbits behind.
-        self.problem.load_state_dict(state_file.within("problem.", tensors, device))
+        kept = state_file.within("problem.", tensors, device)
+        if self.ranks.world > 1:  # what was kept of the terms is the first process's part
+            kept = {name: part for name, part in kept.items() if "." not in name}
+        self.problem.load_state_dict(kept)
         try:
             state = state_file.within("state.", tensors, device)
             state = state_file.unpacked(like, numbers["state"], state)
@@ -414,8 +416,7 @@ class Fit:
                 f"the fit that is to go on has had {state.iteration} iterations, more than the "
                 f"{self.trainer.limit} asked for; ask for more."
             )
-        if self.ranks.world > 1:  # what was kept is the first one's part
-            self.problem.guesses = [None] * len(self.problem.groups)
+        if self.ranks.world > 1:
             state = replace(state, residual=self.problem.residual(state.theta))
         self.state = self.trainer.prolonged(state)
         self.reason = self.state.reason
@@ -432,7 +433,7 @@ class Fit:
         progress = self._progress(start, time.perf_counter() - clock)
         self._first = progress.score
         self._enter(start, progress)
-        self._show(progress, monitors)
+        self._show(start.theta, progress, monitors)
 
     def take(self, after: Any, seconds: float, monitors: Sequence[Monitor] = ()) -> None:
         """Go on from the trainer's next state, which took ``seconds`` to find.
@@ -447,13 +448,12 @@ class Fit:
         self.reason = after.reason
         if math.isfinite(last) and not progress.score <= max(EXPLOSION * last, self._first):
             self.state, self._score = self.trainer.refused(before, after), last
-        self._show(progress, monitors)
+        self._show(after.theta, progress, monitors)
         self.keep(self, False)
 
     def show_last(self, monitors: Sequence[Monitor]) -> None:
         """Call monitors with the latest iterate; the best is in the model again after that."""
-        self.problem.write(self.state.theta)
-        self._show(self.history[-1], monitors)
+        self._show(self.state.theta, self.history[-1], monitors)
         self.problem.write(self._theta_best)
 
     def result(self) -> FitResult:
@@ -475,15 +475,13 @@ class Fit:
         train_rmse, validation_rmse = problem.rmse(state.theta), float("nan")
         score = problem.cost(state.residual)
         if self.judge is not None:
-            problem.write(state.theta)
-            theta = self.judge.theta
+            theta = state.theta[: problem.errors.parameters.own]  # the judge finds initial states
             score = self.judge.cost(self.judge.residual(theta))  # every output counts alike
             # Each process has all of these records, and its own rounding errors.
             score = float(self.ranks.first(torch.tensor(score, dtype=torch.float64)))
             validation_rmse = self.judge.rmse(theta)
         better = score < self.best  # False for the NaN of a model that diverges on validation
         seconds += self._seconds + time.perf_counter() - clock
-        problem.write(state.theta)
         return Progress(
             state.iteration, self.trainer.limit, train_rmse, validation_rmse, seconds, better,
             state.report, score,
@@ -500,7 +498,9 @@ class Fit:
         self.state, self._score, self._seconds = state, progress.score, progress.seconds
         self.history.append(progress)
 
-    def _show(self, progress: Progress, monitors: Sequence[Monitor]) -> None:
-        """Call the monitors, with the latest iterate in the model."""
+    def _show(self, theta: Tensor, progress: Progress, monitors: Sequence[Monitor]) -> None:
+        """Call the monitors, with the iterate in the model."""
+        if monitors:
+            self.problem.write(theta)
         for monitor in monitors:
             monitor(self.model, progress)

@@ -47,7 +47,7 @@ KEPT = 0.1
 
 
 class Contracting:
-    """Certificates on the way of a search.
+    """A guarantee: every model has a certificate.
 
     Args:
         cell: the model; its free parameters are the first entries of θ.
@@ -118,12 +118,9 @@ class Contracting:
                 low = part
         return last + low * (theta - last)
 
-    def bounded(self, theta: Float[Tensor, " P"]) -> Callable[[System], System]:
-        """Let the steps from θ, which has a certificate, keep one."""
+    def bounded(self, theta: Float[Tensor, " P"], system: System) -> System:
+        """The system of steps from θ, which has a certificate, that keep it."""
         self._last = theta.detach().cpu().double()
-        return self._bounded
-
-    def _bounded(self, system: System) -> System:
         found = self._certified(self._last, None) or self._certified(self._last, self._found)
         if found is None:  # rounding of θ to single precision
             return system

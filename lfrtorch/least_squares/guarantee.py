@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal, Protocol
 
 from jaxtyping import Float
@@ -29,8 +28,8 @@ class Guarantee(Protocol):
         """θ, or one near it that keeps the guarantee."""
         ...
 
-    def bounded(self, theta: Float[Tensor, " P"]) -> Callable[[System], System]:
-        """What lets the system of a step from θ keep the guarantee, to first order at least."""
+    def bounded(self, theta: Float[Tensor, " P"], system: System) -> System:
+        """The system at θ, whose steps keep the guarantee, to first order at least."""
         ...
 
 

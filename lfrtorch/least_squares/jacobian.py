@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,7 +24,7 @@ from torch import Tensor
 from lfrtorch._support.threads import spread
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.sensitivity import Linearisation, Rows, fixed_point, output_jacobian
-from lfrtorch.least_squares.gauge import Reduction
+from lfrtorch.least_squares.gauge import Reduction, everything
 from lfrtorch.least_squares.linear_systems import (
     BroadcastSystem,
     CholeskySystem,
@@ -48,11 +48,53 @@ CACHED_BYTES = 1 << 27
 """Rows are cached up to this size, all groups together."""
 
 
+class TermRows(Protocol):
+    """Some rows of J, weighted, and the residual there."""
+
+    @property
+    def count(self) -> int:
+        """How many rows there are."""
+        ...
+
+    @property
+    def states(self) -> StartStates | None:
+        """The initial states that the last ``fold`` eliminated."""
+        ...
+
+    def fold(
+        self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
+    ) -> int:
+        """Add the rows [J r], in the kept columns, to the accumulator.
+
+        The rows may be cached if they take at most ``room`` bytes; returns the bytes cached.
+        """
+        ...
+
+    def tangent(
+        self, d_theta: Float[Tensor, " P"], reduced: Float[Tensor, " K"]
+    ) -> Float[Tensor, " count"]:
+        """J dθ; the change is given in the kept columns, too."""
+        ...
+
+    def adjoint(
+        self,
+        residual: Float[Tensor, " count"],
+        gradient: Float[Tensor, " P"],
+        reduced: Float[Tensor, " K"],
+    ) -> None:
+        """Add Jᵀ residual to the gradient, or to the one in the kept columns."""
+        ...
+
+    def whole(self, parameters: int) -> Float[Tensor, "count P"]:
+        """All rows, with as many columns as θ has parameters."""
+        ...
+
+
 class Jacobian:
     """J (M, P) of a residual at one θ.
 
     Args:
-        parts: the rows of each group of records.
+        parts: the rows of all terms.
         reduced: the columns that are computed; of the shared parameters alone if the parts
             eliminate start states.
         ridge: factors of θ - θ_0, the last entries of the residual of the first process.
@@ -64,7 +106,7 @@ class Jacobian:
 
     def __init__(
         self,
-        parts: list[Part],
+        parts: Sequence[TermRows],
         reduced: Reduction,
         ridge: Float[Tensor, " P"],
         penalty: Float[Tensor, " P"],
@@ -91,7 +133,7 @@ class Jacobian:
             system, gradient = self._eliminated(damping, truncation)
             return self._bounded(system), gradient
         if damping <= NORMAL * torch.finfo(expand.dtype).eps:
-            R, gradient = self.factor()
+            R, gradient = self._factor()
             system = SVDSystem(R, truncation)
         else:
             total = GramAccumulator()
@@ -140,7 +182,7 @@ class Jacobian:
         system = EliminatedSystem(left, states, ridge, gram=gram, truncation=truncation)
         return system, whole.masked_fill(self._fixed, 0.0) + ridge * self._penalty
 
-    def factor(self) -> tuple[Float[Tensor, "k P"], Float[Tensor, " P"]]:
+    def _factor(self) -> tuple[Float[Tensor, "k P"], Float[Tensor, " P"]]:
         """R with RᵀR = JᵀJ, and the gradient Jᵀr, of all processes."""
         total = QRAccumulator()
         self._fold(total)
@@ -160,7 +202,7 @@ class Jacobian:
         """J dθ."""
         d_theta = d_theta.masked_fill(self._fixed, 0.0)
         reduced = self._reduced.expand @ d_theta[: self._shared]
-        parts = [part.tangent(d_theta, reduced).flatten() for part in self.parts]
+        parts = [part.tangent(d_theta, reduced) for part in self.parts]
         return torch.cat([*parts, *([self._ridge * d_theta] if self._own_penalty else [])])
 
     def adjoint(self, residual: Float[Tensor, " M"]) -> Float[Tensor, " P"]:
@@ -169,10 +211,8 @@ class Jacobian:
         reduced = gradient.new_zeros(len(self._reduced.kept))
         first = 0
         for part in self.parts:
-            shape = part.group.y.shape
-            own = residual[first : first + shape.numel()].reshape(shape)
-            first += own.numel()
-            part.adjoint(own, gradient, reduced)
+            part.adjoint(residual[first : first + part.count], gradient, reduced)
+            first += part.count
         gradient[: self._shared] += self._reduced.expand.mT @ reduced
         if self._own_penalty:
             gradient = gradient + self._ridge * residual[first:]
@@ -180,7 +220,7 @@ class Jacobian:
 
     def whole(self) -> Float[Tensor, "M P"]:
         """J as one matrix, for small problems."""
-        parts = [part.whole(len(self._ridge)).flatten(0, 2) for part in self.parts]
+        parts = [part.whole(len(self._ridge)) for part in self.parts]
         J = torch.cat([*parts, *([torch.diag(self._ridge)] if self._own_penalty else [])])
         return J.masked_fill(self._fixed, 0.0)
 
@@ -221,7 +261,7 @@ class _Cached(NamedTuple):
     initial: Float[Tensor, "R nx n"] | None
 
 
-class Part:
+class OutputRows:
     """The rows of one group of records.
 
     Args:
@@ -252,6 +292,11 @@ class Part:
         """Kept parameters, those of them that move the initial state, and how."""
         self.computed: Rows | None = None
         """All rows with one spare column, if someone has computed them already."""
+
+    @property
+    def count(self) -> int:
+        """How many rows there are."""
+        return self.group.y.numel()
 
     @property
     def has_initial_state(self) -> bool:
@@ -368,7 +413,7 @@ class Part:
 
     def tangent(
         self, d_theta: Float[Tensor, " P"], reduced: Float[Tensor, " K"]
-    ) -> Float[Tensor, "R T ny"]:
+    ) -> Float[Tensor, " count"]:
         """Weighted changes of the outputs: J dθ, given as well in the kept columns."""
         if self._cached is not None:
             rows, places, initial = self._cached
@@ -380,7 +425,7 @@ class Part:
                 by_column = torch.cat([by_column, d_theta[self.x0]], dim=1)
             d_y = rows.new_empty(rows.shape[:2])
             spread(_product, len(rows), rows, by_column, d_y)
-            return d_y.reshape(self.group.y.shape)
+            return d_y.flatten()
         linearisation = self.linearisation
         d_x0 = None if self.x0 is None else d_theta[self.x0]
         if self._tied is not None:
@@ -389,11 +434,11 @@ class Part:
             d_theta = torch.zeros_like(d_theta).index_put_((kept,), reduced)
             d_x0 = (initial @ reduced[places].unsqueeze(-1)).squeeze(-1)
         d_y = linearisation.tangent(d_theta[: linearisation.parameters], d_x0)
-        return self.group.weigh(d_y)
+        return self.group.weigh(d_y).flatten()
 
     def adjoint(
         self,
-        residual: Float[Tensor, "R T ny"],
+        residual: Float[Tensor, " count"],
         gradient: Float[Tensor, " P"],
         reduced: Float[Tensor, " K"],
     ) -> None:
@@ -410,20 +455,74 @@ class Part:
                 gradient[self.x0] += d_x0
             reduced.index_add_(0, places.flatten(), by_column.flatten())
             return
-        adjoint = self.linearisation.adjoint(self.group.unweigh(residual))
+        errors = residual.reshape(self.group.y.shape)
+        adjoint = self.linearisation.adjoint(self.group.unweigh(errors))
         gradient[: self.linearisation.parameters] += adjoint.theta.sum(0)
         if self.x0 is not None:
             gradient[self.x0] += adjoint.x0
 
-    def whole(self, parameters: int) -> Float[Tensor, "R T ny P"]:
-        """All weighted rows, with as many columns as θ has parameters."""
+    def whole(self, parameters: int) -> Float[Tensor, "count P"]:
+        """All rows, with as many columns as θ has parameters."""
         rows, P = output_jacobian(self.linearisation), self.linearisation.parameters
         J = rows.new_zeros(*rows.shape[:3], parameters)
         J[..., :P] = rows[..., :P]
         if self.x0 is not None:
             for r, own_columns in enumerate(self.x0):
                 J[r][..., own_columns] = rows[r, ..., P:]
-        return self.group.weigh(J)
+        return self.group.weigh(J).flatten(0, 2)
+
+
+class MappedRows:
+    """w J_φ T: weighted rows for parameters φ that follow from θ.
+
+    Args:
+        rows: J_φ; they eliminate no initial states.
+        change: dφ/dθ.
+        weight: w.
+    """
+
+    states: StartStates | None = None
+
+    def __init__(self, rows: OutputRows, change: Float[Tensor, "Q P"], weight: float) -> None:
+        self._rows, self._change, self._weight = rows, weight * change, weight
+        self._every = everything(change[:, 0])
+
+    @property
+    def count(self) -> int:
+        """How many rows there are."""
+        return self._rows.count
+
+    def fold(
+        self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
+    ) -> int:
+        """Add the rows [J r], in the kept columns, to the accumulator; see ``TermRows``."""
+        own = type(total)()
+        cached = self._rows.fold(self._every.kept, own, room)
+        change = self._change[:, kept]
+        total.absorb_mapped(own, torch.block_diag(change, change.new_tensor([[self._weight]])))
+        return cached
+
+    def tangent(
+        self, d_theta: Float[Tensor, " P"], reduced: Float[Tensor, " K"]
+    ) -> Float[Tensor, " count"]:
+        """J dθ."""
+        d_phi = self._change @ d_theta
+        return self._rows.tangent(d_phi, d_phi)
+
+    def adjoint(
+        self,
+        residual: Float[Tensor, " count"],
+        gradient: Float[Tensor, " P"],
+        reduced: Float[Tensor, " K"],
+    ) -> None:
+        """Add Jᵀ residual to the gradient."""
+        by_phi = residual.new_zeros(len(self._change))
+        self._rows.adjoint(residual, by_phi, by_phi)
+        gradient += self._change.mT @ by_phi
+
+    def whole(self, parameters: int) -> Float[Tensor, "count P"]:
+        """All rows."""
+        return self._rows.whole(len(self._change)) @ self._change
 
 
 def _product(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -22,8 +23,8 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Stacked, is_network, is_polynomial
 from lfrtorch.engine.sensitivity import Linearisation, Rows
 from lfrtorch.engine.simulation import Trajectory
-from lfrtorch.least_squares.jacobian import Jacobian
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.jacobian import Jacobian, OutputRows
+from lfrtorch.least_squares.problem import Problem
 
 
 def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
@@ -67,15 +68,15 @@ class JointProblem:
         ValueError: problems that share a model, or differ in records, scaling or parameters.
     """
 
-    def __init__(self, problems: Sequence[SimulationProblem]) -> None:
+    def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = list(problems)
         first = self.problems[0]
         if len({id(problem.lfr) for problem in problems}) < len(self.problems):
             raise InputError("two problems share one model; give each a model of its own.")
         for problem in self.problems:
             alike = len(problem.theta) == len(first.theta)
-            alike &= len(problem.groups) == len(first.groups)
-            for mine, other in zip(problem.groups, first.groups, strict=False):
+            alike &= len(problem.errors.groups) == len(first.errors.groups)
+            for mine, other in zip(problem.errors.groups, first.errors.groups, strict=False):
                 alike &= torch.equal(mine.u, other.u) and torch.equal(mine.y, other.y)
             if not alike:
                 raise InputError(
@@ -88,16 +89,16 @@ class JointProblem:
     ) -> list[Float[Tensor, " M"]]:
         """r of some of the models (by their numbers), each at its own θ."""
         problems = [self.problems[i] for i in models]
-        for problem, theta in zip(problems, thetas, strict=True):
-            problem.write(theta)
+        errors = [problem.errors for problem in problems]
         found: list[list[Trajectory]] = [[] for _ in problems]
-        for i, group in enumerate(problems[0].groups):
+        for i, group in enumerate(errors[0].groups):
             R = len(group.u)
-            lfr = LFR(stacked([p.lfr.cell for p in problems], R))
+            pairs = list(zip(errors, thetas, strict=True))
+            lfr = LFR(stacked([each.cell_at(theta) for each, theta in pairs], R))
             u = group.u.repeat(len(problems), 1, 1)
-            states = [x for p in problems if (x := p.initial_state(i)) is not None]
+            states = [x for each, theta in pairs if (x := each.initial_state(i, theta)) is not None]
             x0 = torch.cat(states) if states else None
-            near = [x for p in problems if (x := p.guesses[i]) is not None]
+            near = [x for each in errors if (x := each.guess(i)) is not None]
             trajectory = lfr.trajectory(
                 u,
                 x0,
@@ -108,8 +109,8 @@ class JointProblem:
                 found, zip(*(s.split(R) for s in trajectory), strict=True), strict=True
             ):
                 mine.append(Trajectory(*signals))
-        for problem, theta, trajectories in zip(problems, thetas, found, strict=True):
-            problem.remember(theta, trajectories)
+        for each, theta, trajectories in zip(errors, thetas, found, strict=True):
+            each.remember(theta, trajectories)
         return [problem.residual(theta) for problem, theta in zip(problems, thetas, strict=True)]
 
     def linearise(
@@ -121,13 +122,13 @@ class JointProblem:
         jacobians = [
             p.linearise(theta, reduce=False) for p, theta in zip(problems, thetas, strict=True)
         ]
-        for i, group in enumerate(problems[0].groups):
-            parts = [jacobian.parts[i] for jacobian in jacobians]
+        for i, group in enumerate(problems[0].errors.groups):
+            parts = [cast(OutputRows, jacobian.parts[i]) for jacobian in jacobians]
             R, T, ny = group.y.shape
             each = [part.linearisation.trajectory for part in parts]
             trajectory = Trajectory(*(torch.cat(signals) for signals in zip(*each, strict=True)))
             linearisation = Linearisation(
-                stacked([p.lfr.cell for p in problems], R),
+                stacked([p.errors.cell_at(t) for p, t in zip(problems, thetas, strict=True)], R),
                 group.u.repeat(len(problems), 1, 1),
                 trajectory,
                 periodic=group.start == "periodic",

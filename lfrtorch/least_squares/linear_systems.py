@@ -197,6 +197,10 @@ class QRAccumulator:
         wide[:, place] = R
         self.fold(wide)
 
+    def absorb_mapped(self, other: Any, change: Float[Tensor, "m n"]) -> None:
+        """Add the rows of another times a matrix."""
+        self.fold(other.R @ change)
+
     def combine(self, ranks: Ranks) -> None:
         """Add the rows of all other processes."""
         self._parts = [torch.linalg.qr(ranks.stack(self.R), mode="r").R]
@@ -238,6 +242,10 @@ class GramAccumulator:
             self._parts = [other.G.new_zeros(width, width)]
         G = other.G if tie is None else tied(tied(other.G, tie).mT, tie)
         self._parts[0][place.unsqueeze(1), place] += G
+
+    def absorb_mapped(self, other: Any, change: Float[Tensor, "m n"]) -> None:
+        """Add the rows of another times a matrix."""
+        self.add(change.mT @ other.G @ change)
 
     def combine(self, ranks: Ranks) -> None:
         """Add the rows of all other processes."""

@@ -8,8 +8,6 @@ stay as they are. A step of a search is held within the limit to first order, at
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import scipy
 import torch
@@ -106,10 +104,10 @@ class Stable:
         found = stabilised(A, self._integrating, self._limit)
         return theta if found is A else torch.cat([found.flatten(), theta[self._nx**2 :]])
 
-    def bounded(self, theta: Float[Tensor, " P"]) -> Callable[[System], System]:
-        """Let the steps from θ keep A's eigenvalues within the limit."""
-        A = self._matrix(theta)
-        return lambda system: BoundedSystem(system, PoleBounds(A, self._integrating, self._limit))
+    def bounded(self, theta: Float[Tensor, " P"], system: System) -> System:
+        """The system of steps from θ that keep A's eigenvalues within the limit."""
+        bounds = PoleBounds(self._matrix(theta), self._integrating, self._limit)
+        return BoundedSystem(system, bounds)
 
     def _matrix(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "nx nx"]:
         return theta[: self._nx**2].view(self._nx, self._nx)

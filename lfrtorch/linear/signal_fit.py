@@ -12,7 +12,7 @@ minimises them. A constant among the inputs of the cell gives the offset of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,10 +21,13 @@ import torch
 from torch import Tensor
 
 from lfrtorch._support.types import Array
+from lfrtorch.distributed import Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
+from lfrtorch.least_squares.jacobian import TermRows
 from lfrtorch.least_squares.linear_systems import SVDSystem
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
+from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signals
@@ -97,6 +100,7 @@ class SignalFit:
             if np.isfinite(system.scale):
                 theta = problem.theta + system.solve(gradient, 0.0)
                 cost = problem.cost(problem.residual(theta))
+                problem.write(theta)
         B, D = (m.detach().numpy()[:, :nu].copy() for m in (cell.Bu, cell.Dyu))
         return (cost if np.isfinite(cost) else np.inf), (A, B, C, D)
 
@@ -127,12 +131,12 @@ class SignalFit:
         in the records.
         """
         problem, state = search.problem, search.state
-        x0 = problem.initial_states(state.theta)
+        x0 = problem.errors.parameters.initial_states(state.theta)
         if self._prediction or not len(x0):
             return state.cost
         problem.write(state.theta)
         driven = torch.cat(
-            [problem.lfr.trajectory(group.u).x.flatten(0, 1) for group in problem.groups]
+            [problem.lfr.trajectory(group.u).x.flatten(0, 1) for group in problem.errors.groups]
         )
         spread, axes = torch.linalg.eigh(driven.mT @ driven / len(driven))
         variances = spread.clamp_min(ROUNDING * float(spread[-1]))
@@ -173,14 +177,13 @@ class SignalFit:
         )
         if not self._prediction:
             return found
-        pairs = zip(problem.groups, problem.trajectories(state.theta), strict=True)
+        trajectories = problem.errors.trajectories(state.theta)
+        pairs = zip(problem.errors.groups, trajectories, strict=True)
         errors = torch.cat([(b.y - t.y)[b.scored[..., 0].bool()] for b, t in pairs])
         innovations = np.atleast_2d(np.cov(errors.numpy().T, bias=True))
         return replace(found, K=K, innovation_covariance=innovations)
 
-    def _spread(
-        self, problem: SimulationProblem, theta: Tensor, cost: float, system: SVDSystem
-    ) -> Array:
+    def _spread(self, problem: Problem, theta: Tensor, cost: float, system: SVDSystem) -> Array:
         """Covariance of θ, for white innovations or for simulation errors of any spectrum.
 
         The DFT lines of a stationary error are almost independent, whatever its spectrum. So the
@@ -192,7 +195,7 @@ class SignalFit:
             return inverse * (cost / spare)
         rows, errors = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
         found, first = np.zeros_like(inverse), 0
-        for group in problem.groups:
+        for group in problem.errors.groups:
             shape = group.y.shape
             last = first + shape.numel()
             if group.spectral:  # lines already
@@ -221,7 +224,7 @@ class SignalFit:
             inputs.append(np.ones((len(each.u), 1)))
         return NormalisedRecord(np.hstack(inputs), each.y, record)
 
-    def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> SimulationProblem:
+    def _problem(self, matrices: Matrices, K: Array, *, observed: bool = True) -> Problem:
         """Least-squares problem of the cell; unless ``observed`` in B, D and the constant alone."""
         A, B, C, D = matrices
         nu, ny = self.nu, self.ny
@@ -239,22 +242,18 @@ class SignalFit:
         cell = linear_cell(A - K @ C, Bu, C, Dyu)
         for parameter in (cell.A, cell.Cy):
             parameter.requires_grad_(observed)
-        if observed:
-            measured = slice(nu, nu + ny) if self._prediction else None
-            problem = _Stable(LFR(cell), self._driven, measured)
-        else:
-            problem = SimulationProblem(LFR(cell), self._driven)
         free = {"Bu": free_B, "Dyu": free_D}
-        problem.fixed = torch.cat(
-            [
-                torch.as_tensor(~free[name].ravel())
-                if name in free
-                else torch.zeros(p.numel(), dtype=torch.bool)
-                for name, p in cell.named_parameters()
-                if p.requires_grad
-            ]
-        )
-        return problem
+        fixed = [
+            torch.as_tensor(~free[name].ravel())
+            if name in free
+            else torch.zeros(p.numel(), dtype=torch.bool)
+            for name, p in cell.named_parameters()
+            if p.requires_grad
+        ]
+        errors = SimulationErrors(cell, self._driven, Ranks())
+        measured = slice(nu, nu + ny) if self._prediction else None
+        walls = [_PoleWall(errors, measured)] if observed else []
+        return Problem(LFR(cell), errors, walls, fixed=torch.cat(fixed))
 
     def _observer(self, matrices: Matrices, variances: Array) -> Array:
         """Kalman gain (nx, ny) for state noise of these variances."""
@@ -281,27 +280,36 @@ class SignalFit:
         return change @ covariance @ change.T
 
 
-class _Stable(SimulationProblem):
-    """Simulation error of a linear cell; infinite if a pole passes LARGEST_POLE.
+class _PoleWall:
+    """A term without rows: infinite if a pole of a linear cell passes LARGEST_POLE.
 
     Args:
-        lfr, records: as for ``SimulationProblem``.
+        errors: of the cell.
         outputs: which inputs are the measured outputs, if the cell is a predictor. Then the system
             that it predicts must be stable as well.
     """
 
-    def __init__(
-        self, lfr: LFR, records: Sequence[NormalisedRecord], outputs: slice | None
-    ) -> None:
-        super().__init__(lfr, records)
-        self._outputs = outputs
+    eliminates = True
+
+    def __init__(self, errors: SimulationErrors, outputs: slice | None) -> None:
+        self._errors, self._outputs = errors, outputs
 
     def residual(self, theta: Tensor) -> Tensor:
-        r = super().residual(theta)
-        self.write(theta)
-        cell = self.lfr.cell
+        cell = self._errors.cell_at(theta)
         matrices = [cell.A.detach()]
         if self._outputs is not None:
             matrices.append((cell.A + cell.Bu[:, self._outputs] @ cell.Cy).detach())
         stable = all(spectral_radius(A) < LARGEST_POLE for A in matrices)
-        return r if stable else torch.full_like(r, torch.inf)
+        return theta[:0] if stable else theta.new_full((1,), torch.inf)
+
+    def linearise(self, theta: Tensor, *, eliminate: bool) -> list[TermRows]:
+        return []
+
+    def release(self) -> None:
+        pass
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        pass

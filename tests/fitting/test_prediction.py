@@ -16,7 +16,7 @@ from reference import normal, random_cell, random_model
 import lfrtorch
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.least_squares.prediction_problem import PredictionProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start, with_past_outputs
@@ -163,7 +163,7 @@ def test_the_derivatives_of_both_errors_are_those_of_differences(start: Start):
     model, record, _ = noisy(60)
     parts = [replace(part, skip=5, start=start) for part in (record[:25], record[25:])]
     driven = [with_past_outputs(part) for part in parts]
-    problem = PredictionProblem.of(model.predictor(), driven, simulation=0.5)
+    problem = Problem.of_predictor(model.predictor(), driven, simulation=0.5)
     free = torch.ones_like(problem.theta)
     if problem.fixed is not None:
         free[: len(problem.fixed)] = ~problem.fixed
@@ -182,7 +182,7 @@ def test_the_derivatives_of_both_errors_are_those_of_differences(start: Start):
 
 def test_both_errors_are_as_large_at_the_start_as_the_weight_says():
     model, record, _ = noisy(60)
-    problem = PredictionProblem.of(model.predictor(), with_past_outputs(record), simulation=2.0)
+    problem = Problem.of_predictor(model.predictor(), with_past_outputs(record), simulation=2.0)
     predicted, simulated = problem.residual(problem.theta).reshape(2, -1).norm(dim=1)
     assert float(simulated / predicted) == pytest.approx(2.0)
 

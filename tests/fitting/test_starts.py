@@ -17,7 +17,7 @@ from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.starts import OUTPUT_RANGE, initialise
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rmse
@@ -100,12 +100,12 @@ def test_signals_have_unit_deviation(bla: LinearModel, method):
     T = np.random.default_rng(1).normal(size=(3, 3))  # also from a model in any coordinates
     for start in (bla, bla.transformed(T)):
         model = initialise(start, RECORDS, **SIZES, method=method)
-        problem = SimulationProblem.of(model, RECORDS)
-        trajectories = problem.trajectories(problem.theta)
+        problem = Problem.of(model, RECORDS)
+        trajectories = problem.errors.trajectories(problem.theta)
         x = torch.cat([t.x[:, :-1].flatten(0, 1) for t in trajectories])
         z = torch.cat([t.z.flatten(0, 1) for t in trajectories])
-        u = torch.cat([group.u.flatten(0, 1) for group in problem.groups])
-        y = torch.cat([group.y.flatten(0, 1) for group in problem.groups])
+        u = torch.cat([group.u.flatten(0, 1) for group in problem.errors.groups])
+        y = torch.cat([group.y.flatten(0, 1) for group in problem.errors.groups])
         for signal in (x, z):
             np.testing.assert_allclose(signal.std(dim=0, correction=0).numpy(), 1, rtol=1e-8)
         for signal in (u, y):  # about the operating point, which need not be the mean

@@ -22,7 +22,7 @@ from lfrtorch.least_squares.levenberg_marquardt import (
     LeastSquares,
     LevenbergMarquardt,
 )
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.metrics import nrmse, rmse
 from lfrtorch.model import Model, load
 from lfrtorch.records import Record
@@ -343,7 +343,7 @@ def test_a_lost_process_keeps_the_best():
     assert result.outcome == "a process was lost: all of them"
     chosen = result.history[result.chosen_iteration]
     assert chosen.train < result.history[0].train
-    error = SimulationProblem.of(model, train)
+    error = Problem.of(model, train)
     # The periodic state is known to 1e-10.
     assert error.rmse(error.theta) == pytest.approx(chosen.train, rel=1e-9, abs=1e-9)
 

@@ -15,7 +15,7 @@ from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.contracting import Contracting, MarginBound
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -28,7 +28,7 @@ def held(sizes: dict[str, Any]) -> tuple[BoundedSystem, MarginBound, int]:
     cell = random_cell(**default | sizes)
     theta = torch.cat([p.detach().flatten() for p in cell.parameters()])
     system = CholeskySystem(torch.eye(len(theta), dtype=theta.dtype), len(theta))
-    found = Contracting(cell).bounded(theta)(system)
+    found = Contracting(cell).bounded(theta, system)
     assert isinstance(found, BoundedSystem)
     assert isinstance(found.bounds, MarginBound)
     return found, found.bounds, len(theta)
@@ -99,7 +99,7 @@ def test_every_model_on_the_way_contracts(trainer):
 
 def test_what_has_no_certificate_is_not_admitted():
     model, record = bistable()
-    problem = SimulationProblem.of(model, record, guarantee="contracting")
+    problem = Problem.of(model, record, guarantee="contracting")
     theta = problem.theta
     assert problem.admissible(theta) is theta
     problem.linearise(theta)
@@ -114,7 +114,7 @@ def test_a_start_without_a_certificate_is_refused():
     with torch.no_grad():
         model.lfr.cell.A.fill_(1.1)
     with pytest.raises(ValueError, match="needs a start that is proven to contract"):
-        SimulationProblem.of(model, record, guarantee="contracting")
+        Problem.of(model, record, guarantee="contracting")
     polynomial = random_model(polynomial_cell(1, 1, 2))
     trainer = LevenbergMarquardt(guarantee="contracting")
     with pytest.raises(ValueError, match=r"needs a network .* not a Polynomial"):

@@ -13,7 +13,7 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.least_squares.joint import JointProblem, stacked
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start
 
@@ -67,9 +67,9 @@ def some_records(model: Model) -> list[Record]:
     ]
 
 
-def problems(kind: str) -> list[SimulationProblem]:
+def problems(kind: str) -> list[Problem]:
     models = some_models(kind)
-    return [SimulationProblem.of(model, some_records(models[0]), ridge=0.1) for model in models]
+    return [Problem.of(model, some_records(models[0]), ridge=0.1) for model in models]
 
 
 @KINDS
@@ -131,7 +131,7 @@ def test_frozen_parameters_stay_frozen():
     for model in models:
         model.lfr.cell.A.requires_grad_(False)
     records = some_records(models[0])[:3]
-    stack = JointProblem([SimulationProblem.of(model, records) for model in models])
+    stack = JointProblem([Problem.of(model, records) for model in models])
     thetas = [problem.theta for problem in stack.problems]
     stack.residuals([0, 1, 2], thetas)
     for problem, jacobian in zip(stack.problems, stack.linearise([0, 1, 2], thetas), strict=True):
@@ -142,11 +142,11 @@ def test_frozen_parameters_stay_frozen():
 def test_problems_that_are_no_stack():
     models = some_models("network", 2)
     records = some_records(models[0])
-    one = SimulationProblem.of(models[0], records)
+    one = Problem.of(models[0], records)
     with pytest.raises(ValueError, match="two problems share one model"):
-        JointProblem([one, SimulationProblem.of(models[0], records)])
+        JointProblem([one, Problem.of(models[0], records)])
     with pytest.raises(ValueError, match="differ in records, scaling or free parameters"):
-        JointProblem([one, SimulationProblem.of(models[1], records[:2])])
+        JointProblem([one, Problem.of(models[1], records[:2])])
 
 
 @pytest.mark.parametrize("signal", ["u", "y"])
@@ -155,10 +155,10 @@ def test_problems_of_other_signals_are_no_stack(signal: str):
     models = some_models("network")
     records = some_records(models[0])[1:4:2]
     other = replace(records[1], **{signal: getattr(records[1], signal) + 1e-3})
-    same = [SimulationProblem.of(model, records) for model in models[:2]]
+    same = [Problem.of(model, records) for model in models[:2]]
     JointProblem(same)
     with pytest.raises(ValueError, match="differ in records, scaling or free parameters"):
-        JointProblem([*same, SimulationProblem.of(models[2], [records[0], other])])
+        JointProblem([*same, Problem.of(models[2], [records[0], other])])
 
 
 def test_problems_of_other_free_parameters_are_no_stack():
@@ -166,14 +166,14 @@ def test_problems_of_other_free_parameters_are_no_stack():
     models[1].lfr.cell.A.requires_grad_(False)
     records = some_records(models[0])
     with pytest.raises(ValueError, match="differ in records, scaling or free parameters"):
-        JointProblem([SimulationProblem.of(model, records) for model in models])
+        JointProblem([Problem.of(model, records) for model in models])
 
 
 def test_start_states_that_are_solved_for():
     models = some_models("network", 2)
     records = [record for record in some_records(models[0]) if record.start == "estimated"]
-    stack = JointProblem([SimulationProblem.judge(m, records) for m in models])
-    alone = [SimulationProblem.judge(m, records) for m in some_models("network", 2)]
+    stack = JointProblem([Problem.judge(m, records) for m in models])
+    alone = [Problem.judge(m, records) for m in some_models("network", 2)]
     thetas = [problem.theta for problem in alone]
     for mine, problem, theta in zip(stack.residuals([0, 1], thetas), alone, thetas, strict=True):
         assert_close(mine, problem.residual(theta), rtol=0, atol=1e-10)

@@ -14,7 +14,7 @@ from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import CholeskySystem, System
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.stable_states import PoleBounds, fading, largest_modulus, stabilised
 from lfrtorch.model import Model
 from lfrtorch.records import Record
@@ -172,7 +172,7 @@ def test_a_start_that_is_not_stable_stays_within_its_own_circle():
     model, record = unstable_data()
     with torch.no_grad():
         model.lfr.cell.A[0, 0] = 1.01
-    problem = SimulationProblem.of(model, record, guarantee="stable")
+    problem = Problem.of(model, record, guarantee="stable")
     theta = problem.theta.clone()
     assert problem.admissible(theta) is theta
     theta[0] = 1.3

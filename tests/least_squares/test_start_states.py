@@ -10,7 +10,8 @@ from torch.testing import assert_close
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import SVDSystem
-from lfrtorch.least_squares.simulation_problem import Ridge, SimulationProblem
+from lfrtorch.least_squares.parameters import Ridge
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -35,8 +36,8 @@ def many_records(model: Model, *, samples: int = 12) -> list[Record]:
     return [*free, measure(model, 30, seed=99, start="periodic", skip=0), exact[0]]
 
 
-def problem_of(model: Model, *, ridge: Ridge = 0.0, **options: int) -> SimulationProblem:
-    problem = SimulationProblem.of(model, many_records(model, **options), ridge=ridge)
+def problem_of(model: Model, *, ridge: Ridge = 0.0, **options: int) -> Problem:
+    problem = Problem.of(model, many_records(model, **options), ridge=ridge)
     problem.write(problem.theta + 0.05 * torch.sin(torch.arange(len(problem.theta))))
     return problem
 
@@ -74,7 +75,7 @@ def test_records_of_fewer_samples_than_states_and_long_ones(model: Model, monkey
         if samples == 40:  # blocks of a record's samples
             monkeypatch.setattr("lfrtorch.engine.sensitivity.BLOCK", 16)
             monkeypatch.setattr(jacobian, "CACHED_BYTES", 0)
-        problem = SimulationProblem.of(model, many_records(model, samples=samples))
+        problem = Problem.of(model, many_records(model, samples=samples))
         theta = problem.theta
         J = problem.jacobian(theta)
         system, gradient = problem.linearise(theta).system(1e-3, 1e-13)
@@ -87,7 +88,7 @@ def test_a_search_over_many_records_finds_the_model(model: Model):
     records = [
         replace(r, y=r.y - 0.1) if r.start == "estimated" else r for r in many_records(model)
     ]
-    problem = SimulationProblem.of(model, records)
+    problem = Problem.of(model, records)
     assert len(problem.theta) > 2 * COUNT
     search = LevenbergMarquardt(max_iter=60)
     state = search.init(problem, problem.theta + 0.02 * normal(len(problem.theta)))

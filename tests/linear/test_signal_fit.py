@@ -323,9 +323,9 @@ def test_start_states_that_no_input_leads_to_are_improbable():
     records = [Record(u[10:60], noisy[10:60], start="estimated"), Record(u, noisy)]
     both = fit_of(records)
     search = both.search(matrices).advance(1)
-    (x0,) = search.problem.initial_states(search.state.theta).numpy()
-    search.problem.write(search.state.theta)
-    cell = search.problem.lfr.cell
+    errors = search.problem.errors
+    (x0,) = errors.parameters.initial_states(search.state.theta).numpy()
+    cell = errors.cell_at(search.state.theta)
     A, B = (m.detach().numpy() for m in (cell.A, cell.Bu))
     # The state after the last sample counts, too.
     states = [reference.dlsim((A, B, C, 0 * B), np.vstack([r.u, [[0.0]]])) for r in records]

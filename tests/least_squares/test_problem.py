@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 from reference import measure, normal, random_cell, random_model
+from torch import Tensor
 from torch.testing import assert_close
 
+from lfrtorch.least_squares.jacobian import Jacobian, OutputRows
 from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_problem import SimulationProblem
+from lfrtorch.least_squares.problem import Problem
 from lfrtorch.metrics import rmse
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Start
@@ -55,7 +57,7 @@ def all_kinds(model: Model, *, given: bool = True) -> list[Record]:
 
 def test_residual_is_the_error_of_all_scored_samples(model: Model):
     records = some_records(model)
-    problem = SimulationProblem.of(model, records)
+    problem = Problem.of(model, records)
     r = problem.residual(problem.theta)
     expected = [((model.simulate(x) - x.y) / model.scaler.y_scale)[x.skip :] for x in records]
     assert r.shape == (2 * (30 + 30 + 30 + 20),)
@@ -68,7 +70,7 @@ def test_residual_is_the_error_of_all_scored_samples(model: Model):
 def test_rmse_is_that_of_the_metrics(model: Model):
     records = some_records(model)
     for record in records:
-        problem = SimulationProblem.of(model, record)
+        problem = Problem.of(model, record)
         score = problem.rmse(problem.theta)
         assert score == pytest.approx(rmse(record, model.simulate(record)), rel=1e-9)
 
@@ -82,17 +84,17 @@ def with_gaps(record: Record) -> Record:
 def test_samples_that_are_not_valid_have_no_error(model: Model):
     zero, _, third, _ = some_records(model)
     records = [with_gaps(zero), with_gaps(replace(third, start="estimated"))]
-    problem = SimulationProblem.of(model, records)
+    problem = Problem.of(model, records)
     kept = [r.valid[r.skip :] for r in records if r.valid is not None]
     assert problem.size == sum(int(valid.sum()) for valid in kept)
     r = problem.residual(problem.theta)
-    (group, _) = problem.groups
+    (group, _) = problem.errors.groups
     expected = ((model.simulate(zero) - zero.y) / model.scaler.y_scale)[kept[0]]
     assert np.count_nonzero(r[: group.y.numel()]) == len(expected)
     np.testing.assert_allclose(
         np.sort(r[: group.y.numel()][r[: group.y.numel()] != 0].numpy()), np.sort(expected)
     )
-    alone = SimulationProblem.of(model, records[0])
+    alone = Problem.of(model, records[0])
     score = rmse(records[0], model.simulate(records[0]))
     assert alone.rmse(alone.theta) == pytest.approx(score, rel=1e-9)
 
@@ -102,7 +104,7 @@ RIDGES = pytest.mark.parametrize("ridge", [0.0, 0.5, {"static": 0.1, "A": 0.3, "
 
 @RIDGES
 def test_gradient_and_jacobian_agree(model: Model, ridge):
-    problem = SimulationProblem.of(model, all_kinds(model), ridge=ridge)
+    problem = Problem.of(model, all_kinds(model), ridge=ridge)
     theta = problem.theta + 0.1
     r, gradient = problem.gradient(theta)
     J = problem.jacobian(theta)
@@ -112,7 +114,7 @@ def test_gradient_and_jacobian_agree(model: Model, ridge):
 
 @RIDGES
 def test_jacobian_is_the_slope_of_the_residual(model: Model, ridge):
-    problem = SimulationProblem.of(model, all_kinds(model), ridge=ridge)
+    problem = Problem.of(model, all_kinds(model), ridge=ridge)
     theta = problem.theta
     assert len(theta) == model.parameter_count + 4 * 2
     step = 1e-4 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
@@ -141,7 +143,7 @@ def test_system_and_products_are_those_of_the_whole_jacobian(
     """
     monkeypatch.setattr("lfrtorch.engine.sensitivity.BLOCK", 5)
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
-    problem = SimulationProblem.of(model, all_kinds(model, given=given), ridge=ridge)
+    problem = Problem.of(model, all_kinds(model, given=given), ridge=ridge)
     theta = problem.theta + 0.1
     r, J = problem.residual(theta), problem.jacobian(theta)
     jacobian = problem.linearise(theta)
@@ -158,10 +160,10 @@ def test_system_and_products_are_those_of_the_whole_jacobian(
 
 def test_weights_multiply_the_squared_errors(model: Model):
     (record,) = some_records(model)[:1]
-    plain = SimulationProblem.of(model, record)
+    plain = Problem.of(model, record)
     theta = plain.theta + 0.1
     squares = plain.residual(theta).reshape(-1, 2).square().sum(0)
-    weighted = SimulationProblem.of(model, replace(record, weight=[0.5, 3.0]))
+    weighted = Problem.of(model, replace(record, weight=[0.5, 3.0]))
     assert weighted.cost(weighted.residual(theta)) == pytest.approx(
         float(0.5 * squares[0] + 3.0 * squares[1]), rel=1e-9
     )
@@ -173,7 +175,7 @@ def test_beyond_a_limit_there_is_no_error(model: Model):
     exact = measure(model, 60)
     high = float(np.quantile(exact.y, 0.7))
     record = replace(exact, y=np.minimum(exact.y, high), limits=(None, high))
-    problem = SimulationProblem.of(model, record)
+    problem = Problem.of(model, record)
     theta = problem.theta
     assert problem.cost(problem.residual(theta)) < 1e-20
     assert problem.rmse(theta) < 1e-9
@@ -187,7 +189,7 @@ def test_beyond_a_limit_there_is_no_error(model: Model):
     assert ((record.y >= high) & ~beyond).any()
     shown = rmse(record, model.simulate(record))
     assert problem.rmse(other) == pytest.approx(shown, rel=1e-12)
-    judge = SimulationProblem.judge(model, record)
+    judge = Problem.judge(model, record)
     assert judge.rmse(judge.theta) == pytest.approx(shown, rel=1e-12)
     error = (model.simulate(record) - record.y) / model.scaler.y_scale
     assert judge.cost(judge.residual(judge.theta)) == pytest.approx(np.sum(error**2), rel=1e-12)
@@ -205,7 +207,7 @@ def test_unit_line_weights_are_plain_least_squares(model: Model, T: int):
     record = measure(model, T, start="periodic")
     record = replace(record, y=record.y + noise)
     lines = replace(record, line_weight=np.ones(T // 2 + 1))
-    plain, weighted = SimulationProblem.of(model, record), SimulationProblem.of(model, lines)
+    plain, weighted = Problem.of(model, record), Problem.of(model, lines)
     theta = plain.theta + 0.1
     cost = plain.cost(plain.residual(theta))
     assert weighted.cost(weighted.residual(theta)) == pytest.approx(cost, rel=1e-9)
@@ -218,7 +220,7 @@ def test_line_weights_weigh_the_spectrum_of_the_error(model: Model, T: int):
     y = record.y + model.scaler.y_scale * (np.cos(3 * t) + 2.0 * np.sin(5 * t))
     weight = np.zeros(T // 2 + 1)
     weight[[3, 5, 6]] = 4.0, 0.25, 9.0
-    problem = SimulationProblem.of(model, replace(record, y=y, line_weight=weight))
+    problem = Problem.of(model, replace(record, y=y, line_weight=weight))
     # Σ cos² = Σ sin² = T / 2 over whole periods, in each of two outputs.
     expected = 2 * (4.0 * 1.0 + 0.25 * 4.0) * T / 2
     assert problem.cost(problem.residual(problem.theta)) == pytest.approx(expected, rel=1e-7)
@@ -231,8 +233,8 @@ def test_adjoint_of_the_weights_is_that_of_their_product(model: Model, T: int, b
     rng, record = np.random.default_rng(0), measure(model, T, start="periodic")
     F = T // 2 + 1
     weights = {"line_weight": rng.uniform(0.5, 2.0, (F, 2))} if by_line else {"weight": [0.5, 3.0]}
-    problem = SimulationProblem.of(model, [replace(record, **weights)] * 2)
-    (group,) = problem.groups
+    problem = Problem.of(model, [replace(record, **weights)] * 2)
+    (group,) = problem.errors.groups
     e, r = normal(2, T, 2), normal(2, T, 2, seed=1)
     weighed, unweighed = group.weigh(e), group.unweigh(r)
     assert weighed.shape == unweighed.shape == e.shape
@@ -244,11 +246,11 @@ def test_start_state_is_fitted_with_the_parameters(model: Model):
     """A record cut from the middle of another, and the first of its samples thrown away."""
     whole = measure(model, 200)
     later = replace(whole[50:], start="estimated")
-    problem = SimulationProblem.of(model, [whole, later])
+    problem = Problem.of(model, [whole, later])
     states = model.signals(whole).x[0]
     assert_close(problem.theta[-2:], states[50], rtol=0, atol=1e-7)
     assert problem.rmse(problem.theta) < 1e-8
-    solved = SimulationProblem.of(model, [whole, later], solve_initial_states=True)
+    solved = Problem.judge(model, [whole, later])
     assert len(solved.theta) == model.parameter_count
     assert solved.rmse(solved.theta) < 1e-8
 
@@ -256,12 +258,12 @@ def test_start_state_is_fitted_with_the_parameters(model: Model):
 def test_given_start_state(model: Model):
     whole = measure(model, 200)
     state = model.signals(whole).x[0, 50].numpy()
-    problem = SimulationProblem.of(model, replace(whole[50:], start="given", x0=state))
+    problem = Problem.of(model, replace(whole[50:], start="given", x0=state))
     assert problem.rmse(problem.theta) < 1e-9
 
 
 def test_ridge_by_group_is_of_its_parameters_only(model: Model):
-    problem = SimulationProblem.of(model, some_records(model), ridge={"A": 0.25, "static.bz": 4.0})
+    problem = Problem.of(model, some_records(model), ridge={"A": 0.25, "static.bz": 4.0})
     theta = problem.theta
     longer = problem.residual(theta + 1.0)[-len(theta) :]
     names = [name for name, p in model.lfr.cell.named_parameters() for _ in range(p.numel())]
@@ -271,16 +273,16 @@ def test_ridge_by_group_is_of_its_parameters_only(model: Model):
 
 def test_ridge_of_an_unknown_group(model: Model):
     with pytest.raises(ValueError, match=r"ridge has a group 'B',.*parameters are A, Bu, .*bw"):
-        SimulationProblem.of(model, some_records(model), ridge={"B": 1.0})
+        Problem.of(model, some_records(model), ridge={"B": 1.0})
     with pytest.raises(ValueError, match=r"ridge of 'A' is -1; give"):
-        SimulationProblem.of(model, some_records(model), ridge={"A": -1})
+        Problem.of(model, some_records(model), ridge={"A": -1})
 
 
 def test_penalty_is_no_part_of_the_score(model: Model):
     records = some_records(model)
     plain, ridged = (
-        SimulationProblem.of(model, records),
-        SimulationProblem.of(model, records, ridge=4.0),
+        Problem.of(model, records),
+        Problem.of(model, records, ridge=4.0),
     )
     theta = plain.theta + 0.1
     r, longer = plain.residual(theta), ridged.residual(theta)
@@ -291,9 +293,9 @@ def test_penalty_is_no_part_of_the_score(model: Model):
 
 def test_jacobian_is_that_of_its_argument_whatever_the_module_holds(model: Model):
     records = some_records(model)
-    theta = SimulationProblem.of(model, records).theta
-    expected = SimulationProblem.of(model, records).jacobian(theta)
-    problem, other = SimulationProblem.of(model, records), SimulationProblem.of(model, records)
+    theta = Problem.of(model, records).theta
+    expected = Problem.of(model, records).jacobian(theta)
+    problem, other = Problem.of(model, records), Problem.of(model, records)
     problem.residual(theta)
     other.residual(theta + 0.1)
     assert_close(problem.jacobian(theta), expected, rtol=0, atol=1e-8)
@@ -302,7 +304,7 @@ def test_jacobian_is_that_of_its_argument_whatever_the_module_holds(model: Model
 def test_frozen_parameters_are_no_part_of_theta(model: Model):
     model.lfr.cell.A.requires_grad_(False)
     before = model.lfr.cell.A.clone()
-    problem = SimulationProblem.of(model, some_records(model))
+    problem = Problem.of(model, some_records(model))
     assert len(problem.theta) == model.parameter_count - 4
     problem.residual(problem.theta + 0.1)
     assert torch.equal(model.lfr.cell.A, before)
@@ -310,7 +312,7 @@ def test_frozen_parameters_are_no_part_of_theta(model: Model):
 
 
 def test_divergence_is_a_residual_that_is_not_finite(model: Model):
-    problem = SimulationProblem.of(model, measure(model, 2000))
+    problem = Problem.of(model, measure(model, 2000))
     theta = problem.theta
     assert not torch.isfinite(problem.residual(theta + 3.0)).all()
     assert torch.isfinite(problem.residual(theta)).all()
@@ -319,7 +321,7 @@ def test_divergence_is_a_residual_that_is_not_finite(model: Model):
 @pytest.mark.parametrize("ridge", [-1.0, float("nan")])
 def test_negative_ridge(model: Model, ridge: float):
     with pytest.raises(ValueError, match=r"ridge is .*; give a number of at least 0"):
-        SimulationProblem.of(model, some_records(model), ridge=ridge)
+        Problem.of(model, some_records(model), ridge=ridge)
 
 
 @pytest.mark.parametrize(
@@ -329,7 +331,7 @@ def test_negative_ridge(model: Model, ridge: float):
 def test_records_that_are_not_the_model_s(model: Model, nu: int, ny: int, fs: float, message: str):
     record = Record(np.ones((20, nu)), np.ones((20, ny)), fs, name="lab")
     with pytest.raises(ValueError, match=f"(?s)lab.*{message}"):
-        SimulationProblem.of(model, record)
+        Problem.of(model, record)
 
 
 def test_integrator_in_steady_state_ends_the_search_with_a_reason():
@@ -341,7 +343,7 @@ def test_integrator_in_steady_state_ends_the_search_with_a_reason():
     model = random_model(cell)
     u = np.tile([1.0, -1.0], 10) * model.scaler.u_scale + model.scaler.u_offset
     record = Record(u, np.ones(20), model.fs, "periodic")
-    problem = SimulationProblem.of(model, record)
+    problem = Problem.of(model, record)
     optimiser = LevenbergMarquardt()
     state = optimiser.step(problem, optimiser.init(problem, problem.theta))
     assert state.reason == "the Jacobian vanishes or is not finite"
@@ -349,7 +351,7 @@ def test_integrator_in_steady_state_ends_the_search_with_a_reason():
 
 def test_one_record_twice_has_two_start_states(model: Model):
     record = replace(some_records(model)[0], start="estimated")
-    problem = SimulationProblem.of(model, [record, record])
+    problem = Problem.of(model, [record, record])
     theta = problem.theta + 0.1
     r, gradient = problem.gradient(theta)
     J = problem.jacobian(theta)
@@ -358,7 +360,7 @@ def test_one_record_twice_has_two_start_states(model: Model):
 
 
 def test_theta_changed_in_place_is_another_theta(model: Model):
-    problem = SimulationProblem.of(model, some_records(model))
+    problem = Problem.of(model, some_records(model))
     theta = problem.theta
     before = problem.residual(theta)
     theta += 0.1
@@ -366,7 +368,7 @@ def test_theta_changed_in_place_is_another_theta(model: Model):
 
 
 def test_weights_of_the_module_are_not_those_of_theta(model: Model):
-    problem = SimulationProblem.of(model, some_records(model))
+    problem = Problem.of(model, some_records(model))
     theta = problem.theta
     problem.residual(theta)
     kept = theta.clone()
@@ -380,7 +382,7 @@ def test_weights_of_the_module_are_not_those_of_theta(model: Model):
 def test_an_output_without_weight_is_scored_all_the_same(model: Model):
     record = measure(model, 30)
     off = replace(record, y=record.y + model.scaler.y_scale, weight=[0.0, 1.0])
-    problem = SimulationProblem.of(model, off)
+    problem = Problem.of(model, off)
     expected = np.sqrt(np.mean(model.scaler.y_scale**2))
     assert problem.rmse(problem.theta) == pytest.approx(expected, rel=1e-9)
 
@@ -388,35 +390,42 @@ def test_an_output_without_weight_is_scored_all_the_same(model: Model):
 def test_start_state_of_the_wrong_length(model: Model):
     record = replace(some_records(model)[0], start="given", x0=[1.0])
     with pytest.raises(ValueError, match=r"x0 of 1 entries and the model 2 states"):
-        SimulationProblem.of(model, record)
+        Problem.of(model, record)
 
 
 def test_nothing_to_fit(model: Model):
     model.lfr.requires_grad_(False)
     with pytest.raises(ValueError, match="all parameters of the model are frozen"):
-        SimulationProblem.of(model, some_records(model))
+        Problem.of(model, some_records(model))
     start = replace(some_records(model)[0], start="estimated")
-    assert len(SimulationProblem.of(model, start).theta) == 2
+    assert len(Problem.of(model, start).theta) == 2
+
+
+def cached_rows(jacobian: Jacobian, group: int = 0) -> Tensor | None:
+    """The rows that the Jacobian of a group of records holds."""
+    part = jacobian.parts[group]
+    assert isinstance(part, OutputRows)
+    return None if part._cached is None else part._cached[0]
 
 
 @pytest.mark.parametrize("spare", [0, -1])
 def test_rows_of_all_groups_share_the_room_for_them(model: Model, spare: int, monkeypatch):
     """Two of three groups fit exactly; a byte less, and the last does not."""
     records = some_records(model)
-    problem = SimulationProblem.of(model, records)
+    problem = Problem.of(model, records)
     columns = len(problem.linearise(problem.theta)._reduced.kept) + 1
     room = 8 * 2 * (2 * 30 + 20) * columns + spare  # of two outputs
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", room)
     jacobian = problem.linearise(problem.theta)
     jacobian.system(1e-2, 1e-12)
-    kept = [part._cached is not None for part in jacobian.parts]
+    kept = [cached_rows(jacobian, group) is not None for group in range(3)]
     assert kept == [True, False, spare == 0]
     d = torch.ones_like(problem.theta)
     assert_close(jacobian.tangent(d), jacobian.whole() @ d, rtol=0, atol=1e-8)
 
 
 def test_two_jacobians_keep_their_own_rows_and_a_third_takes_over_the_room(model: Model):
-    problem = SimulationProblem.of(model, some_records(model))
+    problem = Problem.of(model, some_records(model))
     first_theta, second_theta = problem.theta, problem.theta + 0.1
     first, second = problem.linearise(first_theta), problem.linearise(second_theta)
     for jacobian in (first, second):
@@ -424,18 +433,19 @@ def test_two_jacobians_keep_their_own_rows_and_a_third_takes_over_the_room(model
     d = torch.ones_like(first_theta)
     assert_close(first.tangent(d), first.whole() @ d, rtol=0, atol=1e-8)
     assert_close(second.tangent(d), second.whole() @ d, rtol=0, atol=1e-8)
-    rows = second.parts[0]._cached
+    rows = cached_rows(second)
     assert rows is not None
-    where = rows[0].untyped_storage().data_ptr()
+    where = rows.untyped_storage().data_ptr()
     del second, jacobian, rows
     third = problem.linearise(second_theta)
     third.system(1e-2, 1e-12)
-    assert third.parts[0]._cached is not None
-    assert third.parts[0]._cached[0].untyped_storage().data_ptr() == where
+    rows = cached_rows(third)
+    assert rows is not None
+    assert rows.untyped_storage().data_ptr() == where
 
 
 def test_a_jacobian_asks_for_room_once(model: Model, monkeypatch):
-    problem = SimulationProblem.of(model, some_records(model))
+    problem = Problem.of(model, some_records(model))
     jacobian = problem.linearise(problem.theta)
     jacobian.system(1e-2, 1e-12)
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.Memory.take", None)
@@ -462,11 +472,13 @@ def test_fixed_entries_have_columns_of_zeros(
     """The other columns are the plain Jacobian's, whichever way a product or a system takes."""
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     records = all_kinds(model, given=False)
-    theta = SimulationProblem.of(model, records).theta + 0.1
-    plain = SimulationProblem.of(model, records, ridge=ridge).jacobian(theta)
-    problem = SimulationProblem.of(model, records, ridge=ridge)
-    problem.fixed = some_fixed(model)
-    held = torch.cat([problem.fixed, torch.zeros(4 * 2, dtype=torch.bool)])  # start states follow
+    theta = Problem.of(model, records).theta + 0.1
+    plain = Problem.of(model, records, ridge=ridge).jacobian(theta)
+    problem = Problem.of(model, records, ridge=ridge)
+    held = torch.cat(
+        [some_fixed(model), torch.zeros(4 * 2, dtype=torch.bool)]
+    )  # start states follow
+    problem.fixed = held
     r, J = problem.residual(theta), problem.jacobian(theta)
     assert torch.equal(J[:, held], torch.zeros_like(J[:, held]))
     # The same recurrence from a periodic start known to 1e-10.
@@ -499,8 +511,8 @@ def test_search_leaves_fixed_entries_and_brings_the_rest_home(
     """With geodesic acceleration, whose right side is a product with J by itself."""
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     records = [measure(model, 60, seed=i) for i in range(2)]
-    theta = SimulationProblem.of(model, records).theta
-    problem = SimulationProblem.of(model, records, ridge=1e-8 * ridge)
+    theta = Problem.of(model, records).theta
+    problem = Problem.of(model, records, ridge=1e-8 * ridge)
     problem.fixed = some_fixed(model)
     away = 0.02 * torch.randn(len(theta), generator=torch.Generator().manual_seed(0)).double()
     away[problem.fixed] = 0.0
@@ -519,7 +531,7 @@ def test_stack_leaves_fixed_entries(kept: bool, monkeypatch):
     monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
     models = [random_model(random_cell(2, 2, 2, 2, 1, 3, seed=i)) for i in range(2)]
     record = measure(models[0], 60)
-    problems = [SimulationProblem.of(m, replace(record, y=record.y + 0.1)) for m in models]
+    problems = [Problem.of(m, replace(record, y=record.y + 0.1)) for m in models]
     for problem, m in zip(problems, models, strict=True):
         problem.fixed = some_fixed(m)
     starts = [p.theta for p in problems]
