@@ -31,7 +31,6 @@ CONF = Path(__file__).resolve().parents[1] / "conf"
 VARIANTS = {
     "zero_output": ["init=zero_output"],
     "paper": ["init=paper"],
-    "zero_output, slow modes kept": ["init=zero_output", "init.minor=0"],
     "zero_output, no acceleration": ["init=zero_output", "trainer.acceleration=false"],
     "zero_output, first damping 1e-2": ["init=zero_output", "trainer.least_damping=1e-2"],
     "zero_output, ridge 0": ["init=zero_output", "ridge=0"],

@@ -426,7 +426,6 @@ def starting_model(
         nw=cast(int, settings.nw),
         method=settings.init,
         seed=seed,
-        minor=settings.minor,
         relaxations=settings.relaxations,
         modes=settings.modes,
         z_feedthrough=settings.z_feedthrough,

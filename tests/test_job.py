@@ -392,7 +392,6 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
         ({"static": -1}, "static is -1"),
         ({"static": torch.nn.Linear, "nz": "auto"}, "is not searched; give numbers"),
         ({"init": "magic"}, "init is 'magic'"),
-        ({"minor": -1.0}, "minor is -1"),
         ({"modes": -1}, "modes is -1"),
         ({"relaxations": -1}, "relaxations is -1"),
         ({"first_part": 0}, "first_part is 0"),

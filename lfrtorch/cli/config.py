@@ -45,7 +45,6 @@ def configured(cfg: DictConfig) -> Settings:
         **{name: plain[name] for name in AS_THEY_ARE},
         static=partial(own_map, cfg) if cfg.static.kind == "own" else cfg.static.kind,
         init=cfg.init.method,
-        minor=cfg.init.get("minor"),
         linear=plain["bla"],
         trainer=instantiate(cfg.trainer),
         init_from=None if cfg.init_from is None else opened(cfg),

@@ -88,7 +88,6 @@ class Settings:
             keywords nz and nw it returns a module from (..., nz) to (..., nw), for example the
             module's class.
         init: where the fit starts, see :func:`lfrtorch.initialise`.
-        minor: see :func:`lfrtorch.initialise`. Default: its own.
         relaxations, modes: that w alone drives, one and two states each beside the ``nx`` of the
             linear model, see :func:`lfrtorch.initialise`.
         z_feedthrough: whether the input acts on z at once; False for a nonlinearity of the states
@@ -139,7 +138,6 @@ class Settings:
     degree: Size = 3
     static: Literal["network", "polynomial"] | Callable[..., Module] = "network"
     init: Literal["zero_output", "paper"] = "zero_output"
-    minor: float | None = None
     relaxations: int = 0
     modes: int = 0
     z_feedthrough: bool = True
@@ -195,8 +193,6 @@ class Settings:
         for name in self.linear:
             if name not in known:
                 raise InputError(f"linear has no option '{name}'; there are {', '.join(known)}.")
-        if self.minor is not None:
-            number("minor", self.minor)
         number("first_part", self.first_part, positive=True)
         if self.first_part > 1:
             raise InputError(f"first_part is {self.first_part}; give a part: above 0, 1 at most.")

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from lfrtorch._support.arguments import typed
-from lfrtorch._support.checks import integer, number
+from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
 from lfrtorch.engine.cell import LFRCell, check_dtype
@@ -27,7 +27,7 @@ from lfrtorch.fitting.nonlinear_end import nonlinear_end
 from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.modes import MINOR, without_slow_minor_modes
+from lfrtorch.linear.modes import without_slow_minor_modes
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
 
@@ -51,7 +51,6 @@ def initialise(
     static: Module | None = None,
     method: Literal["zero_output", "paper"] = "zero_output",
     seed: int = 0,
-    minor: float | None = None,
     relaxations: int = 0,
     modes: int = 0,
     z_feedthrough: bool = True,
@@ -61,8 +60,9 @@ def initialise(
 ) -> Model:
     """NL-LFR model whose output is that of the linear model.
 
-    But for modes of the linear model that add next to nothing to the output and are slower than all
-    others: those are made as fast first (:func:`lfrtorch.linear.modes.without_slow_minor_modes`).
+    ``"zero_output"`` first speeds up modes of the linear model that add next to nothing to the
+    output and are slower than all others (:func:`lfrtorch.linear.modes.without_slow_minor_modes`),
+    unless it has a noise model.
 
     Signals and states are scaled to unit standard deviation over the records, and so is every z:
     C*, D* ~ U(-1, 1), then Cz, Dzu = C*, D* over the standard deviation of C* x + D* u. The static
@@ -107,8 +107,6 @@ def initialise(
             any module from (..., nz) to (..., nw); nn, activation and layers are then of no use.
         method: which of the two starts.
         seed: of the random weights.
-        minor: what counts as next to nothing: the part of a mode in the output over the model's
-            error; 0 leaves the linear model as it is. Default: 0 for ``"paper"``, else 1/3.
         relaxations, modes: how many are added to those of the linear model, one and two states
             each.
         z_feedthrough: whether the input acts on z at once.
@@ -145,11 +143,9 @@ def initialise(
         _check_structure(structure, nz, nw, nn, layers, static, relaxations + modes, z_feedthrough)
     if not feedthrough:
         _check_no_feedthrough(bla, structure, z_feedthrough)
-    if minor is None:
-        minor = MINOR if method != "paper" and bla.K is None else 0.0  # noise has slow modes
-    number("minor", minor)
     data = [without_coordinates(record) for record in as_records(records)]
-    bla = without_slow_minor_modes(bla, data, minor) if minor else bla
+    if method != "paper" and bla.K is None:  # noise has slow modes
+        bla = without_slow_minor_modes(bla, data)
     scaler = Scaler(
         bla.u_offset,
         rms_scale([r.u for r in data], bla.u_offset),

@@ -56,6 +56,7 @@ def shares(
         D=np.zeros((nx * ny, len(model.inputs))),
         y_offset=np.zeros(nx * ny),
         outputs=outputs,
+        K=None,
     )
     parts_of, added, error = split.to_model(), np.zeros((nx, ny)), np.zeros(ny)
     for record in map(without_coordinates, as_records(data)):

@@ -46,6 +46,7 @@ def measured(model: LinearModel, start: Start = "periodic") -> Record:
 def test_a_share_is_what_the_mode_alone_puts_out(start):
     model, slow = assembled()
     record = measured(model, start)
+    model = replace(model, K=np.ones((5, 1)), innovation_covariance=np.eye(1))  # no part of it
     poles, share = shares(model, record)
     np.testing.assert_allclose(np.poly(poles), np.poly(model.A), atol=1e-12)
     alone = replace(record, y=np.zeros_like(record.y))
@@ -93,9 +94,15 @@ def test_a_model_of_equal_poles_stays():
     assert without_slow_minor_modes(chain, measured(chain)) is chain
 
 
-@pytest.mark.parametrize(("method", "slowest"), [("paper", 0.998), ("zero_output", 0.9)])
-def test_the_papers_start_is_the_linear_model_itself(method, slowest):
+@pytest.mark.parametrize(
+    ("method", "noise", "slowest"),
+    [("paper", False, 0.998), ("zero_output", False, 0.9), ("zero_output", True, 0.998)],
+)
+def test_the_papers_start_and_a_noise_model_keep_all_modes(method, noise, slowest):
     model, _ = assembled()
+    if noise:
+        K = np.linalg.solve(model.C.T @ model.C + np.eye(5), 0.1 * model.A @ model.C.T)
+        model = replace(model, K=K, innovation_covariance=np.eye(1))
     start = initialise(model, measured(model), nz=1, nw=1, nn=3, method=method)
     poles = np.linalg.eigvals(start.lfr.cell.A.detach().numpy())
     np.testing.assert_allclose(np.abs(poles).max(), slowest, rtol=1e-9)
