@@ -32,7 +32,7 @@ from lfrtorch.linear.integrators import (
     simulation_errors,
     whitening_pole,
 )
-from lfrtorch.linear.minima import LinearLeastSquares, best_minimum, candidates, transformation
+from lfrtorch.linear.minima import Problem, best_minimum, candidates, transformation
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Refined
 from lfrtorch.linear.requirements import (
@@ -99,7 +99,6 @@ def estimate_bla(
     offset: bool = True,
     feedthrough: bool = True,
     integrators: Literal[0, 1, 2] = 0,
-    coordinates: Literal["balanced", "given"] = "balanced",
     max_iter: int = 200,
 ) -> LinearModel:
     """Best linear approximation of order ``nx``: a stable model that minimises a squared error.
@@ -139,15 +138,15 @@ def estimate_bla(
             simulation error that is filtered so that it is about white, and D is 0 unless it lowers
             the error by 1 %. Not for a prediction, and not for records in steady state: the system
             has none of its own.
-        coordinates: ``"balanced"`` states, or ``"given"`` by the subspace estimate.
         max_iter: iterations of the refinement; 0 keeps the best subspace estimate.
 
     Shape:
         weight: (F, ny, nu).
 
     Returns:
-        The model, with states of unit standard deviation over the data (for a response: under an
-        input of equal power at all lines), the covariance of its parameters, and notes in ``fit``.
+        The model in balanced coordinates, its states of unit standard deviation over the data (for
+        a response: under an input of equal power at all lines), with the covariance of its
+        parameters, and notes in ``fit``.
         The covariance holds for errors of any spectrum; for predictions, and for millions of
         samples, it assumes white errors.
 
@@ -184,7 +183,7 @@ def estimate_bla(
     true_or_false("feedthrough", feedthrough)
     if refine != "frequency" and weight is not None:
         raise InputError("weight is that of a response: use refine='frequency'.")
-    settings = _Settings(refine, weight, offset, feedthrough, coordinates, max_iter)
+    settings = _Settings(refine, weight, offset, feedthrough, max_iter)
     estimate = partial(_integrating, integrators=integrators) if integrators else _stable
     model = estimate(data, nx, settings)
     fit = _fit(model)
@@ -220,7 +219,6 @@ class _Settings(NamedTuple):
     weight: Weight | Array | None
     offset: bool
     feedthrough: bool
-    coordinates: Literal["balanced", "given"]
     max_iter: int
 
 
@@ -241,7 +239,7 @@ def _stable(
             the inputs of a response, which it need not have.
         near: a model whose A and C the search starts from, too.
     """
-    refine, weight, offset, feedthrough, coordinates, max_iter = settings
+    refine, weight, offset, feedthrough, max_iter = settings
     records = [] if isinstance(data, FRF) else data
     notes: list[str] = []
     about: FRF | Record
@@ -275,13 +273,12 @@ def _stable(
         check_length(driving, nx)
         notes += excitation_notes(driving, nx)
 
-    balanced = coordinates == "balanced"
     given = []
     if near is not None:
         values = np.array(_fit(near).singular_values)
         given = [SubspaceEstimate(near.A, near.C / scaler.y_scale[:, None], values, None)]
     tried = candidates(problem, nx, given)
-    estimate, found = best_minimum(problem, tried, max_iter, balanced=balanced)
+    estimate, found = best_minimum(problem, tried, max_iter)
     notes += _notes(problem, estimate, found)
     if isinstance(problem, ResponseFit) and problem.data.weight is not None:
         notes += _residual_notes(found.rmse, weight)
@@ -291,7 +288,7 @@ def _stable(
             f"use estimate_bla(max_iter={2 * max_iter})."
         )
     model = physical(found, scaler, about)
-    model = model.transformed(*transformation(problem, found.matrices, balanced=balanced))
+    model = model.transformed(*transformation(problem, found.matrices))
     rmse = found.rmse
     if found.constant is not None:
         model = replace(model, y_offset=model.y_offset + scaler.y_scale * found.constant)
@@ -391,7 +388,7 @@ def _of_records(
     prediction: bool,
     feedthrough: bool,
     direct: int,
-) -> ResponseFit | SignalFit:
+) -> Problem:
     """The fit to the spectra of the records if that is the same, else to their signals."""
     normalised = [scaler.normalise(record) for record in records]
     if not prediction:
@@ -414,7 +411,7 @@ def _band_notes(data: SpectralData, fs: float) -> list[str]:
     ]
 
 
-def _notes(problem: LinearLeastSquares, estimate: SubspaceEstimate, found: Refined) -> list[str]:
+def _notes(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> list[str]:
     """What the subspace and the poles say of data and order."""
     nx, notes, s = len(found.A), [], estimate.singular_values
     if len(s) >= nx and s[nx - 1] < EMPTY:

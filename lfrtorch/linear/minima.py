@@ -8,7 +8,7 @@ end, as a single search may end in a poor minimum.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.linear.model import balancing
 from lfrtorch.linear.refinement import Matrices, Refined, Search
+from lfrtorch.linear.response_fit import ResponseFit
+from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.linear.subspace import SubspaceEstimate
 
 FIRST_STEPS, FINALISTS = 8, 6
@@ -34,40 +36,7 @@ ALIKE, HOPELESS = 1.001, 10.0
 HOPELESS times the best is dropped."""
 
 
-class LinearLeastSquares(Protocol):
-    """Least squares between data and a linear model, in normalised units."""
-
-    def most_candidates(self, nx: int) -> int:
-        """How many subspace estimates are refined: several if an iteration takes milliseconds."""
-        ...
-
-    def many(self, nx: int) -> bool:
-        """Whether a model of the order has so many unknowns that iterations count."""
-        ...
-
-    def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
-        """Subspace estimates of A and C."""
-        ...
-
-    def with_input_matrices(self, A: Array, C: Array) -> tuple[float, Matrices]:
-        """Cost and system with the best B and D for A and C."""
-        ...
-
-    def state_deviation(self, matrices: Matrices) -> Array:
-        """Standard deviation (nx,) of the states."""
-        ...
-
-    def search(self, matrices: Matrices) -> Search:
-        """A search for the minimum near the given system."""
-        ...
-
-    def improbability(self, search: Search) -> float:
-        """The cost of a search, raised for initial states that the inputs hardly lead to."""
-        ...
-
-    def refined(self, search: Search) -> Refined:
-        """The present result of a search."""
-        ...
+Problem = ResponseFit | SignalFit
 
 
 class Candidate(NamedTuple):
@@ -78,9 +47,7 @@ class Candidate(NamedTuple):
     matrices: Matrices
 
 
-def candidates(
-    problem: LinearLeastSquares, nx: int, more: Sequence[SubspaceEstimate] = ()
-) -> list[Candidate]:
+def candidates(problem: Problem, nx: int, more: Sequence[SubspaceEstimate] = ()) -> list[Candidate]:
     """The candidates of finite cost, and more of them, the best one first."""
     found = []
     for estimate in (*problem.subspace_estimates(nx), *more):
@@ -101,11 +68,7 @@ def no_start(nx: int) -> InputError:
 
 
 def best_minimum(
-    problem: LinearLeastSquares,
-    tried: list[Candidate],
-    max_iter: int,
-    *,
-    balanced: bool,
+    problem: Problem, tried: list[Candidate], max_iter: int
 ) -> tuple[SubspaceEstimate, Refined]:
     """The best of the minima that the candidates lead to: after a few steps the best few go on.
 
@@ -128,10 +91,7 @@ def best_minimum(
     if max_iter <= FIRST_STEPS:
         field = field[:1]
     for _, estimate, matrices in field[:RACERS] if many else field:
-        try:
-            search = problem.search(scaled(problem, matrices, balanced=balanced))
-        except ValueError:  # the data hardly move some states: their scaling is a rounding error
-            search = problem.search(matrices)
+        search = search_from(problem, matrices)
         searches.append((estimate, search.advance(min(FIRST_STEPS, max_iter))))
         costs = [search.state.cost for _, search in searches]
         if len(costs) >= AGREED and max(costs[-AGREED:]) <= SAME * min(costs):
@@ -153,21 +113,20 @@ def best_minimum(
     return estimate, problem.refined(search)
 
 
-def scaled(problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool) -> Matrices:
-    """The system with states of unit standard deviation, in balanced coordinates if wanted."""
+def search_from(problem: Problem, matrices: Matrices) -> Search:
+    """A search that starts in balanced coordinates, from states of unit deviation."""
     A, B, C, D = matrices
-    T, inverse = transformation(problem, matrices, balanced=balanced)
-    return T @ A @ inverse, T @ B, C @ inverse, D
+    try:
+        T, inverse = transformation(problem, matrices)
+        return problem.search((T @ A @ inverse, T @ B, C @ inverse, D))
+    except ValueError:  # the data hardly move some states: their scaling is a rounding error
+        return problem.search(matrices)
 
 
-def transformation(
-    problem: LinearLeastSquares, matrices: Matrices, *, balanced: bool
-) -> tuple[Array, Array]:
-    """T and T⁻¹ (nx, nx) that give states of unit deviation, in balanced coordinates if wanted."""
+def transformation(problem: Problem, matrices: Matrices) -> tuple[Array, Array]:
+    """T and T⁻¹ (nx, nx) to balanced coordinates with states of unit deviation."""
     A, B, C, D = matrices
-    T = inverse = np.eye(len(A))
-    if balanced:
-        T, inverse = balancing(A, B, C)
+    T, inverse = balancing(A, B, C)
     std = problem.state_deviation((T @ A @ inverse, T @ B, C @ inverse, D))
     std = np.where(std > 0, std, 1.0)
     return T / std[:, None], inverse * std

@@ -22,7 +22,7 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
 from lfrtorch.linear.bla import physical
 from lfrtorch.linear.frf import FRF, estimate_frf
-from lfrtorch.linear.minima import ALIKE, no_start, scaled, transformation
+from lfrtorch.linear.minima import ALIKE, no_start, search_from, transformation
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Matrices, Refined, Search
 from lfrtorch.linear.requirements import check_spectral_data, of_response, steady_state
@@ -123,7 +123,7 @@ class OrderFits:
     @classmethod
     def of(cls, data: Sequence[Record] | FRF, most: int, options: Mapping[str, Any]) -> Self | None:
         """The fits of what ``estimate_bla`` takes, ``None`` if it has to fit them one by one."""
-        known = {"refine", "weight", "offset", "feedthrough", "coordinates", "max_iter"}
+        known = {"refine", "weight", "offset", "feedthrough", "max_iter"}
         given = {name: value for name, value in options.items() if value is not None}
         refine = given.get("refine")
         if refine is None and not isinstance(data, FRF) and of_response(data):
@@ -195,7 +195,7 @@ class OrderFits:
         """
         clock = time.perf_counter()
         check_spectral_data(self.problem.data, nx)
-        searches = [self._search(matrices) for matrices in self._starts(nx)]
+        searches = [search_from(self.problem, matrices) for matrices in self._starts(nx)]
         found = [self.problem.refined(searches[0])]
         for search in searches:
             self._advance(search, FIRST_STEPS)
@@ -226,7 +226,7 @@ class OrderFits:
         """
         clock = time.perf_counter()
         check_spectral_data(self.problem.data, model.nx)
-        search = self._search(self._near(model))
+        search = search_from(self.problem, self._near(model))
         found = [self.problem.refined(search)]
         self._advance(search, NEAR_STEPS)
         found.append(self.problem.refined(search))
@@ -281,12 +281,6 @@ class OrderFits:
             if e is not None
         ]
 
-    def _search(self, matrices: Matrices) -> Search:
-        try:
-            return self.problem.search(scaled(self.problem, matrices, balanced=True))
-        except ValueError:  # the data hardly move some states: their scaling is a rounding error
-            return self.problem.search(matrices)
-
     def _advance(self, search: Search, steps: int) -> None:
         steps = min(steps, self._max_iter)
         while not search.state.reason and search.state.iteration < steps:
@@ -306,7 +300,7 @@ class OrderFits:
         """
         found = self._without_starts(found)
         model = physical(found, self._scaler, self._about)
-        model = model.transformed(*transformation(self._driven, found.matrices, balanced=True))
+        model = model.transformed(*transformation(self._driven, found.matrices))
         rmse = found.rmse
         if self._train:
             model = replace(model, y_offset=y_offset)

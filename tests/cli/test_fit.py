@@ -706,7 +706,7 @@ def test_user_errors_are_one_message(
         (["static=own", "nz=auto"], "a map of one's own is not searched; give numbers"),
         (["activation=softsign"], "activation is 'softsign'"),
         (["trainer.damping=-1"], "damping is -1"),
-        (["bla.coordinates=polar"], "coordinates is 'polar'"),
+        (["bla.refine=output"], "refine is 'output'"),
         (["+bench=boucwen", "data.samples=ten"], "a period of ten samples"),
         (["+bench=boucwen", "data.seed=x"], "data: seed is 'x'"),
         (["+bench=silverbox", "data.root=/nowhere"], "there is no 'Silverbox/"),

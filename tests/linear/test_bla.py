@@ -179,14 +179,10 @@ def test_model_of_any_data_is_stable(data: str, nx: int, start: Start):
 
 def test_states_have_unit_deviation():
     record = record_of(random_system(4, 2, 2), "periodic", noise=0.1)  # the refinement moves it
-    for coordinates in ("balanced", "given"):
-        model = estimate_bla(record, 4, coordinates=coordinates)
-        # y = x: the states as outputs
-        n = len(model.A)
-        states = reference.periodic_response(
-            (model.A, model.B, np.eye(n), np.zeros((n, 2))), record.u - model.u_offset
-        )
-        np.testing.assert_allclose(states.std(axis=0), np.ones(4), rtol=1e-9)
+    model = estimate_bla(record, 4)
+    states_as_outputs = model.A, model.B, np.eye(4), np.zeros((4, 2))
+    states = reference.periodic_response(states_as_outputs, record.u - model.u_offset)
+    np.testing.assert_allclose(states.std(axis=0), np.ones(4), rtol=1e-9)
 
 
 def test_balanced_gramians_are_diagonal_and_alike():
@@ -200,12 +196,6 @@ def test_balanced_gramians_are_diagonal_and_alike():
     hankel = np.sqrt(np.diag(P) * np.diag(Q))  # the scaling of the states cancels
     assert np.all(np.diff(hankel) < 0)
     np.testing.assert_allclose(hankel**2, np.sort(np.linalg.eigvals(P @ Q).real)[::-1], rtol=1e-8)
-
-
-def test_given_coordinates_have_the_same_response():
-    record = record_of(random_system(3), "periodic")
-    balanced, given = estimate_bla(record, 3), estimate_bla(record, 3, coordinates="given")
-    np.testing.assert_allclose(given.frf(OMEGA), balanced.frf(OMEGA), atol=1e-9)
 
 
 # --- refusals -------------------------------------------------------------------------------
@@ -252,15 +242,6 @@ def test_many_short_records_do():
 def test_order(nx: int):
     refused(
         f"nx is {nx}; give a whole number of at least 1", record_of(random_system(1), "zero"), nx
-    )
-
-
-def test_coordinates():
-    refused(
-        "coordinates is 'modal'; give 'balanced' or 'given'.",
-        record_of(random_system(1), "zero"),
-        1,
-        coordinates="modal",
     )
 
 
@@ -609,39 +590,25 @@ class Race:
         return search.state.cost
 
 
-def test_candidates_that_are_alike_or_hopeless_are_not_searched(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(minima, "scaled", lambda problem, matrices, balanced: matrices)
-    race, estimate = Race(), cast(Any, SimpleNamespace(A=[0]))
-    candidates: Any = [
-        minima.Candidate(cost, estimate, cast(Any, cost))
-        for cost in (1.0, 1.0005, 2.0, 9.9, 10.1, 50.0)
-    ]
-    _, refined = minima.best_minimum(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
-    assert race.searched == [1.0, 2.0, 9.9]
-    assert refined == 9.9  # the most probable one
-    minima.best_minimum(race, candidates, minima.FIRST_STEPS, balanced=True)  # pyright: ignore[reportArgumentType]
-    assert race.searched[3:] == [1.0]  # without steps to compare them the best one alone
-
-
-def test_candidates_that_went_to_one_minimum_end_the_race(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(minima, "scaled", lambda problem, matrices, balanced: matrices)
-    race, estimate = Race(minimum=0.5), cast(Any, SimpleNamespace(A=[0]))
-    candidates: Any = [
-        minima.Candidate(cost, estimate, cast(Any, cost)) for cost in (1.0, 2.0, 3.0, 4.0, 5.0)
-    ]
-    minima.best_minimum(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
-    assert race.searched == [1.0, 2.0, 3.0]
-
-
-def test_of_many_unknowns_few_starts_that_differ_are_searched(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(minima, "scaled", lambda problem, matrices, balanced: matrices)
-    race, estimate = Race(large=True), cast(Any, SimpleNamespace(A=[0]))
-    candidates: Any = [
-        minima.Candidate(cost, estimate, cast(Any, cost))
-        for cost in (1.0, 1.02, 1.1, 1.3, 1.5, 1.7, 1.9)
-    ]
-    minima.best_minimum(race, candidates, 100, balanced=True)  # pyright: ignore[reportArgumentType]
-    assert race.searched == [1.0, 1.1, 1.3, 1.5]
+@pytest.mark.parametrize(
+    ("race", "costs", "max_iter", "searched"),
+    [
+        (Race(), (1.0, 1.0005, 2.0, 9.9, 10.1, 50.0), 100, [1.0, 2.0, 9.9]),  # alike, hopeless
+        (Race(), (1.0, 2.0, 9.9), minima.FIRST_STEPS, [1.0]),  # no steps to compare them
+        (Race(minimum=0.5), (1.0, 2.0, 3.0, 4.0, 5.0), 100, [1.0, 2.0, 3.0]),  # all in one minimum
+        (Race(large=True), (1.0, 1.02, 1.1, 1.3, 1.5, 1.7, 1.9), 100, [1.0, 1.1, 1.3, 1.5]),
+    ],
+)
+def test_candidates_that_can_win_are_searched(
+    race: Race, costs: tuple[float, ...], max_iter: int, searched: list[float], monkeypatch
+):
+    monkeypatch.setattr(minima, "search_from", lambda problem, matrices: problem.search(matrices))
+    estimate: Any = SimpleNamespace(A=[0])
+    field: Any = [minima.Candidate(cost, estimate, cast(Any, cost)) for cost in costs]
+    _, found = minima.best_minimum(cast(Any, race), field, max_iter)
+    assert race.searched == searched
+    if not race.large and race.minimum is None:
+        assert found == searched[-1]  # the most probable one, of the largest cost here
 
 
 def settling_records(*, drift: float = 0.0) -> tuple[Record, Record]:
