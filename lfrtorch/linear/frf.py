@@ -28,7 +28,6 @@ from lfrtorch.linear.local_polynomial import WindowErrors, fit_local_polynomials
 from lfrtorch.linear.realisations import united
 from lfrtorch.linear.regression import Regression, covariance, divided, outer, regress
 from lfrtorch.linear.spectra import (
-    Removal,
     Spectra,
     excited_lines,
     in_band,
@@ -71,11 +70,6 @@ class Level:
         """Power beyond the noise, at least 0."""
         return np.maximum(self.power - self.noise, 0.0)
 
-    def restricted(self, f_low: float, f_high: float) -> Level:
-        """The lines from ``f_low`` to ``f_high`` Hz."""
-        inside = (self.frequencies >= f_low) & (self.frequencies <= f_high)
-        return Level(self.frequencies[inside], self.power[inside], self.noise[inside])
-
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
@@ -89,11 +83,6 @@ class Distortion:
     output: Level
     odd: Level
     even: Level
-
-    def restricted(self, f_low: float, f_high: float) -> Distortion:
-        """The lines from ``f_low`` to ``f_high`` Hz."""
-        levels = (self.output, self.odd, self.even)
-        return Distortion(*(level.restricted(f_low, f_high) for level in levels))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,32 +164,6 @@ class FRF:
             return None
         return np.diagonal(cov, axis1=1, axis2=2).real.reshape(self.G.shape)
 
-    def restricted(self, f_low: float, f_high: float) -> FRF:
-        """The lines from ``f_low`` to ``f_high`` Hz.
-
-        Raises:
-            ValueError: there is none.
-
-        Example:
-            >>> lfrtorch.estimate_frf(record).restricted(1.0, 2.0).frequencies.tolist()
-            [1.0, 1.25, 1.5, 1.75, 2.0]
-        """
-        inside = (self.frequencies >= f_low) & (self.frequencies <= f_high)
-        if not inside.any():
-            raise InputError(
-                f"no line from {f_low} to {f_high} Hz; the lines go from "
-                f"{self.frequencies[0]:g} to {self.frequencies[-1]:g} Hz."
-            )
-        return replace(
-            self,
-            frequencies=self.frequencies[inside],
-            G=self.G[inside],
-            cov_noise=None if self.cov_noise is None else self.cov_noise[inside],
-            cov_total=None if self.cov_total is None else self.cov_total[inside],
-            distortion=self.distortion and self.distortion.restricted(f_low, f_high),
-            errors=self.errors and self.errors.at(inside),
-        )
-
 
 @typed()
 @spread_by_hand()
@@ -211,8 +174,6 @@ def estimate_frf(
     lines: ArrayLike | None = None,
     band: tuple[float, float] | None = None,
     order: int = 2,
-    degrees_of_freedom: int | None = None,
-    transient: bool = False,
 ) -> FRF:
     """Frequency response of the best linear approximation, and its variances as the data allow.
 
@@ -250,10 +211,6 @@ def estimate_frf(
             0 < line < N / 2. Default: those that are excited. The fast method needs all of these.
         band: lowest and highest frequency in Hz. Default: all lines.
         order: of the local polynomials.
-        degrees_of_freedom: least number that a window of local polynomials leaves.
-            Default: ny + 4.
-        transient: whether the transient of periodic records is removed, by local polynomials at
-            the lines between those of the period. It takes two periods and adds to the noise.
 
     Raises:
         ValueError: a constant input, records of different periods or without, an input that does
@@ -279,8 +236,6 @@ def estimate_frf(
     """
     data = as_records(records)
     integer("order", order, 0)
-    if degrees_of_freedom is not None:
-        integer("degrees_of_freedom", degrees_of_freedom, 1)
     if band is not None:
         checks.band(band)
     if band is not None and not 0 <= band[0] <= band[1]:
@@ -290,18 +245,17 @@ def estimate_frf(
     if method == "auto":
         periodic = all(record.period or record.start == "periodic" for record in data)
         method = "robust" if periodic else "local_polynomial"
-    freedom = degrees_of_freedom or len(data[0].outputs) + SPARE_FREEDOM
     if method == "local_polynomial":
-        return _local_polynomial(data, lines, band, order, freedom)
-    spectra = spectra_of_periods(data, Removal(order, freedom) if transient else None)
+        return _local_polynomial(data, lines, band, order)
+    spectra = spectra_of_periods(data)
     chosen = in_band(excited_lines(spectra, data, lines), spectra.resolution, band)
     at_once = [
         f"noise: record '{record.name}' is used from its first sample on; a transient there counts "
-        "as noise (skip=N leaves it out, transient=True removes it)."
+        "as noise; skip=N leaves it out."
         for record, P in zip(data, spectra.P, strict=True)
         if record.start != "periodic" and record.samples == P * spectra.N
     ]
-    if transient or not spectra.freedom:
+    if not spectra.freedom:
         at_once = []
     spectra, data, notes = united(spectra, data, shifted=True)
     frf = (_robust if method == "robust" else _fast)(spectra, data, chosen)
@@ -386,18 +340,18 @@ def _local_polynomial(
     given: ArrayLike | None,
     band: tuple[float, float] | None,
     order: int,
-    degrees_of_freedom: int,
 ) -> FRF:
     """Noise and distortion together, from the residuals of smooth functions of frequency."""
     spectra = spectra_of_records(data)
     cut = any(record.samples - record.skip > spectra.N for record in data)
     spectra, data, repeated = united(spectra, data, shifted=False)
     last = (spectra.N - 1) // 2
-    n = half_width(order, degrees_of_freedom, len(data[0].inputs), len(data))
+    freedom = len(data[0].outputs) + SPARE_FREEDOM
+    n = half_width(order, freedom, len(data[0].inputs), len(data))
     if 2 * n + 1 > last:
         raise InputError(
             f"{spectra.N} samples have {last} lines and a window of local polynomials takes "
-            f"{2 * n + 1}; use longer records, a lower order or fewer degrees_of_freedom."
+            f"{2 * n + 1}; use longer records or a lower order."
         )
     lines = powered_lines(spectra, n)
     if given is not None:

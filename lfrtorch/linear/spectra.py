@@ -2,9 +2,8 @@
 
 A periodic signal has power at the lines of its period alone, and a steady state repeats. So the
 mean over the periods of a record is its signal, and the scatter of the periods about the mean is
-noise. If the record begins with a transient, the lines between those of the period show it, and it
-can be removed. A response can be estimated only at lines that the inputs excite; they are found by
-their power, compared to the strongest line and to the noise.
+noise. A response can be estimated only at lines that the inputs excite; they are found by their
+power, compared to the strongest line and to the noise.
 """
 
 from __future__ import annotations
@@ -91,20 +90,8 @@ class Spectra(NamedTuple):
         return np.asarray(lines * self.resolution, dtype=np.float64)
 
 
-class Removal(NamedTuple):
-    """How transients are removed: order of local polynomials, and the least freedom they leave."""
-
-    order: int
-    degrees_of_freedom: int
-
-
-def spectra_of_periods(data: Sequence[Record], removal: Removal | None = None) -> Spectra:
-    """Spectra of the last whole periods after ``skip``; a ``removal`` takes their transients off.
-
-    Raises:
-        ValueError: a record without a period or of another one, or shorter than it (with removal:
-            than two); an input that is constant or does not repeat.
-    """
+def spectra_of_periods(data: Sequence[Record]) -> Spectra:
+    """Return the spectra of the last whole periods after ``skip``."""
     N = _period(data[0])
     windows = []
     for record in data:
@@ -119,21 +106,12 @@ def spectra_of_periods(data: Sequence[Record], removal: Removal | None = None) -
                 f"record '{record.name}': skip={record.skip} leaves less than one period of {N} "
                 f"out of {record.samples} samples; skip less or measure longer."
             )
-        if removal and count == 1:
-            raise InputError(
-                f"record '{record.name}' has one period of {N} samples after skip; "
-                "transient=True needs two or more, as it shows between the lines of the period."
-            )
         windows.append(slice(record.samples - count * N, record.samples))
-    return _spectra(data, windows, N, removal)
+    return _spectra(data, windows, N)
 
 
 def spectra_of_records(data: Sequence[Record]) -> Spectra:
-    """Spectra after ``skip``, over as many samples as the shortest record has there.
-
-    Raises:
-        ValueError: an input that is constant.
-    """
+    """Return the spectra after ``skip``, over as many samples as the shortest record has there."""
     N = min(record.samples - record.skip for record in data)
     return _spectra(data, [slice(record.skip, record.skip + N) for record in data], N)
 
@@ -147,10 +125,8 @@ def _period(record: Record) -> int:
     return int(record.period or record.samples)
 
 
-def _spectra(
-    data: Sequence[Record], windows: list[slice], N: int, removal: Removal | None = None
-) -> Spectra:
-    """Spectra of whole periods of N samples in a window of each record."""
+def _spectra(data: Sequence[Record], windows: list[slice], N: int) -> Spectra:
+    """Return the spectra of whole periods of N samples in a window of each record."""
     if N < 3:
         raise InputError(f"{N} samples have no line between 0 and fs / 2; give more.")
     known = given_references(data)
@@ -180,9 +156,6 @@ def _spectra(
         references.append(E.mean(axis=0))
         # Line 0 is left out: a drift of the offset is no change of the input.
         change = np.sum(np.abs(E - references[-1])[:, 1:] ** 2, axis=(0, 1)) / max(count, 1)
-        if removal:
-            mean, D = _without_transient(signals, N, removal)
-            count = D.shape[1]
         if count:
             C += outer(D)
         freedom += count
@@ -200,11 +173,7 @@ def _spectra(
 
 
 def given_references(data: Sequence[Record]) -> list[Array | None]:
-    """The references of the records.
-
-    Raises:
-        ValueError: some records have one and others none.
-    """
+    """Return the references of the records; all of them have one, or none."""
     with_one = [record.name for record in data if record.reference is not None]
     without = [record.name for record in data if record.reference is None]
     if with_one and without:
@@ -213,38 +182,6 @@ def given_references(data: Sequence[Record]) -> list[Array | None]:
             "one, or none."
         )
     return [record.reference for record in data]
-
-
-def _without_transient(signals: Array, N: int, removal: Removal) -> tuple[Complex, Complex]:
-    """Mean spectrum (F, n) over P periods without the transient, and errors (F, freedom, n).
-
-    In the spectrum of all P N samples (P N, n) the periods have power at every P-th line only. The
-    lines about each of these hold transient and noise. A polynomial in the line r is fitted to
-    them, and its value at r = 0 is subtracted (Pintelon and Schoukens, 2012, chapter 7). The window
-    is the same about each line, and so are the weights b of this value, which add |b|² to the
-    noise. The errors have the covariance of the noise of one period.
-    """
-    P = len(signals) // N
-    Z = np.fft.fft(signals, axis=0) * (np.sqrt(2) / len(signals))
-    least = removal.order + 1 + removal.degrees_of_freedom
-    n = 1
-    while 2 * (n - n // P) < least:
-        n += 1
-    if 2 * n + 1 > len(signals):
-        raise InputError(
-            f"{len(signals)} samples have no {2 * n + 1} lines to remove a transient by; use "
-            "longer records, a lower order or fewer degrees_of_freedom."
-        )
-    r = np.arange(-n, n + 1)
-    r = r[r % P != 0]
-    vandermonde = (r[:, None] / n) ** np.arange(removal.order + 1)
-    b = np.linalg.pinv(vandermonde)[0]
-    complement = np.linalg.qr(vandermonde, mode="complete")[0][:, removal.order + 1 :]
-    # The complement is orthogonal to all polynomials of the order: it keeps noise alone.
-    at = np.arange(N // 2 + 1) * P
-    window = Z[(at[:, None] + r) % len(signals)]
-    D = complement.T @ window * np.sqrt(P * (1 + b @ b))
-    return Z[at] - b @ window, D
 
 
 def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:

@@ -1,22 +1,12 @@
-"""The lines of periodic records: which are excited, and how transients leave them."""
+"""The lines of periodic records: which of them are used."""
 
 import numpy as np
 import pytest
-from experiments import (
-    FS,
-    SEEDS,
-    check_covariance,
-    coloured,
-    recorded,
-    slow_system,
-    steady,
-    true_frf,
-    vec,
-)
+from experiments import FS, recorded, steady, true_frf
 from reference import dlsim, random_system
 
 from lfrtorch.excitation import multisine
-from lfrtorch.linear.frf import Method, estimate_frf
+from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
@@ -39,7 +29,6 @@ def test_skip_and_the_last_whole_periods_are_used():
     assert not any("first sample" in note for note in estimate.notes)
     estimate = estimate_frf(record[:400])
     assert estimate.notes[-1].startswith("noise: record 'record' is used from its first sample on;")
-    assert len(estimate.notes) == len(estimate_frf(record[:400], transient=True).notes) + 1
 
 
 # --- excited lines -----------------------------------------------------------------------
@@ -119,57 +108,3 @@ def test_lines_end_below_half_the_sampling_frequency(N: int):
     response = estimate_frf(Record(u, u, 1.0, "periodic", period=N))
     assert response.frequencies.max() == pytest.approx((N - 1) // 2 / N)
     assert response.frequencies.max() < 0.5
-
-
-# --- transients of periodic records ---------------------------------------------------------
-
-
-@pytest.mark.parametrize("periods", [2, 3])
-@pytest.mark.parametrize("method", ["robust", "fast"])
-def test_transient_is_removed_between_the_lines(periods: int, method: Method):
-    system = slow_system()
-    design = multisine(1000, grid="random_odd", realisations=2)
-    records = [
-        Record(x + 2, dlsim(system, x) + 1, start="zero", period=1000, name=f"r{r}")
-        for r, x in enumerate(np.tile(design.u, (1, periods, 1)))
-    ]
-
-    def rms_error(transient: bool) -> float:
-        estimate = estimate_frf(records, method=method, transient=transient)
-        assert np.allclose([estimate.u_offset[0], estimate.y_offset[0]], [2.0, 1.0], atol=0.01)
-        assert len(estimate.frequencies) == len(design.lines)
-        return float(np.sqrt(np.mean(np.abs(estimate.G - true_frf(system, estimate)) ** 2)))
-
-    # Poles of 0.03 rad, lines of 2 π / 2000 and windows of 15 of them: a fifth of the width at 3.
-    assert rms_error(True) < 0.02 * rms_error(False)
-
-
-@pytest.mark.parametrize("periods", [2, 3])
-@pytest.mark.parametrize(("order", "error"), [(2, 1e-4), (4, 1e-6), (8, 1e-10)])
-def test_transient_removal_converges_with_the_order(periods: int, order: int, error: float):
-    """A transient of 10 samples turns by 10 · 2 π / 800 from line to line, 1 in a window.
-
-    It is some 0.1 of the input, and a polynomial of even order in a window about its line leaves
-    the term of order + 2: 0.1 · 0.5⁴ / 4!, 0.1 · 0.7⁶ / 6!, 0.1 / 10!, less by 2^order or so.
-    """
-    u = np.tile(multisine(400).u[0], (periods, 1))
-    y = dlsim((np.eye(10, k=-1), np.eye(10, 1), np.eye(1, 10, 9), np.ones((1, 1))), u)
-    estimate = estimate_frf(Record(u, y, period=400), transient=True, order=order)
-    z = np.exp(2j * np.pi * estimate.frequencies)
-    assert np.abs(estimate.G[:, 0, 0] - (1 + z**-10)).max() < error
-
-
-@pytest.mark.parametrize("periods", [2, 3])
-def test_transient_removal_keeps_the_covariances(periods: int):
-    """Noise alone; neighbouring lines share the lines between them, at most 6 of theirs."""
-    design = multisine(100, realisations=2)
-    D = np.array([[2.0], [1.0]])
-    errors, noises = [], []
-    for seed in range(SEEDS):
-        noise = 0.1 * coloured(np.random.default_rng(seed), (2, 100 * periods), 2)
-        noise = np.concatenate([noise, np.zeros((2, 100 * periods, 1))], axis=2)
-        records = recorded(design.u @ D.T, design.u, periods=periods, noise=noise)
-        estimate = estimate_frf(records, transient=True)
-        errors.append(vec(estimate, D))
-        noises.append(estimate.cov_noise)
-    check_covariance(np.array(errors), np.array(noises), 2 * 6, share=1 / 6)
