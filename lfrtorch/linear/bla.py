@@ -1,7 +1,7 @@
 """Parametric best linear approximation (BLA): a linear state-space model of an order.
 
-Records or a response become a least-squares problem in normalised units, whose best minimum
-``minima`` finds. The result is put into balanced coordinates and physical units, with its
+Records or a response become a least-squares problem in normalised units (``pose``), whose best
+minimum ``minima`` finds. The result is put into balanced coordinates and physical units, with its
 covariance and notes on what is doubtful.
 """
 
@@ -47,7 +47,6 @@ from lfrtorch.linear.requirements import (
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.linear.spectral_data import (
-    SpectralData,
     Weight,
     spectral_data_of_records,
     spectral_data_of_response,
@@ -60,32 +59,8 @@ from lfrtorch.survey.integration import integrators as count_integrators
 
 Criterion = Literal["simulation", "prediction", "frequency"]
 
-EMPTY = 1e-10
-"""Relative singular values below this are rounding errors: the data do not carry the order."""
-
-AT_THE_LIMIT = 1.0 - 1e-4
-"""Radius of a pole above which the data may drift or come from an unstable system."""
-
-ROUNDING = 1e-6
-"""A fit with a relative error below this is perfect."""
-
-POOR = 0.7
-"""A model with an error above this part of the output's rms explains little: half its power."""
-
-AT_ONCE = 0.99
-"""D of a system that integrates is a parameter if that brings the error below this part of what it
-is without: few have one, and it costs precision at high frequencies."""
-
-COLOURED, CLOSER, ROUNDS = 0.3, 0.7, 4
-"""A differenced output is fitted without a filter if its pole λ is below COLOURED. Others are fit
-again, ROUNDS times at most, while 1 - λ of the errors is below the part CLOSER of the last one."""
-
-FAR = 2.0
-"""A normalised residual above this is not explained by the variances: that of good fits to 50 lines
-or more was 1.3 at most."""
-
-BETTER = 0.25
-"""The data come from an unstable system if its cost is below this part of a stable model's."""
+FILTERS = 4
+"""Most filters that the error of a differenced output is whitened by."""
 
 
 @typed()
@@ -179,18 +154,18 @@ def estimate_bla(
     else:
         data = [without_coordinates(record) for record in as_records(data)]
         check_signals(data)
-        refine = refine or ("frequency" if of_response(data) else "simulation")
+        refine = refine or default_criterion(data)
     true_or_false("feedthrough", feedthrough)
     if refine != "frequency" and weight is not None:
         raise InputError("weight is that of a response: use refine='frequency'.")
-    settings = _Settings(refine, weight, offset, feedthrough, max_iter)
+    settings = Settings(refine, weight, offset, feedthrough, max_iter)
     estimate = partial(_integrating, integrators=integrators) if integrators else _stable
     model = estimate(data, nx, settings)
     fit = _fit(model)
     notes = fit.notes
     if not integrators and not isinstance(data, FRF):
         notes += _integrator_notes(data)
-    if fit.rmse > POOR and refine != "frequency":
+    if fit.rmse > 0.7 and refine != "frequency":  # half of the power
         notes += (
             f"the model explains little: {100 * fit.rmse:.0f} % of the output's rms remain. Are "
             "columns swapped, or is there drift, a long delay, noise, an even nonlinearity?",
@@ -202,7 +177,7 @@ def estimate_bla(
 
 
 def _integrator_notes(records: list[Record]) -> tuple[str, ...]:
-    """What to do about outputs that integrate, by the longest record."""
+    """Say what to do about outputs that integrate, by the longest record."""
     longest = max(records, key=lambda record: record.samples)
     u, y = longest.u[longest.skip :], longest.y[longest.skip :]
     counts = [count_integrators(u, y[:, i]) for i in range(y.shape[1])]
@@ -212,8 +187,13 @@ def _integrator_notes(records: list[Record]) -> tuple[str, ...]:
     return (f"output {names} integrates: use integrators={max(counts)} for exact poles at z = 1.",)
 
 
-class _Settings(NamedTuple):
-    """The settings of :func:`estimate_bla`, checked."""
+def default_criterion(records: Sequence[Record]) -> Criterion:
+    """Return the error that records are fitted by if none is asked for."""
+    return "frequency" if of_response(records) else "simulation"
+
+
+class Settings(NamedTuple):
+    """Settings of :func:`estimate_bla`, checked."""
 
     refine: Criterion
     weight: Weight | Array | None
@@ -222,64 +202,84 @@ class _Settings(NamedTuple):
     max_iter: int
 
 
+class Posed(NamedTuple):
+    """A least-squares problem in normalised units, and the data that it stands for."""
+
+    problem: Problem
+    scaler: Scaler
+    about: FRF | Record  # rate and channels of the models
+    records: list[Record]
+    notes: list[str]
+
+
+def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> Posed:
+    """Pose the problem of a criterion: on spectra where that is the same as on signals.
+
+    The last ``direct`` inputs act on the output alone; of a response they are differences of its
+    inputs, which it need not have.
+    """
+    refine, weight, offset, feedthrough, _ = settings
+    records = [] if isinstance(data, FRF) else data
+    if refine == "frequency":
+        response = data if isinstance(data, FRF) else estimate_frf(records)
+        differences = direct // len(response.inputs)
+        spectra, scaler, known, more = spectral_data_of_response(
+            response, weight, offset=offset, differences=differences
+        )
+        about = replace(response, inputs=response.inputs * (1 + differences))
+        problem = ResponseFit(spectra, known=known, feedthrough=feedthrough, direct=direct)
+        notes = [*about.notes, *more]
+    else:
+        prediction = refine == "prediction"
+        if not prediction:
+            records = steady_state(records) or records
+        about, notes = records[0], []
+        scaler = Scaler.of(records, offset=offset)
+        normalised = [scaler.normalise(record) for record in records]
+        spectra = None if prediction else spectral_data_of_records(normalised, offset=offset)
+        if spectra is None:
+            problem = SignalFit(
+                normalised,
+                offset=offset,
+                prediction=prediction,
+                feedthrough=feedthrough,
+                direct=direct,
+            )
+            return Posed(problem, scaler, about, records, notes)
+        problem = ResponseFit(spectra, known=False, feedthrough=feedthrough)
+    if spectra.left_out:
+        f = np.abs(np.angle(spectra.z)) * about.fs / (2 * np.pi)
+        notes.append(
+            f"the fit is to the {len(f)} lines that the input excites, {f.min():.4g} to "
+            f"{f.max():.4g} Hz; {spectra.left_out} lines with noise, hum or distortion at the "
+            "input are left out."
+        )
+    return Posed(problem, scaler, about, records, notes)
+
+
 def _stable(
     data: list[Record] | FRF,
     nx: int,
-    settings: _Settings,
+    settings: Settings,
     direct: int = 0,
     near: LinearModel | None = None,
 ) -> LinearModel:
-    """The model with all poles inside the unit circle.
-
-    Args:
-        data: records or a response.
-        nx: order.
-        settings: checked.
-        direct: how many inputs act on the output alone: the last of the records, or differences of
-            the inputs of a response, which it need not have.
-        near: a model whose A and C the search starts from, too.
-    """
-    refine, weight, offset, feedthrough, max_iter = settings
-    records = [] if isinstance(data, FRF) else data
-    notes: list[str] = []
-    about: FRF | Record
-    if refine == "frequency":
-        about = data if isinstance(data, FRF) else estimate_frf(records)
-        differences = direct // len(about.inputs)
-        spectra, scaler, known, more = spectral_data_of_response(
-            about, weight, offset=offset, differences=differences
-        )
-        about = replace(about, inputs=about.inputs * (1 + differences))
-        problem = ResponseFit(spectra, known=known, feedthrough=feedthrough, direct=direct)
-        notes += [*about.notes, *more]
-    else:
-        if refine == "simulation":
-            records = steady_state(records) or records
-        about = records[0]
-        scaler = Scaler.of(records, offset=offset)
-        problem = _of_records(
-            records,
-            scaler,
-            offset=offset,
-            prediction=refine == "prediction",
-            feedthrough=feedthrough,
-            direct=direct,
-        )
+    """Fit a model with all poles inside the unit circle; A and C of ``near`` are a start, too."""
+    refine, weight, offset, _, max_iter = settings
+    problem, scaler, about, records, notes = pose(data, settings, direct)
     if isinstance(problem, ResponseFit):
         check_spectral_data(problem.data, nx, direct)
-        notes += _band_notes(problem.data, about.fs)
     else:
         driving = [without_inputs(record, direct) for record in records]
         check_length(driving, nx)
         notes += excitation_notes(driving, nx)
-
     given = []
     if near is not None:
         values = np.array(_fit(near).singular_values)
         given = [SubspaceEstimate(near.A, near.C / scaler.y_scale[:, None], values, None)]
     tried = candidates(problem, nx, given)
     estimate, found = best_minimum(problem, tried, max_iter)
-    notes += _notes(problem, estimate, found)
+    notes += _doubts(problem, estimate, found)
     if isinstance(problem, ResponseFit) and problem.data.weight is not None:
         notes += _residual_notes(found.rmse, weight)
     if max_iter and found.iterations >= max_iter:
@@ -299,24 +299,17 @@ def _stable(
             errors = errors - errors.mean(axis=0)
         if refine == "simulation":
             rmse = float(rms(errors / scaler.y_scale))
-    return replace(
-        model,
-        fit=LinearFit(
-            criterion=refine,
-            rmse=rmse,
-            iterations=found.iterations,
-            reason=found.reason,
-            seconds=0.0,
-            singular_values=tuple(map(float, estimate.singular_values)),
-            notes=tuple(notes),
-        ),
-    )
+    fit = LinearFit(
+        refine, rmse, found.iterations, found.reason, 0.0,
+        tuple(map(float, estimate.singular_values)), tuple(notes),
+    )  # fmt: skip
+    return replace(model, fit=fit)
 
 
 def _integrating(
-    data: list[Record] | FRF, nx: int, settings: _Settings, integrators: int
+    data: list[Record] | FRF, nx: int, settings: Settings, integrators: int
 ) -> LinearModel:
-    """The model of the differenced output, with the integrators behind it."""
+    """Fit the differenced output, and put the integrators behind that model."""
     about = data if isinstance(data, FRF) else data[0]
     nu, ny = len(about.inputs), len(about.outputs)
     added, refine = integrators * ny, settings.refine
@@ -344,7 +337,7 @@ def _integrating(
         response = estimate_frf(differenced(data, integrators))
 
     def found(
-        differences: int, own: _Settings, pole: float = 0.0, near: LinearModel | None = None
+        differences: int, own: Settings, pole: float = 0.0, near: LinearModel | None = None
     ) -> tuple[LinearModel, list[Record]]:
         if response is not None:
             return _stable(response, order, own, nu * differences, near), []
@@ -357,17 +350,19 @@ def _integrating(
     model, parts = found(differences, own)
     if settings.feedthrough:
         at_once, _ = found(integrators, own._replace(max_iter=0), near=model)
-        if _fit(at_once).rmse < AT_ONCE * _fit(model).rmse:
+        # Few systems have a D, and it costs precision at high frequencies.
+        if _fit(at_once).rmse < 0.99 * _fit(model).rmse:
             differences = integrators
             model, parts = found(differences, own, near=model)
     while True:
         whole = integrated(model, about, integrators, differences)
         models.append(placed(whole, records, added, offset=own.offset) if records else whole)
-        if refine == "frequency" or len(models) == ROUNDS:
+        if refine == "frequency" or len(models) == FILTERS:
             break
         before, errors = pole, [simulation_errors(model, part) for part in parts]
         pole = whitening_pole(errors, integrators, pole)
-        if pole < COLOURED or 1.0 - pole > CLOSER * (1.0 - before):
+        # An error that is almost white, or as coloured as in the last round, needs no other filter.
+        if pole < 0.3 or 1.0 - pole > 0.7 * (1.0 - before):
             break
         model, parts = found(differences, own, pole, model)
     model = min(models, key=lambda each: _fit(each).rmse)
@@ -380,50 +375,19 @@ def _fit(model: LinearModel) -> LinearFit:
     return model.fit
 
 
-def _of_records(
-    records: list[Record],
-    scaler: Scaler,
-    *,
-    offset: bool,
-    prediction: bool,
-    feedthrough: bool,
-    direct: int,
-) -> Problem:
-    """The fit to the spectra of the records if that is the same, else to their signals."""
-    normalised = [scaler.normalise(record) for record in records]
-    if not prediction:
-        spectra = spectral_data_of_records(normalised, offset=offset)
-        if spectra is not None:
-            return ResponseFit(spectra, known=False, feedthrough=feedthrough)
-    return SignalFit(
-        normalised, offset=offset, prediction=prediction, feedthrough=feedthrough, direct=direct
-    )
-
-
-def _band_notes(data: SpectralData, fs: float) -> list[str]:
-    """What lines are fitted if not all at which the input has some power."""
-    if not data.left_out:
-        return []
-    f = np.abs(np.angle(data.z)) * fs / (2 * np.pi)
-    return [
-        f"the fit is to the {len(f)} lines that the input excites, {f.min():.4g} to {f.max():.4g} "
-        f"Hz; {data.left_out} lines with noise, hum or distortion at the input are left out."
-    ]
-
-
-def _notes(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> list[str]:
-    """What the subspace and the poles say of data and order."""
+def _doubts(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> list[str]:
+    """Say what the subspace and the poles tell of data and order."""
     nx, notes, s = len(found.A), [], estimate.singular_values
-    if len(s) >= nx and s[nx - 1] < EMPTY:
-        carried = int((s > EMPTY).sum())
+    carried = int((s > 1e-10).sum())
+    if len(s) >= nx > carried:
         notes.append(
             f"order {nx} is above what the data carry: the subspace has {carried} direction(s) "
             f"above rounding errors; try nx={max(1, carried)}."
         )
-    if estimate.unstable is not None and found.rmse > ROUNDING:
+    if estimate.unstable is not None and found.rmse > 1e-6:  # a perfect fit is stable
         cost, _ = problem.with_input_matrices(estimate.unstable, estimate.C)
         stable, _ = problem.with_input_matrices(found.A, found.C)
-        if cost < BETTER * stable:
+        if cost < 0.25 * stable:
             slowest = float(np.abs(np.linalg.eigvals(estimate.unstable)).max())
             return [
                 *notes,
@@ -431,7 +395,7 @@ def _notes(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> list
                 "explains them much better than any stable model. Look for drift or feedback.",
             ]
     slowest = float(np.abs(np.linalg.eigvals(found.A)).max())
-    if slowest > AT_THE_LIMIT:
+    if slowest > 1.0 - 1e-4:
         notes.append(
             f"the slowest pole has radius {radius(slowest)}: data that drift or integrate ask for "
             "one, or an order above what they carry; look at the data, or lower nx."
@@ -440,15 +404,15 @@ def _notes(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> list
 
 
 def _residual_notes(rmse: float, weight: Weight | Array | None) -> list[str]:
-    """What a residual says that is far above what the variances explain."""
-    if rmse <= FAR or not isinstance(weight, str | None):
+    """Say what a normalised residual means that the variances do not explain."""
+    if rmse <= 2.0 or not isinstance(weight, str | None):  # good fits to 50 lines reached 1.3
         return []
     cause = "nonlinear distortion or too low an order" if weight == "noise" else "too low an order"
     return [f"the error is {number(rmse)} times its {weight or 'total'} deviation: {cause}."]
 
 
 def physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearModel:
-    """The model in physical units, with its covariance."""
+    """Return the model in physical units, with its covariance."""
     nx = len(found.A)
     by_u, by_y = 1.0 / scaler.u_scale, scaler.y_scale[:, None]
     sizes = [np.ones((nx, nx)), np.tile(by_u, (nx, 1)), np.tile(by_y, (1, nx)), by_y * by_u]

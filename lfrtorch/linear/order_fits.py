@@ -20,21 +20,18 @@ import numpy as np
 
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
-from lfrtorch.linear.bla import physical
-from lfrtorch.linear.frf import FRF, estimate_frf
+from lfrtorch.linear.bla import Settings, default_criterion, physical, pose
+from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.minima import ALIKE, no_start, search_from, transformation
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Matrices, Refined, Search
-from lfrtorch.linear.requirements import check_spectral_data, of_response, steady_state
+from lfrtorch.linear.requirements import check_spectral_data
 from lfrtorch.linear.response_fit import ResponseFit
-from lfrtorch.linear.spectral_data import (
-    spectral_data_of_parts,
-    spectral_data_of_records,
-    spectral_data_of_response,
-)
+from lfrtorch.linear.signal_fit import SignalFit
+from lfrtorch.linear.spectral_data import spectral_data_of_parts
 from lfrtorch.linear.subspace import SpectralSubspace, spectral_subspaces
 from lfrtorch.metrics import rms
-from lfrtorch.records import Record, Scaler, without_coordinates
+from lfrtorch.records import Record, Scaler
 
 Window = tuple[int, int]
 """First sample, and the one after the last."""
@@ -54,12 +51,9 @@ NEAR_STEPS = 12
 SETTLED, STRIDE = 1e-4, 4
 """The search ends if STRIDE iterations lower the cost by less than the part SETTLED."""
 
-SHORTEST = 4
-"""Samples that a part has at least, in multiples of nx + 1."""
-
 
 def description_length(rmse: float, parameters: int, equations: float) -> float:
-    """The error times M^(p / 2M), for p parameters and M independent equations.
+    """Return the error times M^(p / 2M), for p parameters and M independent equations.
 
     Its logarithm is the description length M ln V + p ln M of a mean square V, over 2M. (The usual
     √(1 + p ln M / M) is the same for p ln M « M. Of 200 lines of local polynomials, which are 100
@@ -72,17 +66,10 @@ def description_length(rmse: float, parameters: int, equations: float) -> float:
 
 
 class OrderFits:
-    """The fits of several orders to the same data.
+    """Fits of several orders to the same data.
 
-    Args:
-        problem: the least-squares problem.
-        scaler: from its units to physical ones.
-        about: what the data are: the rate and the channels of the models.
-        criterion: name of its error.
-        train: records whose mean error gives the offset of the output; none for a response.
-        offset: whether it has one.
-        most: highest order.
-        max_iter: iterations of a search.
+    ``train`` has the records, and the windows of them, whose mean error is the offset of the
+    output: none for a response.
     """
 
     def __init__(
@@ -110,7 +97,7 @@ class OrderFits:
         self._y_offset = scaler.y_offset
 
     def _subspaces_for(self, nx: int) -> list[SpectralSubspace]:
-        """Those that hold the order: small while it is low, as few scans come near the highest."""
+        """Return subspaces that hold the order: small ones as long as it is low."""
         most = LOW
         while most < nx:
             most *= 2
@@ -121,35 +108,25 @@ class OrderFits:
         return self._subspaces[most]
 
     @classmethod
-    def of(cls, data: Sequence[Record] | FRF, most: int, options: Mapping[str, Any]) -> Self | None:
-        """The fits of what ``estimate_bla`` takes, ``None`` if it has to fit them one by one."""
-        known = {"refine", "weight", "offset", "feedthrough", "max_iter"}
+    def of(cls, data: list[Record] | FRF, most: int, options: Mapping[str, Any]) -> Self | None:
+        """Return the fits of ``estimate_bla``, or ``None`` if it has to fit them one by one."""
         given = {name: value for name, value in options.items() if value is not None}
-        refine = given.get("refine")
-        if refine is None and not isinstance(data, FRF) and of_response(data):
-            refine = "frequency"
-        if refine == "prediction" or any(given[name] for name in given.keys() - known):
+        if given.get("refine") == "prediction" or given.get("integrators"):
             return None
+        default = "frequency" if isinstance(data, FRF) else default_criterion(data)
         offset, through = given.get("offset", True), given.get("feedthrough", True)
-        common: dict[str, Any] = {"offset": offset, "most": most}
-        common["max_iter"] = given.get("max_iter", MOST_STEPS)
-        if isinstance(data, FRF) or refine == "frequency":
-            about = data if isinstance(data, FRF) else estimate_frf(data)
-            spectra, scaler, known_, _ = spectral_data_of_response(
-                about, given.get("weight"), offset=offset
-            )
-            problem = ResponseFit(spectra, known=known_, feedthrough=through)
-            return cls(problem, scaler, about, "frequency", (), **common)
-        records = [without_coordinates(record) for record in data]
-        records = steady_state(records) or records
-        scaler = Scaler.of(records, offset=offset)
-        spectra = spectral_data_of_records([scaler.normalise(r) for r in records], offset=offset)
-        if spectra is None:
+        most_steps = given.get("max_iter", MOST_STEPS)
+        settings = Settings(
+            given.get("refine", default), given.get("weight"), offset, through, most_steps
+        )
+        problem, scaler, about, records, _ = pose(data, settings)
+        common: dict[str, Any] = {"offset": offset, "most": most, "max_iter": most_steps}
+        if isinstance(problem, SignalFit):
             windows = [[(record.skip, record.samples)] for record in records]
             return cls.of_windows(records, windows, **common, feedthrough=through)
-        problem = ResponseFit(spectra, known=False, feedthrough=through)
         whole = [(record, [(0, record.samples)]) for record in records]
-        return cls(problem, scaler, records[0], "simulation", whole, **common)
+        train = whole if settings.refine == "simulation" else ()
+        return cls(problem, scaler, about, settings.refine, train, **common)
 
     @classmethod
     def of_windows(
@@ -162,7 +139,7 @@ class OrderFits:
         most: int,
         max_iter: int = MOST_STEPS,
     ) -> Self:
-        """The fits of parts of records, each from an initial state of its own."""
+        """Return the fits of parts of records, each with its initial state as a parameter."""
         scaler = Scaler.of(records, offset=offset)
         parts, weights = [], []
         for record, own in zip(records, windows, strict=True):
@@ -171,7 +148,7 @@ class OrderFits:
                 parts.append((normalised.u[first:last], normalised.y[first:last]))
                 weights.append(float(np.max(record.weight)))
         longest = max(len(u) for u, _ in parts)
-        enough = min(longest, SHORTEST * (most + 1))
+        enough = min(longest, 4 * (most + 1))  # samples of a part that is fitted
         kept = [i for i, (u, _) in enumerate(parts) if len(u) >= enough]
         kept = [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, MOST_PARTS).astype(int))]
         spectra = spectral_data_of_parts(
@@ -186,13 +163,7 @@ class OrderFits:
 
     @spread_by_hand()
     def fit(self, nx: int) -> tuple[LinearModel, float]:
-        """The model of an order, and its description length.
-
-        If the ones below were fitted before, it starts from them, too.
-
-        Raises:
-            ValueError: fewer equations than unknowns, or no stable start.
-        """
+        """Fit an order, also from the fits of lower ones; return its description length, too."""
         clock = time.perf_counter()
         check_spectral_data(self.problem.data, nx)
         searches = [search_from(self.problem, matrices) for matrices in self._starts(nx)]
@@ -219,14 +190,11 @@ class OrderFits:
 
     @spread_by_hand()
     def fit_near(self, model: LinearModel) -> tuple[LinearModel, list[Array]]:
-        """The model of the minimum near another one, and its errors over each whole record.
-
-        Raises:
-            ValueError: fewer equations than unknowns, or no stable start.
-        """
+        """Fit from a model; return the errors over each whole record, too."""
         clock = time.perf_counter()
         check_spectral_data(self.problem.data, model.nx)
-        search = search_from(self.problem, self._near(model))
+        C = model.C / self._scaler.y_scale[:, None]
+        search = search_from(self.problem, self.problem.with_input_matrices(model.A, C)[1])
         found = [self.problem.refined(search)]
         self._advance(search, NEAR_STEPS)
         found.append(self.problem.refined(search))
@@ -235,7 +203,7 @@ class OrderFits:
     def _best(
         self, found: Sequence[Refined], clock: float, y_offset: Array
     ) -> tuple[Refined, LinearModel, list[Array]]:
-        """The system of least simulation error, or least criterion of a response; its errors.
+        """Choose the system of least simulation error, or least criterion of a response.
 
         A free initial state may bring a mode that explains drift and fails in a simulation; the
         start of a search has it less than its minimum.
@@ -244,11 +212,8 @@ class OrderFits:
         best = int(np.argmin([error for _, _, error in models]))
         return found[best], *models[best][:2]
 
-    def _near(self, model: LinearModel) -> Matrices:
-        return self.problem.with_input_matrices(model.A, model.C / self._scaler.y_scale[:, None])[1]
-
     def _starts(self, nx: int) -> list[Matrices]:
-        """Starts of finite cost, the best first; of those that are alike one."""
+        """Return starts of finite cost, the best first; of those that are alike one."""
         pairs = [
             pair
             for below in (nx - 2, nx - 1)
@@ -270,7 +235,7 @@ class OrderFits:
         return (apart or [matrices for _, matrices in ranked])[:STARTS]
 
     def _extended(self, below: Matrices, more: int) -> list[tuple[Array, Array]]:
-        """A and C of a model with ``more`` states that describe its errors."""
+        """Return A and C of a model with ``more`` states that describe its errors."""
         errors = self.problem.equal_noise(self.problem.errors(below))
         estimates = [each.estimate(more) for each in spectral_subspaces(*errors, more)]
         A, _, C, _ = below
@@ -292,8 +257,7 @@ class OrderFits:
     def _model(
         self, found: Refined, clock: float, y_offset: Array
     ) -> tuple[LinearModel, list[Array], float]:
-        """In physical units, without what belongs to the initial states; its errors in each record,
-        (T, ny), and what it is chosen by.
+        """Return the model in physical units, its errors in each record, and their size.
 
         The states that records begin from depend on the offset of the output, so that a guess of it
         comes first, and is corrected by the mean of the errors.
@@ -318,7 +282,7 @@ class OrderFits:
         return replace(model, fit=fit), errors, rmse
 
     def _without_starts(self, found: Refined) -> Refined:
-        """The system without the inputs that make its initial states."""
+        """Return the system without the inputs that make its initial states."""
         _, B, _, D = found.matrices
         inputs = B.shape[1] - self.problem.starts
         kept = [np.ones_like(m, dtype=bool) for m in found.matrices]

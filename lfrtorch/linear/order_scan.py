@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from math import inf
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,10 +50,6 @@ PATIENCE = 3
 FOLDS = 5
 """Stretches of a cross-validation."""
 
-MEMORIES = 20
-"""Validation records are short if their scored samples are fewer than this number of time
-constants."""
-
 UNLIKE = 1.5
 """Validation and training records are unlike if the errors of the order that fits best differ by
 more than this factor between them: what is seen on one says little of the other."""
@@ -74,7 +70,6 @@ class OrderScan:
         validated: whether validation records give the scores.
         chosen: the lowest order whose score is within one standard error of the best, 5 % at most,
             or within 1 %; without validation records the order of the best score.
-        lengths: the error of the fit with that factor, whatever the scores are.
         notes: why the scores are those of a cross-validation, and what orders were left out.
 
     Example:
@@ -87,7 +82,6 @@ class OrderScan:
     scores: tuple[float, ...]
     validated: bool
     chosen: int
-    lengths: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -113,10 +107,9 @@ class OrderScan:
         for model, score in zip(self.models, self.scores, strict=True):
             s = self.singular_values
             value = s[model.nx - 1] if model.nx <= len(s) else None
-            assert model.fit is not None
             radius = tables.radius(float(np.abs(model.poles).max()))
             chosen = "chosen" if model.nx == self.chosen else ""
-            rows.append([model.nx, model.fit.rmse, score, value, radius, chosen])
+            rows.append([model.nx, _fitted(model), score, value, radius, chosen])
         head = ["nx", "fitted", how, "singular value", "largest pole", ""]
         return tables.table(head, rows, digits=4)
 
@@ -165,70 +158,68 @@ def scan_orders(
     fits = OrderFits.of(given, max(orders), options)
     fit = partial(_alone, given, options) if fits is None else fits.fit
     how = "validation" if judges else "MDL"
-    models: list[LinearModel] = []
-    lengths: list[float] = []
-    errors: list[list[Array]] = []
     notes: list[str] = []
 
-    def held_back(model: LinearModel) -> list[Array]:
-        return _errors(judges, Scaler.of(judges).y_scale, model)
-
-    def score(model: LinearModel, clock: float) -> bool:
-        """Enter and tell the model's errors; whether the last orders brought nothing."""
-        if judges:
-            errors.append(held_back(model))
-        scores = _rms(errors) or lengths
-        assert model.fit is not None
+    def enter(tried: list[_Tried], new: _Tried, clock: float) -> bool:
+        """Enter and tell an order; return whether the last ones brought nothing."""
+        tried.append(new)
+        scores = _scores(tried)
         watch(
-            f"order {model.nx}: fitted {number(model.fit.rmse)}, {how} {number(scores[-1])}, "
-            f"{quantity(time.perf_counter() - clock, 's')}"
+            f"order {new.model.nx}: fitted {number(_fitted(new.model))}, {how} "
+            f"{number(scores[-1])}, {quantity(time.perf_counter() - clock, 's')}"
         )
         return no_progress(scores, PATIENCE)
 
+    tried: list[_Tried] = []
     for nx in orders:
         clock = time.perf_counter()
         try:
             if records:
                 check_length(records, nx)
-            if models and (narrow := _narrow(records, nx)):
+            if tried and (narrow := _narrow(records, nx)):
                 notes.append(narrow)
                 break
             model, length = fit(nx)
-            models.append(model)
-            lengths.append(length)
         except ValueError:
-            if not models:
+            if not tried:
                 raise
             break
-        if score(models[-1], clock):
+        errors = _errors(judges, Scaler.of(judges).y_scale, model) if judges else []
+        if enter(tried, _Tried(model, length, errors), clock):
             break
     doubt = ""
     if records and judges and fits is not None:
-        fittest = models[int(np.argmin(lengths))]
-        doubt = _doubt(models[_first(errors, lengths)], fittest, records, judges)
+        fittest = min(tried, key=lambda each: each.length)
+        doubt = _doubt(tried[_first(tried)].model, fittest.model, records, judges)
     if doubt:
         notes.append(f"{doubt}: the order is chosen by cross-validation over both.")
-        how, errors = "cross-validation", []
-        kept = _worthwhile(models)
-        if left := [model.nx for model in models if model.nx not in kept]:
+        how, every, tried = "cross-validation", tried, []
+        kept = _worthwhile([each.model for each in every])
+        if left := [each.model.nx for each in every if each.model.nx not in kept]:
             notes.append(
                 f"orders {left} are left out of it: they fit less than {MARGIN:.0%} better than "
                 "those below."
             )
-        lengths = [each for each, m in zip(lengths, models, strict=True) if m.nx in kept]
-        models = [model for model in models if model.nx in kept]
-        held_back = _Folds(records, judges, models[-1].nx, options).errors
-        for model in models:
-            if score(model, time.perf_counter()):
+        every = [each for each in every if each.model.nx in kept]
+        folds = _Folds(records, judges, every[-1].model.nx, options)
+        for each in every:
+            clock = time.perf_counter()
+            if enter(tried, each._replace(errors=folds.errors(each.model)), clock):
                 break
-        models, lengths = models[: len(errors)], lengths[: len(errors)]
-    first = _first(errors, lengths)
+    first, models = _first(tried), [each.model for each in tried]
     if fits is not None:
         models[first] = estimate_bla(given, models[first].nx, **options)
-    scores = _rms(errors) or lengths
     return OrderScan(
-        tuple(models), tuple(scores), bool(judges), models[first].nx, tuple(lengths), tuple(notes)
+        tuple(models), tuple(_scores(tried)), bool(judges), models[first].nx, tuple(notes)
     )
+
+
+class _Tried(NamedTuple):
+    """A model of an order, its description length, and its errors on records held back."""
+
+    model: LinearModel
+    length: float
+    errors: list[Array]
 
 
 def _rising(orders: Sequence[int], least: int) -> list[int]:
@@ -241,25 +232,34 @@ def _rising(orders: Sequence[int], least: int) -> list[int]:
     return [nx for nx in rising if nx >= least] or rising
 
 
-def _rms(errors: Sequence[Sequence[Array]]) -> list[float]:
-    """Of all errors of each model; infinite if one is not finite."""
-    found = [float(rms(np.concatenate(each))) for each in errors]
-    return [value if np.isfinite(value) else inf for value in found]
+def _fitted(model: LinearModel) -> float:
+    assert model.fit is not None
+    return model.fit.rmse
+
+
+def _scores(tried: Sequence[_Tried]) -> list[float]:
+    """Return the rms of all errors of each model, or its description length without any."""
+    return [_rms(each.errors) if each.errors else each.length for each in tried]
+
+
+def _rms(errors: Sequence[Array]) -> float:
+    """Return the rms of all errors; infinite if one is not finite."""
+    found = float(rms(np.concatenate(errors)))
+    return found if np.isfinite(found) else inf
 
 
 def _worthwhile(models: Sequence[LinearModel]) -> list[int]:
-    """The first order, and each that fits better than those below by ``MARGIN``."""
+    """Return the first order, and each that fits better than those below by ``MARGIN``."""
     kept, best = [], inf
     for model in models:
-        assert model.fit is not None
-        if not kept or model.fit.rmse < best / (1.0 + MARGIN):
+        if not kept or _fitted(model) < best / (1.0 + MARGIN):
             kept.append(model.nx)
-            best = model.fit.rmse
+            best = _fitted(model)
     return kept
 
 
 def _narrow(records: list[Record], nx: int) -> str:
-    """A note if the input excites too few directions for an order."""
+    """Return a note if the input excites too few directions for an order."""
     if not records:
         return ""
     excited, wanted = excited_directions(records, nx)
@@ -271,18 +271,17 @@ def _narrow(records: list[Record], nx: int) -> str:
     )
 
 
-def _first(errors: Sequence[Sequence[Array]], lengths: Sequence[float]) -> int:
-    """The first model that does as well as the best; without errors that of the least length."""
-    if not errors:
-        return int(np.argmin(lengths))
-    if sum(map(len, errors[0])) < BLOCKS:
-        return int(np.argmin(_rms(errors)))
+def _first(tried: Sequence[_Tried]) -> int:
+    """Return the first model that does as well as the best, or the one of the best score."""
+    errors = [each.errors for each in tried]
+    if sum(map(len, errors[0])) < BLOCKS:  # or none
+        return int(np.argmin(_scores(tried)))
     counts = np.array([len(block) for block in in_blocks([e[:, 0] for e in errors[0]])])
     return int(np.argmax(as_good([squares_in_blocks(each) for each in errors], counts)))
 
 
 def _errors(records: Sequence[Record], scale: Array, model: LinearModel) -> list[Array]:
-    """Relative errors of a simulation of each record, (T, ny), after its ``skip``."""
+    """Return the relative errors of a simulation of each record, (T, ny), after its ``skip``."""
     with np.errstate(over="ignore", invalid="ignore"):
         return [((r.y - model.simulate(r)) / scale)[r.skip :] for r in records]
 
@@ -290,31 +289,29 @@ def _errors(records: Sequence[Record], scale: Array, model: LinearModel) -> list
 def _doubt(
     model: LinearModel, fittest: LinearModel, train: list[Record], judges: list[Record]
 ) -> str:
-    """Why the validation records say little of an order; empty if they say enough.
+    """Say why validation records tell little of an order; empty if they tell enough.
 
-    Args:
-        model: of the order that they choose.
-        fittest: of the order that the training records choose. A poor model errs alike on both.
-        train, judges: training and validation records.
+    They chose the order of ``model``, and the training records that of ``fittest``: a poor model
+    errs alike on both.
     """
     scored = sum(record.samples - record.skip for record in judges)
     memory = memory_of(model, max(record.samples for record in train))
-    if scored < MEMORIES * memory:
+    if scored < 20 * memory:
         return (
             f"validation has {scored} scored samples, {number(scored / memory)} time constants "
             "of the linear model"
         )
     scale = Scaler.of(train).y_scale
-    here, there = _rms([_errors(some, scale, fittest) for some in (train, judges)])
+    here, there = (_rms(_errors(some, scale, fittest)) for some in (train, judges))
     if not here / UNLIKE < there < here * UNLIKE:
         return f"the linear error on validation is {number(there / here)} times that on training"
     return ""
 
 
 def memory_of(model: LinearModel, samples: int) -> float:
-    """Time constant, in samples, of one pole whose impulse response is as long.
+    """Return the time constant of one pole whose impulse response is as long, in samples.
 
-    That of the slowest pole says too much: it may be next to nothing in the response.
+    The slowest pole would say too much: it may be next to nothing in the response.
     """
     x, responses = model.B, []
     for _ in range(samples):
@@ -359,7 +356,7 @@ class _Folds:
             self._fits.append(OrderFits.of_windows(self._records, rest, most=most, **chosen))
 
     def errors(self, model: LinearModel) -> list[Array]:
-        """Relative errors in each stretch, of fits that begin at the model."""
+        """Return the relative errors in each stretch, of fits that begin at the model."""
         return [
             error for some in each_alone(partial(self._of, model), range(FOLDS)) for error in some
         ]
@@ -375,8 +372,7 @@ class _Folds:
 
 
 def _united(train: list[Record], judges: list[Record]) -> list[Record]:
-    """Training and validation records; one that goes on from another, and scores the rest, is one
-    with it."""
+    """Join training and validation records; one that goes on from another is one with it."""
     found = list(train)
     for judge in map(without_coordinates, judges):
         for i, record in enumerate(found):
@@ -394,9 +390,8 @@ def _united(train: list[Record], judges: list[Record]) -> list[Record]:
 def _alone(
     data: list[Record] | FRF, options: Mapping[str, Any], nx: int
 ) -> tuple[LinearModel, float]:
-    """The full estimate of one order, and its description length."""
+    """Return the full estimate of one order, and its description length."""
     model = estimate_bla(data, nx, **options)
-    assert model.fit is not None
     nu, ny = len(model.inputs), len(model.outputs)
     if isinstance(data, FRF):
         M, starts = 2 * data.G.size / (1.0 if data.errors is None else data.errors.sharing), 0
@@ -405,4 +400,4 @@ def _alone(
         starts = sum(r.start != "zero" for r in data)
     gains = 0 if model.K is None else ny
     p = nx * (nu + ny + gains + starts) + nu * ny
-    return model, description_length(model.fit.rmse, p, M)
+    return model, description_length(_fitted(model), p, M)

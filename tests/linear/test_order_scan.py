@@ -165,7 +165,7 @@ def test_description_length_counts_parameters_and_equations(monkeypatch):
 def test_the_same_periods_again_change_no_length():
     once = record_of(PLANTED, 0, T=128)
     thrice = Record(np.tile(once.u, (3, 1)), np.tile(once.y, (3, 1)), 10.0, "periodic", period=128)
-    short, long = (scan_orders(record, [2, 3]).lengths for record in (once, thrice))
+    short, long = (scan_orders(record, [2, 3]).scores for record in (once, thrice))
     np.testing.assert_allclose(short, long, rtol=1e-6)
 
 
