@@ -14,7 +14,7 @@ from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.resolvent import response_jacobian, solve_resolvents
+from lfrtorch.linear.resolvent import gain_jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +101,7 @@ def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
     response = model.frf(frequencies)
     f = np.atleast_1d(reals("frequencies", frequencies))
     z = np.exp(2j * np.pi * f / model.fs)
-    X, L = solve_resolvents(model.A, model.B, model.C, z)
-    nu = len(model.inputs)
-    J = response_jacobian(X, L, np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu)))
+    J = gain_jacobian(model.A, model.B, model.C, z)
     parts = np.stack([J.real, J.imag], axis=-2)
     of = np.einsum("...ip,pq,...jq->...ij", parts, covariance, parts, optimize=True)
     return ResponseBand(f, response, of)

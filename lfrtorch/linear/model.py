@@ -22,7 +22,7 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, listed, offsets, system_lines
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.operating_point import StateSpace
-from lfrtorch.linear.resolvent import frequency_response, response_jacobian, solve_resolvents
+from lfrtorch.linear.resolvent import frequency_response, gain_jacobian
 from lfrtorch.model import Model
 from lfrtorch.records import (
     Channel,
@@ -32,14 +32,6 @@ from lfrtorch.records import (
     with_past_outputs,
     without_coordinates,
 )
-
-SINGULAR = 1e-12
-"""Singular values below this, relative to the size of the system, count as zero when zeros at
-infinity are taken out."""
-
-TWICE = 2
-"""Times that outputs and inputs are scaled for it: the first time, an input in tiny units makes D
-the largest part of its output, and that output then is next to nothing beside the input."""
 
 
 @dataclass(frozen=True)
@@ -207,10 +199,7 @@ class LinearModel:
             raise InputError(
                 "the covariance of this model is not known: estimate_bla finds it in a refinement."
             )
-        z = self._z(frequencies)
-        X, L = solve_resolvents(self.A, self.B, self.C, z)
-        nu = len(self.inputs)
-        J = response_jacobian(X, L, np.broadcast_to(np.eye(nu, dtype=complex), (len(z), nu, nu)))
+        J = gain_jacobian(self.A, self.B, self.C, self._z(frequencies))
         variance = np.einsum("foip,pq,foiq->foi", J, self.covariance, J.conj(), optimize=True)
         return np.sqrt(np.maximum(variance.real, 0.0))
 
@@ -445,13 +434,7 @@ class LinearModel:
 
 
 def control_labels(channels: Sequence[Channel]) -> list[str]:
-    """Names of channels as labels of python-control: without dots, and each another one.
-
-    Example:
-        >>> from lfrtorch.linear.model import control_labels
-        >>> control_labels([lfrtorch.Channel("a.b"), lfrtorch.Channel("a_b")])
-        ['a_b', 'a_b_']
-    """
+    """Make labels of python-control from channel names: without dots, and each another one."""
     labels: list[str] = []
     for channel in channels:
         label = channel.name.replace(".", "_")
@@ -462,7 +445,7 @@ def control_labels(channels: Sequence[Channel]) -> list[str]:
 
 
 def without_units(record: Record) -> Record:
-    """The record with weights by which its outputs count alike in a fit in physical units."""
+    """Return the record with weights by which its outputs count alike in physical units."""
     if record.y.shape[1] == 1:
         return record
     power = np.var(record.y, axis=0)
@@ -474,7 +457,7 @@ _OPTIONAL = ("K", "innovation_covariance", "state_covariance", "covariance")
 
 
 def linear_cell(A: Array, B: Array, C: Array, D: Array) -> LFRCell:
-    """A cell without static nonlinearity."""
+    """Return a cell without static nonlinearity."""
     cell = LFRCell(B.shape[1], C.shape[0], len(A), dtype=torch.float64)
     with torch.no_grad():
         for parameter, value in ((cell.A, A), (cell.Bu, B), (cell.Cy, C), (cell.Dyu, D)):
@@ -492,12 +475,12 @@ def _zeros(A: Array, B: Array, C: Array, D: Array) -> Complex:
         Emami-Naeini and Van Dooren, "Computation of zeros of linear multivariable systems",
         Automatica 18, 1982.
     """
-    for _ in range(TWICE):
+    for _ in range(2):  # an input in tiny units makes its outputs tiny the first time
         by_y = np.linalg.norm(np.hstack([C, D]), axis=1)
         C, D = (M / np.where(by_y > 0, by_y, 1.0)[:, None] for M in (C, D))
         by_u = np.linalg.norm(np.vstack([B, D]), axis=0)
         B, D = (M / np.where(by_u > 0, by_u, 1.0) for M in (B, D))
-    limit = SINGULAR * float(np.linalg.norm(np.block([[A, B], [C, D]]), 2))
+    limit = 1e-12 * float(np.linalg.norm(np.block([[A, B], [C, D]]), 2))
     A, B, C, D = _outputs_reduced(A, B, C, D, limit)
     A, C, B, D = (M.T for M in _outputs_reduced(A.T, C.T, B.T, D.T, limit))
     zeros = np.linalg.eigvals(A - B @ np.linalg.solve(D, C))  # D is square and regular now
@@ -507,7 +490,7 @@ def _zeros(A: Array, B: Array, C: Array, D: Array) -> Complex:
 def _outputs_reduced(
     A: Array, B: Array, C: Array, D: Array, limit: float
 ) -> tuple[Array, Array, Array, Array]:
-    """A system with the same finite zeros whose D has full row rank."""
+    """Return a system with the same finite zeros whose D has full row rank."""
     while True:
         U, rank = _range(D, limit)
         C, D = U.T @ C, (U.T @ D)[:rank]
@@ -524,17 +507,13 @@ def _outputs_reduced(
 
 
 def _range(M: Array, limit: float) -> tuple[Array, int]:
-    """An orthogonal matrix, and how many of its first columns span the range of M."""
+    """Return an orthogonal matrix, and how many of its first columns span the range of M."""
     U, s, _ = np.linalg.svd(M)
     return U, int((s > limit).sum())
 
 
 def balancing(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
-    """T and T⁻¹ to balanced coordinates by the square-root method (Laub et al. 1987).
-
-    Shape:
-        A: (nx, nx), B: (nx, nu), C: (ny, nx) -> (nx, nx).
-    """
+    """Return T and T⁻¹ to balanced coordinates, by the square-root method (Laub et al. 1987)."""
     Lp, Lq = _square_root(_gramian(A, B @ B.T)), _square_root(_gramian(A.T, C.T @ C))
     U, s, Vh = np.linalg.svd(Lq.T @ Lp)
     if not s.any():  # no input reaches an output: all coordinates are balanced

@@ -49,14 +49,11 @@ def _substituted(T: Complex, Q: Complex, forced: Complex, z: Complex) -> Complex
     return (Q @ X).reshape(nx, m, F).transpose(2, 0, 1)
 
 
-def solve_resolvents(
-    A: Float[Array, "nx nx"],
-    B: Float[Array, "nx nu"],
-    C: Float[Array, "ny nx"],
-    z: Complex128[Complex, " F"],
-) -> tuple[Complex128[Complex, "F nx nu"], Complex128[Complex, "F ny nx"]]:
-    """X = (zI - A)⁻¹ B and L = C (zI - A)⁻¹."""
-    return solve_resolvent(A, B, z), solve_resolvent(A.T, C.T, z).swapaxes(1, 2)
+def solve_left(
+    A: Float[Array, "nx nx"], C: Float[Array, "ny nx"], z: Complex128[Complex, " F"]
+) -> Complex128[Complex, "F ny nx"]:
+    """Return L = C (zI - A)⁻¹."""
+    return solve_resolvent(A.T, C.T, z).swapaxes(1, 2)
 
 
 def frequency_response(
@@ -71,28 +68,12 @@ def frequency_response(
 
 
 def response_jacobian(
-    X: Complex128[Complex, "F nx nu"],
-    L: Complex128[Complex, "F ny nx"],
-    U: Complex128[Complex, "F nu m"],
-    columns: Integer[np.ndarray, " K"] | None = None,
-) -> Complex128[Complex, "F ny m K"]:
-    """Derivative of G U with the entries of A, B, C, D, row by row, one matrix after another.
-
-    Args:
-        X, L: see ``solve_resolvents``.
-        U: input spectra.
-        columns: which entries. Default: all P.
-    """
-    return driven_jacobian(X @ U, L, U, columns)
-
-
-def driven_jacobian(
     S: Complex128[Complex, "F nx m"],
     L: Complex128[Complex, "F ny nx"],
     U: Complex128[Complex, "F nu m"],
     columns: Integer[np.ndarray, " K"] | None = None,
 ) -> Complex128[Complex, "F ny m K"]:
-    """The same from the states S = X U."""
+    """Derivative of G U with the entries of A, B, C, D, row by row, from the states S = X U."""
     F, ny, nx = L.shape
     rows, others = _places(nx, U.shape[1], ny)
     if columns is not None:
@@ -100,6 +81,17 @@ def driven_jacobian(
     left = np.concatenate([L, np.broadcast_to(np.eye(ny), (F, ny, ny))], axis=2)
     right = np.concatenate([S, U], axis=1).swapaxes(1, 2)
     return left[:, :, None, rows] * right[:, None, :, others]
+
+
+def gain_jacobian(
+    A: Float[Array, "nx nx"],
+    B: Float[Array, "nx nu"],
+    C: Float[Array, "ny nx"],
+    z: Complex128[Complex, " F"],
+) -> Complex128[Complex, "F ny nu P"]:
+    """Derivative of G itself with all entries of A, B, C, D."""
+    one = np.broadcast_to(np.eye(B.shape[1], dtype=complex), (len(z), *B.shape[1:] * 2))
+    return response_jacobian(solve_resolvent(A, B, z), solve_left(A, C, z), one)
 
 
 def _places(nx: int, nu: int, ny: int) -> tuple[Integers, Integers]:

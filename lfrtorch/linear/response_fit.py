@@ -26,12 +26,11 @@ from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.pole_limits import PART, Excess, PoleLimits
 from lfrtorch.linear.refinement import TOLERANCE, TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.resolvent import (
-    driven_jacobian,
     frequency_response,
     response_jacobian,
     solve_driven,
+    solve_left,
     solve_resolvent,
-    solve_resolvents,
 )
 from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_spectra
@@ -48,14 +47,10 @@ COARSE = 1e-7
 
 
 class ResponseFit:
-    """The least-squares problem between spectra and linear models of any order.
+    """Least-squares problem between spectra and linear models of any order.
 
-    Args:
-        data: what is fitted.
-        known: whether the weights are the inverse variances of the errors.
-        feedthrough: whether D is a parameter; it is 0 otherwise.
-        starts: how many of the last inputs are those of initial states, whose D is 0.
-        direct: how many of the last inputs act on the output alone: their part of B is 0.
+    The last ``starts`` inputs make initial states and have no D; the last ``direct`` ones act on
+    the output alone. If ``known``, the weights are the inverse variances of the errors.
     """
 
     def __init__(
@@ -71,12 +66,12 @@ class ResponseFit:
         self._driving = data.U.shape[1] - direct
 
     def most_candidates(self, nx: int) -> int:
-        """How many subspace estimates are refined: one if an iteration takes long."""
+        """Return how many subspace estimates are refined: one if an iteration takes long."""
         nu, ny = self.data.U.shape[1], self.data.Y.shape[1]
         return MOST_CANDIDATES if self.data.Y.size * nx * (nu + ny) < LARGE else 1
 
     def many(self, nx: int) -> bool:
-        """Whether a model of the order has so many unknowns that its modes save work."""
+        """Tell if a model of the order has so many unknowns that its modes save work."""
         nu, free = self.data.U.shape[1], int(self._free_feedthrough.sum())
         unknowns = nx * (nu + self.data.Y.shape[1]) + free
         return unknowns >= MANY and not self.starts and self._driving == nu
@@ -108,13 +103,14 @@ class ResponseFit:
                 errors = self.data.weighted(self.errors(matrices))
                 return float(np.sum(np.abs(errors) ** 2)), matrices
         matrices = A, np.zeros((nx, nu)), C, np.zeros((ny, nu))
-        X, L = solve_resolvents(*matrices[:3], self.data.z)
         free_B = self._free_inputs(nx)
         of_B = nx * nx + np.flatnonzero(free_B)
         free = self._free_feedthrough
         of_D = nx * (nx + nu + ny) + np.flatnonzero(free)
         columns = np.concatenate([of_B, of_D])
-        J = _real(self.data.weighted(response_jacobian(X, L, self.data.U, columns))).numpy()
+        F, _, m = self.data.U.shape
+        L, rest = solve_left(A, C, self.data.z), np.zeros((F, nx, m), dtype=complex)
+        J = _real(self.data.weighted(response_jacobian(rest, L, self.data.U, columns))).numpy()
         r = _real(self.data.weighted(self.data.Y)).numpy()
         if not np.isfinite(J).all():
             return np.inf, matrices
@@ -126,11 +122,11 @@ class ResponseFit:
 
     def state_deviation(self, matrices: Matrices) -> Array:
         """Standard deviation (nx,) of the states."""
-        X = solve_resolvent(*matrices[:2], self.data.z)
-        return np.sqrt((np.abs(X @ self.data.U) ** 2).sum(axis=(0, 2)))
+        states = solve_resolvent(*matrices[:2], self.data.z) @ self.data.U
+        return np.sqrt((np.abs(states) ** 2).sum(axis=(0, 2)))
 
     def search(self, matrices: Matrices) -> Search:
-        """A search over A, B, C, D that starts from the given ones."""
+        """Begin a search over A, B, C, D from the given ones."""
         problem = ResponseProblem(
             self.data,
             len(matrices[0]),
@@ -145,23 +141,23 @@ class ResponseFit:
         return Search(problem, theta, COARSE if self.many(len(matrices[0])) else TOLERANCE)
 
     def _free_inputs(self, nx: int) -> Booleans:
-        """Which entries of B (nx, nu) are parameters."""
+        """Mask of the entries of B (nx, nu) that are parameters."""
         return np.tile(np.arange(self.data.U.shape[1]) < self._driving, (nx, 1))
 
     @property
     def _free_feedthrough(self) -> Booleans:
-        """Which entries of D (ny, nu) are parameters."""
+        """Mask of the entries of D (ny, nu) that are parameters."""
         nu, ny = self.data.U.shape[1], self.data.Y.shape[1]
         free = np.full((ny, nu), self.feedthrough)
         free[:, nu - self.starts :] = False
         return free
 
     def improbability(self, search: Search) -> float:
-        """The cost: spectra have no initial states."""
+        """Return the cost: spectra have no initial states."""
         return search.state.cost
 
     def refined(self, search: Search) -> Refined:
-        """The present result of a search, with its covariance."""
+        """Return the present result of a search, with its covariance."""
         problem, state = search.problem, search.state
         return Refined(
             *problem.matrices(state.theta),
@@ -175,18 +171,8 @@ class ResponseFit:
 class ResponseProblem(LeastSquares):
     """Residual and Jacobian of a linear model over spectra; infinite if a pole passes a limit.
 
-    θ holds A, B, C and D, row by row, one matrix after another.
-
-    Args:
-        data: what is fitted.
-        nx: order.
-        largest_pole: limit for the radius of poles. Default: no limit.
-        free_inputs: which entries of B may change, (nx, nu). Default: all.
-        free_feedthrough: which entries of D may change, (ny, nu). Default: all.
-        together: whether the states under all inputs together are solved for, not those under each
-            alone: less work for inputs of few columns, other last digits.
-        by_modes: whether derivatives are computed by modes: less work for many unknowns.
-        limits: of the poles.
+    θ holds A, B, C and D, row by row, one matrix after another. States under all inputs
+    ``together`` are less work than under each one for inputs of few columns.
     """
 
     def __init__(
@@ -239,7 +225,7 @@ class ResponseProblem(LeastSquares):
         return float(residual.square().sum())
 
     def linearise(self, theta: Tensor) -> ResponseJacobian | ModalJacobian:
-        """The Jacobian of the residual, without the columns of a change of state coordinates."""
+        """Return the Jacobian, without the columns of a change of state coordinates."""
         modes, excess = self._modes(theta), self._excess(theta)
         if modes is not None:
             errors = self.errors(theta)
@@ -247,13 +233,10 @@ class ResponseProblem(LeastSquares):
         return ResponseJacobian(*self._jacobian(theta), self.errors(theta), excess)
 
     def covariance(self, theta: Tensor, known: bool) -> Array:
-        """Covariance (P, P) of θ at the minimum.
+        """Return the covariance (P, P) of θ at the minimum.
 
-        Args:
-            theta: the minimum.
-            known: whether the weights are the inverse variances of the errors. Otherwise the error
-                found at each line stands for its variance (White's estimate). Errors that are
-                correlated from line to line are known by themselves.
+        Unless the weights are ``known`` to be inverse variances, the error found at each line
+        stands for its variance (White's estimate).
         """
         jacobian = self.linearise(theta)
         if isinstance(jacobian, ModalJacobian):
@@ -271,9 +254,8 @@ class ResponseProblem(LeastSquares):
         initial_states = torch.zeros(0, len(cell.A), dtype=torch.float64)
         self._reduced = reduction(cell, initial_states, before=self._reduced, fixed=self._fixed)
         A, _, C, _ = self.matrices(theta)
-        X, L = self._states(theta), solve_resolvent(A.T, C.T, self.data.z).swapaxes(1, 2)
-        jacobian = driven_jacobian if self._together else response_jacobian
-        J = jacobian(X, L, self.data.U, self._reduced.kept.numpy())
+        U, X, L = self.data.U, self._states(theta), solve_left(A, C, self.data.z)
+        J = response_jacobian(X if self._together else X @ U, L, U, self._reduced.kept.numpy())
         return self.data.weighted(J), self._reduced
 
     def _excess(self, theta: Tensor) -> tuple[Array, Array]:
@@ -309,7 +291,7 @@ class ResponseProblem(LeastSquares):
         return self.data.weighted(response - self.data.Y)
 
     def _modes(self, theta: Tensor) -> Modes | None:
-        """The modes of θ, the latest of which are cached, if derivatives are computed by them."""
+        """Return the modes of θ, if derivatives are computed by them; the latest are cached."""
         if not self._by_modes:
             return None
         if self._latest_modes is None or not torch.equal(self._latest_modes[0], theta):
@@ -317,7 +299,7 @@ class ResponseProblem(LeastSquares):
         return self._latest_modes[1]
 
     def _states(self, theta: Tensor) -> Complex:
-        """(zI - A)⁻¹ B (F, nx, nu), or that times U; the one of the latest θ is cached."""
+        """Return (zI - A)⁻¹ B, times U if ``together``; the one of the latest θ is cached."""
         if self._latest is None or not torch.equal(self._latest[0], theta):
             A, B, _, _ = self.matrices(theta)
             z = self.data.z
@@ -327,14 +309,7 @@ class ResponseProblem(LeastSquares):
 
 
 class ResponseJacobian:
-    """Jacobian of the residual with θ.
-
-    Args:
-        J: derivative of the errors in the columns that are kept.
-        reduced: how these give all columns.
-        errors: at θ.
-        excess: of each pole, and its derivative with θ.
-    """
+    """Jacobian of the residual with θ, from the columns of the errors that are kept."""
 
     def __init__(
         self,
@@ -355,7 +330,7 @@ class ResponseJacobian:
             self._residual = torch.cat([r, torch.as_tensor(self._more.residual)])
 
     def system(self, damping: float, truncation: float) -> tuple[SVDSystem, Tensor]:
-        """The system and the gradient, see ``levenberg_marquardt.Jacobian``."""
+        """Return the system and the gradient, see ``levenberg_marquardt.Jacobian``."""
         R = torch.linalg.qr(self._rows, mode="r").R
         return SVDSystem(self._reduced.columns(R), truncation), self._adjoint(self._residual)
 

@@ -49,14 +49,9 @@ besides none, relative to those of the states and in units of the output noise."
 
 
 class SignalFit:
-    """The least-squares problem between records and linear models of any order.
+    """Least-squares problem between records and linear models of any order.
 
-    Args:
-        records: signals with their initial states, windows and weights.
-        offset: whether the output has a constant as a parameter.
-        prediction: whether the error is that of the one-step-ahead prediction.
-        feedthrough: whether D is a parameter; it is 0 otherwise.
-        direct: how many of the last inputs act on the output alone: their part of B is 0.
+    The last ``direct`` inputs act on the output alone: their part of B is 0.
     """
 
     def __init__(
@@ -75,11 +70,11 @@ class SignalFit:
         self._driven = [self._with_all_inputs(each) for each in records]
 
     def most_candidates(self, nx: int) -> int:
-        """How many subspace estimates are refined: one of long records, as it is good."""
+        """Return how many subspace estimates are refined: one of long records, as it is good."""
         return MOST_CANDIDATES if sum(map(len, self._us)) * nx**2 <= SHORT else 1
 
     def many(self, nx: int) -> bool:
-        """No: all searches go to the end."""
+        """Return False: all searches go to the end."""
         return False
 
     def subspace_estimates(self, nx: int) -> list[SubspaceEstimate]:
@@ -114,7 +109,7 @@ class SignalFit:
         return np.concatenate(states).std(axis=0)
 
     def search(self, matrices: Matrices) -> Search:
-        """A search over A, B, C, D and K that starts from the given ones and the best of some K."""
+        """Begin a search over A, B, C, D and K from the given ones and the best of some K."""
         gains = [np.zeros((len(matrices[0]), self.ny))]
         if self._prediction:
             variances = self.state_deviation(matrices) ** 2
@@ -124,7 +119,7 @@ class SignalFit:
         return Search(problem, problem.theta)
 
     def improbability(self, search: Search) -> float:
-        """The cost plus x0ᵀ P⁻¹ x0 of each estimated initial state, times the error's variance.
+        """Return the cost plus x0ᵀ P⁻¹ x0 of each estimated start, times the error's variance.
 
         P is the covariance of the states that the inputs lead to from rest. The sum is the cost of
         the most probable model and initial states, if the inputs before the records were like those
@@ -144,7 +139,7 @@ class SignalFit:
         return state.cost * (1.0 + unlikely / problem.size)
 
     def refined(self, search: Search) -> Refined:
-        """The present result of a search, with its covariance."""
+        """Return the present result of a search, with its covariance."""
         problem, state = search.problem, search.state
         problem.write(state.theta)
         cell = problem.lfr.cell
@@ -213,7 +208,7 @@ class SignalFit:
         return found * (problem.size / spare)
 
     def _with_all_inputs(self, each: NormalisedRecord) -> NormalisedRecord:
-        """The record with the inputs of the cell: u, then y for a prediction, then the constant."""
+        """Return the record with the cell's inputs: u, then y for a prediction, a constant."""
         inputs, record = [each.u], each.record
         if self._prediction:
             record.require_all_valid(PAST_OUTPUTS)
@@ -283,10 +278,7 @@ class SignalFit:
 class _PoleWall:
     """A term without rows: infinite if a pole of a linear cell passes LARGEST_POLE.
 
-    Args:
-        errors: of the cell.
-        outputs: which inputs are the measured outputs, if the cell is a predictor. Then the system
-            that it predicts must be stable as well.
+    If the cell is a predictor of ``outputs`` among its inputs, its system must be stable, too.
     """
 
     eliminates = True
