@@ -203,7 +203,7 @@ class Settings(NamedTuple):
 
 
 class Posed(NamedTuple):
-    """A least-squares problem in normalised units, and the data that it stands for."""
+    """Least-squares problem in normalised units, and the data that it stands for."""
 
     problem: Problem
     scaler: Scaler

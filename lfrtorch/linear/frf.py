@@ -40,9 +40,6 @@ from lfrtorch.records import Channel, Record, as_records
 
 Method = Literal["auto", "robust", "fast", "local_polynomial"]
 
-ORTHOGONAL = 1e-6
-"""Largest relative deviation of orthogonal experiments from orthogonality and equal powers."""
-
 SPARE_FREEDOM = 4
 """The windows of the local polynomial method leave this many degrees of freedom more than outputs:
 covariances are regular, and with one output a variance has a standard deviation of 45 %."""
@@ -341,7 +338,7 @@ def _local_polynomial(
     band: tuple[float, float] | None,
     order: int,
 ) -> FRF:
-    """Noise and distortion together, from the residuals of smooth functions of frequency."""
+    """Fit smooth functions of frequency; their residuals tell noise and distortion together."""
     spectra = spectra_of_records(data)
     cut = any(record.samples - record.skip > spectra.N for record in data)
     spectra, data, repeated = united(spectra, data, shifted=False)
@@ -479,7 +476,7 @@ def _block_covariance(spectra: Spectra, lines: Integers) -> Complex | None:
     products = X.conj().swapaxes(2, 3) @ X
     power = np.diagonal(products[:, :1], axis1=2, axis2=3).real  # of the first block
     unit = products / np.sqrt(power[..., :, None] * power[..., None, :])
-    if np.abs(unit - np.eye(nu)).max() > ORTHOGONAL:
+    if np.abs(unit - np.eye(nu)).max() > 1e-6:
         return None
     blocks = np.linalg.solve(X, spectra.Y[lines].reshape(len(lines), M, nu, -1)).swapaxes(2, 3)
     d = (blocks - blocks.mean(axis=1, keepdims=True)).reshape(len(lines), M, -1)

@@ -44,16 +44,9 @@ SAME_LINE = 1e-9
 def differenced(
     records: Sequence[Record], integrators: int, differences: int = 0, pole: float = 0.0
 ) -> list[Record]:
-    """The records of G₁: the output differenced, and all signals filtered.
+    """Return the records of G₁: the output differenced n times, and all signals filtered.
 
-    Args:
-        records: u (T, nu) and y (T, ny).
-        integrators: n; it takes n samples off, and the start state is unknown.
-        differences: how many differences of u follow it as inputs.
-        pole: λ. With a filter, the last inputs are what its start adds, n for each record.
-
-    Returns:
-        Records with a reference if they have the inputs that were given.
+    ``differences`` of u follow it as inputs, and what the start of a filter of pole λ adds.
     """
     found = []
     for i, record in enumerate(records):
@@ -94,11 +87,6 @@ def whitening_pole(errors: Sequence[Array], integrators: int, pole: float = 0.0)
 
     The errors count as white noise of the output, n times differenced, and white noise of G₁: a
     moving average (1 - λ z⁻¹)ⁿ of white noise, which is smaller than what any other λ leaves.
-
-    Args:
-        errors: of each record, (T, ny).
-        integrators: n.
-        pole: λ of the filters that the errors have passed.
     """
     n, T = integrators, min(map(len, errors))
     plain = [scipy.signal.lfilter(np.poly([pole] * n), [1.0], e, axis=0)[n:] for e in errors]
@@ -119,7 +107,7 @@ def _squares(errors: Array, n: int, pole: float) -> Array:
 
 
 def _filter_starts(samples: int, n: int, pole: float) -> Array:
-    """What n filters make of what they hold at the beginning: λᵏ, k λᵏ, ..., (T, n)."""
+    """Return what n filters make of their start: λᵏ, k λᵏ, ..., (T, n)."""
     k = np.arange(float(samples))[:, None]
     return pole**k * k ** np.arange(n)
 
@@ -151,7 +139,7 @@ def differenced_weight(frf: FRF, weight: Array, integrators: int) -> Array:
 
 
 def gain(records: Sequence[Record], *, offset: bool) -> LinearModel:
-    """A model without states: the input times a matrix, by least squares."""
+    """Fit a model without states, the input times a matrix, by least squares."""
     first, scaler = records[0], Scaler.of(records, offset=offset)
     parts = [(scaler.normalise(r), r.skip) for r in records]
     u = np.concatenate([n.u[skip:] for n, skip in parts])
@@ -185,16 +173,10 @@ def simulation_errors(model: LinearModel, record: Record) -> Array:
 def integrated(
     model: LinearModel, like: FRF | Record, integrators: int, differences: int
 ) -> LinearModel:
-    """The model with integrators behind each output, whose states come last.
+    """Put integrators behind each output of a model; their states come last.
 
     The operating point of the input moves to where the output of the given model is 0, so that the
     integrators stay where they are; with fewer inputs than outputs as close to it as it can.
-
-    Args:
-        model: from the inputs of ``differenced`` to its output.
-        like: data with the channels of the result.
-        integrators: n.
-        differences: how many differences of u are inputs of the given model.
     """
     nu, ny = len(like.inputs), len(like.outputs)
 
@@ -239,14 +221,7 @@ def integrated(
 def placed(
     model: LinearModel, records: Sequence[Record], integrators: int, *, offset: bool
 ) -> LinearModel:
-    """The model about the operating point of records, its states with unit deviation over them.
-
-    Args:
-        model: it ends with its integrators.
-        records: signals; those in steady state are simulated from an estimated state.
-        integrators: how many states they are.
-        offset: whether the output has an operating point.
-    """
+    """Put a model about the operating point of records, with states of unit deviation there."""
     records = [replace(r, start="estimated") if r.start == "periodic" else r for r in records]
     scaler = Scaler.of(records, offset=offset)
     model = replace(model, y_offset=scaler.y_offset)

@@ -26,27 +26,20 @@ class WindowErrors(NamedTuple):
 
     The error of G(k)_yu is Σ weights(k)_url V_ry(first(k) + l) over records r and lines l, with V
     the noise and distortion of the spectra, independent from line to line and record to record.
-
-    Args:
-        first: lowest line of each window, counted from the first one of the spectra.
-        weights: of the lines in it.
-        noise: covariance of V about each line.
-        sizes: with a reference the variance of each column of G that noise of unit variance would
-            make, if the inputs followed it without noise.
     """
 
-    first: Int64[Integers, " F"]
+    first: Int64[Integers, " F"]  # lowest line of each window
     weights: Complex128[Complex, "F nu R lines"]
-    noise: Complex128[Complex, "F ny ny"]
-    sizes: Float[Array, "F nu"] | None
+    noise: Complex128[Complex, "F ny ny"]  # covariance of V about each line
+    sizes: Float[Array, "F nu"] | None  # with a reference: |weights|² if inputs followed it exactly
 
     def at(self, lines: Booleans) -> WindowErrors:
-        """The errors at some of the lines."""
+        """Return the errors at some of the lines."""
         sizes = None if self.sizes is None else self.sizes[lines]
         return WindowErrors(self.first[lines], self.weights[lines], self.noise[lines], sizes)
 
     def times(self, by_y: Array | Complex, by_u: Array | float) -> WindowErrors:
-        """The errors of by_y G by_u; factors of every line are (F, 1)."""
+        """Return the errors of by_y G by_u; factors of every line are (F, 1)."""
         factor = np.asarray(by_y)[..., :, None] * np.conj(by_y)[..., None, :]
         weights = np.asarray(by_u)[..., :, None, None] * self.weights
         return WindowErrors(self.first, weights, factor * self.noise, self.sizes)
@@ -67,12 +60,7 @@ class WindowErrors(NamedTuple):
         return float(np.sum(np.abs(sums) ** 2) / (F * unit.shape[1]))
 
     def covariance(self, linear: Callable[[Complex], Complex], K: int) -> Float[Array, "K K"]:
-        """Covariance of Re Σ linear(δG)(k) over the lines k.
-
-        Args:
-            linear: from errors (F, ny, nu) to K numbers (F, K) at each line, or their conjugates.
-            K: how many.
-        """
+        """Return the covariance of the K numbers Re Σ linear(δG)(k) over the lines k."""
         values, vectors = np.linalg.eigh(self.noise)
         roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
         last, total = int(self.first.max()) + self.weights.shape[3], np.zeros((K, K))
@@ -118,18 +106,6 @@ def fit_local_polynomials(
 
     The records share g, and each has its own t. A projection across all polynomials of the order,
     the same for all windows, removes t. The result is g_0 = G(k).
-
-    Args:
-        U, Y: spectra at successive lines.
-        centres: at which lines, counted from the first one of the spectra.
-        order: of the polynomials.
-        n: half width of the window.
-        outputs: how many of Y are outputs if U is a reference: the others are the inputs, and G is
-            the response from these to the outputs. Default: all.
-
-    Returns:
-        G, the covariance of vec(G) from the residuals (noise and nonlinear distortion together),
-        whether the input determines G about each centre, and the errors of all lines together.
 
     References:
         Pintelon and Schoukens, "System Identification: A Frequency Domain Approach", 2nd ed.,

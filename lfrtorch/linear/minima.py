@@ -1,4 +1,4 @@
-"""The best of the minima of a linear model's error.
+"""Race of several starts to the best minimum of a linear model's error.
 
 Subspace methods give several first estimates of A and C, and least squares the B and D of each.
 The estimates that fit best are refined a few steps by Levenberg-Marquardt, the best of these to the
@@ -40,7 +40,7 @@ Problem = ResponseFit | SignalFit
 
 
 class Candidate(NamedTuple):
-    """A subspace estimate with the best B and D, and its cost."""
+    """Subspace estimate with the best B and D, and its cost."""
 
     cost: float
     estimate: SubspaceEstimate
@@ -48,7 +48,7 @@ class Candidate(NamedTuple):
 
 
 def candidates(problem: Problem, nx: int, more: Sequence[SubspaceEstimate] = ()) -> list[Candidate]:
-    """The candidates of finite cost, and more of them, the best one first."""
+    """Return the candidates of finite cost, and more of them, the best one first."""
     found = []
     for estimate in (*problem.subspace_estimates(nx), *more):
         cost, matrices = problem.with_input_matrices(estimate.A, estimate.C)
@@ -60,7 +60,7 @@ def candidates(problem: Problem, nx: int, more: Sequence[SubspaceEstimate] = ())
 
 
 def no_start(nx: int) -> InputError:
-    """No candidate has a finite cost."""
+    """Say that no candidate has a finite cost."""
     return InputError(
         f"no stable linear model of order {nx} could be started from these data; "
         "try a lower nx or a longer record."
@@ -70,7 +70,7 @@ def no_start(nx: int) -> InputError:
 def best_minimum(
     problem: Problem, tried: list[Candidate], max_iter: int
 ) -> tuple[SubspaceEstimate, Refined]:
-    """The best of the minima that the candidates lead to: after a few steps the best few go on.
+    """Search from the candidates; after a few steps the best few go on.
 
     The candidate that fits best may lead to a poor minimum: at the highest level of the parallel
     Wiener-Hammerstein system to one whose error on the data fitted is 4 % above the best one's.
@@ -114,7 +114,7 @@ def best_minimum(
 
 
 def search_from(problem: Problem, matrices: Matrices) -> Search:
-    """A search that starts in balanced coordinates, from states of unit deviation."""
+    """Begin a search in balanced coordinates, with states of unit deviation."""
     A, B, C, D = matrices
     try:
         T, inverse = transformation(problem, matrices)
@@ -124,7 +124,7 @@ def search_from(problem: Problem, matrices: Matrices) -> Search:
 
 
 def transformation(problem: Problem, matrices: Matrices) -> tuple[Array, Array]:
-    """T and T⁻¹ (nx, nx) to balanced coordinates with states of unit deviation."""
+    """Return T and T⁻¹ to balanced coordinates with states of unit deviation."""
     A, B, C, D = matrices
     T, inverse = balancing(A, B, C)
     std = problem.state_deviation((T @ A @ inverse, T @ B, C @ inverse, D))

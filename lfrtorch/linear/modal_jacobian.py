@@ -26,34 +26,20 @@ DEFECTIVE = 1e6
 with A. The derivatives of modes grow with it and cancel in those of the response: JᵀJ then has four
 digits left."""
 
-SMALLEST = 1e-14
-"""Eigenvalues of JᵀJ below this part of the largest are rounding errors."""
-
-TWICE = 2
-"""Solutions by normal equations, the later of what the earlier left: as precise as one by J."""
-
 
 class Modes(NamedTuple):
-    """A linear model by its modes.
-
-    Args:
-        poles: λ.
-        V: eigenvectors as columns.
-        W: V⁻¹.
-        b, c: V⁻¹ B and C V.
-        D: feedthrough.
-    """
+    """Linear model by its modes."""
 
     poles: Complex128[Complex, " nx"]
-    V: Complex128[Complex, "nx nx"]
-    W: Complex128[Complex, "nx nx"]
-    b: Complex128[Complex, "nx nu"]
-    c: Complex128[Complex, "ny nx"]
+    V: Complex128[Complex, "nx nx"]  # eigenvectors as columns
+    W: Complex128[Complex, "nx nx"]  # V⁻¹
+    b: Complex128[Complex, "nx nu"]  # W B
+    c: Complex128[Complex, "ny nx"]  # C V
     D: Float[Array, "ny nu"]
 
     @classmethod
     def of(cls, A: Array, B: Array, C: Array, D: Array) -> Modes | None:
-        """Those of a system, ``None`` if they cannot be told apart."""
+        """Return the modes of a system, or ``None`` if they cannot be told apart."""
         poles, V = (np.asarray(part, dtype=np.complex128) for part in np.linalg.eig(A))
         try:
             W = np.asarray(np.linalg.inv(V), dtype=np.complex128)
@@ -73,15 +59,7 @@ class Modes(NamedTuple):
 
 
 class ModalJacobian:
-    """Jacobian of √weight (G U - Y) with θ = (A, B, C, D).
-
-    Args:
-        modes: of the model.
-        data: what is fitted.
-        errors: √weight (G U - Y).
-        free: which entries of D are parameters.
-        excess: of each pole, and its derivative with θ.
-    """
+    """Jacobian of the errors √weight (G U - Y), and of the excess of poles, with A, B, C, D."""
 
     def __init__(
         self,
@@ -102,7 +80,7 @@ class ModalJacobian:
         self._excess = Excess(*excess, size, self._gradient_of_errors)
 
     def system(self, damping: float, truncation: float) -> tuple[GramSystem, Tensor]:
-        """The system and the gradient, see ``levenberg_marquardt.Jacobian``."""
+        """Return the system and the gradient, see ``levenberg_marquardt.Jacobian``."""
         del damping, truncation
         Q = np.linalg.qr(_without_scaling(self._modes, self._change).T)[0]
         Z = self._change @ Q
@@ -129,8 +107,7 @@ class ModalJacobian:
         return torch.as_tensor(of_errors + self._excess.jacobian.T @ residual[-nx:].numpy())
 
     def covariance(self, *, known: bool) -> Array | None:
-        """Covariance (P, P) of θ as ``ResponseProblem.covariance`` has it; ``None`` if JᵀJ, which
-        has half the digits of J, does not tell all directions."""
+        """Return the covariance of ``ResponseProblem``; ``None`` if JᵀJ has too few digits."""
         Q = np.linalg.qr(_without_scaling(self._modes, self._change).T)[0]
         Z = self._change @ Q
         system = GramSystem((Z.conj().T @ (self._products() @ Z)).real, np.eye(Q.shape[1]))
@@ -154,7 +131,7 @@ class ModalJacobian:
         return _products(functions, self._data, left[:, free], right[:, free])
 
     def _scores(self, r: Complex) -> Complex:
-        """What each line adds to Jᴴ r with λ, b, c and D, conjugate: (F, Kc)."""
+        """Return what each line adds to Jᴴ r with λ, b, c and D, conjugate: (F, Kc)."""
         m, (squares, singles) = self._modes, np.split(self._functions, 2, axis=1)
         F, H = len(r), self._data.weighted(r).conj() @ self._data.U.swapaxes(1, 2)
         with_b, with_c = H @ m.b.T, m.c.T @ H  # (F, ny, nx), (F, nx, nu)
@@ -167,7 +144,7 @@ class ModalJacobian:
         return np.hstack(parts)
 
     def _tangent(self, change: Complex) -> Complex:
-        """The change of G (F, ny, nu) with that of λ, b, c and D."""
+        """Return the change of G (F, ny, nu) with a change of λ, b, c and D."""
         m = self._modes
         d_poles, db, dc, dD = self._parts(change)
         squares = d_poles[:, None, None] * (m.c.T[:, :, None] * m.b[:, None, :])
@@ -200,18 +177,13 @@ class ModalJacobian:
 
 
 class GramSystem:
-    """From JᵀJ in a basis of the directions that change the response, by eigenvalues.
-
-    Args:
-        G: JᵀJ there.
-        Q: the orthonormal basis.
-    """
+    """Normal equations JᵀJ = G in a basis Q of the directions that change the response."""
 
     def __init__(self, G: Float[Array, "K K"], Q: Float[Array, "P K"]) -> None:
         self.scale, self.rank = float("nan"), 0
         if np.isfinite(G).all():
             squares, axes = np.linalg.eigh(G)
-            kept = squares > SMALLEST * squares[-1]
+            kept = squares > 1e-14 * squares[-1]  # the others are rounding errors
             self._squares, self._axes = squares[kept], Q @ axes[:, kept]
             self.scale, self.rank = float(squares[-1]), int(kept.sum())
 
@@ -262,13 +234,7 @@ def _products(functions: Complex, data: SpectralData, left: Complex, right: Comp
 def with_best_inputs(
     A: Array, C: Array, data: SpectralData, free: Booleans
 ) -> tuple[Array, Array] | None:
-    """B and D of least errors for A and C; ``None`` if the modes cannot be told apart.
-
-    Args:
-        A, C: state and output matrix.
-        data: what is fitted.
-        free: which entries of D are not 0.
-    """
+    """Return B and D of least errors for A and C, ``None`` if modes cannot be told apart."""
     z, U, n, nu, ny = data.z, data.U, len(A), data.U.shape[1], len(C)
     B, D = np.zeros((n, nu)), np.zeros((ny, nu))
     m = Modes.of(A, B, C, D)
@@ -284,7 +250,7 @@ def with_best_inputs(
     system = GramSystem(G / np.outer(size, size), np.eye(len(G)))
     if not system.rank:
         return None
-    for _ in range(TWICE):
+    for _ in range(2):  # solving again for what is left is as precise as a solution by J
         errors = data.Y - Modes(*m[:3], m.W @ B, m.c, D).response(z) @ U
         H = data.weighted(data.weighted(errors)) @ U.conj().swapaxes(1, 2)
         sums = (functions.conj().T @ H.reshape(len(H), -1)).reshape(-1, ny, nu)

@@ -20,9 +20,6 @@ from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.model import LinearModel, balancing
 from lfrtorch.records import Channel, Record, as_records, without_coordinates
 
-DEFECTIVE = 1e8
-"""Modes cannot be told apart if the condition number of the eigenvectors is above this."""
-
 MINOR = 1 / 3
 """Largest share in the output that counts as minor. Of the linear models of Bouc-Wen,
 Wiener-Hammerstein, Silverbox and the parallel Wiener-Hammerstein stand-in (orders 2 to 12, 10
@@ -32,15 +29,9 @@ realisations) spurious modes have 0.01 to 0.29, the others 0.40 and more."""
 def shares(
     model: LinearModel, data: Record | Sequence[Record]
 ) -> tuple[Complex128[Complex, " nx"], Float[Array, " nx"]]:
-    """Poles, and how much the mode of each adds to the output, relative to the model's error.
+    """Return poles, and the rms that the mode of each adds to the output, over the error's.
 
-    Args:
-        model: linear model.
-        data: records.
-
-    Returns:
-        Poles λ, and for each the rms of what its mode (with its conjugate) adds to the simulated
-        output, over the rms of the simulation error; of several outputs the largest.
+    A mode counts with its conjugate; of several outputs the largest share is taken.
     """
     poles, right, left = _modes(model)
     nx, ny = len(poles), len(model.outputs)
@@ -88,7 +79,7 @@ def without_slow_minor_modes(
     old, share = shares(model, data)
     matters = share > minor
     _, right, left = _modes(model)
-    if not matters.any() or np.linalg.cond(right) > DEFECTIVE:
+    if not matters.any() or np.linalg.cond(right) > 1e8:  # no mode, or none apart
         return model
     radius = np.abs(old[matters]).max()
     slow = ~matters & (np.abs(old) > radius)

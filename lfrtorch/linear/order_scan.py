@@ -215,7 +215,7 @@ def scan_orders(
 
 
 class _Tried(NamedTuple):
-    """A model of an order, its description length, and its errors on records held back."""
+    """Model of an order, its description length, and its errors on records held back."""
 
     model: LinearModel
     length: float
@@ -223,7 +223,7 @@ class _Tried(NamedTuple):
 
 
 def _rising(orders: Sequence[int], least: int) -> list[int]:
-    """The orders, each once; without those below the least, if there are others."""
+    """Return the orders, each once; without those below the least, if there are others."""
     if not len(orders):
         raise InputError("orders is empty; give at least one, for example range(1, 13).")
     for nx in orders:

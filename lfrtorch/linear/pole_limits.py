@@ -28,11 +28,7 @@ Bouc-Wen's linear model has 2 / 3."""
 
 
 class PoleLimits:
-    """The limits that some lines set.
-
-    Args:
-        z: the lines' points on the unit circle.
-    """
+    """Limits that lines z on the unit circle set."""
 
     def __init__(self, z: Complex128[Complex, " F"]) -> None:
         self._lines = np.unique(np.abs(np.angle(z)))
@@ -69,14 +65,7 @@ class PoleLimits:
 
 
 class Excess:
-    """The residuals ρ e at some θ, and their derivative.
-
-    Args:
-        e: excess of each pole.
-        slopes: its derivative with θ.
-        errors: |r|.
-        gradient: Jᵀ r.
-    """
+    """Residuals ρ e at some θ, and their derivative, from those of e and |r|."""
 
     def __init__(
         self,

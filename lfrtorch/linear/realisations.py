@@ -24,19 +24,13 @@ about √2. The lines count by their amplitude, as one strong line can always be
 FEW = 8
 """A shift is looked for with this many lines: fewer lines of two realisations agree by chance."""
 
-STEPS = 2
-"""Corrections of a shift in whole samples by the slope of the phase."""
-
 
 def united(
     spectra: Spectra, data: Sequence[Record], *, shifted: bool
 ) -> tuple[Spectra, list[Record], tuple[str, ...]]:
-    """The spectra of each realisation, the first record of each, and a note if some have several.
+    """Return the spectra and the first record of each realisation, and a note on repeated ones.
 
-    Args:
-        spectra: of all records.
-        data: the records.
-        shifted: whether one realisation may begin anywhere in its period.
+    If ``shifted``, one realisation may begin anywhere in its period.
     """
     E = spectra.excitation
     power = np.mean(np.abs(E) ** 2, axis=1)  # (F, nu)
@@ -84,7 +78,7 @@ def delay(
     *,
     shifted: bool = True,
 ) -> float | None:
-    """The shift τ in samples if V is U, shifted; ``None`` if it is another realisation."""
+    """Return the shift τ in samples if V is U, shifted; ``None`` for another realisation."""
     size = np.sqrt((np.abs(U) ** 2 + np.abs(V) ** 2) / 2)
     size = np.maximum(size, np.finfo(float).tiny)
 
@@ -100,7 +94,7 @@ def delay(
         spectrum[lines] = cross
         tau = float(np.argmax(np.fft.irfft(spectrum, N)))
         weight = np.abs(cross) * lines
-        for _ in range(STEPS):
+        for _ in range(2):  # corrections of whole samples by the slope of the phase
             phase = np.angle(cross * np.exp(2j * np.pi * lines * tau / N))
             tau -= N / (2 * np.pi) * float(weight @ phase / (weight @ lines))
     turned = U * np.exp(-2j * np.pi * lines * tau / N)[:, None]

@@ -19,7 +19,7 @@ TOLERANCE = 1e-9
 """A relative decrease of the cost below this ends the search."""
 
 STRIDE = 4
-"""Iterations over which a search that need not end exactly is seen to have settled."""
+"""Iterations over which a search is seen to have settled."""
 
 TRUNCATION = 1e-12
 """Relative singular value below which a direction of θ counts as gauge, which has no covariance."""
@@ -27,29 +27,17 @@ TRUNCATION = 1e-12
 
 @dataclass(frozen=True)
 class Refined:
-    """A refined system in normalised units.
-
-    Args:
-        A, B, C, D: system matrices.
-        covariance: of their entries, row by row, one matrix after another; ``None`` before the
-            first iteration.
-        rmse: root mean squared error at the end.
-        iterations: of the search.
-        reason: why it ended.
-        constant: output (ny,) at rest, ``None`` if it was no parameter.
-        K: innovation gain, ``None`` without a noise model.
-        innovation_covariance: of the innovations, ``None`` without a noise model.
-    """
+    """Refined system in normalised units."""
 
     A: Array
     B: Array
     C: Array
     D: Array
-    covariance: Array | None
+    covariance: Array | None  # of A, B, C, D, row by row; ``None`` before the first iteration
     rmse: float
     iterations: int
     reason: str
-    constant: Array | None = None
+    constant: Array | None = None  # of the output at rest, if it is a parameter
     K: Array | None = None
     innovation_covariance: Array | None = None
 
@@ -64,11 +52,6 @@ class Search:
 
     Geodesic acceleration halves the iterations: 60 to 80 instead of 150 and more for order 12 at
     the five levels of the parallel Wiener-Hammerstein system.
-
-    Args:
-        problem: what is minimised.
-        theta: initial parameters (P,).
-        tolerance: relative decrease of the cost that counts as none.
     """
 
     def __init__(self, problem: Any, theta: Tensor, tolerance: float = TOLERANCE) -> None:
@@ -77,11 +60,9 @@ class Search:
         self.state = self._optimiser.init(problem, theta)
 
     def advance(self, max_iter: int, settled: float = 0.0) -> Self:
-        """Go on until the cost no longer falls, or to the iteration ``max_iter``.
+        """Go on to the iteration ``max_iter``, or until the cost no longer falls.
 
-        Args:
-            max_iter: last iteration.
-            settled: also end once STRIDE iterations lower the cost by less than this part.
+        It has ``settled``, too, if STRIDE iterations lower it by less than that part.
         """
         costs = [self.state.cost]
         while not self.state.reason and self.state.iteration < max_iter:

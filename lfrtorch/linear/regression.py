@@ -14,19 +14,12 @@ DEPENDENT = 1e-10
 
 
 class Regression(NamedTuple):
-    """Solution of Y = X Θ at each line; the response belongs to the last nu columns of X.
-
-    Args:
-        G: transpose of the last nu rows of Θ.
-        weights: the same rows of the pseudo-inverse of X, so that G = (weights Y)ᵀ.
-        residual: Y - X Θ.
-        determined: whether the columns of X are independent. If not, the rest means nothing.
-    """
+    """Solution of Y = X Θ at each line; the response belongs to the last nu columns of X."""
 
     G: Complex128[Complex, "F ny nu"]
-    weights: Complex128[Complex, "F nu R"]
+    weights: Complex128[Complex, "F nu R"]  # G = (weights Y)ᵀ
     residual: Complex128[Complex, "F R ny"]
-    determined: Bool[Booleans, " F"]
+    determined: Bool[Booleans, " F"]  # if not, the rest means nothing
 
 
 def regress(
@@ -49,7 +42,7 @@ def regress(
 
 
 def divided(fitted: Regression, ny: int) -> Regression:
-    """The response between the columns of Y, from the last nu of them to the first ny.
+    """Return the response between columns of Y, from the last nu of them to the first ny.
 
     Y = [y, u] follows from X as y = G_y X and u = G_u X, and so y = G_y G_u⁻¹ u: what X drives
     through u, without what else moves y and u together.

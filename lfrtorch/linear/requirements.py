@@ -1,4 +1,4 @@
-"""What data must have for a linear model of an order: excitation, length, enough equations."""
+"""Requirements on data for a linear model of an order: excitation, length, equations."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from lfrtorch.linear.subspace import shortest, suffice
 from lfrtorch.metrics import rms
 from lfrtorch.periods import find_transient
 from lfrtorch.records import Record
-
-NARROW = 1e-10
-"""Relative size of a direction that the input does not excite."""
 
 REPEATS = 0.1
 """Largest deviation of periods of an input, and of the means of an output, over the signal's."""
@@ -53,19 +50,19 @@ def check_length(records: list[Record], nx: int) -> None:
 
 
 def without_inputs(record: Record, last: int) -> Record:
-    """The record without its last inputs."""
+    """Return the record without its last inputs."""
     kept = len(record.inputs) - last
     return replace(record, u=record.u[:, :kept], inputs=record.inputs[:kept], reference=None)
 
 
 def steady_state(records: Sequence[Record]) -> list[Record] | None:
-    """The whole periods in steady state of all records, if these are most of the scored samples."""
+    """Return the whole periods in steady state, if they are most of what all records score."""
     found = [_steady_part(record) for record in records]
     return [record for record in found if record] if all(found) else None
 
 
 def of_response(records: Sequence[Record]) -> bool:
-    """Whether records are best fitted by their response: a reference drives them, not in periods.
+    """Tell if records are best fitted by their response: a reference drives them, not in periods.
 
     A controller makes such inputs, so that a simulation error of what they do is biased.
     """
@@ -117,7 +114,7 @@ def excited_directions(records: Sequence[Record], nx: int) -> tuple[int, int]:
     rows = np.concatenate([w.reshape(len(w), -1) for w in windows])
     rows = rows / np.maximum(rms(rows, axis=0), 1e-300)
     size = np.linalg.eigvalsh(rows.T @ rows)
-    return int((size > NARROW * size[-1]).sum()), nu * wanted
+    return int((size > 1e-10 * size[-1]).sum()), nu * wanted
 
 
 def check_excitation(records: Sequence[Record], nx: int) -> None:
@@ -131,7 +128,7 @@ def check_excitation(records: Sequence[Record], nx: int) -> None:
 
 
 def excitation_notes(records: list[Record], nx: int) -> list[str]:
-    """A note if the input moves in too few directions to tell all parameters apart."""
+    """Return a note if the input moves in too few directions to tell all parameters apart."""
     excited, wanted = excited_directions(records, nx)
     if excited == wanted:
         return []

@@ -24,11 +24,8 @@ from lfrtorch.records import Record
 RELATIVE_POWER = 1e-4
 """Smallest power of each input at an excited line, relative to its best line: -40 dB."""
 
-NOISE_RATIO = 30.0
-"""Smallest ratio of power to noise at an excited line, the noise averaged over NOISE_LINES lines.
-With two periods of one record, a line of noise alone passes once in 1e8."""
-
 NOISE_LINES = 21
+"""Lines about each one that noise is averaged over."""
 
 NO_POWER = 1e-12
 """An input has no power at a line if it has less than this part of that of its best line."""
@@ -37,52 +34,24 @@ SILENT = 1e-10
 """Relative amplitude of the input below which a line is not excited."""
 
 
-GAP = 1e-2
-"""A line with less than this part of the power of the next stronger one is not excited, nor are
-weaker ones ..."""
-
-FEW = 3
-"""... if they are this many. Of 3 weakest lines of a random input it is so once in 1e6."""
-
-ROUNDING = 1e-24
-"""Power of the changes of an input from period to period that are rounding, relative to its own."""
-
-CLEAR = 0.5
-"""The noise of an input is subtracted if it leaves this part of the power at a line."""
-
-LARGEST_CHANGE = 0.1
-"""Largest rms deviation of a period of an input from the mean period, relative to the input's rms
-over all records."""
-
-
 class Spectra(NamedTuple):
     """Spectra Y = √2 / N · DFT of R records, lines 0 to N / 2.
 
     So |Y|² is the mean square of the sine at a line, and their sum the variance of the signal.
-
-    Args:
-        U, Y: means over the periods of a record.
-        C: covariance of the noise of [Y, U] in one period (P times that of the mean over P
-            periods), pooled over the records.
-        freedom: degrees of freedom of C; without any, C is 0.
-        P: numbers of periods.
-        N: samples of a period.
-        resolution: fs / N, Hz.
-        reference: mean spectra of the references, if the records have them.
     """
 
-    U: Complex128[Complex, "F R nu"]
+    U: Complex128[Complex, "F R nu"]  # means over the periods of a record
     Y: Complex128[Complex, "F R ny"]
-    C: Complex128[Complex, "F ny+nu ny+nu"]
-    freedom: int
-    P: Int64[Integers, " R"]
-    N: int
-    resolution: float
+    C: Complex128[Complex, "F ny+nu ny+nu"]  # covariance of the noise of [Y, U] in one period
+    freedom: int  # of C, which is 0 without any
+    P: Int64[Integers, " R"]  # periods of each record
+    N: int  # samples of a period
+    resolution: float  # fs / N, Hz
     reference: Complex128[Complex, "F R nu"] | None = None
 
     @property
     def excitation(self) -> Complex128[Complex, "F R nu"]:
-        """What is known without noise to excite: the references, or else the inputs."""
+        """Signals known without noise to excite: the references, or else the inputs."""
         return self.U if self.reference is None else self.reference
 
     def frequencies(self, lines: Int64[Integers, " F"]) -> Float[Array, " F"]:
@@ -186,7 +155,7 @@ def given_references(data: Sequence[Record]) -> list[Array | None]:
 
 def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
     """Refuse inputs whose periods change; ``change`` (R, nu) is relative to the rms."""
-    if change.max() > LARGEST_CHANGE:
+    if change.max() > 0.1:
         r, channel = (int(i) for i in np.unravel_index(np.argmax(change), change.shape))
         raise InputError(
             f"record '{data[r].name}': the periods of {N} samples of input "
@@ -197,11 +166,7 @@ def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
 
 
 def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | None) -> Integers:
-    """The lines between 0 and fs / 2 at which all inputs are excited, or the given ones.
-
-    Raises:
-        ValueError: there is none, or a given one has no power in an input.
-    """
+    """Return the lines between 0 and fs / 2 at which all inputs are excited, or the given ones."""
     last = (spectra.N - 1) // 2
     inputs = data[0].inputs
     power = np.mean(np.abs(spectra.excitation[1 : last + 1]) ** 2, axis=1)  # (lines, nu), from 1
@@ -218,7 +183,8 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     noise = np.diagonal(spectra.C, axis1=1, axis2=2).real[1 : last + 1, -len(inputs) :]
     noise = noise if spectra.reference is None else np.zeros_like(noise)
     shown = smoothed(noise, NOISE_LINES) * np.mean(1 / spectra.P)
-    excited = power > np.maximum(RELATIVE_POWER * power.max(axis=0), NOISE_RATIO * shown)
+    # With two periods of one record, a line of noise alone has 30 times that once in 1e8.
+    excited = power > np.maximum(RELATIVE_POWER * power.max(axis=0), 30.0 * shown)
     if not noise.any():  # one period does not tell noise from a weak line
         excited &= np.stack([carrying(channel) for channel in power.T], axis=1)
     lines = 1 + np.flatnonzero(excited.all(axis=1))
@@ -233,24 +199,24 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
 
 
 def carrying(power: Array) -> Booleans:
-    """Which lines the input is meant to excite, of their power (F,).
+    """Tell which lines the input is meant to excite, of their power (F,).
 
-    Sorted by power, they end where the next one has less than the part GAP: a measured input has
-    noise, hum and distortion at the lines that its generator leaves out. A few lines of a random
-    input are as weak, and count.
+    Sorted by power, they end where the next one has less than a hundredth: a measured input has
+    noise, hum and distortion at the lines that its generator leaves out. One or two lines of a
+    random input are as weak, and count; three are so once in 1e6.
     """
     order = np.argsort(-power, kind="stable")
     ranked = power[order]
     loud = int((ranked > SILENT**2 * power.max(initial=0.0)).sum())
-    gaps = 1 + np.flatnonzero(ranked[1:loud] < GAP * ranked[: max(0, loud - 1)])
-    ends = [int(end) for end in gaps if loud - end >= FEW]
+    gaps = 1 + np.flatnonzero(ranked[1:loud] < 1e-2 * ranked[: max(0, loud - 1)])
+    ends = [int(end) for end in gaps if loud - end >= 3]
     excited = np.zeros(len(power), dtype=bool)
     excited[order[: min([loud, *ends])]] = True
     return excited
 
 
 def powered_lines(spectra: Spectra, n: int) -> Integers:
-    """The lines between 0 and fs / 2 within n lines of which every input has power.
+    """Return the lines between 0 and fs / 2 within n lines of which every input has power.
 
     Estimates at other lines would be made of rounding errors.
     """
@@ -274,19 +240,15 @@ def without_noise(
     Elsewhere it is the unit matrix. It is ``None`` if the inputs have no noise.
     """
     clear = np.ones(len(power), dtype=bool)
-    if not np.abs(noise).max(initial=0.0) > ROUNDING * np.abs(power).max(initial=0.0):
-        return None, clear
+    if not np.abs(noise).max(initial=0.0) > 1e-24 * np.abs(power).max(initial=0.0):
+        return None, clear  # only rounding changes from period to period
     left = power - noise
-    clear = np.linalg.eigvalsh(left)[:, 0] > CLEAR * np.linalg.eigvalsh(power)[:, 0]
+    clear = np.linalg.eigvalsh(left)[:, 0] > 0.5 * np.linalg.eigvalsh(power)[:, 0]
     return np.where(clear[:, None, None], left, np.eye(power.shape[1])), clear
 
 
 def in_band(lines: Integers, resolution: float, band: tuple[float, float] | None) -> Integers:
-    """The lines in a band of frequencies in Hz, or all of them.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Return the lines in a band of frequencies in Hz, or all of them."""
     if band is None:
         return lines
     inside = lines[(lines * resolution >= band[0]) & (lines * resolution <= band[1])]

@@ -36,34 +36,17 @@ DEGREES_OF_FREEDOM = 20
 """Degrees of freedom that a variance needs before it is used as a weight; neighbouring lines are
 averaged until it has them."""
 
-VANISHING = 1e-12
-"""Smallest variance that enters a weight, relative to the largest."""
-
-
-FOUND = 10.0
-"""A noisy input excites a line if it has this many times the power of its noise, which is averaged
-over neighbouring lines; a line of noise alone passes once in 1e4."""
-
 
 @dataclass(frozen=True, eq=False)
 class SpectralData:
-    """What is fitted: Y = G(z) U, and the weight of each error.
-
-    Args:
-        z: points on the unit circle.
-        U, Y: spectra of m experiments, scaled so that the sum of squared errors is their mean
-            square.
-        weight: of the errors Y - G U. Default: 1 for all.
-        left_out: lines at which the input has some power and yet is not meant to excite.
-        errors: of Y, if those of several lines are correlated.
-    """
+    """Spectra that are fitted, Y = G(z) U; the sum of squared errors is their mean square."""
 
     z: Complex128[Complex, " F"]
     U: Complex128[Complex, "F nu m"]
     Y: Complex128[Complex, "F ny m"]
-    weight: Float[Array, "F ny m"] | None = None
-    left_out: int = 0
-    errors: WindowErrors | None = None
+    weight: Float[Array, "F ny m"] | None = None  # of the errors Y - G U
+    left_out: int = 0  # lines of some power that the input is not meant to excite
+    errors: WindowErrors | None = None  # of Y, if those of several lines are correlated
 
     def weighted(self, errors: Complex) -> Complex:
         """√weight times errors (F, ny, m), or times their Jacobian (F, ny, m, K)."""
@@ -99,10 +82,6 @@ def spectral_data_of_records(
     bias it, too. What the periods of a record differ by tells its share in U Uᴴ and Y Uᴴ, on which
     alone the fit depends: it is subtracted (Pintelon and Schoukens, 2012, chapter 9). References
     of several experiments tell more: there, only what follows them is kept.
-
-    Args:
-        normalised: the records, with their weights and periods.
-        offset: whether the model has a constant in its output. It is eliminated from line 0.
     """
     records, ny = [each.record for each in normalised], normalised[0].y.shape[1]
     if any(r.start != "periodic" or r.skip for r in records):
@@ -165,14 +144,6 @@ def spectral_data_of_parts(
     beginning. The jump is the response to an impulse in the last sample, so that the impulse's
     column of B is the jump, and D has none. By Parseval's theorem the sum of squared errors is the
     mean square of the simulation errors from the best initial states.
-
-    Args:
-        parts: normalised inputs (T, nu) and outputs (T, ny).
-        weights: of their squared errors.
-        offset: whether each output may have a constant: line 0 is left out.
-
-    Returns:
-        Spectra of one experiment with nu inputs and one more for each part.
     """
     R, total = len(parts), sum(len(u) for u, _ in parts)
     zs, Us, Ys = [], [], []
@@ -193,7 +164,7 @@ def spectral_data_of_parts(
 
 
 def _twice(N: int) -> Array:
-    """How many lines each line (F, 1) of N samples stands for: itself and its conjugate."""
+    """Count the lines (F, 1) that each line of N samples stands for: itself and its conjugate."""
     twice = np.full((N // 2 + 1, 1), 2.0)
     twice[0] = 1.0  # lines 0 and N / 2 are their own
     if N % 2 == 0:
@@ -214,17 +185,11 @@ def _line_0(
 
 
 class _Lines(NamedTuple):
-    """Spectra of a record at lines from 1 on, weighted.
-
-    Args:
-        U, Y: means over the periods, (F, nu) and (F, ny).
-        noise: covariance (F, nu + ny, nu + ny) of the noise of [U, Y]; ``None`` without any.
-        reference: (F, nu), or ``None``.
-    """
+    """Weighted spectra of a record at lines from 1 on, means over the periods."""
 
     U: Complex
     Y: Complex
-    noise: Complex | None
+    noise: Complex | None  # covariance of the noise of [U, Y]
     reference: Complex | None
 
 
@@ -255,7 +220,8 @@ def _together(group: Sequence[_Lines]) -> tuple[Complex, Complex]:
         return _compressed(U, Y)
     if excited is None:
         shown, power = (np.trace(S, axis1=1, axis2=2).real for S in (noise[:, :nu, :nu], U @ Uh))
-        excited = power > FOUND * smoothed(shown[:, None], NOISE_LINES)[:, 0]
+        # A line of noise alone has ten times its mean power once in 1e4.
+        excited = power > 10.0 * smoothed(shown[:, None], NOISE_LINES)[:, 0]
     counts = (excited & clear)[:, None, None]
     root = np.asarray(np.linalg.cholesky(left) * counts, dtype=np.complex128)
     across = (Y @ Uh - noise[:, nu:, :nu]) * counts
@@ -264,7 +230,7 @@ def _together(group: Sequence[_Lines]) -> tuple[Complex, Complex]:
 
 
 def _compressed(U: Complex, Y: Complex) -> tuple[Complex, Complex]:
-    """The same normal equations in at most nu columns."""
+    """Return the same normal equations in at most nu columns."""
     nu = U.shape[1]
     if U.shape[2] <= nu:
         return U, Y
@@ -276,17 +242,10 @@ def _compressed(U: Complex, Y: Complex) -> tuple[Complex, Complex]:
 def spectral_data_of_response(
     frf: FRF, weight: Weight | Array | None, *, offset: bool, differences: int = 0
 ) -> tuple[SpectralData, Scaler, bool, list[str]]:
-    """A frequency response as spectra, scaled to channels of unit size.
+    """Return a response as spectra of channels of unit size, with their scaling.
 
-    Args:
-        frf: the response.
-        weight: as for ``estimate_bla``.
-        offset: whether the means of the records are its operating point.
-        differences: how many differences of the inputs follow these.
-
-    Returns:
-        The spectra, the scaling, whether the weights are the inverse variances of the errors, and
-        notes on the choice of weights.
+    Also whether the weights are the inverse variances of the errors, and notes on their choice.
+    ``differences`` of the inputs follow these.
     """
     weights, known, notes = _weights(frf, weight)
     u_scale = 1.0 / rms_scale([np.abs(frf.G).reshape(-1, frf.G.shape[2])], np.zeros(1))
@@ -349,7 +308,7 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
     else:
         freedom = frf.realisations - 1 if weight == "total" else frf.experiments * (frf.periods - 1)
         smooth = _smoothed(variance, 1 if frf.method == "local_polynomial" else freedom)
-    return 1.0 / np.maximum(smooth, VANISHING * smooth.max()), weight == "total", notes
+    return 1.0 / np.maximum(smooth, 1e-12 * smooth.max()), weight == "total", notes
 
 
 def _of_other_windows(variance: Array, sizes: Array, errors: WindowErrors) -> Array:

@@ -48,25 +48,13 @@ MOST_OPERATIONS = 1e10
 """Most multiplications of a decomposition; horizons that need more are skipped."""
 
 
-MOST_PRODUCTS = 2e9
-"""The same for spectra, which have three frequency axes."""
-
-
 class SubspaceEstimate(NamedTuple):
-    """An estimate of A and C.
+    """Subspace estimate of A and C."""
 
-    Args:
-        A: state matrix, with unstable poles moved into the unit circle.
-        C: output matrix.
-        singular_values: of the subspace, relative to the size of the outputs: they drop after the
-            order that the data carry.
-        unstable: A before its poles were moved, ``None`` if it was stable.
-    """
-
-    A: Float[Array, "nx nx"]
+    A: Float[Array, "nx nx"]  # with unstable poles moved into the unit circle
     C: Float[Array, "ny nx"]
-    singular_values: Float[Array, " n"]
-    unstable: Float[Array, "nx nx"] | None
+    singular_values: Float[Array, " n"]  # they drop after the order that the data carry
+    unstable: Float[Array, "nx nx"] | None  # A before its poles were moved
 
 
 def from_spectra(
@@ -80,11 +68,6 @@ def from_spectra(
     The powers of z that tell the states apart are almost equal if the lines cover a small part of
     the unit circle. A bilinear map of the circle to itself spreads the lines: from a tenth of the
     frequency axis, a noise-free system of order 12 is found to 1e-14 with the map, to 1e-7 without.
-
-    Args:
-        z: points on the unit circle.
-        U, Y: spectra, scaled so that all errors of Y have the same variance.
-        nx: order.
     """
     # Several outputs tell states apart better than further powers of z: order 12 with 3 outputs is
     # found on a tenth of the axis to 1e-14 by 5 block rows, to 1e-6 by 13.
@@ -94,34 +77,25 @@ def from_spectra(
     wanted = (fewest, *(multiple * (nx + 1) for multiple in SPECTRAL_HORIZONS))
     rows = [q for q in sorted({min(q, most) for q in wanted}) if q >= fewest]
     ny, nu, m = Y.shape[1], *U.shape[1:]
-    cheap = [q for q in rows if (q * (nu + ny)) ** 2 * 2 * len(U) * m <= MOST_PRODUCTS]
+    limit = MOST_OPERATIONS / 5  # there are three frequency axes
+    cheap = [q for q in rows if (q * (nu + ny)) ** 2 * 2 * len(U) * m <= limit]
     rows = cheap or rows[:1]
     found = (subspace.estimate(nx) for q in rows for subspace in _subspaces(z, U, Y, q))
     return [estimate for estimate in found if estimate is not None]
 
 
 class SpectralSubspace(NamedTuple):
-    """Directions that hold estimates of every order, from one decomposition.
+    """Directions that hold estimates of every order, from one decomposition."""
 
-    Args:
-        directions: of the outputs that the inputs do not explain, the main one first.
-        singular_values: of the directions.
-        size: norm of the outputs, to which singular values are relative.
-        whiten: what the noise of the outputs was divided by.
-        warp: parameter a of the bilinear map of the frequency axis.
-        ny: number of outputs.
-    """
-
-    directions: Array
+    directions: Array  # of the outputs that the inputs do not explain, the main one first
     singular_values: Array
-    size: float
-    whiten: Array
-    warp: float
+    size: float  # norm of the outputs
+    whiten: Array  # what the noise of the outputs was divided by
+    warp: float  # a of the bilinear map of the frequency axis
     ny: int
 
     def estimate(self, nx: int) -> SubspaceEstimate | None:
-        """The estimate of an order; ``None`` if there are fewer directions, or the map of the axis
-        has no inverse there."""
+        """Return the estimate of an order, if there are directions for it and an inverse map."""
         if nx > len(self.directions):
             return None
         observability = _main(self.directions, self.singular_values, nx)
@@ -152,7 +126,7 @@ def _most_rows(U: Complex, Y: Complex) -> int:
 
 
 def _subspaces(z: Complex, U: Complex, Y: Complex, q: int) -> list[SpectralSubspace]:
-    """Those of q block rows, on several frequency axes, with and without equal noise."""
+    """Return subspaces of q block rows, on several frequency axes, with and without equal noise."""
     ny, half = Y.shape[1], np.angle(z) / 2
     power = (np.abs(Y) ** 2).sum(axis=(1, 2))
     centres = [np.median(half), np.average(half, weights=power if power.any() else None)]
@@ -217,7 +191,7 @@ def shortest(nx: int, nu: int, ny: int) -> int:
 
 
 def suffice(lengths: Sequence[int], nx: int, nu: int, ny: int) -> bool:
-    """Whether records of these lengths together are enough for ``from_signals``."""
+    """Tell if records of these lengths together are enough for ``from_signals``."""
     window = 2 * HORIZONS[0] * (nx + 1)
     return sum(max(0, T - window + 1) for T in lengths) > window * (nu + ny)
 
@@ -237,18 +211,18 @@ def _directions(outputs: Array, seen: slice) -> tuple[Array, Array, float]:
 
 
 def _main(directions: Array, s: Array, nx: int) -> Array:
-    """The first nx directions, scaled."""
+    """Return the first nx directions, scaled."""
     return directions[:, :nx] * np.sqrt(np.pad(s, (0, max(0, nx - len(s))))[:nx])
 
 
 def _shift(observability: Array, ny: int) -> tuple[Array, Array]:
-    """A and C from the extended observability matrix [C; C A; C A²; ...]."""
+    """Return A and C from the extended observability matrix [C; C A; C A²; ...]."""
     A = np.linalg.lstsq(observability[:-ny], observability[ny:], rcond=None)[0]
     return np.asarray(A, dtype=np.float64), observability[:ny]
 
 
 def _stable(A: Array, C: Array, singular_values: Array) -> SubspaceEstimate:
-    """The estimate with unstable poles reflected into the unit circle, at most to MOVED_POLE."""
+    """Return the estimate with unstable poles reflected into the unit circle, to MOVED_POLE."""
     values, vectors = np.linalg.eig(A)
     radius = np.abs(values)
     unstable = radius > LARGEST_POLE
