@@ -29,6 +29,7 @@ from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import of_static
 from lfrtorch.engine.operating_point import double
 from lfrtorch.engine.static_jacobian import linearise_static
+from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
@@ -134,14 +135,14 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     bent = np.sqrt(power)[:, None] * (W @ (J - slope) @ _inverse(Z))
     bends, turn = _ordered(np.einsum("swi,swj->ij", bent, bent) / len(bent))
     Z = turn.T @ Z
-    angles: Array = np.asarray(2 * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)
-    Z = _signs(_frf(A, Bu, Z @ Cz, Z @ Dzu, angles), 1)[:, None] * Z
-    into_y = _frf(A, Bw @ _inverse(W), Cy, Dyw @ _inverse(W), angles)
+    points = np.exp(2j * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)
+    Z = _signs(frequency_response(A, Bu, Z @ Cz, Z @ Dzu, points), 1)[:, None] * Z
+    into_y = frequency_response(A, Bw @ _inverse(W), Cy, Dyw @ _inverse(W), points)
     W = _signs(into_y, 2)[:, None] * W
     # x, turned to the axes of the observability Gramian.
     X = _whitening(x_all)
     seen = np.vstack([Cy, Z @ Cz]) @ _inverse(X)
-    G = _frf(X @ A @ _inverse(X), np.eye(len(A)), seen, np.zeros_like(seen), angles)
+    G = frequency_response(X @ A @ _inverse(X), np.eye(len(A)), seen, np.zeros_like(seen), points)
     _, turn = _ordered(np.einsum("fsi,fsj->ij", G.conj(), G).real)
     X = turn.T @ X
     seen = seen @ turn
@@ -198,13 +199,6 @@ def _ordered(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Arr
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
 
 
-def _frf(A: Array, B: Array, C: Array, D: Array, angles: Float[Array, " F"]) -> Complex:
-    """C (zI - A)⁻¹ B + D at z = exp(j angle): (F, outputs, inputs)."""
-    resolvent = np.exp(1j * angles)[:, None, None] * np.eye(len(A)) - A
-    columns = np.broadcast_to(B.astype(np.complex128), (len(angles), *B.shape))
-    return C @ np.linalg.solve(resolvent, columns) + D
-
-
 def _response(
     A: Array, Bw: Array, Cy: Array, Dyw: Array, w: Float[Array, "T nw"], W: Float[Array, "nw nw"]
 ) -> Float[Array, "nw nw"]:
@@ -213,9 +207,9 @@ def _response(
     It is computed from frequency responses, which an unstable linear block has, too.
     """
     lines = np.asarray(np.fft.rfftfreq(len(w)), dtype=np.float64)
-    angles = 2 * np.pi * (lines + 0.5 / len(w))
+    between = np.exp(2j * np.pi * (lines + 0.5 / len(w)))  # so that no pole at 1 is hit
     out = _inverse(W)
-    G = _frf(A, Bw @ out, Cy, Dyw @ out, angles)  # between the lines, so that no pole at 1 is hit
+    G = frequency_response(A, Bw @ out, Cy, Dyw @ out, between)
     power = np.sum(np.abs(np.fft.rfft(w @ W.T, axis=0)) ** 2, axis=1)
     return np.einsum("fyi,fyj,f->ij", G.conj(), G, power).real
 

@@ -321,9 +321,8 @@ class LinearModel:
         """
         nu, ny = len(self.inputs), len(self.outputs)
         unit = Scaler(self.u_offset, np.ones(nu), self.y_offset, np.ones(ny))
-        cell = linear_cell(self.A, self.B, self.C, self.D)
-        if self.state_covariance is not None:
-            cell.state_covariance.copy_(torch.as_tensor(self.state_covariance))
+        cell = LFRCell(nu, ny, self.nx, dtype=torch.float64)
+        self.write(cell, unit)
         K = None if self.K is None else torch.as_tensor(self.K)
         return Model(LFR(cell), unit, self.fs, self.inputs, self.outputs, K=K)
 
@@ -373,7 +372,7 @@ class LinearModel:
             "inputs": [c._asdict() for c in self.inputs],
             "outputs": [c._asdict() for c in self.outputs],
         }
-        arrays = {name: getattr(self, name) for name in (*_ARRAYS, *_OPTIONAL)}
+        arrays = {name: getattr(self, name) for name in _SHAPES}
         weights = {k: torch.tensor(v) for k, v in arrays.items() if v is not None}
         return checkpoint.write(folder, description, weights)
 
@@ -398,29 +397,24 @@ class LinearModel:
                 fit = LinearFit(
                     **fit | {name: tuple(fit[name]) for name in ("singular_values", "notes")}
                 )
-            arrays = {name: weights[name].numpy() for name in _ARRAYS}
-            optional = {name: weights[name].numpy() for name in _OPTIONAL if name in weights}
             inputs, outputs = (
                 described_channels(description[side]) for side in ("inputs", "outputs")
             )
-            nx, nu, ny = len(arrays["A"]), len(inputs), len(outputs)
-            P = (nx + ny) * (nx + nu)
-            for name, shape in (
-                ("A", (nx, nx)), ("B", (nx, nu)), ("C", (ny, nx)), ("D", (ny, nu)),
-                ("u_offset", (nu,)), ("y_offset", (ny,)), ("K", (nx, ny)),
-                ("innovation_covariance", (ny, ny)), ("state_covariance", (nx, nx)),
-                ("covariance", (P, P)),
-            ):  # fmt: skip
-                found = (arrays | optional).get(name)
-                if found is not None and found.shape != shape:
-                    raise InputError(f"{name} is {found.shape}, not {shape}")
-            lost = [name for name, array in arrays.items() if not np.isfinite(array).all()]
+            known = [name for name in _SHAPES if name in _ALWAYS or name in weights]
+            arrays = {name: weights[name].numpy() for name in known}
+            sizes = {"x": len(arrays["A"]), "u": len(inputs), "y": len(outputs)}
+            sizes["P"] = (sizes["x"] + sizes["y"]) * (sizes["x"] + sizes["u"])
+            for name, array in arrays.items():
+                shape = tuple(sizes[axis] for axis in _SHAPES[name])
+                if array.shape != shape:
+                    raise InputError(f"{name} is {array.shape}, not {shape}")
+            lost = [name for name in _ALWAYS if not np.isfinite(arrays[name]).all()]
             if lost:
                 raise InputError(f"{', '.join(lost)} have numbers that are not finite")
             fs = float(made["fs"])
             if not (np.isfinite(fs) and fs > 0):
                 raise InputError(f"fs is {fs}")
-            return cls(**arrays, fs=fs, inputs=inputs, outputs=outputs, **optional, fit=fit)
+            return cls(**arrays, fs=fs, inputs=inputs, outputs=outputs, fit=fit)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."
@@ -452,8 +446,11 @@ def without_units(record: Record) -> Record:
     return replace(record, weight=record.weight / np.where(power > 0, power, 1.0))
 
 
-_ARRAYS = ("A", "B", "C", "D", "u_offset", "y_offset")
-_OPTIONAL = ("K", "innovation_covariance", "state_covariance", "covariance")
+_ALWAYS = ("A", "B", "C", "D", "u_offset", "y_offset")
+_SHAPES = {
+    "A": "xx", "B": "xu", "C": "yx", "D": "yu", "u_offset": "u", "y_offset": "y", "K": "xy",
+    "innovation_covariance": "yy", "state_covariance": "xx", "covariance": "PP",
+}  # fmt: skip
 
 
 def linear_cell(A: Array, B: Array, C: Array, D: Array) -> LFRCell:
