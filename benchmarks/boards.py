@@ -27,25 +27,23 @@ Sizes = tuple[int, ...]
 
 MIRROR_ITERATIONS = 15
 MIRROR: tuple[Sizes, ...] = (
-    (4, 4, 20, 1, 0),
-    (12, 8, 30, 1, 0),
-    (12, 8, 30, 1, 6),
-    (12, 8, 15, 2, 6),
+    (4, 4, 20, 0),
+    (12, 8, 30, 0),
+    (12, 8, 30, 6),
 )
-"""nz, nw, nn, layers and relaxations."""
+"""nz, nw, nn and relaxations."""
 
 F16_ITERATIONS = 60
-F16: tuple[Sizes, ...] = ((2, 2, 15, 1, 0), (2, 2, 15, 1, 6), (2, 2, 15, 2, 6), (2, 2, 8, 2, 6))
-"""nz, nw, nn, layers and modes."""
+F16: tuple[Sizes, ...] = ((2, 2, 15, 0), (2, 2, 15, 6))
+"""nz, nw, nn and modes."""
 
 QUARTERS, STARTS = 4, 8
 EMPS: tuple[tuple[Sizes, bool], ...] = (
-    ((1, 1, 5, 1), True),
-    ((1, 1, 5, 1), False),
-    ((1, 2, 10, 1), False),
-    ((1, 2, 5, 2), False),
+    ((1, 1, 5), True),
+    ((1, 1, 5), False),
+    ((1, 2, 10), False),
 )
-"""nz, nw, nn and layers; z_feedthrough."""
+"""nz, nw and nn; z_feedthrough."""
 
 
 def main() -> int:
@@ -67,7 +65,7 @@ def of_mirror(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
     """All levels, two realisations of each."""
     data = fine_steering_mirror.load(root=root, validation=4)
     levels = fine_steering_mirror.LEVELS
-    heads = "nz, nw, nn", "layers", "relaxations", "net parameters", *(f"{a} mV" for a in levels)
+    heads = "nz, nw, nn", "relaxations", "net parameters", *(f"{a} mV" for a in levels)
 
     def errors(model: lfrtorch.Model) -> list[float]:
         each = {record.name: error_of(model, record) for record in data.validation}
@@ -75,17 +73,16 @@ def of_mirror(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
         return [1e6 * float(np.mean(found)) for found in grouped]
 
     def rows() -> Iterable[Sequence[Any]]:
-        for *sizes, layers, relaxations in MIRROR:
+        for *sizes, relaxations in MIRROR:
             settings = lfrtorch.Settings(
                 nx=28,
                 **named(sizes),
-                layers=layers,
                 relaxations=relaxations,
                 trainer=lfrtorch.LevenbergMarquardt(max_iter=MIRROR_ITERATIONS),
             )
             model = fitted(data, settings)
             net = model.net_parameter_count
-            yield of(sizes), layers, relaxations, net, *errors(model)
+            yield of(sizes), relaxations, net, *errors(model)
 
     return heads, rows()
 
@@ -93,20 +90,19 @@ def of_mirror(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
 def of_f16(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
     """Multisines of three levels."""
     data = f16.load(root=root, levels=[1, 3, 7], validation=["multisine_5", "sweep_5"])
-    heads = "nz, nw, nn", "layers", "modes", "net parameters", *(r.name for r in data.validation)
+    heads = "nz, nw, nn", "modes", "net parameters", *(r.name for r in data.validation)
 
     def rows() -> Iterable[Sequence[Any]]:
-        for *sizes, layers, modes in F16:
+        for *sizes, modes in F16:
             settings = lfrtorch.Settings(
                 nx=14,
                 **named(sizes),
-                layers=layers,
                 modes=modes,
                 trainer=lfrtorch.LevenbergMarquardt(max_iter=F16_ITERATIONS),
             )
             model = fitted(data, settings)
             found = [float(error_of(model, record)[0]) for record in data.validation]
-            yield of(sizes), layers, modes, model.net_parameter_count, *found
+            yield of(sizes), modes, model.net_parameter_count, *found
 
     return heads, rows()
 
@@ -115,7 +111,7 @@ def of_emps(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
     """Three quarters of the record: what is before that left out, and what is after it."""
     (whole,) = emps.load(root=root).train
     ends = np.linspace(0, whole.samples, QUARTERS + 1).astype(int)
-    heads = "nz, nw, nn", "layers", "z_feedthrough", *(f"quarter {i + 1}" for i in range(QUARTERS))
+    heads = "nz, nw, nn", "z_feedthrough", *(f"quarter {i + 1}" for i in range(QUARTERS))
 
     def left_out(settings: lfrtorch.Settings, quarter: int) -> float:
         first, last = ends[quarter], ends[quarter + 1]
@@ -128,18 +124,17 @@ def of_emps(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
         return 1e3 * float(np.sqrt(np.mean(np.square(error[first:last]))))
 
     def rows() -> Iterable[Sequence[Any]]:
-        for (*sizes, layers), z_feedthrough in EMPS:
+        for sizes, z_feedthrough in EMPS:
             settings = lfrtorch.Settings(
                 nx=2,
                 **named(sizes),
-                layers=layers,
                 z_feedthrough=z_feedthrough,
                 starts=STARTS,
                 linear={"integrators": 1, "feedthrough": False},
                 trainer=lfrtorch.LevenbergMarquardt(max_iter=60),
             )
             found = [left_out(settings, quarter) for quarter in range(QUARTERS)]
-            yield of(sizes), layers, z_feedthrough, *found
+            yield of(sizes), z_feedthrough, *found
 
     return heads, rows()
 

@@ -167,19 +167,13 @@ class Model:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a map of the user's own.
-
-        The number of hidden layers is among them if there are several.
-        """
+        """nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a map of the user's own."""
         cell = self.lfr.cell
         sizes = {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw}
         static = base_of(cell.static)
         if isinstance(static, Polynomial):
             return sizes | {"degree": static.degree}
-        if not is_network(static):
-            return sizes | {"nn": 0}
-        layers = {"layers": static.layers} if static.layers > 1 else {}
-        return sizes | {"nn": len(static.bz)} | layers
+        return sizes | {"nn": len(static.bz) if is_network(static) else 0}
 
     @property
     def state_covariance(self) -> Float[Array, "nx nx"]:
@@ -574,8 +568,7 @@ def _described(static: Module | None) -> dict[str, Any] | None:
     if isinstance(static, Beyond):
         return {"type": "Beyond", "base": _described(static.base)}
     if is_network(static):
-        found = {"type": "Network", "nn": len(static.bz), "activation": static.activation}
-        return found | ({"layers": static.layers} if static.layers > 1 else {})
+        return {"type": "Network", "nn": len(static.bz), "activation": static.activation}
     if type(static) is Polynomial:
         return {"type": "Polynomial", "degree": static.degree}
     return {"type": "own", "class": type(static).__qualname__}
@@ -590,17 +583,11 @@ def _made(
             if (found := _made(base, nz, nw, dtype, own)) is None:
                 raise InputError("the static map that a linear one is taken off is missing")
             return Beyond(found, torch.zeros(nw, nz), torch.eye(nz), torch.eye(nw))
-        case {"type": "Network", "nn": nn, "activation": activation, **more}:
-            return Network(nz, nw, nn, activation, layers=more.get("layers", 1), dtype=dtype)
+        case {"type": "Network", "nn": nn, "activation": activation}:
+            return Network(nz, nw, nn, activation, dtype=dtype)
         case {"type": "Polynomial", "degree": degree}:
             return Polynomial(nz, nw, degree, dtype=dtype)
     return own
-
-
-def _layers(description: Any) -> int:
-    """Hidden layers of a static map's description."""
-    own = description if isinstance(description, dict) else {}
-    return _layers(own["base"]) if "base" in own else own.get("layers", 1)
 
 
 @typed()
@@ -636,6 +623,11 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             f"'{folder}' holds a static nonlinearity of class {own.get('class')}, which is not "
             "part of this package; pass an instance of it: load(folder, static=...)."
         )
+    if isinstance(own, dict) and own.get("layers", 1) != 1:
+        raise InputError(
+            f"'{folder}' holds a network of {own['layers']} hidden layers, and this version has "
+            "networks of one; fit again with a torch module of your own: static=own."
+        )
     try:
         sizes = description["sizes"]
         dtype = getattr(torch, description["dtype"])
@@ -650,7 +642,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
                 for name in ("u_offset", "u_scale", "y_offset", "y_scale")
             )
         )
-        if weights["A"].shape != (sizes["nx"],) * 2 or _layers(made) > len(weights):
+        if weights["A"].shape != (sizes["nx"],) * 2:
             raise InputError("they are of other sizes")
         static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)

@@ -27,14 +27,13 @@ def in_canonical_form(model: Model) -> Model:
 
 MODELS: dict[str, Model] = {
     **{name: random_model(random_cell(2, 3, 4, 2, 3, 5, activation=name)) for name in ACTIVATIONS},
-    "layers": random_model(random_cell(3, 2, 3, 2, 1, 4, layers=3)),
     "polynomial": random_model(polynomial_cell(2, 2, 3)),
     "affine": random_model(polynomial_cell(1, 1, 1)),
     "linear": random_model(random_cell(2, 2, 3, 0, 0)),
     "canonical": in_canonical_form(random_model(random_cell(2, 3, 4, 2, 3, 5))),
     "smallest": random_model(random_cell(1, 1, 1, 1, 1, 1), fs=750.0),
 }
-"""Every activation, several layers, polynomials, no static map, a canonical form, one of all."""
+"""Every activation, polynomials, no static map, a canonical form, one of all."""
 
 
 OBSERVED: dict[str, Model] = {
@@ -42,7 +41,7 @@ OBSERVED: dict[str, Model] = {
         MODELS[name],
         K=0.1 * normal(MODELS[name].lfr.cell.nx, len(MODELS[name].outputs), seed=2),
     )
-    for name in ("softplus", "layers", "polynomial", "linear", "canonical", "smallest")
+    for name in ("softplus", "polynomial", "linear", "canonical", "smallest")
 }
 """Models with a gain K."""
 

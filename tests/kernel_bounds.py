@@ -36,7 +36,6 @@ def model(draw: random.Random) -> lfrtorch.Model:
     static: torch.nn.Module | None = draw.choice(
         [
             lfrtorch.Network(nz, nw, nn, draw.choice(sorted(ACTIVATIONS)), dtype=dtype),
-            lfrtorch.Network(nz, nw, nn, layers=draw.randint(2, 3), dtype=dtype),
             lfrtorch.Polynomial(nz, nw, draw.randint(1, 3), dtype=dtype),
             None,
         ]

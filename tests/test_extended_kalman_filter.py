@@ -74,7 +74,7 @@ def with_own_map(model: Model) -> Model:
     return replace(model, lfr=lfrtorch.LFR(cell))
 
 
-CASES = MODELS | {"own": with_own_map(MODELS["layers"])}
+CASES = MODELS | {"own": with_own_map(MODELS["softplus"])}
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -318,7 +318,7 @@ def test_parts_of_other_sizes_make_no_model(
 
 
 def test_a_model_is_printed_in_a_few_lines(tmp_path: Path):
-    large = random_model(random_cell(nu=5, ny=5, nx=60, nz=6, nw=6, nn=40, layers=2))
+    large = random_model(random_cell(nu=5, ny=5, nx=60, nz=6, nw=6, nn=40))
     large = replace(large, fitted_to="lab: 3 record(s), 900 samples")
     shown = str(large).splitlines()
     assert len(shown) <= 25

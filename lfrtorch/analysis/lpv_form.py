@@ -1,10 +1,9 @@
 """The model as one that is linear in x and u and varies with parameters: the exact LPV form.
 
 With z - z0 = ζ the static map is f(z) = f(z0) + Δ(ζ) ζ, Δ = ∫ f'(z0 + t ζ) dt over t from 0 to 1.
-In each layer of a network the integral is a quotient s = (σ(v0 + d) - σ(v0)) / d, the mean slope of
-a neuron between v0 and v0 + d: with the layers' d1 = Wz ζ, d2 = W2 (s1 d1), .., it is
-Δ = Ww diag(s_last) .. W2 diag(s1) Wz. A mean slope lies between the least and the largest slope, so
-the parameters of the form are bounded.
+Of a network it is Δ = Ww diag(s) Wz with the mean slopes s = (σ(v0 + d) - σ(v0)) / d of the neurons
+between v0 and v0 + d, d = Wz ζ. A mean slope lies between the least and the largest slope, so the
+parameters of the form are bounded.
 """
 
 from __future__ import annotations
@@ -26,13 +25,7 @@ from lfrtorch.analysis.linearisation import vector
 from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import of_static
-from lfrtorch.engine.nonlinearity import (
-    ACTIVATIONS,
-    Network,
-    has_one_layer,
-    is_network,
-    is_polynomial,
-)
+from lfrtorch.engine.nonlinearity import Network, is_network, is_polynomial
 from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.engine.static_jacobian import linearise_static
 from lfrtorch.model import Model
@@ -185,10 +178,10 @@ def lpv(
         u: constant input u0. Default: the inputs' offsets in the data.
         x: state x0 in the model's coordinates. Default: the one at rest under u0, so that the form
             has no constant terms; 0 if there is none.
-        schedule: what p are. ``"neurons"``: the mean slope of each neuron of a network with one
-            hidden layer. ``"map"``: the entries of Δ, by rows (w1 z1, w1 z2, .., w2 z1, ..), of
-            any static map; a network with fewer of them than neurons is better off with them.
-            Default: the neurons if there is one hidden layer.
+        schedule: what p are. ``"neurons"``: the mean slope of each neuron of a network.
+            ``"map"``: the entries of Δ, by rows (w1 z1, w1 z2, .., w2 z1, ..), of any static map; a
+            network with fewer of them than neurons is better off with them. Default: the neurons of
+            a network, the map of others.
 
     A map of the user's own class is integrated by a Gauss-Legendre rule with 32 nodes; what the
     rule leaves goes along ζ, so that f(z0) + Δ ζ is exact.
@@ -208,15 +201,14 @@ def lpv(
         ((2, 1, 1), True)
     """
     cell, s = folded(double(model.lfr.cell)), model.scaler
-    one_layer = has_one_layer(cell.static)
+    network = is_network(cell.static)
     if schedule not in (None, "neurons", "map"):
         raise InputError(f"schedule is {schedule!r}; give 'neurons' or 'map'.")
-    if schedule == "neurons" and not one_layer:
+    if schedule == "neurons" and not network:
         raise InputError(
-            "schedule is 'neurons', and the static map is no network with one hidden layer; "
-            "give schedule='map'."
+            "schedule is 'neurons', and the static map is no network; give schedule='map'."
         )
-    schedule = schedule or ("neurons" if one_layer else "map")
+    schedule = schedule or ("neurons" if network else "map")
     u0 = s.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
     v0 = torch.as_tensor((u0 - s.u_offset) / s.u_scale)
     if x is not None:
@@ -255,9 +247,9 @@ def _slopes(
     if static is None:
         return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 2)), lambda zeta: zeta
     if is_network(static) and schedule == "neurons":
-        W, _ = _layers(static)
-        bounds = np.tile(SLOPES[static.activation], (len(W[0]), 1))
-        return W[1], W[0], bounds, lambda zeta: _mean_slopes(static, z0, zeta)[0]
+        Wz, Ww = _matrices(static)
+        bounds = np.tile(SLOPES[static.activation], (len(Wz), 1))
+        return Ww, Wz, bounds, lambda zeta: _mean_slopes(static, z0, zeta)
     left, right = np.repeat(np.eye(nw), nz, axis=1), np.tile(np.eye(nz), (nw, 1))
     known = _bounds(static) if is_network(static) else np.array([-np.inf, np.inf])
     bounds = np.broadcast_to(known, (nw, nz, 2)).reshape(-1, 2)
@@ -270,11 +262,8 @@ def _delta(
     """Δ(ζ)."""
     static = cell.static
     if is_network(static):
-        W, _ = _layers(static)
-        product = np.broadcast_to(W[0], (len(zeta), *W[0].shape))
-        for s, after in zip(_mean_slopes(static, z0, zeta), W[1:], strict=True):
-            product = after @ (s[..., None] * product)
-        return product
+        Wz, Ww = _matrices(static)
+        return Ww @ (_mean_slopes(static, z0, zeta)[..., None] * Wz)
     t, weight = gauss_legendre(static)
     points = z0 + t[:, None, None] * zeta
     theta = {name: p.detach() for name, p in cell.named_parameters()}
@@ -316,25 +305,17 @@ def _left_over(
     return error[:, :, None] * along[:, None, :]
 
 
-def _layers(static: Network) -> tuple[list[Array], list[Array]]:
-    """All matrices of a network, and the constants of its hidden layers."""
-    W = [static.Wz, *(W for W, _ in static.inner), static.Ww]
-    b = [static.bz, *(b for _, b in static.inner)]
-    return [m.detach().numpy() for m in W], [c.detach().numpy() for c in b]
+def _matrices(static: Network) -> tuple[Array, Array]:
+    """Wz and Ww."""
+    return static.Wz.detach().numpy(), static.Ww.detach().numpy()
 
 
 def _mean_slopes(
     static: Network, z0: Float[Array, " nz"], zeta: Float[Array, "S nz"]
-) -> list[Float[Array, "S nn"]]:
-    """The mean slopes of each layer's neurons between z0 and z0 + ζ."""
-    h, d, found = z0, zeta, []
-    W, b = _layers(static)
-    for W_h, b_h in zip(W, b, strict=False):
-        v, d = W_h @ h + b_h, d @ W_h.T
-        found.append(mean_slope(static.activation, v, d))
-        h = ACTIVATIONS[static.activation](torch.as_tensor(v)).numpy()
-        d = found[-1] * d
-    return found
+) -> Float[Array, "S nn"]:
+    """The mean slopes of the neurons between z0 and z0 + ζ."""
+    Wz, _ = _matrices(static)
+    return mean_slope(static.activation, Wz @ z0 + static.bz.detach().numpy(), zeta @ Wz.T)
 
 
 def mean_slope(activation: str, v: ArrayLike, d: ArrayLike) -> Array:
@@ -379,16 +360,12 @@ def _quotient(a: Array, d: Array) -> Array:
 
 
 def _bounds(static: Network) -> Float[Array, "nw nz 2"]:
-    """Bounds of the entries of Δ, by interval arithmetic from layer to layer."""
-    W, _ = _layers(static)
-    slopes = SLOPES[static.activation]
-    low = high = W[0]
-    for after in W[1:]:
-        corners = [s * M for s in slopes for M in (low, high)]
-        low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
-        plus, minus = np.maximum(after, 0.0), np.minimum(after, 0.0)
-        low, high = plus @ low + minus @ high, plus @ high + minus @ low
-    return np.stack([low, high], axis=-1)
+    """Bounds of the entries of Δ, by interval arithmetic."""
+    Wz, Ww = _matrices(static)
+    corners = [slope * Wz for slope in SLOPES[static.activation]]
+    low, high = np.minimum(*corners), np.maximum(*corners)
+    plus, minus = np.maximum(Ww, 0.0), np.minimum(Ww, 0.0)
+    return np.stack([plus @ low + minus @ high, plus @ high + minus @ low], axis=-1)
 
 
 __all__ = ["LPV", "gauss_legendre", "lpv", "mean_slope"]

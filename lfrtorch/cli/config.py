@@ -61,8 +61,8 @@ def limit_threads(cfg: DictConfig) -> None:
 
 
 AS_THEY_ARE = (
-    "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "layers", "z_feedthrough",
-    "feedthrough", "structure", "activation", "degree", "ridge", "noise", "horizon", "average",
+    "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "z_feedthrough", "feedthrough",
+    "structure", "activation", "degree", "ridge", "noise", "horizon", "average",
     "distil", "refit", "first_part", "first_iterations", "starts", "seed", "device",
 )  # fmt: skip
 """Settings that are the words of the configuration."""
@@ -84,7 +84,7 @@ def opened(cfg: DictConfig) -> lfrtorch.Model:
             "lfrtorch fit, or leave it out, as a fit starts from a linear model of its own."
         )
     model = lfrtorch.load(cfg.init_from, static=own)
-    for name, size in {"layers": 1, **model.sizes}.items():
+    for name, size in model.sizes.items():
         if cfg[name] not in (size, None):
             print(
                 f"note: {name} is {size}, that of the model in '{cfg.init_from}', not {cfg[name]}"

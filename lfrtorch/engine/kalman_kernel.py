@@ -31,7 +31,7 @@ from lfrtorch.engine.simulation_kernel import activate, affine
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def filter_record(
-    u, y, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, inner, activation, growth, G, x, U
+    u, y, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth, G, x, U
 ):
     """Take x and U over all samples; returns log p(y). NaN in y is a missing output.
 
@@ -41,14 +41,14 @@ def filter_record(
         u: (T, nu), y: (T, ny), G: (ny + nx, ny + nx), x: (nx,), U: (nx, nx).
     """
     A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = A[0], Bu[0], Bw[0], Cz[0], Dzu[0], Cy[0], Dyu[0], Dyw[0]
-    WzT, Ww, bz, bw, inner = WzT[0], Ww[0], bz[0, 0], bw[0, 0], inner[0]
+    WzT, Ww, bz, bw = WzT[0], Ww[0], bz[0, 0], bw[0, 0]
     (nx, nw), nz, ny = Bw.shape, len(Cz), len(Cy)
     z, w, J, by_x = np.empty(nz), np.empty(nw), np.empty((nw, nz)), np.empty((nw, nx))
     e, H, F, w_hat = np.empty(ny), np.empty((ny, nx)), np.empty((nx, nx)), np.empty(nx)
     x_next, total = np.empty(nx), 0.0
     for k in range(len(u)):
         affine(Cz, x, Dzu, u[k], z)
-        _static(z, WzT, Ww, bz, bw, inner, activation, growth, w, J)
+        _static(z, WzT, Ww, bz, bw, activation, growth, w, J)
         affine(Cy, x, Dyu, u[k], e)
         for i in range(ny):
             e[i] = y[k, i] - e[i]
@@ -58,7 +58,7 @@ def filter_record(
         M, known, log_p = correct(e, H, G, x, U, w_hat)
         total += log_p
         affine(Cz, x, Dzu, u[k], z)
-        _static(z, WzT, Ww, bz, bw, inner, activation, growth, w, J)
+        _static(z, WzT, Ww, bz, bw, activation, growth, w, J)
         affine(A, x, Bu, u[k], x_next)
         for i in range(nx):
             x_next[i] += w_hat[i]
@@ -157,7 +157,7 @@ def reflect(M, rows):
 
 
 @njit(nogil=True, error_model="numpy")
-def _static(z, WzT, Ww, bz, bw, inner, activation, growth, w, J):
+def _static(z, WzT, Ww, bz, bw, activation, growth, w, J):
     """Write w = f(z) and J = ∂w/∂z: derivatives go forward with the values."""
     nz, nn = len(z), Ww.shape[1]
     h, dh = np.empty(nn), np.zeros((nn, nz))
@@ -175,15 +175,6 @@ def _static(z, WzT, Ww, bz, bw, inner, activation, growth, w, J):
             for j in range(nz):
                 h[n] += WzT[j, n] * z[j]
                 dh[n, j] = WzT[j, n]
-        _activate(activation, h, dh)
-    for first in range(0, len(inner), nn + 1):
-        before, d_before = h, dh
-        h, dh = inner[first + nn].copy(), np.zeros((nn, nz))
-        for m in range(nn):
-            for n in range(nn):
-                h[n] += inner[first + m, n] * before[m]
-                for j in range(nz):
-                    dh[n, j] += inner[first + m, n] * d_before[m, j]
         _activate(activation, h, dh)
     for q in range(len(w)):
         w[q] = bw[q]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from itertools import combinations_with_replacement
 from typing import TypeGuard
 
@@ -30,23 +30,21 @@ BYTES = 1000
 
 
 class Network(Module):
-    """One hidden layer, w = Ww σ(Wz z + bz) + bw, or several: h1 = σ(Wz z + bz),
-    h2 = σ(W2 h1 + b2), .., w = Ww h + bw with the last h.
+    """One hidden layer: w = Ww σ(Wz z + bz) + bw.
 
     Args:
         nz: inputs.
         nw: outputs.
-        nn: neurons of each hidden layer.
+        nn: neurons.
         activation: σ: ``"tanh"``, ``"sigmoid"``, ``"relu"``, ``"rbf"`` (exp(-v²)) or ``"softplus"``
             (ln(1 + exp(v)), a hinge without its corner).
-        layers: hidden layers.
         device, dtype: of the weights, as in any torch module.
 
     Shape:
-        Wz: (nn, nz), bz: (nn,), W2, W3, ..: (nn, nn), b2, b3, ..: (nn,), Ww: (nw, nn), bw: (nw,).
+        Wz: (nn, nz), bz: (nn,), Ww: (nw, nn), bw: (nw,).
 
     Raises:
-        ValueError: an unknown activation, or layers below 1.
+        ValueError: an unknown activation, or a size below 1.
 
     Example:
         >>> static = lfrtorch.Network(nz=2, nw=1, nn=15)
@@ -63,7 +61,6 @@ class Network(Module):
         nn: int,
         activation: str = "tanh",
         *,
-        layers: int = 1,
         device: torch.device | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
@@ -72,74 +69,41 @@ class Network(Module):
             raise InputError(
                 f"activation is {activation!r}; use one of {', '.join(sorted(ACTIVATIONS))}."
             )
-        for name, size in (("nz", nz), ("nw", nw), ("nn", nn), ("layers", layers)):
+        for name, size in (("nz", nz), ("nw", nw), ("nn", nn)):
             integer(name, size, 1)
-        self.activation, self.layers = activation, layers
+        self.activation = activation
         self.Wz = Parameter(torch.empty(nn, nz, device=device, dtype=dtype))
         self.bz = Parameter(torch.empty(nn, device=device, dtype=dtype))
-        for layer in range(2, layers + 1):
-            self.register_parameter(f"W{layer}", Parameter(self.Wz.new_empty(nn, nn)))
-            self.register_parameter(f"b{layer}", Parameter(self.Wz.new_empty(nn)))
         self.Ww = Parameter(torch.empty(nw, nn, device=device, dtype=dtype))
         self.bw = Parameter(torch.empty(nw, device=device, dtype=dtype))
         self.reset_parameters()
 
     def reset_parameters(self, generator: torch.Generator | None = None) -> None:
-        """Wz, bz, Ww ~ U(-1, 1) and bw = 0, the draw of Schoukens and Tóth (2020).
-
-        W2, W3, .. are uniform with the variance 1/nn, and b2, b3, .. like bz.
-        """
-        limit = math.sqrt(3.0 / len(self.bz))
+        """Wz, bz, Ww ~ U(-1, 1) and bw = 0, the draw of Schoukens and Tóth (2020)."""
         with torch.no_grad():
             for weight in (self.Wz, self.bz, self.Ww):
                 weight.uniform_(-1.0, 1.0, generator=generator)
-            for W, b in self.inner:
-                W.uniform_(-limit, limit, generator=generator)
-                b.uniform_(-1.0, 1.0, generator=generator)
             self.bw.zero_()
-
-    @property
-    def inner(self) -> list[tuple[Tensor, Tensor]]:
-        """(W2, b2), (W3, b3), ..: of the layers after the first."""
-        return inner_weights(dict(self.named_parameters(recurse=False)))
 
     def weight_shapes(self, nz: int, nw: int) -> dict[str, tuple[int, ...]]:
         """Shapes of the weights of a map from nz to nw signals with these neurons."""
         nn = self.bz.shape[-1]
-        shapes: dict[str, tuple[int, ...]] = {"Wz": (nn, nz), "bz": (nn,)}
-        for layer in range(2, self.layers + 1):
-            shapes |= {f"W{layer}": (nn, nn), f"b{layer}": (nn,)}
-        return shapes | {"Ww": (nw, nn), "bw": (nw,)}
+        return {"Wz": (nn, nz), "bz": (nn,), "Ww": (nw, nn), "bw": (nw,)}
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
         """w of z."""
-        activation = ACTIVATIONS[self.activation]
-        hidden = activation(z @ self.Wz.mT + self.bz)
-        for W, b in self.inner:
-            hidden = activation(hidden @ W.mT + b)
+        hidden = ACTIVATIONS[self.activation](z @ self.Wz.mT + self.bz)
         return hidden @ self.Ww.mT + self.bw
 
     def extra_repr(self) -> str:
         """Sizes and activation, for ``print(module)``."""
         (nn, nz), nw = self.Wz.shape, len(self.Ww)
-        layers = f", layers={self.layers}" if self.layers > 1 else ""
-        return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}{layers}"
-
-
-def inner_weights(weights: Mapping[str, Tensor]) -> list[tuple[Tensor, Tensor]]:
-    """(W2, b2), (W3, b3), .. among the weights of a ``Network``."""
-    layers = range(2, 2 + len(weights) // 2 - 2)  # a matrix and a vector each
-    return [(weights[f"W{layer}"], weights[f"b{layer}"]) for layer in layers]
+        return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}"
 
 
 def is_network(static: Module | None) -> TypeGuard[Network]:
     """Whether a map is a ``Network`` itself: a subclass may have another forward pass."""
     return type(static) is Network
-
-
-def has_one_layer(static: Module | None) -> bool:
-    """Whether a map is a ``Network`` itself with one hidden layer."""
-    return is_network(static) and static.layers == 1
 
 
 def is_polynomial(static: Module | None) -> TypeGuard[Polynomial]:

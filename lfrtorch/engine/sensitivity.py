@@ -38,7 +38,7 @@ from lfrtorch.engine.feedback_recurrence import backwards, forwards, transition
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
 from lfrtorch.engine.linear_recurrence import has_kernels, linear_recurrence, to_numpy
 from lfrtorch.engine.linearised import PASS, Linearised, linearise_at, of_static
-from lfrtorch.engine.nonlinearity import has_one_layer
+from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.parameter_layout import DirectTerms, layout
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.engine.static_jacobian import NetworkJacobian, StaticJacobian, linearise_static
@@ -147,7 +147,7 @@ class Linearisation:
     def _whole(self) -> _Block | None:
         """All samples, kept from one pass to the next if they are few."""
         R, T = self.u.shape[:2]
-        few = KEPT if has_kernels(self.u) and has_one_layer(self.static) else PASS
+        few = KEPT if has_kernels(self.u) and is_network(self.static) else PASS
         if few < R * T:
             return None
         return self._at(slice(0, R), slice(0, T))
@@ -349,10 +349,9 @@ class Linearisation:
         chunks = 1 if R % workers() == 0 else workers()
         static, none = block.static, S.new_zeros(R, len(block.v[0]), 0)
         whole = len(columns.static) == self.layout.weights
-        if isinstance(static, NetworkJacobian) and len(static.slopes) == 1 and whole:
-            (z, h), (slope,), Ww = static.h, static.slopes, static.W[-1]
-            Ww = Ww if Ww.ndim == 3 else Ww.unsqueeze(0)
-            by_weight = (none.unsqueeze(2), slope, h, Ww, z)
+        if isinstance(static, NetworkJacobian) and whole:
+            Ww = static.Ww if static.Ww.ndim == 3 else static.Ww.unsqueeze(0)
+            by_weight = (none.unsqueeze(2), static.slope, static.h, Ww, static.z)
         else:
             by_weight = (self._by_weight(block, columns), none, none, none[:1], none)
         tensors = (*W, static.J, block.v, *by_weight, *columns[:3])

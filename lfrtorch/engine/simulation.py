@@ -236,17 +236,14 @@ def kernel_arguments(cell: LFRCell) -> list[Any]:
     like = cell.A.detach()
     static, activation, growth = cell.static, "tanh", np.zeros((0, 2), np.int64)
     vectors, matrices = [like.new_zeros(0), like.new_zeros(cell.nw)], [like.new_zeros(0, 0)] * 2
-    inner: list[Tensor] = []
     if is_network(static):
         vectors, matrices = [static.bz, static.bw], [static.Wz.mT, static.Ww]
-        inner = [part for W, b in static.inner for part in (W.mT, b if b.ndim == 3 else b[None])]
         activation = static.activation
     elif is_polynomial(static):
         matrices[1], growth = static.C, np.array(static.growth)
     lti = (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
-    layers = torch.cat(inner, dim=-2) if inner else like.new_zeros(0, 0)
     # A leading axis, for one model or one a record; in numpy that takes half the time.
-    weights = [w.detach().numpy() for w in (*lti, *matrices, *vectors, layers)]
+    weights = [w.detach().numpy() for w in (*lti, *matrices, *vectors)]
     weights = [w if w.ndim == 3 else w[(np.newaxis,) * (3 - w.ndim)] for w in weights]
     count = len(weights[0])
     weights = [w if len(w) == count else w.repeat(count, axis=0) for w in weights]

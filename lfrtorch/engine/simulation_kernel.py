@@ -12,7 +12,7 @@ ACTIVATION_CODES = {"tanh": 0, "sigmoid": 1, "relu": 2, "rbf": 3, "softplus": 4}
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def simulate_record(
-    r, u, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, inner, activation, growth,
+    r, u, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth,
     met_within, x, z, w, y,
 ):  # fmt: skip
     """Simulate record r: write its signals over those in x, z, w and y.
@@ -21,19 +21,18 @@ def simulate_record(
     rest of the earlier trajectory then holds for this one, too.
 
     The weights have a leading axis: one model for all records, or one a record. The hidden layer
-    is σ(Wz z + bz), or has the monomials of a polynomial if these have a growth. Each layer after
-    it has the rows of its matrix, transposed, and its vector as the last row.
+    is σ(Wz z + bz), or has the monomials of a polynomial if these have a growth.
 
     Shape:
-        WzT: (models, nz, nn), bz: (models, 1, nn), bw: (models, 1, nw), inner: (models,
-        (layers - 1) (nn + 1), nn), growth: (nn - 1, 2) as that of ``Polynomial``, or (0, 2),
-        x: (R, T + 1, nx), u: (R, T, nu), z: (R, T, nz), w: (R, T, nw), y: (R, T, ny).
+        WzT: (models, nz, nn), bz: (models, 1, nn), bw: (models, 1, nw), growth: (nn - 1, 2) as
+        that of ``Polynomial``, or (0, 2), x: (R, T + 1, nx), u: (R, T, nu), z: (R, T, nz),
+        w: (R, T, nw), y: (R, T, ny).
     """
     m = min(r, len(A) - 1)  # which model
     A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = A[m], Bu[m], Bw[m], Cz[m], Dzu[m], Cy[m], Dyu[m], Dyw[m]
-    WzT, Ww, bz, bw, inner = WzT[m], Ww[m], bz[m, 0], bw[m, 0], inner[m]
+    WzT, Ww, bz, bw = WzT[m], Ww[m], bz[m, 0], bw[m, 0]
     u, x, z, w, y = u[r], x[r], z[r], w[r], y[r]
-    h, before = np.empty(Ww.shape[1], u.dtype), np.empty(Ww.shape[1], u.dtype)
+    h = np.empty(Ww.shape[1], u.dtype)
     for k in range(len(u)):
         affine(Cz, x[k], Dzu, u[k], z[k])
         if len(growth):
@@ -46,14 +45,6 @@ def simulate_record(
             for j in range(z.shape[1]):
                 for n in range(len(h)):
                     h[n] += WzT[j, n] * z[k, j]
-            activate(activation, h)
-        for first in range(0, len(inner), len(h) + 1):
-            h, before = before, h
-            for n in range(len(h)):
-                h[n] = inner[first + len(h), n]
-            for j in range(len(h)):
-                for n in range(len(h)):
-                    h[n] += inner[first + j, n] * before[j]
             activate(activation, h)
         for i in range(w.shape[1]):
             w[k, i] = bw[i] + _dot(Ww[i], h)

@@ -1,6 +1,6 @@
 """Values and slopes that a network cannot leave while its inputs stay in a box.
 
-Intervals go through the layers: σ of an interval lies between its values at the ends and at the
+Intervals go through the map: σ of an interval lies between its values at the ends and at the
 extremes inside, and so does σ'. This counts each neuron as if the others did not matter, and is too
 wide where large ones cancel. So the box is cut into cells: what holds in all of them holds in the
 box. In a cell about c the mean value theorem, w ∈ f(c) + J (z - c) with any J within the slopes, is
@@ -23,7 +23,7 @@ from jaxtyping import Float
 from lfrtorch._support.types import Array
 from lfrtorch.engine.nonlinearity import Network
 
-CELLS, CELLS_OF_SEVERAL_LAYERS = 2**12, 2**9
+CELLS = 2**12
 """Most cells of a box."""
 
 FAR = 1e100
@@ -94,7 +94,7 @@ class Interval(NamedTuple):
 
 class Enclosure(NamedTuple):
     """What a map cannot leave in a box: w (nw,), or w - K z, J = ∂w/∂z (nw, nz), and the slopes σ'
-    (nn,) of its first layer.
+    (nn,).
 
     ``centres`` (C, nz) are the middles of its cells.
     """
@@ -125,33 +125,27 @@ def enclosure(
         K: a matrix; then w - K z is bounded instead of w.
     """
     sigma = _ACTIVATIONS[static.activation]
-    W = [_array(M) for M in (static.Wz, *(M for M, _ in static.inner), static.Ww)]
-    b = [_array(v) for v in (static.bz, *(v for _, v in static.inner), static.bw)]
-    K = np.zeros((len(W[-1]), W[0].shape[1])) if K is None else K
-    cells = _cells(z, W[0], b[0], CELLS if len(W) == 2 else CELLS_OF_SEVERAL_LAYERS)
-    first = _product(W[0], cells)
+    Wz, bz, Ww, bw = (_array(p) for p in (static.Wz, static.bz, static.Ww, static.bw))
+    K = np.zeros((len(Ww), Wz.shape[1])) if K is None else K
+    cells = _cells(z, Wz, bz)
+    inside = _product(Wz, cells)
     if a is not None:
-        first = first.within(a)
-        reached = (first.low <= first.high).all(axis=-1)
-        cells, first = (Interval(i.low[reached], i.high[reached]) for i in (cells, first))
+        inside = inside.within(a)
+        reached = (inside.low <= inside.high).all(axis=-1)
+        cells, inside = (Interval(i.low[reached], i.high[reached]) for i in (cells, inside))
     centres = cells.middle
-
-    # h and ∂h/∂z after each layer, as intervals, and h at the centres.
-    v, at = first, centres @ W[0].T
-    slopes = _range(sigma.slope, sigma.extremes_of_slope, Interval(v.low + b[0], v.high + b[0]))
-    J = Interval(*np.broadcast_arrays(W[0], W[0]))
-    for M, bias in zip(W[1:], b[:-1], strict=True):
-        v, at = Interval(v.low + bias, v.high + bias), at + bias
-        J = _scaled(J, _range(sigma.slope, sigma.extremes_of_slope, v))
-        J = _product(M, Interval(J.low.swapaxes(-1, -2), J.high.swapaxes(-1, -2)))
-        J = Interval(J.low.swapaxes(-1, -2), J.high.swapaxes(-1, -2))
-        v = _product(M, _range(sigma.value, sigma.extremes, v))
-        at = sigma.value(at) @ M.T
+    v = Interval(inside.low + bz, inside.high + bz)
+    slopes = _range(sigma.slope, sigma.extremes_of_slope, v)
+    # J = Ww diag(slopes) Wz: an entry is a sum over the neurons.
+    J = _product(Ww, _transposed(_scaled(Wz, slopes)))
+    J = _transposed(J)
+    w = _product(Ww, _range(sigma.value, sigma.extremes, v))
     linear = _product(K, cells)
-    w = Interval(v.low + b[-1] - linear.high, v.high + b[-1] - linear.low)
+    w = Interval(w.low + bw - linear.high, w.high + bw - linear.low)
+    # The mean value theorem about the centre of each cell.
     steepest = np.maximum(np.abs(J.low - K), np.abs(J.high - K))
     reach = (steepest @ cells.radius[..., None])[..., 0]
-    at = at + b[-1] - centres @ K.T
+    at = sigma.value(centres @ Wz.T + bz) @ Ww.T + bw - centres @ K.T
     w = w.within(Interval(at - reach, at + reach))
     return Enclosure(_hull(w).wider(), _hull(J).wider(), _hull(slopes).wider(), centres)
 
@@ -166,10 +160,14 @@ def _product(M: Float[Array, "m k"], x: Interval) -> Interval:
     return Interval(x.low @ up + x.high @ down, x.high @ up + x.low @ down)
 
 
-def _scaled(J: Interval, slope: Interval) -> Interval:
-    """Rows of J times the slopes (C, nn)."""
-    ends = [s[..., None] * side for s in slope for side in J]
-    return Interval(np.minimum.reduce(ends), np.maximum.reduce(ends))
+def _scaled(W: Float[Array, "nn nz"], slope: Interval) -> Interval:
+    """Rows of W times the slopes (C, nn)."""
+    ends = [s[..., None] * W for s in slope]
+    return Interval(np.minimum(*ends), np.maximum(*ends))
+
+
+def _transposed(M: Interval) -> Interval:
+    return Interval(M.low.swapaxes(-1, -2), M.high.swapaxes(-1, -2))
 
 
 def _range(
@@ -191,10 +189,10 @@ def _hull(each: Interval) -> Interval:
     return Interval(each.low.min(axis=0), each.high.max(axis=0))
 
 
-def _cells(z: Interval, Wz: Float[Array, "nn nz"], bz: Float[Array, " nn"], most: int) -> Interval:
+def _cells(z: Interval, Wz: Float[Array, "nn nz"], bz: Float[Array, " nn"]) -> Interval:
     """Cells (C, nz) that cover a box: half of them alike, half where the neurons bend."""
     nz = len(z.low)
-    each = math.floor(most ** (1.0 / nz) + 1e-9)
+    each = math.floor(CELLS ** (1.0 / nz) + 1e-9)
     edges = []
     for j, (low, high) in enumerate(zip(*z, strict=True)):
         steep = np.abs(Wz[:, j]) > 1.0 / FAR

@@ -16,7 +16,6 @@ from lfrtorch.engine.nonlinearity import (
     Network,
     Polynomial,
     Stacked,
-    inner_weights,
     is_network,
     is_polynomial,
 )
@@ -76,88 +75,58 @@ _DERIVATIVES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 class NetworkJacobian:
     """A network in closed form: six times faster than ``torch.func``.
 
-    With h0 = z and the layers v = W h_before + b, h = σ(v), w = Ww h + bw, every matrix but the
-    last has a slope σ'(v) and an output h; ``W`` holds all matrices, the last is Ww.
+    With v = Wz z + bz and h = σ(v) the slopes σ'(v) are all that is not among the weights.
     """
 
     def __init__(self, network: Network, z: Float[Tensor, "R T nz"], weights: Weights) -> None:
-        inner = inner_weights(weights)
-        self.W = [weights["Wz"], *(W for W, _ in inner), weights["Ww"]]
-        self.h, self.slopes = [z], []
-        for W, b in zip(self.W, [weights["bz"], *(b for _, b in inner)], strict=False):
-            v = (self.h[-1] @ W.mT).add_(b)
-            self.h.append(ACTIVATIONS[network.activation](v))
-            self.slopes.append(_DERIVATIVES[network.activation](v, self.h[-1]))  # (R, T, nn)
-        shapes = [W.shape[-2:] for W in self.W]
-        self.sizes = [size for n, m in shapes for size in (n * m, n)]
-        nw, nz = shapes[-1][0], shapes[0][1]
-        if len(self.slopes) == 1:
-            # J = Σ_n slope_n Ww[:, n] Wz[n, :] at every sample: one product with (nn, nw nz).
-            rank_ones = self.W[-1].mT.unsqueeze(-1) * self.W[0].unsqueeze(-2)
-            self.J = (self.slopes[0] @ rank_ones.flatten(-2)).unflatten(-1, (nw, nz))
-        else:
-            self.J = self._by_layer()[0] @ _over_time(self.W[0])
-
-    def _by_layer(self) -> list[Float[Tensor, "R T nw nn"]]:
-        """∂w/∂v of all layers, the first one first."""
-        found = [self.slopes[-1].unsqueeze(-2) * _over_time(self.W[-1])]
-        for slope, W in zip(self.slopes[-2::-1], self.W[-2:0:-1], strict=True):
-            found.append((found[-1] @ _over_time(W)).mul_(slope.unsqueeze(-2)))
-        return found[::-1]
+        self.Wz, self.Ww, self.z = weights["Wz"], weights["Ww"], z
+        v = (z @ self.Wz.mT).add_(weights["bz"])
+        self.h = ACTIVATIONS[network.activation](v)
+        self.slope = _DERIVATIVES[network.activation](v, self.h)  # (R, T, nn)
+        (nn, nz), nw = self.Wz.shape[-2:], self.Ww.shape[-2]
+        self.sizes = [nn * nz, nn, nw * nn, nw]
+        # J = Σ_n slope_n Ww[:, n] Wz[n, :] at every sample: one product with (nn, nw nz).
+        rank_ones = self.Ww.mT.unsqueeze(-1) * self.Wz.unsqueeze(-2)
+        self.J = (self.slope @ rank_ones.flatten(-2)).unflatten(-1, (nw, nz))
 
     def part(self, records: slice, time: slice) -> StaticJacobian:
         """The same for some of the records and samples."""
         part = copy.copy(self)
-        part.h, part.slopes = (
-            [signal[records, time] for signal in signals] for signals in (self.h, self.slopes)
+        part.z, part.h, part.slope, part.J = (
+            signal[records, time] for signal in (self.z, self.h, self.slope, self.J)
         )
-        part.J = self.J[records, time]
-        if self.W[0].ndim == 3:
-            part.W = [W[records] for W in self.W]
+        if self.Wz.ndim == 3:
+            part.Wz, part.Ww = self.Wz[records], self.Ww[records]
         return part
 
     def by_weight(self) -> Float[Tensor, "R T nw weights"]:
         """∂w/∂φ."""
-        R, T, nw = self.J.shape[:3]
-        # With s = slope: ∂w_q/∂W[n, m] = ∂w_q/∂v_n h_m with the h before it, ∂w_q/∂b = ∂w_q/∂v,
+        R, T, nw, nz = self.J.shape
+        nn = self.h.shape[-1]
+        # With s = slope: ∂w_q/∂Wz[n, j] = Ww[q, n] s_n z_j, ∂w_q/∂bz[n] = Ww[q, n] s_n,
         # ∂w_q/∂Ww[q, n] = h_n, ∂w_q/∂bw[q] = 1; the last two are 0 in the rows of other outputs.
-        out = self.h[-1].new_zeros(R, T, nw, sum(self.sizes))
-        *parts, Ww, bw = out.split(self.sizes, dim=-1)
-        layers = zip(self.h, self._by_layer(), parts[::2], parts[1::2], strict=False)
-        for h, by_v, W, b in layers:
-            b.copy_(by_v)
-            into = W.unflatten(-1, (b.shape[-1], h.shape[-1]))
-            torch.mul(by_v.unsqueeze(-1), h[:, :, None, None], out=into)
-        h = self.h[-1].unsqueeze(-1).expand(-1, -1, -1, nw)
-        Ww.unflatten(-1, (nw, h.shape[2])).diagonal(dim1=2, dim2=3).copy_(h)
+        out = self.h.new_zeros(R, T, nw, sum(self.sizes))
+        Wz, bz, Ww, bw = out.split(self.sizes, dim=-1)
+        torch.mul(self.slope.unsqueeze(-2), self.Ww.unsqueeze(-3), out=bz)
+        into = Wz.unflatten(-1, (nn, nz))
+        torch.mul(bz.unsqueeze(-1), self.z[:, :, None, None], out=into)
+        h = self.h.unsqueeze(-1).expand(-1, -1, -1, nw)
+        Ww.unflatten(-1, (nw, nn)).diagonal(dim1=2, dim2=3).copy_(h)
         bw.diagonal(dim1=2, dim2=3).fill_(1.0)
         return out
 
     def tangent(self, d_weights: Float[Tensor, "*records weights"]) -> Float[Tensor, "R T nw"]:
         """(∂w/∂φ) dφ."""
-        parts, d_h = d_weights.split(self.sizes, dim=-1), None
-        layers = zip(self.W, self.h, parts[::2], parts[1::2], [*self.slopes, None], strict=True)
-        for W, h, d_W, d_b, slope in layers:
-            d_v = h @ d_W.unflatten(-1, W.shape[-2:]).mT + d_b.unsqueeze(-2)
-            if d_h is not None:
-                d_v += d_h @ W.mT
-            d_h = d_v if slope is None else slope * d_v
-        assert d_h is not None
-        return d_h
+        d_Wz, d_bz, d_Ww, d_bw = d_weights.split(self.sizes, dim=-1)
+        d_v = self.z @ d_Wz.unflatten(-1, self.Wz.shape[-2:]).mT + d_bz.unsqueeze(-2)
+        d_w = self.h @ d_Ww.unflatten(-1, self.Ww.shape[-2:]).mT + d_bw.unsqueeze(-2)
+        return d_w + (self.slope * d_v) @ self.Ww.mT
 
     def adjoint(self, d_w: Float[Tensor, "R T nw"]) -> Float[Tensor, "R weights"]:
         """Σ_k (∂w/∂φ)ᵀ d_w(k)."""
-        d_v, parts = d_w, []
-        for W, h, slope in zip(self.W[::-1], self.h[::-1], [*self.slopes[::-1], None], strict=True):
-            parts = [(d_v.mT @ h).flatten(1), d_v.sum(-2), *parts]
-            if slope is not None:
-                d_v = (d_v @ W) * slope
-        return torch.cat(parts, dim=-1)
-
-
-def _over_time(W: Tensor) -> Tensor:
-    """A matrix, or one a record, for all samples."""
-    return W.unsqueeze(-3)
+        d_v = (d_w @ self.Ww) * self.slope
+        products = (d_v.mT @ self.z).flatten(1), d_v.sum(-2), (d_w.mT @ self.h).flatten(1)
+        return torch.cat([*products, d_w.sum(-2)], dim=-1)
 
 
 class PolynomialJacobian:

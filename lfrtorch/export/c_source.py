@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from lfrtorch._support.types import Array
-from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.export.equations import Equations, check_name, equations
 from lfrtorch.export.observer_equations import KalmanNoise, SteadyGain, observer_equations
 from lfrtorch.export.rendering import rendered
 from lfrtorch.extended_kalman_filter import NoiseCovariance
@@ -80,11 +81,11 @@ def c_source(
             known["arrays"].append(constant("U0", "NX * NX", U))
     inner = {"NZ": e.sizes["nz"], "NW": e.sizes["nw"]} if e.static else {}
     match e.static:
-        case Layers():
+        case Network():
             known["value"], known["slope"] = ACTIVATIONS[e.static.activation]
-            known |= {"activation": e.static.activation, "layers": e.static.names[:-1]}
-            inner["NN"] = len(e.static.b[0])
-        case Monomials():
+            known["activation"] = e.static.activation
+            inner["NN"] = len(e.static.bz)
+        case Polynomial():
             known["monomials"] = True
             inner |= {"NM": e.static.C.shape[1], "NS": len(e.static.slopes)}
     known["inner"] = inner.items()
@@ -101,23 +102,18 @@ def _arrays(e: Equations) -> Iterator[str]:
         value = getattr(e, name)
         if value.size:
             yield constant(name, size, value)
-    match e.static:
-        case Layers():
-            sizes = ["NN * NZ", *["NN * NN"] * (len(e.static.W) - 2), "NW * NN"]
-            weights = zip(e.static.names, sizes, e.static.W, e.static.b, strict=True)
-            for (W, b), size, weight, bias in weights:
-                yield constant(W, size, weight)
-                yield constant(b, size[:2], bias)
-        case Monomials():
-            yield constant("C", "NW * NM", e.static.C)
-            growth, slopes = (
-                braces([[f"{{{', '.join(map(str, row))}}}" for row in rows]])
-                for rows in (e.static.growth, e.static.slopes)
-            )
-            yield "/* Monomial i + 1 is one monomial times one z. */"
-            yield f"static const int growth[NM - 1][2] = {growth};"
-            yield "/* (n, j, e, m): the derivative of monomial n by z[j] is e times monomial m. */"
-            yield f"static const int slopes[NS][4] = {slopes};"
+    sizes = {"Wz": "NN * NZ", "bz": "NN", "Ww": "NW * NN", "bw": "NW", "C": "NW * NM"}
+    for name, weight in e.weights.items():
+        yield constant(name, sizes[name], weight)
+    if isinstance(e.static, Polynomial):
+        growth, slopes = (
+            braces([[f"{{{', '.join(map(str, row))}}}" for row in rows]])
+            for rows in (e.static.growth, e.static.slopes)
+        )
+        yield "/* Monomial i + 1 is one monomial times one z. */"
+        yield f"static const int growth[NM - 1][2] = {growth};"
+        yield "/* (n, j, e, m): the derivative of monomial n by z[j] is e times monomial m. */"
+        yield f"static const int slopes[NS][4] = {slopes};"
 
 
 def constant(name: str, size: str, value: Array) -> str:

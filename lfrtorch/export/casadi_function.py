@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from lfrtorch._support.optional import imported
-from lfrtorch.export.equations import Layers, Monomials, check_name, equations
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.export.equations import Equations, check_name, equations
 from lfrtorch.export.observer_equations import KalmanNoise, observer_equations
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
@@ -47,8 +48,8 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
     u = ca.vertcat(*(ca.SX.sym(channel.name) for channel in e.inputs))
     v = u - e.u_offset
     x_next, y = ca.mtimes(e.A, x) + ca.mtimes(e.Bu, v), ca.mtimes(e.Cy, x) + ca.mtimes(e.Dyu, v)
-    if isinstance(e.static, Layers | Monomials):
-        w = _static(ca, e.static, ca.mtimes(e.Cz, x) + ca.mtimes(e.Dzu, v))
+    if e.static is not None:
+        w = _static(ca, e, ca.mtimes(e.Cz, x) + ca.mtimes(e.Dzu, v))
         x_next, y = x_next + ca.mtimes(e.Bw, w), y + ca.mtimes(e.Dyw, w)
     return ca.Function(name, [x, u], [x_next, y + e.y_offset], ["x", "u"], ["x_next", "y"])
 
@@ -128,25 +129,24 @@ def casadi_observer(
     return predict, update
 
 
-def _static(ca: Any, static: Layers | Monomials, z: Any) -> Any:
+def _static(ca: Any, e: Equations, z: Any) -> Any:
     """w = f(z)."""
-    if isinstance(static, Monomials):
+    if isinstance(e.static, Polynomial):
         m = [ca.SX(1.0)]
-        for before, j in static.growth:
+        for before, j in e.static.growth:
             m.append(m[before] * z[j])
-        return ca.mtimes(static.C, ca.vertcat(*m))
-    *layers, (W, b) = zip(static.W, static.b, strict=True)
-    for W_h, b_h in layers:
-        v = ca.mtimes(W_h, z) + b_h
-        match static.activation:
-            case "tanh":
-                z = ca.tanh(v)
-            case "sigmoid":
-                z = 0.5 + 0.5 * ca.tanh(0.5 * v)  # no overflow, in derivatives neither
-            case "relu":
-                z = ca.fmax(v, 0.0)
-            case "rbf":
-                z = ca.exp(-v * v)
-            case _:
-                z = ca.fmax(v, 0.0) + ca.log1p(ca.exp(-ca.fabs(v)))  # softplus
-    return ca.mtimes(W, z) + b
+        return ca.mtimes(e.weights["C"], ca.vertcat(*m))
+    assert isinstance(e.static, Network)
+    v = ca.mtimes(e.weights["Wz"], z) + e.weights["bz"]
+    match e.static.activation:
+        case "tanh":
+            h = ca.tanh(v)
+        case "sigmoid":
+            h = 0.5 + 0.5 * ca.tanh(0.5 * v)  # no overflow, in derivatives neither
+        case "relu":
+            h = ca.fmax(v, 0.0)
+        case "rbf":
+            h = ca.exp(-v * v)
+        case _:
+            h = ca.fmax(v, 0.0) + ca.log1p(ca.exp(-ca.fabs(v)))  # softplus
+    return ca.mtimes(e.weights["Ww"], h) + e.weights["bw"]

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from lfrtorch._support.optional import imported
-from lfrtorch.export.equations import Equations, Layers, Monomials, check_name, equations
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.export.equations import Equations, check_name, equations
 from lfrtorch.export.rendering import rendered
 from lfrtorch.linear.model import LinearModel, control_labels
 from lfrtorch.model import Model
@@ -77,8 +78,8 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
         "arrays": _arrays(e),
         "fs": float(e.fs),
     }
-    if isinstance(e.static, Layers):
-        known |= {"layers": e.static.names[:-1], "value": ACTIVATIONS[e.static.activation]}
+    if isinstance(e.static, Network):
+        known["value"] = ACTIVATIONS[e.static.activation]
     sides = {"inputs": e.inputs, "outputs": e.outputs, "static": e.static}
     known |= {"labels": {name: control_labels(sides[name]) for name in ("inputs", "outputs")}}
     return rendered("model_py.txt", **known, **sides, **e.sizes, repr=repr)
@@ -102,14 +103,8 @@ def _arrays(e: Equations) -> Iterator[tuple[str, str | list[str]]]:
             "Dyw",
         )
     }
-    match e.static:
-        case Layers():
-            for (W, b), weight, bias in zip(e.static.names, e.static.W, e.static.b, strict=True):
-                named |= {W: weight, b: bias}
-        case Monomials():
-            named["C"] = e.static.C
-    for name, value in named.items():
+    for name, value in (named | dict(e.weights)).items():
         if value.size:
             yield name, str(value.tolist()) if value.ndim == 1 else [*map(str, value.tolist())]
-    if isinstance(e.static, Monomials):
+    if isinstance(e.static, Polynomial):
         yield "growth", [*map(str, e.static.growth)]

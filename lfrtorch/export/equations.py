@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import keyword
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -18,50 +18,14 @@ from torch.nn import Module
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.beyond_linear import folded
-from lfrtorch.engine.nonlinearity import is_network, is_polynomial
+from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network, is_polynomial
 from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
 
-
-@dataclass(frozen=True, eq=False)
-class Layers:
-    """w = W h + b with the last W and b, where h = σ(W h + b) of the layers before and first h = z.
-
-    Args:
-        W, b: of all layers, the first one first.
-        activation: σ, a name of ``Network``.
-    """
-
-    W: tuple[Array, ...]
-    b: tuple[Array, ...]
-    activation: str
-
-    @property
-    def names(self) -> list[tuple[str, str]]:
-        """The letters of the layers: Wz and bz, W2 and b2, .., Ww and bw."""
-        inner = [(f"W{layer}", f"b{layer}") for layer in range(2, len(self.W))]
-        return [("Wz", "bz"), *inner, ("Ww", "bw")]
-
-
 MEANT = {"rbf": ", rbf(v) = exp(-v^2)", "softplus": ", softplus(v) = log(1 + exp(v))"}
 """Activations whose names do not say what they are."""
-
-
-@dataclass(frozen=True, eq=False)
-class Monomials:
-    """w = C m(z).
-
-    Args:
-        C: (nw, monomials).
-        growth: a pair (m, j) for each monomial but the constant, which is monomial m times z_j.
-        slopes: entries (n, j, e, m): the derivative of monomial n by z_j is e times monomial m.
-    """
-
-    C: Array
-    growth: Sequence[tuple[int, int]]
-    slopes: Sequence[tuple[int, int, int, int]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +59,7 @@ class Equations:
         u_offset, y_offset: operating point.
         x_rest: state at rest under u_offset, (nx,); empty if none was found. x = 0 is near it.
         static: f; None for a linear model.
+        weights: of f, by the names of its parameters.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
     """
@@ -110,7 +75,8 @@ class Equations:
     u_offset: Array
     y_offset: Array
     x_rest: Array
-    static: Layers | Monomials | Own | None
+    static: Network | Polynomial | Own | None
+    weights: Mapping[str, Array]
     fs: float
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
@@ -130,15 +96,12 @@ class Equations:
                 counts from 0 as {1} and from 1 as {2}.
         """
         match self.static:
-            case Layers(activation=sigma):
-                h = "z"
-                for W, b in self.static.names[:-1]:
-                    h = f"{sigma}({W} {h} + {b})"
-                static = [f"w      = f(z) = Ww {h} + bw{MEANT.get(sigma, '')}"]
-            case Monomials():
+            case Network(activation=sigma):
+                static = [f"w      = f(z) = Ww {sigma}(Wz z + bz) + bw{MEANT.get(sigma, '')}"]
+            case Polynomial():
                 static = ["w      = f(z) = C m, m = 1, z1, z2, .., z1 z1, z1 z2, .."]
-            case Own(name=name):
-                static = [f"w      = f(z), the map {printable(name)}"]
+            case Own():
+                static = [f"w      = f(z), the map {printable(self.static.name)}"]
             case None:
                 static = []
         z, w, bw = (["z      = Cz x + Dzu v"], " + Dyw w", " + Bw w") if static else ([], "", "")
@@ -197,6 +160,7 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
     """
     model = model.to_model() if isinstance(model, LinearModel) else model
     cell, s = folded(model.lfr.cell), model.scaler
+    weights = {} if cell.static is None else cell.static.state_dict()
     found = Equations(
         A=numbers(cell.A),
         Bu=numbers(cell.Bu) / s.u_scale,
@@ -210,29 +174,22 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         y_offset=np.asarray(s.y_offset, dtype=np.float64),
         x_rest=np.empty(0),
         static=static_map(cell.static, own),
+        weights={name: numbers(weight) for name, weight in weights.items()},
         fs=model.fs,
         inputs=model.inputs,
         outputs=model.outputs,
     )
-    parts = [a for part in (found, found.static) if part for a in arrays(part)]
-    if isinstance(found.static, Own):
-        parts += map(numbers, found.static.module.state_dict().values())
-    if not all(np.isfinite(part).all() for part in parts):
+    parts = [*vars(found).values(), *found.weights.values()]
+    if not all(np.isfinite(part).all() for part in parts if isinstance(part, np.ndarray)):
         raise InputError("the model has weights that are not finite; nothing can be exported.")
     rest = equilibrium(double(cell), torch.zeros(cell.nu, dtype=torch.float64))
     return found if rest is None else replace(found, x_rest=numbers(rest))
 
 
-def static_map(static: Module | None, own: bool) -> Layers | Monomials | Own | None:
+def static_map(static: Module | None, own: bool) -> Network | Polynomial | Own | None:
     """f, as far as this package knows its equations."""
-    if static is None:
-        return None
-    if is_network(static):
-        W = static.Wz, *(W for W, _ in static.inner), static.Ww
-        b = static.bz, *(b for _, b in static.inner), static.bw
-        return Layers(tuple(map(numbers, W)), tuple(map(numbers, b)), static.activation)
-    if is_polynomial(static):
-        return Monomials(numbers(static.C), static.growth, static.slopes)
+    if static is None or is_network(static) or is_polynomial(static):
+        return static
     if own:
         return Own(deepcopy(static).to(device="cpu", dtype=torch.float64).eval())
     raise InputError(
@@ -244,20 +201,6 @@ def static_map(static: Module | None, own: bool) -> Layers | Monomials | Own | N
 def numbers(weight: Tensor) -> Array:
     """A weight as an array of float64."""
     return weight.detach().cpu().double().numpy()
-
-
-def arrays(part: Equations | Layers | Monomials | Own) -> list[Array]:
-    """All arrays of a part."""
-    found: list[Array] = []
-    for field in fields(part):
-        value = getattr(part, field.name)
-        found += [a for a in (value if isinstance(value, tuple) else [value]) if is_array(a)]
-    return found
-
-
-def is_array(value: object) -> bool:
-    """Whether it is an array of numbers."""
-    return isinstance(value, np.ndarray)
 
 
 RESERVED = {

@@ -7,20 +7,20 @@ from typing import Any
 import numpy as np
 
 from lfrtorch.analysis.lpv_form import gauss_legendre, lpv
-from lfrtorch.engine.beyond_linear import base_of
-from lfrtorch.export.equations import Layers, Monomials, check_name, equations
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.export.equations import check_name, equations
 from lfrtorch.export.rendering import rendered
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
 ACTIVATIONS = {
-    "tanh": ("tanh(v#)", "1 - h# .^ 2"),
-    "sigmoid": ("1 ./ (1 + exp(-v#))", "h# .* (1 - h#)"),
-    "relu": ("max(v#, 0)", "double(v# > 0)"),
-    "rbf": ("exp(-v# .^ 2)", "-2 * v# .* h#"),
-    "softplus": ("max(v#, 0) + log1p(exp(-abs(v#)))", "1 ./ (1 + exp(-v#))"),
+    "tanh": ("tanh(a)", "1 - h .^ 2"),
+    "sigmoid": ("1 ./ (1 + exp(-a))", "h .* (1 - h)"),
+    "relu": ("max(a, 0)", "double(a > 0)"),
+    "rbf": ("exp(-a .^ 2)", "-2 * a .* h"),
+    "softplus": ("max(a, 0) + log1p(exp(-abs(a)))", "1 ./ (1 + exp(-a))"),
 }
-"""h = σ(v) and σ'(v); # stands for the number of the layer."""
+"""h = σ(a) and σ'(a)."""
 
 MEAN_SLOPES = {
     "tanh": ["s = (1 - tanh(a) .* tanh(v)) .* over(tanh(d), d);"],
@@ -81,6 +81,7 @@ def matlab_function(
     model = model.to_model() if isinstance(model, LinearModel) else model
     e, form = equations(model), lpv(model)
     found: dict[str, Any] = {letters: getattr(e, letters) for letters in MATRICES}
+    found |= {n: w if w.ndim == 2 else w[:, None] for n, w in e.weights.items()}
     offsets = {name: getattr(e, name)[:, None] for name in ("u_offset", "y_offset", "x_rest")}
     found |= offsets | {"fs": e.fs}
     for side, channels in (("input", e.inputs), ("output", e.outputs)):
@@ -94,26 +95,23 @@ def matlab_function(
         "rest": e.x_rest.size,
     }
     match e.static:
-        case Layers():
+        case Network():
             known["value"], known["slope"] = ACTIVATIONS[e.static.activation]
             known["mean_slope"] = MEAN_SLOPES[e.static.activation]
-            known["layers"] = e.static.names[:-1]
-            for (W, b), weight, bias in zip(e.static.names, e.static.W, e.static.b, strict=True):
-                found |= {W: weight, b: bias[:, None]}
-        case Monomials():
+        case Polynomial():
             known["monomials"] = e.static.C.shape[1]
             # Numbers of monomials and of z count from 1.
             growth = [(m + 1.0, j + 1.0) for m, j in e.static.growth]
             slopes = [
                 (n + 1.0, j + 1.0, float(times), m + 1.0) for n, j, times, m in e.static.slopes
             ]
-            found |= {"C": e.static.C, "growth": np.array(growth), "slopes": np.array(slopes)}
+            found |= {"growth": np.array(growth), "slopes": np.array(slopes)}
     found["lpv"] = {letter: np.moveaxis(getattr(form, letter), 0, -1) for letter in "ABCD"}
     points = {"x0": form.x0, "u0": form.u0, "x_next0": form.x_next0, "y0": form.y0}
     found["lpv"] |= {letters: value[:, None] for letters, value in points.items()}
     found["lpv"] |= {"Cz": form.Cz, "Dzu": form.Dzu, "bounds": form.bounds}
-    if isinstance(e.static, Monomials):
-        nodes = gauss_legendre(base_of(model.lfr.cell.static))
+    if isinstance(e.static, Polynomial):
+        nodes = gauss_legendre(e.static)
         found["lpv"] |= dict(zip(("nodes", "weights"), nodes, strict=True))
     known["schedule"] = form.schedule
     known |= e.sizes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -10,7 +11,8 @@ import numpy as np
 
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
-from lfrtorch.export.equations import Equations, Layers, Monomials, Own, check_name, equations
+from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.export.equations import Equations, Own, check_name, equations
 from lfrtorch.export.traced_map import IR, OPSET, traced
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -70,10 +72,10 @@ def _sample(e: Equations, graph: Graph) -> None:
     if e.static:
         z = combined("z", {"Cz": "x", "Dzu": v})
         match e.static:
-            case Layers():
-                w = _network(graph, e.static, z)
-            case Monomials():
-                w = _polynomial(graph, e.static, z)
+            case Network():
+                w = _network(graph, e, e.static.activation, z)
+            case Polynomial():
+                w = _polynomial(graph, e, e.static.growth, z)
             case Own():
                 w = graph.spliced(traced(e.static, e.sizes["nz"]), "f_", z)
         x_next["Bw"], y["Dyw"] = w, w
@@ -81,15 +83,14 @@ def _sample(e: Equations, graph: Graph) -> None:
     combined("y", y, graph.constant("y_offset", e.y_offset))
 
 
-def _network(graph: Graph, static: Layers, z: str) -> str:
-    """w = Ww h + bw."""
-    signal = z
-    for (W, b), weight, bias in zip(static.names, static.W, static.b, strict=True):
-        if W != "Wz":
-            signal = _activation(graph, static.activation, signal)
-        product = graph.node("MatMul", signal, graph.constant(W, weight.T))
-        signal = graph.node("Add", product, graph.constant(b, bias))
-    return signal
+def _network(graph: Graph, e: Equations, activation: str, z: str) -> str:
+    """w = Ww h + bw with h = σ(Wz z + bz)."""
+
+    def affine(W: str, b: str, signal: str) -> str:
+        product = graph.node("MatMul", signal, graph.constant(W, e.weights[W].T))
+        return graph.node("Add", product, graph.constant(b, e.weights[b]))
+
+    return affine("Ww", "bw", _activation(graph, activation, affine("Wz", "bz", z)))
 
 
 def _activation(graph: Graph, name: str, v: str) -> str:
@@ -105,16 +106,15 @@ def _activation(graph: Graph, name: str, v: str) -> str:
     return node({"tanh": "Tanh", "sigmoid": "Sigmoid", "relu": "Relu"}[name], v)
 
 
-def _polynomial(graph: Graph, static: Monomials, z: str) -> str:
+def _polynomial(graph: Graph, e: Equations, growth: Sequence[tuple[int, int]], z: str) -> str:
     """w = C m; the constant monomial is a bias."""
-    nz = 1 + max(j for _, j in static.growth)
-    each = graph.split("Split", z, to=[f"z{j}" for j in range(nz)], axis=-1)
-    m: list[str] = [""]
-    for before, j in static.growth:
+    C, m = e.weights["C"], [""]
+    each = graph.split("Split", z, to=[f"z{j}" for j in range(e.sizes["nz"])], axis=-1)
+    for before, j in growth:
         m.append(graph.node("Mul", m[before], each[j]) if before else each[j])
     products = graph.node("Concat", *m[1:], axis=-1)
-    w = graph.node("MatMul", products, graph.constant("C", static.C[:, 1:].T))
-    return graph.node("Add", w, graph.constant("c", static.C[:, 0]))
+    w = graph.node("MatMul", products, graph.constant("C", C[:, 1:].T))
+    return graph.node("Add", w, graph.constant("c", C[:, 0]))
 
 
 class Graph:

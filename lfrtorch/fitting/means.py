@@ -26,8 +26,7 @@ def mean_model(models: Sequence[Model]) -> Model:
     neurons of all: A, Bw, Cz, Wz and Ww are block diagonal.
 
     Args:
-        models: of the same data, each with a network of the same activation and number of layers;
-            they are copied.
+        models: of the same data, each with a network of the same activation; they are copied.
 
     Raises:
         ValueError: no model, or models of other channels, scales, rates or static maps.
@@ -48,11 +47,8 @@ def mean_model(models: Sequence[Model]) -> Model:
                 f"the mean is of models with a network, and one of these has {static!r} as its "
                 "static nonlinearity; average the simulated outputs instead."
             )
-        kind = static.activation, static.layers
-        if networks and kind != (networks[0].activation, networks[0].layers):
-            raise InputError(
-                "the models have networks of different activations or layers; give one kind."
-            )
+        if networks and static.activation != networks[0].activation:
+            raise InputError("the models have networks of different activations; give one kind.")
         if not _alike(model, first):
             raise InputError(
                 "the models have other channels, scales or rates than each other; give models "
@@ -74,8 +70,7 @@ def mean_model(models: Sequence[Model]) -> Model:
     nx, nz, nw = (sum(getattr(cell, n) for cell in cells) for n in ("nx", "nz", "nw"))
     nn = sum(len(network.bz) for network in networks)
     like = {"device": cells[0].A.device, "dtype": cells[0].A.dtype}
-    activation, layers = networks[0].activation, networks[0].layers
-    network = Network(nz, nw, nn, activation, layers=layers, **like)
+    network = Network(nz, nw, nn, networks[0].activation, **like)
     cell = LFRCell(cells[0].nu, cells[0].ny, nx, nz, nw, network, **like)
     with torch.no_grad():
         cell.A.copy_(blocks(lambda c: c.A))

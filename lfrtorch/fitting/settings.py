@@ -80,9 +80,7 @@ class Settings:
             Required, unless ``init_from`` brings it.
         nx_max: highest order that ``nx="auto"`` tries.
         nz, nw: inputs and outputs of the static nonlinearity; ``"auto"`` searches for them.
-        nn, activation: neurons of each layer of ``static="network"``, or ``"auto"``, and their
-            function.
-        layers: its hidden layers.
+        nn, activation: neurons of ``static="network"``, or ``"auto"``, and their function.
         degree: of ``static="polynomial"``, or ``"auto"``.
         static: ``"network"``, ``"polynomial"``, or what makes a map of one's own: called with the
             keywords nz and nw it returns a module from (..., nz) to (..., nw), for example the
@@ -134,7 +132,6 @@ class Settings:
     nw: Size = 1
     nn: Size = 15
     activation: str = "tanh"
-    layers: int = 1
     degree: Size = 3
     static: Literal["network", "polynomial"] | Callable[..., Module] = "network"
     init: Literal["zero_output", "paper"] = "zero_output"
@@ -173,9 +170,9 @@ class Settings:
         if self.init_from is None:
             self._check_sizes()
         if self.init_from is not None:
-            for name, size in {"layers": 1, **self.init_from.sizes}.items():
+            for name, size in self.init_from.sizes.items():
                 object.__setattr__(self, name, size)
-        for name in ("layers", "nx_max", "starts", "average"):
+        for name in ("nx_max", "starts", "average"):
             integer(name, getattr(self, name), 1)
         check_noise(self.noise, self.trainer)
         check_horizon(self.horizon, self.noise)
@@ -251,7 +248,7 @@ class Settings:
     def size_names(self) -> tuple[str, ...]:
         """Sizes of the static nonlinearity: nz, nw, and nn or degree."""
         if self.init_from is not None:
-            return tuple(n for n in self.init_from.sizes if n not in ("nx", "layers"))
+            return tuple(n for n in self.init_from.sizes if n != "nx")
         return ("nz", "nw", *(size for kind, size in LAST_SIZE.items() if self.static == kind))
 
     @property
@@ -276,7 +273,7 @@ class Settings:
     def static_map(self) -> dict[str, Any]:
         """The arguments of :func:`lfrtorch.initialise` that say which static map there is."""
         if self.static == "network":
-            return {"nn": self.nn, "activation": self.activation, "layers": self.layers}
+            return {"nn": self.nn, "activation": self.activation}
         if self.static == "polynomial":
             assert isinstance(self.nz, int)
             assert isinstance(self.nw, int)

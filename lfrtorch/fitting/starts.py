@@ -47,7 +47,6 @@ def initialise(
     nw: int,
     nn: int | None = None,
     activation: str = "tanh",
-    layers: int = 1,
     static: Module | None = None,
     method: Literal["zero_output", "paper"] = "zero_output",
     seed: int = 0,
@@ -102,9 +101,9 @@ def initialise(
         bla: stable linear model, best in balanced coordinates.
         records: the data that are to be fitted.
         nz, nw: inputs and outputs of the static nonlinearity.
-        nn, activation, layers: neurons of each hidden layer, their function, and how many layers.
+        nn, activation: neurons of the network and their function.
         static: the map z -> w in the network's place, copied: a ``Network``, a ``Polynomial`` or
-            any module from (..., nz) to (..., nw); nn, activation and layers are then of no use.
+            any module from (..., nz) to (..., nw); nn and activation are then of no use.
         method: which of the two starts.
         seed: of the random weights.
         relaxations, modes: how many are added to those of the linear model, one and two states
@@ -140,7 +139,7 @@ def initialise(
     integer("modes", modes, 0)
     check_dtype(dtype)
     if structure != "free":
-        _check_structure(structure, nz, nw, nn, layers, static, relaxations + modes, z_feedthrough)
+        _check_structure(structure, nz, nw, nn, static, relaxations + modes, z_feedthrough)
     if not feedthrough:
         _check_no_feedthrough(bla, structure, z_feedthrough)
     data = [without_coordinates(record) for record in as_records(records)]
@@ -158,9 +157,9 @@ def initialise(
         integer("nn", nn, 1)
         assert nn is not None
         with torch.device("meta"):  # nothing is allocated
-            planned = Network(nz, nw, nn, activation, layers=layers, dtype=dtype)
+            planned = Network(nz, nw, nn, activation, dtype=dtype)
             check_fit_memory(LFRCell(*sizes, nz, nw, planned, dtype=dtype))
-        static = Network(nz, nw, nn, activation, layers=layers, dtype=dtype)
+        static = Network(nz, nw, nn, activation, dtype=dtype)
         static.reset_parameters(generator)
     else:
         static = deepcopy(static).to(dtype)
@@ -262,7 +261,6 @@ def _check_structure(
     nz: int,
     nw: int,
     nn: int | None,
-    layers: int,
     static: Module | None,
     driven: int,
     z_feedthrough: bool,
@@ -280,10 +278,10 @@ def _check_structure(
             "False; give one of the two."
         )
     if structure == "parallel":
-        if nz != nw or layers > 1 or static is not None:
+        if nz != nw or static is not None:
             raise InputError(
-                "structure is 'parallel', which has a network with one hidden layer, and a w for "
-                f"each z; nz is {nz}, nw is {nw}, layers is {layers}."
+                f"structure is 'parallel', which has a network, and a w for each z; nz is {nz} and "
+                f"nw is {nw}."
             )
         if nn is not None and nn < nz:
             raise InputError(f"structure is 'parallel', and {nn} neurons are fewer than {nz} z.")

@@ -86,7 +86,7 @@ class Differences:
 
     @classmethod
     def by_neuron(cls, cell: LFRCell, static: Network, slopes: Interval) -> Differences:
-        """The slope of each neuron of one layer is anywhere in its interval."""
+        """The slope of each neuron is anywhere in its interval."""
         Wz, Ww = _array(static.Wz), _array(static.Ww)
         J = Ww * slopes.middle @ Wz
         return replace(cls._about(cell, J, Ww, slopes.radius[:, None] * Wz), neurons=True)
@@ -111,7 +111,7 @@ class Differences:
 
     @classmethod
     def of(cls, cell: LFRCell, slopes: Enclosure | None) -> list[Differences]:
-        """By entry and, of one layer, by neuron: the smaller one, and the other if not too large.
+        """By entry and by neuron: the smaller one, and the other if not too large.
 
         Args:
             cell: with a network or no static map.
@@ -120,9 +120,7 @@ class Differences:
         if slopes is None or not is_network(cell.static):
             nothing = np.zeros((0, 0))
             return [cls.by_entry(cell, Interval(nothing, nothing))]
-        systems = [cls.by_entry(cell, slopes.J)]
-        if cell.static.layers == 1:
-            systems.append(cls.by_neuron(cell, cell.static, slopes.slopes))
+        systems = [cls.by_entry(cell, slopes.J), cls.by_neuron(cell, cell.static, slopes.slopes)]
         systems.sort(key=lambda system: system.size)
         return [systems[0], *(system for system in systems[1:] if system.size <= LARGEST)]
 

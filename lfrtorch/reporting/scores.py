@@ -430,8 +430,7 @@ def start_matters(score: Mapping[str, Any]) -> bool:
 
 def neurons(sizes: Mapping[str, int]) -> str:
     """The neurons in words; maps that are not networks have none."""
-    layers = f" in each of {sizes['layers']} layers" if "layers" in sizes else ""
-    return f"{sizes['nn']} neurons{layers}" if sizes["nn"] else "a map of one's own"
+    return f"{sizes['nn']} neurons" if sizes["nn"] else "a map of one's own"
 
 
 def starts_table(result: Mapping[str, Any]) -> str:

@@ -58,7 +58,7 @@ def differences(
     [
         {"nx": 3},
         {"nx": 3, "nz": 2, "nw": 2, "nn": 5, "nu": 2, "ny": 2},
-        {"nx": 2, "layers": 2, "activation": "rbf"},
+        {"nx": 2, "activation": "rbf"},
         {"nx": 2, "activation": "relu"},
         {"nx": 2, "nz": 3, "nw": 3, "nn": 2, "feedback": 0.3, "radius": 0.6},
     ],

@@ -20,9 +20,8 @@ pytestmark = pytest.mark.numeric
 
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
-@pytest.mark.parametrize("layers", [1, 2, 3])
-def test_network_is_its_equation(activation: str, layers: int):
-    network = Network(2, 3, 4, activation, layers=layers, dtype=torch.float64)
+def test_network_is_its_equation(activation: str):
+    network = Network(2, 3, 4, activation, dtype=torch.float64)
     with torch.no_grad():
         network.bw.copy_(normal(3))
     z = normal(5, 7, 2)
@@ -30,9 +29,6 @@ def test_network_is_its_equation(activation: str, layers: int):
     assert w.shape == (5, 7, 3)
     for index in ((0, 0), (4, 6)):
         hidden = SIGMA[activation](network.Wz @ z[index] + network.bz)
-        for layer in range(2, layers + 1):
-            W, b = network.get_parameter(f"W{layer}"), network.get_parameter(f"b{layer}")
-            hidden = SIGMA[activation](W @ hidden + b)
         assert_close(w[index], network.Ww @ hidden + network.bw, rtol=1e-13, atol=1e-14)
 
 
@@ -48,23 +44,8 @@ def test_draw_is_that_of_the_paper():
     assert not network.bw.any()
 
 
-def test_further_layers_keep_the_size_of_their_input():
-    network = Network(2, 2, 300, layers=3)
-    network.reset_parameters(torch.Generator().manual_seed(0))
-    for W, b in network.inner:
-        # Variance 1/nn and 1/3, within 4 σ of their estimates.
-        assert abs(float(300 * W.detach().var()) - 1.0) < 4 * (4 / 5 / W.numel()) ** 0.5
-        assert abs(float(b.detach().var()) - 1 / 3) < 4 * (4 / 45 / b.numel()) ** 0.5
-
-
-def test_layers_must_be_there():
-    with pytest.raises(ValueError, match="layers is 0"):
-        Network(2, 1, 3, layers=0)
-
-
-@pytest.mark.parametrize("layers", [1, 2])
-def test_draw_follows_its_generator(layers: int):
-    a, b, c = (Network(2, 2, 3, layers=layers) for _ in range(3))
+def test_draw_follows_its_generator():
+    a, b, c = (Network(2, 2, 3) for _ in range(3))
     for network, seed in ((a, 1), (b, 1), (c, 2)):
         network.reset_parameters(torch.Generator().manual_seed(seed))
     for mine, same, other in zip(a.parameters(), b.parameters(), c.parameters(), strict=True):
@@ -96,9 +77,6 @@ def test_unknown_activation():
 
 def test_sizes_are_printed():
     assert repr(Network(2, 1, 3, "rbf")) == "Network(nz=2, nw=1, nn=3, activation='rbf')"
-    assert repr(Network(2, 1, 3, layers=2)) == (
-        "Network(nz=2, nw=1, nn=3, activation='tanh', layers=2)"
-    )
 
 
 # --- polynomial -----------------------------------------------------------------------------

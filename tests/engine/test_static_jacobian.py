@@ -34,8 +34,8 @@ class Cube(nn.Module):
         return z**3
 
 
-def network(activation: str, layers: int = 1) -> Network:
-    static = Network(nz, nw, 4, activation, layers=layers, dtype=torch.float64)
+def network(activation: str) -> Network:
+    static = Network(nz, nw, 4, activation, dtype=torch.float64)
     for p, weight in zip(static.parameters(), weights_of(static).values(), strict=True):
         p.data = weight
     return static
@@ -75,9 +75,8 @@ def check(jacobian: StaticJacobian, static: nn.Module, weights: list[dict[str, T
 
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
-@pytest.mark.parametrize("layers", [1, 2, 4])
-def test_network(activation: str, layers: int):
-    static, z = network(activation, layers), normal(R, T, nz)
+def test_network(activation: str):
+    static, z = network(activation), normal(R, T, nz)
     weights = weights_of(static)
     check(linearise_static(static, z, weights), static, [weights, weights], z)
 
@@ -129,9 +128,8 @@ def test_values_and_slopes_of_own_weights_for_every_record():
     )
 
 
-@pytest.mark.parametrize("layers", [1, 3])
-def test_network_with_own_weights_for_every_record(layers: int):
-    base, z = network("tanh", layers), normal(R, T, nz)
+def test_network_with_own_weights_for_every_record():
+    base, z = network("tanh"), normal(R, T, nz)
     each = [weights_of(base, seed=10 * r + 1) for r in range(R)]
     stacked = {name: torch.stack([w[name] for w in each]) for name in each[0]}
     stacked |= {name: w.unsqueeze(1) for name, w in stacked.items() if w.ndim == 2}

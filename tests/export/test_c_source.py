@@ -144,12 +144,12 @@ def test_observers_are_those_of_the_model(name: str, kind: str, observers: ctype
 @needs_compiler
 @pytest.mark.numeric
 def test_the_state_may_be_replaced_in_place(library: ctypes.CDLL):
-    u, x, y = inputs(MODELS["layers"], 1)[0], np.array([0.3, -0.2, 0.1]), np.empty(2)
-    x_next = np.empty(3)
-    call(library, "layers_step", x, u, x_next, y)
-    call(library, "layers_step", x, u, x, y)
+    u, x, y = inputs(MODELS["softplus"], 1)[0], np.array([0.3, -0.2, 0.1, 0.2]), np.empty(3)
+    x_next = np.empty(4)
+    call(library, "softplus_step", x, u, x_next, y)
+    call(library, "softplus_step", x, u, x, y)
     assert np.array_equal(x, x_next)
-    call(library, "layers_reset", x)
+    call(library, "softplus_reset", x)
     assert not x.any()
 
 

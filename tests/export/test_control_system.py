@@ -32,7 +32,7 @@ def test_steps_are_those_of_the_model(name: str):
 
 
 @pytest.mark.numeric
-@pytest.mark.parametrize("name", ["layers", "polynomial"])
+@pytest.mark.parametrize("name", ["softplus", "polynomial"])
 def test_the_system_simulates(name: str):
     model, system = MODELS[name], control_system(MODELS[name], name)
     assert isinstance(system, control.NonlinearIOSystem)

@@ -46,7 +46,7 @@ def started(path: Path, folder: Path) -> Iterator[tuple[Any, dict[str, int]]]:
 
 
 @pytest.mark.numeric
-@pytest.mark.parametrize("name", ["layers", "polynomial", "linear"])
+@pytest.mark.parametrize("name", ["softplus", "polynomial", "linear"])
 def test_the_simulation_is_that_of_the_model(name: str, tmp_path: Path):
     model = MODELS[name]
     (path,) = write(model, "fmu", tmp_path, name="engine")

@@ -17,25 +17,20 @@ from lfrtorch.records import Start
 pytestmark = pytest.mark.numeric
 
 
-def models(layers: int = 1) -> list[Model]:
+def models() -> list[Model]:
     """Three of one data set, whose starts were drawn from three seeds."""
-    first, *others = (
-        random_model(random_cell(2, 2, 3, 2, 1, 4, seed=seed, layers=layers)) for seed in (1, 2, 3)
-    )
+    first, *others = (random_model(random_cell(2, 2, 3, 2, 1, 4, seed=seed)) for seed in (1, 2, 3))
     return [first, *(replace(other, scaler=first.scaler) for other in others)]
 
 
 @pytest.mark.parametrize("start", ["zero", "periodic"])
-@pytest.mark.parametrize("layers", [1, 2])
-def test_mean_of_models_simulates_the_mean(start: Start, layers: int):
-    several = models(layers)
+def test_mean_of_models_simulates_the_mean(start: Start):
+    several = models()
     u = np.random.default_rng(0).normal(size=(200, 2))
     mean = mean_model(several)
     expected = np.mean([model.simulate(u, start=start) for model in several], axis=0)
     np.testing.assert_allclose(mean.simulate(u, start=start), expected, rtol=0, atol=1e-9)
-    assert mean.sizes == {"nx": 9, "nz": 6, "nw": 3, "nn": 12} | (
-        {"layers": layers} if layers > 1 else {}
-    )
+    assert mean.sizes == {"nx": 9, "nz": 6, "nw": 3, "nn": 12}
 
 
 def test_mean_of_one_is_itself():
@@ -91,9 +86,6 @@ def test_mean_refuses_models_that_are_not_alike():
     other = models()[1]
     other.lfr.cell.static = Network(2, 1, 4, "relu", dtype=torch.float64)
     with pytest.raises(ValueError, match="different activations"):
-        mean_model([several[0], other])
-    other.lfr.cell.static = Network(2, 1, 4, layers=2, dtype=torch.float64)
-    with pytest.raises(ValueError, match="different activations or layers"):
         mean_model([several[0], other])
     other.lfr.cell.static = Polynomial(2, 1, 3)
     with pytest.raises(ValueError, match="average the simulated outputs"):

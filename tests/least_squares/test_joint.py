@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial
+from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.least_squares.joint import JointProblem, stacked
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
@@ -33,7 +33,6 @@ pytestmark = pytest.mark.numeric
 
 STATICS = {
     "network": lambda: None,
-    "layers": lambda: Network(2, 1, 3, layers=2),
     "polynomial": lambda: Polynomial(2, 1, 2),
     "own": Bend,
 }

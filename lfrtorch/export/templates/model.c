@@ -53,58 +53,36 @@ static void deviation(const double *u, double *v)
         v[i] = u[i] - u_offset[i];
 }
 
-{% if layers %}
-/* h = {{ activation }}(W g + b), and with dg = dg/dz its derivatives dh = dh/dz, which may be left out (0). */
-static void layer(const double *W, const double *b, const double *g, const double *dg, int count,
-    double *h, double *dh)
+{% if activation %}
+/* v = Wz z + bz and h = {{ activation }}(v). */
+static void neurons(const double *z, double *v, double *h)
 {
-    double v[NN];
-    copy(v, b, NN);
-    add(v, W, g, NN, count);
+    copy(v, bz, NN);
+    add(v, Wz, z, NN, NZ);
     for (int i = 0; i < NN; i++)
         h[i] = {{ value }};
-    if (!dh)
-        return;
-    for (int i = 0; i < NN * NZ; i++)
-        dh[i] = 0.0;
-    add_product(dh, W, dg, NN, count, NZ);
-    for (int i = 0; i < NN; i++)
-        for (int j = 0; j < NZ; j++)
-            dh[i * NZ + j] *= {{ slope }};
 }
 
 /* w = f(z). */
 static void map(const double *z, double *w)
 {
-    double h[{{ layers | length }}][NN];
-{% for W, b in layers %}
-{% if loop.first %}
-    layer({{ W }}, {{ b }}, z, 0, NZ, h[0], 0);
-{% else %}
-    layer({{ W }}, {{ b }}, h[{{ loop.index0 - 1 }}], 0, NN, h[{{ loop.index0 }}], 0);
-{% endif %}
-{% endfor %}
+    double v[NN], h[NN];
+    neurons(z, v, h);
     copy(w, bw, NW);
-    add(w, Ww, h[{{ layers | length - 1 }}], NW, NN);
+    add(w, Ww, h, NW, NN);
 }
 
 /* J = dw/dz. */
 static void map_jacobian(const double *z, double *J)
 {
-    double h[{{ layers | length }}][NN], dz[NZ * NZ] = {0.0}, dh[{{ layers | length }}][NN * NZ];
-    for (int i = 0; i < NZ; i++)
-        dz[i * NZ + i] = 1.0;
-{% for W, b in layers %}
-{% if loop.first %}
-    layer({{ W }}, {{ b }}, z, dz, NZ, h[0], dh[0]);
-{% else %}
-{% set last, now = loop.index0 - 1, loop.index0 %}
-    layer({{ W }}, {{ b }}, h[{{ last }}], dh[{{ last }}], NN, h[{{ now }}], dh[{{ now }}]);
-{% endif %}
-{% endfor %}
+    double v[NN], h[NN], dh[NN * NZ];
+    neurons(z, v, h);
+    for (int i = 0; i < NN; i++)
+        for (int j = 0; j < NZ; j++)
+            dh[i * NZ + j] = Wz[i * NZ + j] * ({{ slope }});
     for (int i = 0; i < NW * NZ; i++)
         J[i] = 0.0;
-    add_product(J, Ww, dh[{{ layers | length - 1 }}], NW, NN, NZ);
+    add_product(J, Ww, dh, NW, NN, NZ);
 }
 
 {% endif %}

@@ -26,13 +26,10 @@ x_next = m.A * x + m.Bu * v;
 y = m.Cy * x + m.Dyu * v + m.y_offset;
 {% if static %}
 z = m.Cz * x + m.Dzu * v;
-{% if layers %}
-h0 = z;
-{% for W, b in layers %}
-v{{ loop.index }} = m.{{ W }} * h{{ loop.index0 }} + m.{{ b }};
-h{{ loop.index }} = {{ value.replace("#", loop.index | string) }};
-{% endfor %}
-w = m.Ww * h{{ layers | length }} + m.bw;
+{% if value %}
+a = m.Wz * z + m.bz; % of the neurons
+h = {{ value }};
+w = m.Ww * h + m.bw;
 {% else %}
 p = ones({{ monomials }}, 1); % 1, z1, z2, .., z1 z1, z1 z2, ..
 for i = 1:{{ monomials - 1 }}
@@ -44,12 +41,8 @@ x_next = x_next + m.Bw * w;
 y = y + m.Dyw * w;
 {% endif %}
 if nargout > 2
-{% if layers %}
-    J = eye({{ nz }});
-{% for W, b in layers %}
-    J = bsxfun(@times, {{ slope.replace("#", loop.index | string) }}, m.{{ W }} * J);
-{% endfor %}
-    J = m.Ww * J; % dw/dz
+{% if value %}
+    J = m.Ww * bsxfun(@times, {{ slope }}, m.Wz); % dw/dz
 {% elif static %}
     J = zeros({{ nw }}, {{ nz }}); % dw/dz
     for i = 1:size(m.slopes, 1)

@@ -28,22 +28,8 @@ end
 {% if static %}
 d = f.Cz * (x(:) - f.x0) + f.Dzu * (u(:) - f.u0); % z - z0
 z = m.Cz * f.x0 + m.Dzu * (f.u0 - m.u_offset); % z0
-{% if layers %}
-h0 = z;
-Delta = eye({{ nz }});
-{% for W, b in layers %}
-v{{ loop.index }} = m.{{ W }} * h{{ loop.index0 }} + m.{{ b }};
-h{{ loop.index }} = {{ value.replace("#", loop.index | string) }};
-d = m.{{ W }} * d;
-s = mean_slope(v{{ loop.index }}, d);
-d = s .* d;
-Delta = bsxfun(@times, s, m.{{ W }} * Delta);
-{% endfor %}
-{% if schedule == "neurons" %}
-p = s;
-{% else %}
-p = reshape((m.Ww * Delta).', [], 1);
-{% endif %}
+{% if value %}
+p = mean_slope(m.Wz * z + m.bz, m.Wz * d);
 {% else %}
 % The mean of the slope between z0 and z, by a Gauss-Legendre rule that is exact.
 Delta = zeros({{ nw }}, {{ nz }});
@@ -69,7 +55,7 @@ end
 function M = at(Ms, p)
 M = reshape(reshape(Ms, [], numel(p) + 1) * [1; p], size(Ms, 1), size(Ms, 2));
 end
-{% if layers %}
+{% if value %}
 
 function s = mean_slope(v, d)
 % (sigma(v + d) - sigma(v)) / d without cancellation.
