@@ -27,7 +27,7 @@ from lfrtorch.engine.description import in_columns, levels, listed, system_lines
 from lfrtorch.engine.initial_state import estimated_start
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network
+from lfrtorch.engine.nonlinearity import Network, Polynomial, known
 from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.extended_kalman_filter import (
@@ -170,10 +170,8 @@ class Model:
         """nx, nz, nw, and nn or the degree of a polynomial; nn = 0 for a map of the user's own."""
         cell = self.lfr.cell
         sizes = {"nx": cell.nx, "nz": cell.nz, "nw": cell.nw}
-        static = base_of(cell.static)
-        if isinstance(static, Polynomial):
-            return sizes | {"degree": static.degree}
-        return sizes | {"nn": len(static.bz) if is_network(static) else 0}
+        static = known(base_of(cell.static))
+        return sizes | ({"nn": 0} if static is None else static.sizes)
 
     @property
     def state_covariance(self) -> Float[Array, "nx nx"]:
@@ -567,10 +565,11 @@ def _described(static: Module | None) -> dict[str, Any] | None:
         return None
     if isinstance(static, Beyond):
         return {"type": "Beyond", "base": _described(static.base)}
-    if is_network(static):
-        return {"type": "Network", "nn": len(static.bz), "activation": static.activation}
-    if type(static) is Polynomial:
-        return {"type": "Polynomial", "degree": static.degree}
+    match known(static):
+        case Network() as network:
+            return {"type": "Network", **network.sizes, "activation": network.activation}
+        case Polynomial() as polynomial:
+            return {"type": "Polynomial", **polynomial.sizes}
     return {"type": "own", "class": type(static).__qualname__}
 
 

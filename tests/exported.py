@@ -13,7 +13,7 @@ from torch.func import jacrev
 from lfrtorch import NoiseCovariance
 from lfrtorch._support.types import Array
 from lfrtorch.analysis import canonical
-from lfrtorch.engine.nonlinearity import ACTIVATIONS
+from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.model import Model
 
 Step = Callable[[Array, Array], tuple[Array, Array]]

@@ -17,9 +17,9 @@ import torch
 from numba import config
 
 import lfrtorch
+from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import ACTIVATIONS
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation_kernel import simulate_record
 from lfrtorch.extended_kalman_filter import NoiseCovariance

@@ -8,7 +8,7 @@ import torch
 from reference import measure, random_cell, random_model
 from torch.testing import assert_close
 
-from lfrtorch.engine.nonlinearity import ACTIVATIONS
+from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
 from lfrtorch.least_squares.problem import Problem

@@ -23,9 +23,8 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.tables import percent
 from lfrtorch._support.types import Array, Booleans
 from lfrtorch.analysis.canonical_form import MOST_SAMPLES, canonical
-from lfrtorch.engine.linearised import of_static, spectral_radius
+from lfrtorch.engine.linearised import spectral_radius, static_slope
 from lfrtorch.engine.operating_point import double
-from lfrtorch.engine.static_jacobian import linearise_static
 from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
@@ -171,9 +170,7 @@ def _slopes(
     points = np.zeros((len(z), len(bent)))
     points[:, bent] = z
     points = points[:: 1 + len(points) // POINTS]
-    theta = of_static({name: p.detach() for name, p in cell.named_parameters()})
-    J = linearise_static(cell.static, torch.as_tensor(points)[None], theta).J[0]
-    return J.detach().numpy()[:, :, bent]
+    return static_slope(cell, torch.as_tensor(points)[None])[0].numpy()[:, :, bent]
 
 
 def _branches(

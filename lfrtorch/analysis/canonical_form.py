@@ -26,9 +26,8 @@ from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.beyond_linear import Beyond
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.linearised import of_static
+from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.operating_point import double
-from lfrtorch.engine.static_jacobian import linearise_static
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
@@ -130,8 +129,7 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     W = turn.T @ W
     # z, turned to the directions in which the slope of w changes the most.
     Z = _whitening(z_all)
-    theta = of_static({name: p.detach() for name, p in cell.named_parameters()})
-    J = linearise_static(cell.static, torch.as_tensor(z_all)[None], theta).J[0].detach().numpy()
+    J = static_slope(cell, torch.as_tensor(z_all)[None])[0].numpy()
     bent = np.sqrt(power)[:, None] * (W @ (J - slope) @ _inverse(Z))
     bends, turn = _ordered(np.einsum("swi,swj->ij", bent, bent) / len(bent))
     Z = turn.T @ Z

@@ -24,10 +24,9 @@ from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import vector
 from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linearised import of_static
-from lfrtorch.engine.nonlinearity import Network, is_network, is_polynomial
+from lfrtorch.engine.linearised import static_slope
+from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network, known
 from lfrtorch.engine.operating_point import double, equilibrium
-from lfrtorch.engine.static_jacobian import linearise_static
 from lfrtorch.model import Model
 
 NODES = 32
@@ -35,18 +34,6 @@ NODES = 32
 
 ROUNDING = 1e-14
 """Error of f(z) - f(z0), relative to both, that is left alone: over a small ζ it would be large."""
-
-STEEPEST = float(np.sqrt(2.0 / np.e))
-"""Largest slope of exp(-v²), at v = -1/√2."""
-
-SLOPES = {
-    "tanh": (0.0, 1.0),
-    "sigmoid": (0.0, 0.25),
-    "relu": (0.0, 1.0),
-    "rbf": (-STEEPEST, STEEPEST),
-    "softplus": (0.0, 1.0),
-}
-"""Least and largest slope of each activation, and so of its mean slopes."""
 
 Slopes = Callable[[Float[Array, "S nz"]], Float[Array, "S P"]]
 
@@ -248,7 +235,7 @@ def _slopes(
         return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 2)), lambda zeta: zeta
     if is_network(static) and schedule == "neurons":
         Wz, Ww = _matrices(static)
-        bounds = np.tile(SLOPES[static.activation], (len(Wz), 1))
+        bounds = np.tile(static.sigma.slope_bounds, (len(Wz), 1))
         return Ww, Wz, bounds, lambda zeta: _mean_slopes(static, z0, zeta)
     left, right = np.repeat(np.eye(nw), nz, axis=1), np.tile(np.eye(nz), (nw, 1))
     known = _bounds(static) if is_network(static) else np.array([-np.inf, np.inf])
@@ -266,11 +253,9 @@ def _delta(
         return Ww @ (_mean_slopes(static, z0, zeta)[..., None] * Wz)
     t, weight = gauss_legendre(static)
     points = z0 + t[:, None, None] * zeta
-    theta = {name: p.detach() for name, p in cell.named_parameters()}
-    with torch.no_grad():
-        J = linearise_static(static, torch.as_tensor(points), of_static(theta)).J.numpy()
-    delta = np.tensordot(weight, J, 1)
-    return delta if is_polynomial(static) else delta + _left_over(cell, z0, zeta, delta)
+    delta = np.tensordot(weight, static_slope(cell, torch.as_tensor(points)).numpy(), 1)
+    exact = known(static) is not None
+    return delta if exact else delta + _left_over(cell, z0, zeta, delta)
 
 
 def gauss_legendre(static: Module | None) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
@@ -283,7 +268,8 @@ def gauss_legendre(static: Module | None) -> tuple[Float[Array, " n"], Float[Arr
         >>> [part.tolist() for part in gauss_legendre(lfrtorch.Polynomial(1, 1, degree=1))]
         [[0.5], [1.0]]
     """
-    nodes = (static.degree + 1) // 2 if is_polynomial(static) else NODES
+    found = known(static)
+    nodes = (found.degree + 1) // 2 if isinstance(found, Polynomial) else NODES
     t, weight = np.polynomial.legendre.leggauss(nodes)
     return (t + 1.0) / 2, weight / 2
 
@@ -315,57 +301,16 @@ def _mean_slopes(
 ) -> Float[Array, "S nn"]:
     """The mean slopes of the neurons between z0 and z0 + ζ."""
     Wz, _ = _matrices(static)
-    return mean_slope(static.activation, Wz @ z0 + static.bz.detach().numpy(), zeta @ Wz.T)
-
-
-def mean_slope(activation: str, v: ArrayLike, d: ArrayLike) -> Array:
-    """(σ(v + d) - σ(v)) / d without cancellation, σ'(v) for d = 0.
-
-    Args:
-        activation: σ, a name of ``Network``.
-        v, d: arrays of shapes that broadcast.
-
-    Example:
-        >>> from lfrtorch.analysis.lpv_form import mean_slope
-        >>> mean_slope("tanh", 0.0, np.array([0.0, 1e-9, 2.0])).round(6).tolist()
-        [1.0, 1.0, 0.482014]
-    """
-    v, d = np.broadcast_arrays(np.asarray(v, dtype=np.float64), np.asarray(d, dtype=np.float64))
-    a = v + d
-    match activation:
-        case "tanh":  # tanh a - tanh v = tanh(a - v) (1 - tanh a tanh v)
-            return _quotient(np.tanh(d), d) * (1.0 - np.tanh(a) * np.tanh(v))
-        case "sigmoid":  # (1 + tanh(v / 2)) / 2
-            return mean_slope("tanh", v / 2, d / 2) / 4
-        case "relu":
-            part = _quotient(np.maximum(a, 0.0) - np.maximum(v, 0.0), d)
-            return np.where((a > 0) & (v > 0), 1.0, np.where((a > 0) | (v > 0), part, 0.0))
-        case "rbf":  # e^-a² - e^-v² = e^-min (e^-|q| - 1) with the sign of q = a² - v² = d (v + a)
-            q = np.abs(d * (v + a))
-            return -(v + a) * np.exp(-np.minimum(a**2, v**2)) * _quotient(-np.expm1(-q), q)
-        case _:  # softplus: ln(1 + s (e^d - 1)), s = sigmoid(v); a plain difference if d is large
-            near = np.clip(d, -1.0, 1.0)
-            s = 0.5 + 0.5 * np.tanh(v / 2)
-            part = np.where(
-                np.abs(d) < 1.0,
-                np.log1p(s * np.expm1(near)),
-                np.logaddexp(a, 0.0) - np.logaddexp(v, 0.0),
-            )
-            return np.where(d == 0, s, _quotient(part, d))
-
-
-def _quotient(a: Array, d: Array) -> Array:
-    """a / d, and 1 for d = 0."""
-    return np.divide(a, d, out=np.ones_like(d), where=d != 0)
+    return static.sigma.mean_slope(Wz @ z0 + static.bz.detach().numpy(), zeta @ Wz.T)
 
 
 def _bounds(static: Network) -> Float[Array, "nw nz 2"]:
     """Bounds of the entries of Δ, by interval arithmetic."""
     Wz, Ww = _matrices(static)
-    corners = [slope * Wz for slope in SLOPES[static.activation]]
+    corners = [slope * Wz for slope in static.sigma.slope_bounds]
     low, high = np.minimum(*corners), np.maximum(*corners)
     plus, minus = np.maximum(Ww, 0.0), np.minimum(Ww, 0.0)
     return np.stack([plus @ low + minus @ high, plus @ high + minus @ low], axis=-1)
 
 
-__all__ = ["LPV", "gauss_legendre", "lpv", "mean_slope"]
+__all__ = ["LPV", "gauss_legendre", "lpv"]

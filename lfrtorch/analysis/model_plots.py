@@ -26,9 +26,8 @@ from lfrtorch._support.tables import percent
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import linear_part, linearise
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linearised import of_static
+from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.operating_point import double
-from lfrtorch.engine.static_jacobian import linearise_static
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rms
 from lfrtorch.model import Model
@@ -267,9 +266,7 @@ def most_nonlinear(cell: LFRCell, where: Visited, j: int) -> tuple[Float[Array, 
     centred = where.z - where.z.mean(axis=0)
     powers, axes = np.linalg.eigh(centred.T @ centred / len(centred))
     scale = np.sqrt(np.maximum(powers, FLAT * powers[-1]))
-    weights = {name: p.detach() for name, p in cell.named_parameters()}
-    z = torch.as_tensor(where.z)[None]
-    J = linearise_static(cell.static, z, of_static(weights)).J[0, :, j].detach().numpy()
+    J = static_slope(cell, torch.as_tensor(where.z)[None])[0, :, j].numpy()
     g = (J - J.mean(axis=0)) @ (axes * scale)
     shares, directions = np.linalg.eigh(g.T @ g / len(g))
     total = float(shares.sum())

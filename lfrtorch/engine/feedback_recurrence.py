@@ -28,8 +28,7 @@ from lfrtorch.engine.linear_recurrence import (
     linear_recurrence,
     to_numpy,
 )
-from lfrtorch.engine.linearised import PASS, linearise_at, of_static
-from lfrtorch.engine.static_jacobian import linearise_static
+from lfrtorch.engine.linearised import PASS, linearise_at, static_slope
 
 Weights = Mapping[str, Tensor]
 
@@ -77,8 +76,7 @@ def monodromy(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx 
     weights = {name: p.detach() for name, p in cell.named_parameters()}
     Phi = torch.eye(cell.nx).to(z).expand(len(z), cell.nx, cell.nx)
     for part in z.split(max(1, PASS // len(z)), dim=1):
-        J = linearise_static(cell.static, part, of_static(weights)).J
-        Phi = transition(weights, J, Phi)
+        Phi = transition(weights, static_slope(cell, part), Phi)
     return Phi
 
 

@@ -26,7 +26,7 @@ import math
 import numpy as np
 from numba import njit
 
-from lfrtorch.engine.simulation_kernel import activate, affine
+from lfrtorch.engine.simulation_kernel import activate, affine, slope_of
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -192,16 +192,7 @@ def _activate(activation, h, dh):
     v = h.copy()
     activate(activation, h)
     for n in range(len(h)):
-        if activation == 0:
-            slope = 1.0 - h[n] * h[n]
-        elif activation == 1:
-            slope = h[n] * (1.0 - h[n])
-        elif activation == 2:
-            slope = 1.0 if v[n] > 0.0 else 0.0
-        elif activation == 3:
-            slope = -2.0 * v[n] * h[n]
-        else:
-            slope = 1.0 / (1.0 + math.exp(-v[n]))
+        slope = slope_of(activation, v[n], h[n])
         for j in range(dh.shape[1]):
             dh[n, j] *= slope
 

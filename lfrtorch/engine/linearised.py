@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.static_jacobian import linearise_static
+from lfrtorch.engine.nonlinearity import linearise_static
 
 PASS = 1 << 14
 """Most samples, of all records together, that are linearised in one pass."""
@@ -26,8 +26,14 @@ class Linearised(NamedTuple):
 @torch.no_grad()
 def linearise(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Linearised:
     """F and H of a trajectory, of which only the input z of the static nonlinearity matters."""
+    return linearise_at(dict(cell.named_parameters()), static_slope(cell, z))
+
+
+@torch.no_grad()
+def static_slope(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R T nw nz"]:
+    """∂w/∂z of the static map at every sample."""
     weights = {name: p.detach() for name, p in cell.named_parameters()}
-    return linearise_at(weights, linearise_static(cell.static, z, of_static(weights)).J)
+    return linearise_static(cell.static, z, of_static(weights)).J
 
 
 def linearise_at(weights: Mapping[str, Tensor], J: Float[Tensor, "R T nw nz"]) -> Linearised:

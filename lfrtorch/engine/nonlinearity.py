@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from itertools import combinations_with_replacement
-from typing import TypeGuard
+from typing import NamedTuple, TypeGuard
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,17 +16,32 @@ from torch.nn import Module, Parameter, ParameterList
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.memory import check_memory
-
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "tanh": torch.tanh,
-    "sigmoid": torch.sigmoid,
-    "relu": torch.relu,
-    "rbf": lambda v: torch.exp(-v.square()),
-    "softplus": lambda v: torch.logaddexp(v, v.new_zeros(())),  # F.softplus cuts off at v = 20
-}
+from lfrtorch._support.types import Integers
+from lfrtorch.engine.activations import ACTIVATIONS, Activation
+from lfrtorch.engine.static_jacobian import (
+    ModuleJacobian,
+    NetworkJacobian,
+    PolynomialJacobian,
+    StaticJacobian,
+    Weights,
+)
 
 BYTES = 1000
 """What Python's lists take for a monomial of a polynomial, about."""
+
+
+class Kernel(NamedTuple):
+    """A map as ``simulation_kernel`` takes it: w = last h + offset, h = σ(first z + bias).
+
+    With a growth of monomials h are these instead, see ``Polynomial``.
+    """
+
+    first: Tensor
+    last: Tensor
+    bias: Tensor
+    offset: Tensor
+    code: int = 0
+    growth: Integers = np.zeros((0, 2), np.int64)
 
 
 class Network(Module):
@@ -36,8 +51,8 @@ class Network(Module):
         nz: inputs.
         nw: outputs.
         nn: neurons.
-        activation: σ: ``"tanh"``, ``"sigmoid"``, ``"relu"``, ``"rbf"`` (exp(-v²)) or ``"softplus"``
-            (ln(1 + exp(v)), a hinge without its corner).
+        activation: σ, by its name in ``lfrtorch.engine.activations``: as ``"tanh"``, ``"relu"`` or
+            ``"rbf"``, exp(-v²).
         device, dtype: of the weights, as in any torch module.
 
     Shape:
@@ -92,23 +107,31 @@ class Network(Module):
 
     def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
         """w of z."""
-        hidden = ACTIVATIONS[self.activation](z @ self.Wz.mT + self.bz)
-        return hidden @ self.Ww.mT + self.bw
+        return self.sigma.value(z @ self.Wz.mT + self.bz) @ self.Ww.mT + self.bw
+
+    @property
+    def sigma(self) -> Activation:
+        """σ."""
+        return ACTIVATIONS[self.activation]
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """nn."""
+        return {"nn": self.bz.shape[-1]}
+
+    @property
+    def kernel(self) -> Kernel:
+        """The map for compiled code."""
+        return Kernel(self.Wz.mT, self.Ww, self.bz, self.bw, self.sigma.code)
+
+    def linearised(self, z: Float[Tensor, "R T nz"], weights: Weights) -> StaticJacobian:
+        """The map linearised at z, with the given weights."""
+        return NetworkJacobian(self.sigma, z, weights)
 
     def extra_repr(self) -> str:
         """Sizes and activation, for ``print(module)``."""
         (nn, nz), nw = self.Wz.shape, len(self.Ww)
         return f"nz={nz}, nw={nw}, nn={nn}, activation={self.activation!r}"
-
-
-def is_network(static: Module | None) -> TypeGuard[Network]:
-    """Whether a map is a ``Network`` itself: a subclass may have another forward pass."""
-    return type(static) is Network
-
-
-def is_polynomial(static: Module | None) -> TypeGuard[Polynomial]:
-    """Whether a map is a ``Polynomial`` itself."""
-    return type(static) is Polynomial
 
 
 class Polynomial(Module):
@@ -185,6 +208,21 @@ class Polynomial(Module):
         """w of z."""
         return self.monomials(z) @ self.C.mT
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The degree."""
+        return {"degree": self.degree}
+
+    @property
+    def kernel(self) -> Kernel:
+        """The map for compiled code."""
+        zeros, nw = self.C.new_zeros, self.C.shape[-2]
+        return Kernel(zeros(0, 0), self.C, zeros(0), zeros(nw), growth=np.array(self.growth))
+
+    def linearised(self, z: Float[Tensor, "R T nz"], weights: Weights) -> StaticJacobian:
+        """The map linearised at z, with the given weights."""
+        return PolynomialJacobian(self.monomials(z), weights["C"], self.slopes, self.nz)
+
     def monomials(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes monomials"]:
         """m(z)."""
         each = z.unbind(-1)
@@ -223,3 +261,28 @@ class Stacked(Module):
             return functional_call(self.base, weights, (z,))
 
         return vmap(one)(dict(zip(self.names, self.weights, strict=True)), z)
+
+
+def known(static: Module | None) -> Network | Polynomial | None:
+    """The map, if its equations are known: a subclass may have another forward pass."""
+    return static if isinstance(static, Network | Polynomial) and type(static) in KNOWN else None
+
+
+KNOWN = (Network, Polynomial)
+"""Maps that have ``sizes``, ``kernel`` and ``linearised``."""
+
+
+def is_network(static: Module | None) -> TypeGuard[Network]:
+    """Whether a map is a ``Network`` itself: some features are for neurons alone."""
+    return type(static) is Network
+
+
+def linearise_static(
+    static: Module | None, z: Float[Tensor, "R T nz"], weights: Weights
+) -> StaticJacobian:
+    """A map linearised at z, with the given weights instead of its own."""
+    if isinstance(static, Stacked):
+        own = dict(zip(static.names, weights.values(), strict=True))
+        return ModuleJacobian(static.base, z, own, by_record=0)
+    found = known(static)
+    return ModuleJacobian(static, z, weights) if found is None else found.linearised(z, weights)

@@ -16,9 +16,8 @@ from torch import Tensor
 
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linearised import of_static
+from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.simulation import simulate
-from lfrtorch.engine.static_jacobian import linearise_static
 from lfrtorch.records import Scaler
 
 MAX_NEWTON, HALVINGS = 50, 30
@@ -68,8 +67,7 @@ def linearised_at(cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"
     With J = ∂w/∂z they are A + Bw J Cz, Bu + Bw J Dzu, Cy + Dyw J Cz and Dyu + Dyw J Dzu.
     """
     z, _ = cell.internal(u, x)
-    weights = {name: p.detach() for name, p in cell.named_parameters()}
-    J = linearise_static(cell.static, z[None, None], of_static(weights)).J[0, 0]
+    J = static_slope(cell, z[None, None])[0, 0]
     Bw, Dyw = cell.Bw @ J, cell.Dyw @ J
     return _arrays(
         cell.A + Bw @ cell.Cz,

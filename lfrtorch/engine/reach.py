@@ -26,9 +26,10 @@ from jaxtyping import Float
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import is_network
-from lfrtorch.engine.static_enclosure import BOUNDED, Enclosure, Interval, enclosure, everywhere
+from lfrtorch.engine.static_enclosure import Enclosure, Interval, enclosure, everywhere
 
 LONGEST = 2**16
 """Most samples of an impulse response that are summed; slower ones have a looser bound."""
@@ -214,15 +215,17 @@ def _is_stable(A: Float[Array, "nx nx"]) -> bool:
 
 def _check(cell: LFRCell) -> None:
     """Refuse a model whose bound would be infinite."""
+    *names, last = (name for name, sigma in ACTIVATIONS.items() if sigma.bounded)
+    bounded = f"{', '.join(names)} or {last}"
     if cell.static is not None and not is_network(cell.static):
         raise InputError(
             f"the static map is a {type(cell.static).__name__}, which is not known to be bounded; "
-            "a proven bound needs a network of tanh, sigmoid or rbf."
+            f"a proven bound needs a network of {bounded}."
         )
-    if is_network(cell.static) and cell.static.activation not in BOUNDED:
+    if is_network(cell.static) and not cell.static.sigma.bounded:
         raise InputError(
             f"the static map is a network of {cell.static.activation}, which is not bounded; a "
-            "proven bound needs one of tanh, sigmoid or rbf."
+            f"proven bound needs one of {bounded}."
         )
     largest = float(np.abs(np.linalg.eigvals(cell.A.detach().numpy())).max())
     if largest >= 1.0:

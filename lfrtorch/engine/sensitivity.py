@@ -38,10 +38,10 @@ from lfrtorch.engine.feedback_recurrence import backwards, forwards, transition
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
 from lfrtorch.engine.linear_recurrence import has_kernels, linear_recurrence, to_numpy
 from lfrtorch.engine.linearised import PASS, Linearised, linearise_at, of_static
-from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.engine.nonlinearity import is_network, linearise_static
 from lfrtorch.engine.parameter_layout import DirectTerms, layout
 from lfrtorch.engine.simulation import Trajectory
-from lfrtorch.engine.static_jacobian import NetworkJacobian, StaticJacobian, linearise_static
+from lfrtorch.engine.static_jacobian import NetworkJacobian, StaticJacobian
 
 FADED = 1e-18
 """An initial state is forgotten when less than this fraction of it is left."""

@@ -16,8 +16,8 @@ from lfrtorch.engine.feedback_recurrence import monodromy
 from lfrtorch.engine.linear_recurrence import has_kernels, to_numpy
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.newton import newton_states
-from lfrtorch.engine.nonlinearity import is_network, is_polynomial
-from lfrtorch.engine.simulation_kernel import ACTIVATION_CODES, simulate_record
+from lfrtorch.engine.nonlinearity import Kernel, known
+from lfrtorch.engine.simulation_kernel import simulate_record
 
 PERIODIC_TOLERANCE = 1e-10
 """Largest |x(T) - x(0)| relative to 1 + max |x| that counts as periodic (states have unit rms)."""
@@ -181,8 +181,7 @@ def steady_state(
 def is_compiled(cell: LFRCell, u: Tensor) -> bool:
     """Whether the cell is simulated in machine code on the device of ``u``."""
     static = base_of(cell.static)
-    known = static is None or is_network(static) or is_polynomial(static)
-    return known and has_kernels(u)
+    return (static is None or known(static) is not None) and has_kernels(u)
 
 
 def _with_loop_where_lost(
@@ -233,18 +232,13 @@ def _compiled(
 
 def kernel_arguments(cell: LFRCell) -> list[Any]:
     """What ``simulate_record`` takes between u and the tolerance: the weights of a cell."""
-    like = cell.A.detach()
-    static, activation, growth = cell.static, "tanh", np.zeros((0, 2), np.int64)
-    vectors, matrices = [like.new_zeros(0), like.new_zeros(cell.nw)], [like.new_zeros(0, 0)] * 2
-    if is_network(static):
-        vectors, matrices = [static.bz, static.bw], [static.Wz.mT, static.Ww]
-        activation = static.activation
-    elif is_polynomial(static):
-        matrices[1], growth = static.C, np.array(static.growth)
+    static, zeros = known(cell.static), cell.A.new_zeros
+    nothing = Kernel(zeros(0, 0), zeros(0, 0), zeros(0), zeros(cell.nw))
+    *own, code, growth = nothing if static is None else static.kernel
     lti = (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
     # A leading axis, for one model or one a record; in numpy that takes half the time.
-    weights = [w.detach().numpy() for w in (*lti, *matrices, *vectors)]
+    weights = [w.detach().numpy() for w in (*lti, *own)]
     weights = [w if w.ndim == 3 else w[(np.newaxis,) * (3 - w.ndim)] for w in weights]
     count = len(weights[0])
     weights = [w if len(w) == count else w.repeat(count, axis=0) for w in weights]
-    return [*map(np.ascontiguousarray, weights), ACTIVATION_CODES[activation], growth]
+    return [*map(np.ascontiguousarray, weights), code, growth]

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-ACTIVATION_CODES = {"tanh": 0, "sigmoid": 1, "relu": 2, "rbf": 3, "softplus": 4}
+TANH, SIGMOID, RELU, RBF, SOFTPLUS = range(5)
+"""Numbers of the activations in compiled code; their rows are in ``activations``."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -91,20 +92,20 @@ def _dot(a, b):
 @njit(nogil=True, fastmath={"contract"})
 def activate(activation, h):
     """σ of all neurons in place, in loops that the compiler can turn into vector instructions."""
-    if activation == 0:
+    if activation == TANH:
         for n in range(len(h)):
             e = _exp(-2.0 * abs(h[n]))
             t = math.copysign((1.0 - e) / (1.0 + e), h[n])
             h[n] = t if h[n] == h[n] else h[n]  # NaN stays
-    elif activation == 1:
+    elif activation == SIGMOID:
         for n in range(len(h)):
             e = _exp(-abs(h[n]))
             t = (1.0 if h[n] > 0.0 else e) / (1.0 + e)
             h[n] = t if h[n] == h[n] else h[n]
-    elif activation == 2:
+    elif activation == RELU:
         for n in range(len(h)):
             h[n] = max(h[n], 0.0)
-    elif activation == 3:
+    elif activation == RBF:
         for n in range(len(h)):
             t = _exp(-h[n] * h[n])
             h[n] = t if h[n] == h[n] else h[n]
@@ -112,6 +113,20 @@ def activate(activation, h):
         for n in range(len(h)):
             t = max(h[n], 0.0) + math.log1p(_exp(-abs(h[n])))
             h[n] = t if h[n] == h[n] else h[n]
+
+
+@njit(nogil=True, error_model="numpy")
+def slope_of(activation, v, h):
+    """σ'(v) of one neuron with h = σ(v)."""
+    if activation == TANH:
+        return 1.0 - h * h
+    if activation == SIGMOID:
+        return h * (1.0 - h)
+    if activation == RELU:
+        return 1.0 if v > 0.0 else 0.0
+    if activation == RBF:
+        return -2.0 * v * h
+    return 1.0 / (1.0 + math.exp(-v))
 
 
 _STEPS = 32  # of an octave

@@ -17,53 +17,20 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Float
 
 from lfrtorch._support.types import Array
+from lfrtorch.engine.activations import FAR
 from lfrtorch.engine.nonlinearity import Network
 
 CELLS = 2**12
 """Most cells of a box."""
 
-FAR = 1e100
-"""Stands for infinity: its products are finite, and every bounded σ is at its limit."""
-
 ACTIVE = np.linspace(-4.0, 4.0, 17)
 """Where σ bends."""
 
-BOUNDED = ("tanh", "sigmoid", "rbf")
-"""Activations that are bounded."""
-
 ROUNDING = 1e-12
 """What is added to intervals, relative to their width and their distance from 0."""
-
-
-class _Activation(NamedTuple):
-    """σ and σ', and the places where each of them has an extreme."""
-
-    value: Callable[[Array], Array]
-    slope: Callable[[Array], Array]
-    extremes: tuple[float, ...]
-    extremes_of_slope: tuple[float, ...]
-
-
-def _rbf(v: Array) -> Array:
-    return np.exp(-np.square(v))
-
-
-def _logistic(v: Array) -> Array:
-    return scipy.special.expit(v)
-
-
-_FLAT = math.sqrt(0.5)
-_ACTIVATIONS = {
-    "tanh": _Activation(np.tanh, lambda v: 1.0 - np.square(np.tanh(v)), (), (0.0,)),
-    "sigmoid": _Activation(_logistic, lambda v: _logistic(v) * _logistic(-v), (), (0.0,)),
-    "relu": _Activation(lambda v: np.maximum(v, 0.0), lambda v: np.heaviside(v, 0.0), (), ()),
-    "rbf": _Activation(_rbf, lambda v: -2.0 * v * _rbf(v), (0.0,), (-_FLAT, _FLAT)),
-    "softplus": _Activation(lambda v: np.logaddexp(v, 0.0), _logistic, (), ()),
-}
 
 
 class Interval(NamedTuple):
@@ -124,7 +91,7 @@ def enclosure(
         a: what Wz z (nn,) cannot leave besides. Default: nothing more is known.
         K: a matrix; then w - K z is bounded instead of w.
     """
-    sigma = _ACTIVATIONS[static.activation]
+    sigma = static.sigma
     Wz, bz, Ww, bw = (_array(p) for p in (static.Wz, static.bz, static.Ww, static.bw))
     K = np.zeros((len(Ww), Wz.shape[1])) if K is None else K
     cells = _cells(z, Wz, bz)
@@ -135,17 +102,17 @@ def enclosure(
         cells, inside = (Interval(i.low[reached], i.high[reached]) for i in (cells, inside))
     centres = cells.middle
     v = Interval(inside.low + bz, inside.high + bz)
-    slopes = _range(sigma.slope, sigma.extremes_of_slope, v)
+    slopes = _range(sigma.slopes, sigma.slope_extremes, v)
     # J = Ww diag(slopes) Wz: an entry is a sum over the neurons.
     J = _product(Ww, _transposed(_scaled(Wz, slopes)))
     J = _transposed(J)
-    w = _product(Ww, _range(sigma.value, sigma.extremes, v))
+    w = _product(Ww, _range(sigma.values, sigma.extremes, v))
     linear = _product(K, cells)
     w = Interval(w.low + bw - linear.high, w.high + bw - linear.low)
     # The mean value theorem about the centre of each cell.
     steepest = np.maximum(np.abs(J.low - K), np.abs(J.high - K))
     reach = (steepest @ cells.radius[..., None])[..., 0]
-    at = sigma.value(centres @ Wz.T + bz) @ Ww.T + bw - centres @ K.T
+    at = sigma.values(centres @ Wz.T + bz) @ Ww.T + bw - centres @ K.T
     w = w.within(Interval(at - reach, at + reach))
     return Enclosure(_hull(w).wider(), _hull(J).wider(), _hull(slopes).wider(), centres)
 

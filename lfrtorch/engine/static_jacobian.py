@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -11,14 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vjp, vmap
 
-from lfrtorch.engine.nonlinearity import (
-    ACTIVATIONS,
-    Network,
-    Polynomial,
-    Stacked,
-    is_network,
-    is_polynomial,
-)
+from lfrtorch.engine.activations import Activation
 
 Weights = dict[str, Tensor]
 
@@ -51,38 +44,17 @@ class StaticJacobian(Protocol):
         ...
 
 
-def linearise_static(
-    static: nn.Module | None, z: Float[Tensor, "R T nz"], weights: Weights
-) -> StaticJacobian:
-    """The map linearised at z, with the given weights instead of its own."""
-    if is_network(static):
-        return NetworkJacobian(static, z, weights)
-    if is_polynomial(static):
-        return PolynomialJacobian(static, z, weights)
-    return ModuleJacobian(static, z, weights)
-
-
-_DERIVATIVES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "tanh": lambda v, h: torch.addcmul(h.new_ones(()), h, h, value=-1.0),
-    "sigmoid": lambda v, h: h * (1.0 - h),
-    "relu": lambda v, h: (v > 0).to(v.dtype),
-    "rbf": lambda v, h: -2.0 * v * h,
-    "softplus": lambda v, h: torch.sigmoid(v),
-}
-"""σ'(v) from v and h = σ(v)."""
-
-
 class NetworkJacobian:
     """A network in closed form: six times faster than ``torch.func``.
 
     With v = Wz z + bz and h = σ(v) the slopes σ'(v) are all that is not among the weights.
     """
 
-    def __init__(self, network: Network, z: Float[Tensor, "R T nz"], weights: Weights) -> None:
+    def __init__(self, sigma: Activation, z: Float[Tensor, "R T nz"], weights: Weights) -> None:
         self.Wz, self.Ww, self.z = weights["Wz"], weights["Ww"], z
         v = (z @ self.Wz.mT).add_(weights["bz"])
-        self.h = ACTIVATIONS[network.activation](v)
-        self.slope = _DERIVATIVES[network.activation](v, self.h)  # (R, T, nn)
+        self.h = sigma.value(v)
+        self.slope = sigma.slope(v, self.h)  # (R, T, nn)
         (nn, nz), nw = self.Wz.shape[-2:], self.Ww.shape[-2]
         self.sizes = [nn * nz, nn, nw * nn, nw]
         # J = Σ_n slope_n Ww[:, n] Wz[n, :] at every sample: one product with (nn, nw nz).
@@ -133,11 +105,14 @@ class PolynomialJacobian:
     """w = C m(z), in closed form: every ∂w/∂z is a polynomial in the same monomials."""
 
     def __init__(
-        self, polynomial: Polynomial, z: Float[Tensor, "R T nz"], weights: Weights
+        self,
+        m: Float[Tensor, "R T monomials"],
+        C: Float[Tensor, "*records nw monomials"],
+        slopes: Sequence[tuple[int, int, int, int]],
+        nz: int,
     ) -> None:
-        C, nz = weights["C"], polynomial.nz
-        self.m, (nw, count) = polynomial.monomials(z), C.shape[-2:]
-        n, j, e, lower = torch.tensor(polynomial.slopes, device=C.device).mT
+        self.m, (nw, count) = m, C.shape[-2:]
+        n, j, e, lower = torch.tensor(slopes, device=C.device).mT
         # Its coefficients: D[.., lower, q, j] = e C[q, n].
         D = C.new_zeros(*C.shape[:-2], count, nw, nz)
         D[..., lower, :, j] = (e * C[..., n]).movedim(-1, 0)
@@ -169,14 +144,15 @@ class ModuleJacobian:
     """Any module, by ``torch.func``; ``None`` is a map without inputs, outputs and weights."""
 
     def __init__(
-        self, static: nn.Module | None, z: Float[Tensor, "R T nz"], weights: Weights
+        self,
+        static: nn.Module | None,
+        z: Float[Tensor, "R T nz"],
+        weights: Weights,
+        by_record: int | None = None,
     ) -> None:
         self.z, self.static, self.weights = z, static, weights
-        self.by_record = None  # axis of the weights that counts the records, for vmap
-        if isinstance(static, Stacked):
-            self.static, self.by_record = static.base, 0
-            self.weights = dict(zip(static.names, weights.values(), strict=True))
-        if self.static is None:
+        self.by_record = by_record  # axis of the weights that counts the records, for vmap
+        if static is None:
             self.J = z.new_zeros(*z.shape, 0)
         else:
             self.J = self._at_every_sample(jacrev(self._map, argnums=1))

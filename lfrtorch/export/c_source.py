@@ -15,18 +15,6 @@ from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
-ACTIVATIONS = {
-    "tanh": ("tanh(v[i])", "1.0 - h[i] * h[i]"),
-    "sigmoid": ("1.0 / (1.0 + exp(-v[i]))", "h[i] * (1.0 - h[i])"),
-    "relu": ("v[i] < 0.0 ? 0.0 : v[i]", "v[i] > 0.0 ? 1.0 : 0.0"),
-    "rbf": ("exp(-v[i] * v[i])", "-2.0 * v[i] * h[i]"),
-    "softplus": (
-        "(v[i] < 0.0 ? 0.0 : v[i]) + log1p(exp(-fabs(v[i])))",
-        "1.0 / (1.0 + exp(-v[i]))",
-    ),
-}
-"""h = σ(v) and σ'(v); a v that is not a number stays one."""
-
 LINE = 96
 """Most columns of a line of numbers."""
 
@@ -82,7 +70,7 @@ def c_source(
     inner = {"NZ": e.sizes["nz"], "NW": e.sizes["nw"]} if e.static else {}
     match e.static:
         case Network():
-            known["value"], known["slope"] = ACTIVATIONS[e.static.activation]
+            known["value"], known["slope"] = e.static.sigma.c
             known["activation"] = e.static.activation
             inner["NN"] = len(e.static.bz)
         case Polynomial():

@@ -138,15 +138,5 @@ def _static(ca: Any, e: Equations, z: Any) -> Any:
         return ca.mtimes(e.weights["C"], ca.vertcat(*m))
     assert isinstance(e.static, Network)
     v = ca.mtimes(e.weights["Wz"], z) + e.weights["bz"]
-    match e.static.activation:
-        case "tanh":
-            h = ca.tanh(v)
-        case "sigmoid":
-            h = 0.5 + 0.5 * ca.tanh(0.5 * v)  # no overflow, in derivatives neither
-        case "relu":
-            h = ca.fmax(v, 0.0)
-        case "rbf":
-            h = ca.exp(-v * v)
-        case _:
-            h = ca.fmax(v, 0.0) + ca.log1p(ca.exp(-ca.fabs(v)))  # softplus
+    h = e.static.sigma.casadi(ca, v)
     return ca.mtimes(e.weights["Ww"], h) + e.weights["bw"]

@@ -12,15 +12,6 @@ from lfrtorch.export.rendering import rendered
 from lfrtorch.linear.model import LinearModel, control_labels
 from lfrtorch.model import Model
 
-ACTIVATIONS = {
-    "tanh": "np.tanh(v)",
-    "sigmoid": "0.5 + 0.5 * np.tanh(0.5 * v)",
-    "relu": "np.maximum(v, 0.0)",
-    "rbf": "np.exp(-(v**2))",
-    "softplus": "np.logaddexp(v, 0.0)",
-}
-"""h = σ(v)."""
-
 
 def control_system(model: Model | LinearModel, name: str = "model") -> Any:
     """A model as a ``control.NonlinearIOSystem`` in discrete time, physical units.
@@ -79,7 +70,7 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
         "fs": float(e.fs),
     }
     if isinstance(e.static, Network):
-        known["value"] = ACTIVATIONS[e.static.activation]
+        known["value"] = e.static.sigma.numpy
     sides = {"inputs": e.inputs, "outputs": e.outputs, "static": e.static}
     known |= {"labels": {name: control_labels(sides[name]) for name in ("inputs", "outputs")}}
     return rendered("model_py.txt", **known, **sides, **e.sizes, repr=repr)

@@ -18,14 +18,11 @@ from torch.nn import Module
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.beyond_linear import folded
-from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network, is_polynomial
+from lfrtorch.engine.nonlinearity import Network, Polynomial, known
 from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
-
-MEANT = {"rbf": ", rbf(v) = exp(-v^2)", "softplus": ", softplus(v) = log(1 + exp(v))"}
-"""Activations whose names do not say what they are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +93,9 @@ class Equations:
                 counts from 0 as {1} and from 1 as {2}.
         """
         match self.static:
-            case Network(activation=sigma):
-                static = [f"w      = f(z) = Ww {sigma}(Wz z + bz) + bw{MEANT.get(sigma, '')}"]
+            case Network(activation=name_of_sigma, sigma=sigma):
+                meaning = f", {sigma.meaning}" if sigma.meaning else ""
+                static = [f"w      = f(z) = Ww {name_of_sigma}(Wz z + bz) + bw{meaning}"]
             case Polynomial():
                 static = ["w      = f(z) = C m, m = 1, z1, z2, .., z1 z1, z1 z2, .."]
             case Own():
@@ -188,8 +186,8 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
 
 def static_map(static: Module | None, own: bool) -> Network | Polynomial | Own | None:
     """f, as far as this package knows its equations."""
-    if static is None or is_network(static) or is_polynomial(static):
-        return static
+    if static is None or known(static) is not None:
+        return known(static)
     if own:
         return Own(deepcopy(static).to(device="cpu", dtype=torch.float64).eval())
     raise InputError(

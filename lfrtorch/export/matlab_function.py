@@ -13,38 +13,6 @@ from lfrtorch.export.rendering import rendered
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
-ACTIVATIONS = {
-    "tanh": ("tanh(a)", "1 - h .^ 2"),
-    "sigmoid": ("1 ./ (1 + exp(-a))", "h .* (1 - h)"),
-    "relu": ("max(a, 0)", "double(a > 0)"),
-    "rbf": ("exp(-a .^ 2)", "-2 * a .* h"),
-    "softplus": ("max(a, 0) + log1p(exp(-abs(a)))", "1 ./ (1 + exp(-a))"),
-}
-"""h = σ(a) and σ'(a)."""
-
-MEAN_SLOPES = {
-    "tanh": ["s = (1 - tanh(a) .* tanh(v)) .* over(tanh(d), d);"],
-    "sigmoid": ["s = (1 - tanh(a / 2) .* tanh(v / 2)) .* over(tanh(d / 2), d / 2) / 4;"],
-    "relu": [
-        "s = over(max(a, 0) - max(v, 0), d);",
-        "s(a > 0 & v > 0) = 1;",
-        "s(a <= 0 & v <= 0) = 0;",
-    ],
-    "rbf": [
-        "q = abs(d .* (v + a));",
-        "s = -(v + a) .* exp(-min(a .^ 2, v .^ 2)) .* over(-expm1(-q), q);",
-    ],
-    "softplus": [
-        "s = 1 ./ (1 + exp(-v));",
-        "near = abs(d) < 1 & d ~= 0;",
-        "s(near) = log1p(s(near) .* expm1(d(near))) ./ d(near);",
-        "far = abs(d) >= 1;",
-        "value = @(v) max(v, 0) + log1p(exp(-abs(v)));",
-        "s(far) = (value(a(far)) - value(v(far))) ./ d(far);",
-    ],
-}
-"""s = (σ(a) - σ(v)) / d with a = v + d, as ``lfrtorch.analysis.lpv_form.mean_slope``."""
-
 
 def matlab_function(
     model: Model | LinearModel, name: str = "model"
@@ -96,8 +64,8 @@ def matlab_function(
     }
     match e.static:
         case Network():
-            known["value"], known["slope"] = ACTIVATIONS[e.static.activation]
-            known["mean_slope"] = MEAN_SLOPES[e.static.activation]
+            known["value"], known["slope"] = e.static.sigma.matlab
+            known["mean_slope"] = e.static.sigma.matlab_mean_slope
         case Polynomial():
             known["monomials"] = e.static.C.shape[1]
             # Numbers of monomials and of z count from 1.

@@ -11,6 +11,7 @@ import numpy as np
 
 from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
+from lfrtorch.engine.activations import Activation
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.export.equations import Equations, Own, check_name, equations
 from lfrtorch.export.traced_map import IR, OPSET, traced
@@ -73,7 +74,7 @@ def _sample(e: Equations, graph: Graph) -> None:
         z = combined("z", {"Cz": "x", "Dzu": v})
         match e.static:
             case Network():
-                w = _network(graph, e, e.static.activation, z)
+                w = _network(graph, e, e.static.sigma, z)
             case Polynomial():
                 w = _polynomial(graph, e, e.static.growth, z)
             case Own():
@@ -83,27 +84,14 @@ def _sample(e: Equations, graph: Graph) -> None:
     combined("y", y, graph.constant("y_offset", e.y_offset))
 
 
-def _network(graph: Graph, e: Equations, activation: str, z: str) -> str:
+def _network(graph: Graph, e: Equations, sigma: Activation, z: str) -> str:
     """w = Ww h + bw with h = σ(Wz z + bz)."""
 
     def affine(W: str, b: str, signal: str) -> str:
         product = graph.node("MatMul", signal, graph.constant(W, e.weights[W].T))
         return graph.node("Add", product, graph.constant(b, e.weights[b]))
 
-    return affine("Ww", "bw", _activation(graph, activation, affine("Wz", "bz", z)))
-
-
-def _activation(graph: Graph, name: str, v: str) -> str:
-    """σ(v)."""
-    node = graph.node
-    match name:
-        case "rbf":
-            return node("Exp", node("Neg", node("Mul", v, v)))
-        case "softplus":  # the operator of that name has no float64 in every runtime
-            one = graph.constant("one", np.ones(1))
-            rest = node("Log", node("Add", one, node("Exp", node("Neg", node("Abs", v)))))
-            return node("Add", node("Relu", v), rest)
-    return node({"tanh": "Tanh", "sigmoid": "Sigmoid", "relu": "Relu"}[name], v)
+    return affine("Ww", "bw", sigma.onnx(graph, affine("Wz", "bz", z)))
 
 
 def _polynomial(graph: Graph, e: Equations, growth: Sequence[tuple[int, int]], z: str) -> str:

@@ -22,9 +22,8 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import of_static
-from lfrtorch.engine.nonlinearity import Network, is_network
+from lfrtorch.engine.nonlinearity import Network, is_network, linearise_static
 from lfrtorch.engine.static_enclosure import enclosure, everywhere
-from lfrtorch.engine.static_jacobian import linearise_static
 from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.certificate import (
     SLOWEST,

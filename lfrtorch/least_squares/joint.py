@@ -20,7 +20,7 @@ from torch.nn import Parameter
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Stacked, is_network, is_polynomial
+from lfrtorch.engine.nonlinearity import Stacked, known
 from lfrtorch.engine.sensitivity import Linearisation, Rows
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.least_squares.jacobian import Jacobian, OutputRows
@@ -43,7 +43,7 @@ def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
     own = {n.removeprefix("static."): w for n, w in weights.items() if n.startswith("static.")}
     if first.static is None:
         static = None
-    elif is_network(first.static) or is_polynomial(first.static):
+    elif known(first.static) is not None:
         static = copy.deepcopy(first.static)
         for name, w in own.items():  # vectors get an axis for time
             setattr(static, name, Parameter(w if w.ndim == 3 else w.unsqueeze(1)))

@@ -14,11 +14,12 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 import lfrtorch.engine.newton
+from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linear_recurrence import compiled, scan
 from lfrtorch.engine.linearised import linearise as linearise_of
 from lfrtorch.engine.newton import newton_states
-from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network
+from lfrtorch.engine.nonlinearity import Network
 
 pytestmark = pytest.mark.numeric
 

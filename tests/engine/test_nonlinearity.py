@@ -10,8 +10,9 @@ from reference import SIGMA, normal
 from torch.func import functional_call, jacrev, vmap
 from torch.testing import assert_close
 
+from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Polynomial
+from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.simulation import simulate
 
 pytestmark = pytest.mark.numeric

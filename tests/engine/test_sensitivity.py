@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from lfrtorch.engine import sensitivity
+from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import ACTIVATIONS
 from lfrtorch.engine.sensitivity import Linearisation, output_jacobian
 from lfrtorch.engine.simulation import simulate, steady_state
 

@@ -13,10 +13,11 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.engine import simulation
+from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import monodromy
 from lfrtorch.engine.linearised import linearise, spectral_radius
-from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Polynomial
+from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.simulation import (
     PERIODIC_TOLERANCE,
     Trajectory,

@@ -9,7 +9,8 @@ from reference import normal
 from torch.func import jacrev, vmap
 
 from lfrtorch._support.types import Array
-from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network
+from lfrtorch.engine.activations import ACTIVATIONS
+from lfrtorch.engine.nonlinearity import Network
 from lfrtorch.engine.static_enclosure import Interval, enclosure, everywhere
 
 pytestmark = pytest.mark.numeric

@@ -7,8 +7,9 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.testing import assert_close
 
-from lfrtorch.engine.nonlinearity import ACTIVATIONS, Network, Polynomial, Stacked
-from lfrtorch.engine.static_jacobian import StaticJacobian, linearise_static
+from lfrtorch.engine.activations import ACTIVATIONS
+from lfrtorch.engine.nonlinearity import Network, Polynomial, Stacked, linearise_static
+from lfrtorch.engine.static_jacobian import StaticJacobian
 
 pytestmark = pytest.mark.numeric
 

@@ -153,5 +153,5 @@ def test_what_is_not_finite_becomes_null():
     }
 
 
-def test_neurons_of_several_layers():
+def test_neurons_in_words():
     assert report.neurons({"nn": 0}) == "a map of one's own"

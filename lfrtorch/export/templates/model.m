@@ -27,8 +27,7 @@ y = m.Cy * x + m.Dyu * v + m.y_offset;
 {% if static %}
 z = m.Cz * x + m.Dzu * v;
 {% if value %}
-a = m.Wz * z + m.bz; % of the neurons
-h = {{ value }};
+[h, slope] = neurons(m.Wz * z + m.bz);
 w = m.Ww * h + m.bw;
 {% else %}
 p = ones({{ monomials }}, 1); % 1, z1, z2, .., z1 z1, z1 z2, ..
@@ -42,7 +41,7 @@ y = y + m.Dyw * w;
 {% endif %}
 if nargout > 2
 {% if value %}
-    J = m.Ww * bsxfun(@times, {{ slope }}, m.Wz); % dw/dz
+    J = m.Ww * bsxfun(@times, slope, m.Wz); % dw/dz
 {% elif static %}
     J = zeros({{ nw }}, {{ nz }}); % dw/dz
     for i = 1:size(m.slopes, 1)
@@ -63,3 +62,10 @@ if nargout > 2
 {% endif %}
 end
 end
+{% if value %}
+
+function [h, slope] = neurons(v)
+h = {{ value }};
+slope = {{ slope }};
+end
+{% endif %}

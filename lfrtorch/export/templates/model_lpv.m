@@ -63,14 +63,12 @@ a = v + d;
 {% for line in mean_slope %}
 {{ line }}
 {% endfor %}
-{% if activation != "softplus" %}
 end
 
 function q = over(a, d)
 % a / d, and 1 for d = 0.
 q = ones(size(d));
 q(d ~= 0) = a(d ~= 0) ./ d(d ~= 0);
-{% endif %}
 end
 {% endif %}
 {% else %}
