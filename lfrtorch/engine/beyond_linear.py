@@ -11,19 +11,9 @@ from lfrtorch.engine.cell import LFRCell
 
 
 class Beyond(Module):
-    """What a map is beyond a linear one, in other coordinates: w = W (f(Z z) - L Z z).
+    """What a map f is beyond a linear one, in other coordinates: w = W (f(Z z) - L Z z).
 
-    Args:
-        base: f.
-        slope: L.
-        into: Z, from the coordinates of this map to those of f.
-        out: W.
-
-    Example:
-        >>> from lfrtorch.engine.beyond_linear import Beyond
-        >>> one = torch.eye(1)
-        >>> Beyond(torch.nn.Tanh(), one, one, 2 * one)(torch.tensor([0.5])).round(decimals=3)
-        tensor([-0.0760])
+    The buffers ``slope``, ``into`` and ``out`` are L, Z and W.
     """
 
     slope: Tensor
@@ -68,13 +58,7 @@ def base_of(static: Module | None) -> Module | None:
 def folded(cell: LFRCell) -> LFRCell:
     """The cell with f itself in the place of its ``Beyond``; any other cell as it is.
 
-    L, Z and W go into the linear block. x, u and y are the same signals as before; z and w are
-    those of f.
-
-    Example:
-        >>> from lfrtorch.engine.beyond_linear import folded
-        >>> folded(model.lfr.cell) is model.lfr.cell
-        True
+    L, Z and W go into the linear block. x, u and y stay; z and w are those of f.
     """
     beyond = cell.static
     if not isinstance(beyond, Beyond):

@@ -26,15 +26,7 @@ IN_SERIES = ("wiener_hammerstein", "parallel")
 
 
 def zeros_of(cell: LFRCell) -> dict[str, Tensor]:
-    """Which entries of the parameters are 0 for good, by name; names without any are left out.
-
-    Example:
-        >>> from lfrtorch.engine.block_form import zeros_of
-        >>> cell = lfrtorch.LFRCell(nu=1, ny=1, nx=2, nz=1, nw=1, static=lfrtorch.Network(1, 1, 5))
-        >>> cell.structure = "wiener_hammerstein"
-        >>> zeros_of(cell)["Cz"], zeros_of(cell)["Bw"].tolist()
-        (tensor([[False,  True]]), [[True], [False]])
-    """
+    """Entries of the parameters that are 0 for good, by the names of those that have any."""
     after = torch.arange(cell.nx, device=cell.A.device) >= cell.nx // 2
     match cell.structure:
         case "wiener":

@@ -66,13 +66,7 @@ def system_lines(
     inputs: Sequence[Channel],
     outputs: Sequence[Channel],
 ) -> list[str]:
-    """Tables of poles and of gains at rest of systems by name, side by side.
-
-    Args:
-        systems: in physical units.
-        fs: sampling frequency in Hz.
-        inputs, outputs: channels.
-    """
+    """Tables of poles and gains at rest of systems by name, physical units, next to each other."""
     head, columns, count = [], [], 0
     for name, system in systems.items():
         roots = frequency_and_damping(np.linalg.eigvals(system.A).astype(complex), fs)

@@ -1,9 +1,7 @@
-"""Recurrences of the linearised model, of which no F(k) is formed: F(k) = A + Bw J(k) Cz.
+"""Recurrences of the linearised model without forming F(k) = A + Bw J(k) Cz.
 
-J(k) has nw nz entries and F(k) has nx². A step of one column costs nx (nx + nz + nw) products, and
-the memory that it passes is that of J, the drive and the states.
-
-Machine code serves the CPU; any other device forms F and goes through ``linear_recurrence``.
+J(k) has nw nz entries and F(k) has nx². A step of one column takes nx (nx + nz + nw) products.
+Compiled code serves the CPU; other devices form F and use ``scan``.
 """
 
 from __future__ import annotations
@@ -22,10 +20,10 @@ from lfrtorch.engine.blocked_kernel import add_feedback
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.jacobian_kernel import copy_to
 from lfrtorch.engine.linear_recurrence import (
-    adjoint_recurrence,
     flush,
     has_kernels,
     linear_recurrence,
+    scan,
     to_numpy,
 )
 from lfrtorch.engine.linearised import PASS, linearise_at, static_slope
@@ -55,7 +53,7 @@ def backwards(
     """All costates of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end."""
     if not has_kernels(J):
         F = linearise_at(weights, J).F
-        return adjoint_recurrence(F, g.unsqueeze(-1), end.unsqueeze(-1)).squeeze(-1)
+        return scan(F.mT.flip(1), g.unsqueeze(-1).flip(1), end.unsqueeze(-1)).squeeze(-1).flip(1)
     return _states(_backwards, weights, J, g, end, -1)
 
 
@@ -88,7 +86,7 @@ def _states(
     known: Float[Tensor, "R nx"],
     at: int,
 ) -> Float[Tensor, "R T+1 nx"]:
-    """What a kernel finds from the states that are known at one time."""
+    """Run a kernel from the states that are known at one time."""
     s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
     s[:, at] = known
     spread(kernel, len(g), *_matrices(weights), to_numpy(J), to_numpy(g), s.numpy())

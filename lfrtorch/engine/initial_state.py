@@ -1,8 +1,8 @@
 """The initial state of a record, estimated from its output.
 
-An output tells the initial state as long as the state is in it: until the last sample with a
-weight, and no longer than until the transition Φ(k) = ∂x(k)/∂x(0) has faded. What comes later costs
-nothing here but, before a fit, one simulation from rest.
+An output tells the initial state until the last sample with a weight, and no longer than until the
+transition Φ(k) = ∂x(k)/∂x(0) has faded. Later samples cost nothing here but, before a fit, one
+simulation from rest.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ def start_from_beginning(
 ) -> Float[Tensor, "R nx"]:
     """``estimated_start``, or the state that a half, a quarter, ... of each record tells.
 
-    Of an oscillation that runs long the error has many minima, one for each phase, and that of its
-    beginning has few. A beginning's state is refined on the whole record, and taken where the
-    squared error is far less.
+    The error of a long oscillation has many minima, one for each phase, and that of its beginning
+    has few. A beginning's state is refined on the whole record, and taken if the squared error is
+    far less.
     """
 
     def squares(trajectory: Trajectory) -> Tensor:
@@ -87,21 +87,15 @@ def estimated_start(
     y: Float[Tensor, "R T ny"],
     weight: Float[Tensor, "R T ny"],
 ) -> Float[Tensor, "R nx"]:
-    """The most probable initial state, given the output.
+    """The most probable initial state, given the output and the factors of its errors.
 
-    Least squares alone follows the noise if there are few samples and many states, and the model's
-    errors, which are as slow as its states. So x0ᵀ P⁻¹ x0 is added to the squared errors over their
-    variance: a normal prior, see ``state_moments``. The variance is estimated in PASSES. The state
-    of least squares is taken if it is FAR better, as a system may begin far from where the training
-    data have been, or if the prior makes no difference, as where there are far more samples than
-    states. A state from which the model runs away, though it does not from rest, is improbable: the
-    simulation begins at rest then.
-
-    Args:
-        cell: the model.
-        u: input.
-        y: output.
-        weight: factors of the errors.
+    Least squares alone follows the noise if samples are few and states many, and the model's
+    errors, which are as slow as its states. So a normal prior adds x0ᵀ P⁻¹ x0 to the squared errors
+    over their variance, see ``state_moments``; PASSES estimate that variance. The state of least
+    squares is taken if it is FAR better, as a system may begin far from where the training data
+    have been, or if the prior makes no difference, as with far more samples than states. From a
+    state after which the model runs away, though it does not from rest, the simulation begins at
+    rest instead.
     """
     R, nx = len(u), cell.nx
     counted = (weight != 0).sum(dim=(1, 2))
@@ -228,7 +222,7 @@ def _factor(
     prior: Float[Tensor, "R nx nx"],
     at: Trajectory,
 ) -> tuple[Float[Tensor, "R n nx"], Float[Tensor, "R n 1"]]:
-    """Rows of the weighted errors' derivative by x0, over the prior's, and the errors; QR of both.
+    """R of the QR of [derivative by x0 | errors], weighted, with the rows of the prior.
 
     dy(k)/dx0 = H(k) Φ(k) with Φ(k+1) = F(k) Φ(k), Φ(0) = I.
     """

@@ -31,18 +31,7 @@ from lfrtorch.engine.cell import LFRCell
 
 
 def predictor_cell(cell: LFRCell, K: Float[Tensor, "nx ny"]) -> LFRCell:
-    """The one-step predictor of a cell with the innovation gain K: its inputs are u, then y.
-
-    Example:
-        >>> from lfrtorch.engine.innovation import predictor_cell, split_predictor
-        >>> cell = lfrtorch.LFRCell(nu=1, ny=1, nx=2)
-        >>> predictor = predictor_cell(cell, torch.ones(2, 1))
-        >>> predictor.nu, predictor.past_outputs
-        (2, 1)
-        >>> again, K = split_predictor(predictor)
-        >>> torch.equal(again.A, cell.A), K.shape
-        (True, torch.Size([2, 1]))
-    """
+    """The one-step predictor of a cell with the innovation gain K: its inputs are u, then y."""
     with torch.no_grad():
         K = K.to(cell.A)
         found = _like(cell, cell.nu + cell.ny)
@@ -57,7 +46,7 @@ def predictor_cell(cell: LFRCell, K: Float[Tensor, "nx ny"]) -> LFRCell:
 
 
 def split_predictor(cell: LFRCell) -> tuple[LFRCell, Float[Tensor, "nx ny"]]:
-    """The cell of the system itself, and its innovation gain K, of a predictor."""
+    """The cell of a predictor's system, and its innovation gain K."""
     with torch.no_grad():
         found = _like(cell, cell.nu - cell.ny)
         weights, K = split_weights(dict(cell.named_parameters()))
@@ -70,7 +59,7 @@ def split_predictor(cell: LFRCell) -> tuple[LFRCell, Float[Tensor, "nx ny"]]:
 def split_weights(
     weights: Mapping[str, Tensor],
 ) -> tuple[dict[str, Tensor], Float[Tensor, "*axes nx ny"]]:
-    """The same of a predictor's parameters by name; they may have leading axes."""
+    """The same for parameters by name, which may have leading axes."""
     nu = weights["Bu"].shape[-1] - weights["Cy"].shape[-2]
     Bu, K = weights["Bu"][..., :nu], weights["Bu"][..., nu:].clone()
     Dyu = weights["Dyu"][..., :nu]

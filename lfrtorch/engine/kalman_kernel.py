@@ -75,11 +75,10 @@ def filter_record(
 def correct(e, H, G, x, U, w_hat):
     """Let x know the output; write the noise of the states into w_hat.
 
-    Returns:
-        M, the number of outputs that are known, and log p(e).
+    Returns M, the number of known outputs and log p(e). A missing output is NaN in e.
 
     Shape:
-        e: (ny,), NaN if missing, H: (ny, nx), G: (ny + nx, ny + nx), x, w_hat: (nx,), U: (nx, nx).
+        e: (ny,), H: (ny, nx), G: (ny + nx, ny + nx), x, w_hat: (nx,), U: (nx, nx).
     """
     ny, nx = H.shape
     total, known = ny + nx, 0

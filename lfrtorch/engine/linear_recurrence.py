@@ -1,8 +1,7 @@
 """Linear recurrences s(k+1) = F(k) s(k) + g(k), for many columns at once.
 
-Sensitivities, adjoints, Newton steps over a trajectory and periodic boundaries are such
-recurrences; the simulation itself is in ``simulation_kernel``. ``compiled`` (numba) serves the CPU,
-and ``scan`` (torch, parallel in time) any other device.
+Newton steps over a trajectory, start states and periodic boundaries are such recurrences. Compiled
+code serves the CPU, and ``scan``, parallel in time, any other device.
 """
 
 from __future__ import annotations
@@ -17,6 +16,9 @@ from torch import Tensor
 
 from lfrtorch._support.threads import spread
 
+NOTHING = 1e-30
+"""Size of what is set to 0, for states of unit size."""
+
 COMPILED_ON = {"cpu"}
 """Devices that have compiled kernels; all else runs in torch, parallel in time."""
 
@@ -30,30 +32,12 @@ def linear_recurrence(
     F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], s0: Float[Tensor, "R n m"]
 ) -> Float[Tensor, "R T+1 n m"]:
     """All states of s(k+1) = F(k) s(k) + g(k), s(0) = s0."""
-    return compiled(F, g, s0) if has_kernels(F) else scan(F, g, s0)
-
-
-def adjoint_recurrence(
-    F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], end: Float[Tensor, "R n m"]
-) -> Float[Tensor, "R T+1 n m"]:
-    """All states of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end: the transposed one, back in time."""
-    if has_kernels(F):
-        return compiled(F, g, end, backwards=True)
-    return scan(F.mT.flip(1), g.flip(1), end).flip(1)
-
-
-def compiled(
-    F: Float[Tensor, "R T n n"],
-    g: Float[Tensor, "R T n m"],
-    s0: Float[Tensor, "R n m"],
-    *,
-    backwards: bool = False,
-) -> Float[Tensor, "R T+1 n m"]:
-    """Either recurrence in machine code, records in parallel; CPU tensors of one dtype."""
+    if not has_kernels(F):
+        return scan(F, g, s0)
     R, T, n, m = g.shape
     s = g.new_empty(R, T + 1, n, m)
-    s[:, T if backwards else 0] = s0
-    spread(_recur_back if backwards else _recur, R, to_numpy(F), to_numpy(g), s.detach().numpy())
+    s[:, 0] = s0
+    spread(_recur, R, to_numpy(F), to_numpy(g), s.detach().numpy())
     return s
 
 
@@ -76,40 +60,22 @@ def _recur(r, F, g, s):
             flush(s[r, k + 1])
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _recur_back(r, F, g, s):
-    _, T, n, m = g.shape
-    for k in range(T - 1, -1, -1):
-        for i in range(n):
-            for c in range(m):
-                a = g[r, k, i, c]
-                for j in range(n):
-                    a += F[r, k, j, i] * s[r, k + 1, j, c]
-                s[r, k, i, c] = a
-        if k % 256 == 255:
-            flush(s[r, k])
-
-
 @njit(nogil=True)
 def flush(s):
-    """A fading state would reach denormal numbers, a hundred times slower, and stay there."""
+    """Set faded entries to 0: on denormal numbers a recurrence is a hundred times slower."""
     for i in range(s.shape[0]):
         for c in range(s.shape[1]):
             if abs(s[i, c]) < NOTHING:
                 s[i, c] = 0.0
 
 
-NOTHING = 1e-30
-"""States of unit size that have faded to less are zero."""
-
-
 def scan(
     F: Float[Tensor, "R T n n"], g: Float[Tensor, "R T n m"], s0: Float[Tensor, "R n m"]
 ) -> Float[Tensor, "R T+1 n m"]:
-    """The recurrence in about 3 √T batched products: chunks of √T steps side by side.
+    """The recurrence in about 3 √T batched products: chunks of √T steps next to each other.
 
-    First, every chunk runs from a zero state, together with its transition matrices. Then one loop
-    over the chunks finds their initial states. Last, the response to these is added in each chunk.
+    Every chunk runs from a zero state, together with its transition matrices; one loop over the
+    chunks finds their initial states; the response to these is added in each chunk.
     """
     R, T, n, m = g.shape
     steps = max(1, math.isqrt(T))

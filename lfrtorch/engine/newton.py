@@ -38,17 +38,10 @@ def newton_states(
 ) -> Float[Tensor, "R T+1 nx"]:
     """States of x(k+1) = f(x(k), u(k)), those of the loop over time to rounding.
 
-    Args:
-        cell: the model. Its matrices may have a leading axis R, one model a record.
-        u: input.
-        x0: initial state.
-        guess: states of a nearby trajectory from any initial state. Default: x0 at all times.
-        periodic: close the boundary by x(T) = x(0) instead of x(0) = x0.
-
-    Returns:
-        The states. A record is NaN if the iteration does not converge or overflows (a model that
-        diverges or is chaotic), or if the periodic solution is not stable: no simulation would
-        settle to it.
+    With ``periodic`` the boundary is x(T) = x(0) instead of x(0) = x0. ``guess`` has the states of
+    a nearby trajectory from any initial state; the default is x0 at all times. A record is NaN if
+    the iteration does not converge or overflows (a model that diverges or is chaotic), or if the
+    periodic solution is not stable: no simulation would settle to it.
 
     References:
         Lim, Zhu, Selfridge and Kasim, "Parallelizing non-linear sequential models over the sequence
@@ -85,10 +78,10 @@ def _open(
 def _closed(
     F: Float[Tensor, "R T nx nx"], defect: Float[Tensor, "R T nx"], gap: Float[Tensor, "R nx"]
 ) -> tuple[Float[Tensor, "R T+1 nx"], Float[Tensor, "R nx nx"]]:
-    """The same from d(0) = d(T) + gap: all d and the transition matrix Φ over the whole record.
+    """The same from d(0) = d(T) + gap: all d, and the transition matrix Φ over the whole record.
 
-    d(k) = Φ(k) d(0) + p(k). One recurrence computes the columns of [Φ(k) p(k)], and the boundary
-    gives (I - Φ) d(0) = p(T) + gap.
+    d(k) = Φ(k) d(0) + p(k): one recurrence has the columns of [Φ(k) p(k)], and the boundary gives
+    (I - Φ) d(0) = p(T) + gap.
     """
     R, _, nx = defect.shape
     identity = torch.eye(nx, dtype=F.dtype, device=F.device).expand(R, nx, nx)

@@ -1,7 +1,7 @@
-"""The model about an operating point: where a constant input holds it, and its linearisation there.
+"""The model at rest under a constant input, and linearised at a point.
 
-At rest x = f(x, u). Newton's method on the gap f(x, u) - x takes steps d with (I - F) d = gap,
-F = ∂f/∂x, halved until the gap shrinks.
+At rest x = f(x, u). Newton's method on the gap f(x, u) - x takes steps d with (I - F) d = gap, F =
+∂f/∂x, halved until the gap shrinks.
 """
 
 from __future__ import annotations
@@ -79,10 +79,10 @@ def linearised_at(cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"
 
 @torch.no_grad()
 def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] | None:
-    """The state in which the constant input holds the model; None if none is found.
+    """The state at rest under a constant input; None if none is found.
 
     Newton's method begins at x = 0, and then at the end of a simulation from there. The rest may be
-    unstable. If there are several, it is the one that the search comes to.
+    unstable, and one of several.
     """
     x = _newton(cell, u, u.new_zeros(cell.nx))
     if x is None:
@@ -94,10 +94,7 @@ def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] 
 
 @torch.no_grad()
 def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"] | None:
-    """The input next to u under which an integrating model is at rest; None if none is found.
-
-    Gauss-Newton for the gap in x and u together, by the least steps, from x = 0.
-    """
+    """The input next to u under which an integrating model is at rest, or None."""
     identity, x = torch.eye(cell.nx, dtype=u.dtype), u.new_zeros(cell.nx)
     for _ in range(MAX_NEWTON):
         gap = cell(u, x)[1] - x

@@ -29,9 +29,9 @@ _EQUATIONS = {
 class DirectTerms(NamedTuple):
     """Direct terms of some columns.
 
-    A triple (column, row, regressor) in ``x``, ``z`` or ``y`` says that the column's parameter
-    multiplies ``v[regressor]`` in that row of the equation. The columns of the static map begin at
-    ``first``; ``static`` holds their positions among all weights of the map.
+    A triple (column, row, regressor) in ``x``, ``z`` or ``y``: the column's parameter multiplies
+    ``v[regressor]`` in that row of the equation. Columns of the static map begin at ``first``;
+    ``static`` has their positions among all weights of the map.
     """
 
     x: Int[Tensor, "n_x 3"]

@@ -46,12 +46,7 @@ SHRINKS, ROUNDS = 0.99, 50
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Bounds of all signals, in normalised units.
-
-    Args:
-        x, y, z, w: bounds of the signals.
-        map: what the static map does in them, if there is one.
-    """
+    """Bounds of all signals, normalised, and what the static map does in them."""
 
     x: Interval
     y: Interval
@@ -61,16 +56,7 @@ class Reach:
 
 
 def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]) -> Reach:
-    """Bounds of all signals for |u| <= amplitude, all normalised.
-
-    Args:
-        cell: in float64 on the CPU.
-        amplitude: of u.
-        x0: initial state.
-
-    Raises:
-        ValueError: A is not stable, or the static map not bounded.
-    """
+    """Bounds of all signals for |u| <= amplitude, normalised; the cell is in float64 on the CPU."""
     _check(cell)
     loop = _Loop(cell, amplitude, x0)
     nothing = np.empty(0)
@@ -98,11 +84,7 @@ def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]
 
 
 class _Loop:
-    """The linear part of a model with the rows that are bounded: x, y, z and, if nz > 1, Wz z.
-
-    Args:
-        cell, amplitude, x0: see ``reach``.
-    """
+    """The linear part of a model with the rows that are bounded: x, y, z and, if nz > 1, Wz z."""
 
     def __init__(
         self, cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]

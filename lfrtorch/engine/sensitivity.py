@@ -59,13 +59,7 @@ MANY_STATES = 8
 
 
 class Rows(NamedTuple):
-    """Rows of the Jacobian for some records and samples.
-
-    Args:
-        records, time: which ones.
-        rows: dy/dθ, then the columns of the initial state, then the spare ones.
-        end: derivative of the state after these samples; the next block may overwrite it.
-    """
+    """Rows dy/dθ of some records and samples, columns of the initial state and spare ones."""
 
     records: slice
     time: slice
@@ -105,12 +99,10 @@ class Linearisation:
     Args:
         cell: the model; parameters with ``requires_grad=False`` are no part of θ. Its weights are
             copied. They may have a leading axis of length R: one model a record.
-        u: input of the trajectory.
-        trajectory: of this cell.
+        u, trajectory: input and signals of this cell.
         periodic: whether the initial state is the end state, whatever the parameters. Otherwise it
             does not depend on them.
-        weights: weights to use instead of the cell's own, in the order of its parameters; all of
-            them are θ then.
+        weights: to use instead of the cell's own, in their order; all of them are θ then.
     """
 
     @torch.no_grad()
@@ -248,7 +240,7 @@ class Linearisation:
     def _periodic_costate(self, e: Float[Tensor, "R T ny"]) -> Float[Tensor, "R nx"]:
         """λ(T) = λ(0) in periodic steady state.
 
-        λ(0) is what a change of the initial state does to the outputs. It needs the samples up to
+        λ(0) is what a change of the initial state does to the outputs. It takes the samples up to
         where that change has faded, and no more.
         """
         Phi, times = self._transition
@@ -260,10 +252,7 @@ class Linearisation:
 
     @property
     def _transition(self) -> tuple[Float[Tensor, "R nx nx"], list[slice]]:
-        """The product of all F(k), and the blocks that an initial state takes to fade.
-
-        ``rows`` finds it on the way.
-        """
+        """Φ over a whole record, and the blocks in which an initial state fades."""
         if self._known_transition is not None:
             return self._known_transition
         R, nx = self.state.shape
@@ -293,7 +282,7 @@ class Linearisation:
 
     @property
     def _times(self) -> list[slice]:
-        """Those blocks."""
+        """The blocks of samples."""
         T = self.u.shape[1]
         return list(_slices(T, T if self._whole else max(1, PASS // len(self.u))))
 
@@ -320,11 +309,7 @@ class Linearisation:
         return by_weight[..., columns.static.to(by_weight.device)]
 
     def _rows_generic(self, block: _Block, columns: DirectTerms, S: Tensor, rows: Tensor) -> Tensor:
-        """Write the rows of a block and return the next S: in torch, on any device.
-
-        ``d_w`` holds the direct terms of w. G and E are what they and the entries of v make of x+
-        and y.
-        """
+        """Write the rows of a block and return the next S: in torch, on any device."""
         J, v, by_weight = block.static.J, block.v, self._by_weight(block, columns)
         C = S.shape[-1]
         d_w = v.new_zeros(*v.shape[:2], J.shape[2], C)

@@ -66,16 +66,10 @@ def simulate(
 ) -> Trajectory:
     """Trajectory from the state ``x0``. A model that diverges gives infinite or NaN samples.
 
-    On the CPU a linear model, a ``Network`` and a ``Polynomial`` are simulated in machine code. Any
-    other map, and any other device, goes through Newton's method over all of time. If that fails
-    for a record, it is simulated step by step.
-
-    Args:
-        cell: the model. Its weights may have a leading axis of length R: one model a record.
-        u: input.
-        x0: initial state.
-        guess: states of a nearby trajectory, T + 1 of them, for Newton's method. Machine code
-            needs none.
+    On the CPU a linear model, a ``Network`` and a ``Polynomial`` run in machine code. Any other map
+    or device goes through Newton's method over all of time, from the states ``guess`` of a nearby
+    trajectory; records for which that fails are simulated step by step. Weights may have a leading
+    axis R: one model a record.
     """
     if is_compiled(cell, u):
         return _compiled(cell, u, x0, None)
@@ -86,10 +80,7 @@ def simulate(
 def simulate_near(
     cell: LFRCell, u: Float[Tensor, "R T nu"], x0: Float[Tensor, "R nx"], near: Trajectory
 ) -> Trajectory:
-    """``simulate``, given the trajectory of the same model and input from another initial state.
-
-    In machine code the simulation ends where the two have met.
-    """
+    """``simulate``, given the trajectory from another initial state, up to where both meet."""
     if is_compiled(cell, u):
         return _compiled(cell, u, x0, Trajectory(*(signal.clone() for signal in near)))
     return simulate(cell, u, x0, guess=near.x)
@@ -179,7 +170,7 @@ def steady_state(
 
 
 def is_compiled(cell: LFRCell, u: Tensor) -> bool:
-    """Whether the cell is simulated in machine code on the device of ``u``."""
+    """Whether machine code simulates the cell on the device of ``u``."""
     static = base_of(cell.static)
     return (static is None or known(static) is not None) and has_kernels(u)
 
@@ -213,7 +204,7 @@ def _compiled(
     x0: Float[Tensor, "R nx"],
     near: Trajectory | None,
 ) -> Trajectory:
-    """Trajectory of a cell that ``is_compiled``, in machine code on the CPU.
+    """Trajectory in machine code of a cell that ``is_compiled``.
 
     ``near`` is the trajectory of the same model and input from another initial state; it is
     overwritten. Once the two have met, the rest of it is taken over.
@@ -231,7 +222,7 @@ def _compiled(
 
 
 def kernel_arguments(cell: LFRCell) -> list[Any]:
-    """What ``simulate_record`` takes between u and the tolerance: the weights of a cell."""
+    """The weights of a cell as ``simulate_record`` takes them, between u and the tolerance."""
     static, zeros = known(cell.static), cell.A.new_zeros
     nothing = Kernel(zeros(0, 0), zeros(0, 0), zeros(0), zeros(cell.nw))
     *own, code, growth = nothing if static is None else static.kernel

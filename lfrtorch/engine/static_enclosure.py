@@ -60,8 +60,7 @@ class Interval(NamedTuple):
 
 
 class Enclosure(NamedTuple):
-    """What a map cannot leave in a box: w (nw,), or w - K z, J = ∂w/∂z (nw, nz), and the slopes σ'
-    (nn,).
+    """What a map cannot leave in a box: w (nw,), or w - K z, J = ∂w/∂z (nw, nz), and σ' (nn,).
 
     ``centres`` (C, nz) are the middles of its cells.
     """
@@ -83,13 +82,9 @@ def enclosure(
     a: Interval | None = None,
     K: Float[Array, "nw nz"] | None = None,
 ) -> Enclosure:
-    """Bounds of a network's outputs and of its slopes.
+    """Bounds of a network's outputs and slopes in a box z (nz,); ``everywhere`` for any z.
 
-    Args:
-        static: the network.
-        z: box (nz,) of its inputs; ``everywhere`` for any.
-        a: what Wz z (nn,) cannot leave besides. Default: nothing more is known.
-        K: a matrix; then w - K z is bounded instead of w.
+    ``a`` is what Wz z (nn,) cannot leave besides. With ``K``, w - K z is bounded instead of w.
     """
     sigma = static.sigma
     Wz, bz, Ww, bw = (_array(p) for p in (static.Wz, static.bz, static.Ww, static.bw))

@@ -16,21 +16,21 @@ from torch.testing import assert_close
 import lfrtorch.engine.newton
 from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linear_recurrence import compiled, scan
+from lfrtorch.engine.linear_recurrence import linear_recurrence, scan
 from lfrtorch.engine.linearised import linearise as linearise_of
 from lfrtorch.engine.newton import newton_states
 from lfrtorch.engine.nonlinearity import Network
 
 pytestmark = pytest.mark.numeric
 
-WAYS = [compiled, scan]  # of the CPU, and of any other device
+WAYS = [linear_recurrence, scan]  # of the CPU, and of any other device
 
 
 def found(
     cell: LFRCell,
     u: Tensor,
     x0: Tensor,
-    way: Callable[..., Tensor] = compiled,
+    way: Callable[..., Tensor] = linear_recurrence,
     **options: Any,
 ) -> Tensor | None:
     with patch.object(lfrtorch.engine.newton, "linear_recurrence", way):
