@@ -19,10 +19,8 @@ from lfrtorch.reporting import linear_plots, plots, survey_plots
 REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "api" / "lfrtorch.md"
 
 MODULES = [
-    *(importlib.import_module(f"{analysis.__name__}.{m.name}")
-      for m in pkgutil.iter_modules(analysis.__path__)),
     *(getattr(datasets, name) for name in datasets.__all__),
-    distributed, export, plots, linear_plots, survey_plots,
+    analysis, distributed, export, plots, linear_plots, survey_plots,
 ]  # fmt: skip
 
 WITHOUT = {"distributed.ProcessGroup"}

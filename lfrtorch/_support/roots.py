@@ -18,7 +18,7 @@ def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | 
     alternates from sample to sample; of a root at 0 it is not known.
 
     Example:
-        >>> from lfrtorch.analysis.poles import frequency_and_damping
+        >>> from lfrtorch._support.roots import frequency_and_damping
         >>> s = 2 * np.pi * 5.0 * np.array([-0.1 + 0.995j, -0.1 - 0.995j])  # 5 Hz, 10 % damping
         >>> (pole,) = frequency_and_damping(np.exp(s / 100.0), fs=100.0)
         >>> round(pole["frequency"], 1), round(pole["damping"], 2)
@@ -46,7 +46,7 @@ def remark(root: Mapping[str, Any], *, pole: bool) -> str:
     """Whether a root stands for two, and whether it is an unstable pole.
 
     Example:
-        >>> from lfrtorch.analysis.poles import frequency_and_damping, remark
+        >>> from lfrtorch._support.roots import frequency_and_damping, remark
         >>> roots = frequency_and_damping(np.array([1.1 + 0.1j, 1.1 - 0.1j]), fs=1.0)
         >>> [remark(root, pole=True) for root in roots]
         ['pair, unstable']

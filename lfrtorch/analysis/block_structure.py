@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.tables import percent
 from lfrtorch._support.types import Array, Booleans
-from lfrtorch.analysis.canonical_form import MOST_SAMPLES, canonical
+from lfrtorch.analysis.canonical_form import MOST_SAMPLES, canonical, nearest_affine
 from lfrtorch.engine.linearised import spectral_radius, static_slope
 from lfrtorch.engine.operating_point import double
 from lfrtorch.metrics import rms
@@ -157,8 +157,8 @@ def _states(A: Array, driven: Float[Array, "T nx"]) -> Float[Array, "T nx"]:
 
 def _left(signal: Float[Array, "T n"], regressors: Float[Array, "T m"]) -> float:
     """Part of the rms of a signal that an affine map of others at the same sample leaves."""
-    affine = np.hstack([regressors, np.ones((len(signal), 1))])
-    left = signal - affine @ np.linalg.lstsq(affine, signal, rcond=None)[0]
+    slope, constant = nearest_affine(regressors, signal)
+    left = signal - regressors @ slope.T - constant
     return float(rms(left) / max(float(rms(signal - signal.mean(axis=0))), 1e-300))
 
 

@@ -12,8 +12,9 @@ from torch.nn import Module
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.tables import engineering, number, quantity, table
+from lfrtorch._support.tables import engineering, number, table
 from lfrtorch._support.types import Array
+from lfrtorch.analysis.linearisation import levels_of, vector
 from lfrtorch.engine.beyond_linear import Beyond, folded
 from lfrtorch.engine.operating_point import double
 from lfrtorch.engine.reach import reach
@@ -88,9 +89,9 @@ def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) ->
     """
     cell, scaler = double(model.lfr.cell), model.scaler
     size = amplitudes(amplitude, len(model.inputs))
-    start = np.zeros(cell.nx) if x0 is None else reals("x0", x0).ravel()
-    if len(start) != cell.nx or not np.isfinite(start).all():
-        raise InputError(f"x0 is {x0!r}; the model has {cell.nx} states: give as many numbers.")
+    start = (
+        np.zeros(cell.nx) if x0 is None else vector("x0", x0, cell.nx, "the model has {} states")
+    )
     reached = reach(folded(cell), size / scaler.u_scale, start)
     y = np.stack([scaler.restore_y(side) for side in reached.y], axis=-1)
     signals = reached.x, *_unfolded(cell.static, reached.z, reached.w)
@@ -116,13 +117,7 @@ def _mapped(M: Array, v: Interval) -> Interval:
 
 
 def amplitudes(given: ArrayLike, nu: int) -> Array:
-    """An amplitude for each input.
-
-    Example:
-        >>> from lfrtorch.analysis.bounds import amplitudes
-        >>> amplitudes(0.5, nu=2)
-        array([0.5, 0.5])
-    """
+    """An amplitude for each input."""
     found = np.atleast_1d(reals("amplitude", given))
     if found.shape not in ((1,), (nu,)) or not (np.isfinite(found) & (found >= 0)).all():
         raise InputError(
@@ -130,15 +125,3 @@ def amplitudes(given: ArrayLike, nu: int) -> Array:
             "or one for each, in physical units and not negative."
         )
     return np.broadcast_to(found, nu).copy()
-
-
-def levels_of(channels: tuple[Channel, ...], amplitude: Array) -> str:
-    """Amplitudes with the names and units of their channels.
-
-    Example:
-        >>> from lfrtorch.analysis.bounds import levels_of
-        >>> levels_of((lfrtorch.Channel("force", "N"),), np.array([2.0]))
-        'force 2.00 N'
-    """
-    pairs = zip(channels, amplitude, strict=True)
-    return ", ".join(f"{c.name} {quantity(float(a), c.unit)}" for c, a in pairs)

@@ -108,7 +108,7 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     x_all, z_all, w_all = (np.concatenate(parts) for parts in (x, z, w))
     if not all(np.isfinite(part).all() for part in (x_all, w_all)):
         raise InputError("the model diverges on the records; give others.")
-    slope, constant = _nearest(z_all, w_all)
+    slope, constant = nearest_affine(z_all, w_all)
     beyond = [w_r - z_r @ slope.T - constant for w_r, z_r in zip(w, z, strict=True)]
     left = np.concatenate(beyond)
     if not np.sum(left**2) > FLAT * np.sum(w_all**2):
@@ -123,24 +123,24 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     A, Bu = A + Bw @ slope @ Cz, Bu + Bw @ slope @ Dzu
     Cy, Dyu = Cy + Dyw @ slope @ Cz, Dyu + Dyw @ slope @ Dzu
     # w in coordinates of unit covariance, turned to the directions of its response in y.
-    W = _whitening(left)
+    W = whitening(left)
     responses = [_response(A, Bw, Cy, Dyw, one, W) for one in beyond]
     power, turn = _ordered(sum(responses, np.zeros((len(W), len(W)))))
     W = turn.T @ W
     # z, turned to the directions in which the slope of w changes the most.
-    Z = _whitening(z_all)
+    Z = whitening(z_all)
     J = static_slope(cell, torch.as_tensor(z_all)[None])[0].numpy()
     bent = np.sqrt(power)[:, None] * (W @ (J - slope) @ _inverse(Z))
     bends, turn = _ordered(np.einsum("swi,swj->ij", bent, bent) / len(bent))
     Z = turn.T @ Z
-    points = np.exp(2j * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)
-    Z = _signs(frequency_response(A, Bu, Z @ Cz, Z @ Dzu, points), 1)[:, None] * Z
-    into_y = frequency_response(A, Bw @ _inverse(W), Cy, Dyw @ _inverse(W), points)
+    circle = np.exp(2j * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)
+    Z = _signs(frequency_response(A, Bu, Z @ Cz, Z @ Dzu, circle), 1)[:, None] * Z
+    into_y = frequency_response(A, Bw @ _inverse(W), Cy, Dyw @ _inverse(W), circle)
     W = _signs(into_y, 2)[:, None] * W
     # x, turned to the axes of the observability Gramian.
-    X = _whitening(x_all)
+    X = whitening(x_all)
     seen = np.vstack([Cy, Z @ Cz]) @ _inverse(X)
-    G = frequency_response(X @ A @ _inverse(X), np.eye(len(A)), seen, np.zeros_like(seen), points)
+    G = frequency_response(X @ A @ _inverse(X), np.eye(len(A)), seen, np.zeros_like(seen), circle)
     _, turn = _ordered(np.einsum("fsi,fsj->ij", G.conj(), G).real)
     X = turn.T @ X
     seen = seen @ turn
@@ -171,7 +171,7 @@ def _cell(cell: LFRCell, made: dict[str, Array], slope: Array, into: Array, out:
     return found
 
 
-def _nearest(
+def nearest_affine(
     z: Float[Array, "S nz"], w: Float[Array, "S nw"]
 ) -> tuple[Float[Array, "nw nz"], Float[Array, " nw"]]:
     """Slope and constant of the affine map nearest to w(z)."""
@@ -180,11 +180,12 @@ def _nearest(
     return solution[:-1].T, solution[-1]
 
 
-def _whitening(signal: Float[Array, "S n"]) -> Float[Array, "n n"]:
+def whitening(signal: Float[Array, "S n"]) -> Float[Array, "n n"]:
     """T such that T s has unit covariance."""
     centred = signal - signal.mean(axis=0)
     power, axes = np.linalg.eigh(centred.T @ centred / len(centred))
-    return (axes / np.sqrt(np.maximum(power, FLAT * max(power[-1], 1e-300)))).T
+    least = max(FLAT * float(power.max(initial=0.0)), 1e-300)
+    return (axes / np.sqrt(np.maximum(power, least))).T
 
 
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -205,9 +206,9 @@ def _response(
     It is computed from frequency responses, which an unstable linear block has, too.
     """
     lines = np.asarray(np.fft.rfftfreq(len(w)), dtype=np.float64)
-    between = np.exp(2j * np.pi * (lines + 0.5 / len(w)))  # so that no pole at 1 is hit
+    z = np.exp(2j * np.pi * (lines + 0.5 / len(w)))  # between the lines: no pole at 1 is hit
     out = _inverse(W)
-    G = frequency_response(A, Bw @ out, Cy, Dyw @ out, between)
+    G = frequency_response(A, Bw @ out, Cy, Dyw @ out, z)
     power = np.sum(np.abs(np.fft.rfft(w @ W.T, axis=0)) ** 2, axis=1)
     return np.einsum("fyi,fyj,f->ij", G.conj(), G, power).real
 

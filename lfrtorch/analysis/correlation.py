@@ -44,12 +44,6 @@ class Correlation:
 
     Shape:
         lags, values, bounds: (K,).
-
-    Example:
-        >>> from lfrtorch.analysis.correlation import autocorrelation
-        >>> noise = np.random.default_rng(0).standard_normal(1000)
-        >>> autocorrelation(noise).p > 0.01, autocorrelation(noise.cumsum()).p > 0.01
-        (True, False)
     """
 
     lags: Int64[Integers, " K"]
@@ -133,14 +127,7 @@ def cross_correlation(
 
 
 def white_cross_correlation(e: Float[Array, " S"], x: Float[Array, " T"], lags: int) -> Correlation:
-    """The same of signals that end together and are white already, as ``whitened`` returns them.
-
-    Example:
-        >>> from lfrtorch.analysis.correlation import white_cross_correlation
-        >>> noise = np.random.default_rng(0).standard_normal(500)
-        >>> white_cross_correlation(noise, noise[10:], 5).largest
-        0
-    """
+    """The same for signals that end together and are ``whitened`` already."""
     T = min(len(e), len(x))
     every = range(-lags, lags + 1)
     values, bounds, scores = _correlated(e[-T:], x[-T:], every)
@@ -152,21 +139,8 @@ def white_cross_correlation(e: Float[Array, " S"], x: Float[Array, " T"], lags: 
 def whitened(x: Float[Array, " T"]) -> Float[Array, " S"]:
     """Errors of predicting a signal from its past: white if an autoregressive model describes it.
 
-    By Burg's method; Akaike's criterion chooses the order, up to 10 log10 T.
-
-    Returns:
-        The last samples, fewer than given by the order.
-
-    References:
-        Burg, "Maximum entropy spectral analysis", PhD thesis, Stanford University, 1975.
-
-    Example:
-        >>> from lfrtorch.analysis.correlation import autocorrelation, whitened
-        >>> noise = np.random.default_rng(0).standard_normal(2000)
-        >>> slow = signal.lfilter([1.0], [1.0, -1.6, 0.7], noise)
-        >>> errors = whitened(slow)
-        >>> len(errors) < 2000, bool(np.std(errors) < 0.4 * np.std(slow))
-        (True, True)
+    By Burg's method (PhD thesis, Stanford University, 1975); Akaike's criterion chooses the order,
+    up to 10 log10 T, and as many samples are missing at the beginning.
     """
     T = len(x)
     forward = backward = best = x - x.mean()
@@ -207,19 +181,16 @@ def _correlated(
 
 
 def _dot(a: Float[Array, " T"], b: Float[Array, " T"]) -> float:
-    """Σ a b on one thread: the sum of ``@`` depends on the threads of BLAS, which wait long where
-    other work keeps them from their processors (34 s instead of 0.2 s were seen)."""
+    """Σ a b on one thread.
+
+    The sum of ``@`` depends on the threads of BLAS, which wait long where other work keeps them
+    from their processors (34 s instead of 0.2 s were seen).
+    """
     return float(np.einsum("t,t->", a, b))
 
 
 def lags_for(T: int, lags: int | None = None) -> int:
-    """How many lags a test of T samples has.
-
-    Example:
-        >>> from lfrtorch.analysis.correlation import lags_for
-        >>> lags_for(1000), lags_for(80), lags_for(1000, 100)
-        (25, 5, 100)
-    """
+    """Number of lags in a test of T samples."""
     if lags is None:
         return min(LAGS, max(LEAST, T // SAMPLES_A_LAG))
     integer("lags", lags, 1)

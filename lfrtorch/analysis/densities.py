@@ -1,4 +1,4 @@
-"""Power spectral densities: of signals, and of the noise that repeated periods show."""
+"""Power spectral densities of signals, and of the noise that repeated periods show."""
 
 from __future__ import annotations
 
@@ -38,11 +38,6 @@ class Densities:
 
     Shape:
         frequencies, output, error: (F,), noise_frequencies, noise: (K,).
-
-    Example:
-        >>> (part,) = lfrtorch.analysis.residuals(bla, record).parts
-        >>> part.densities.error.shape == part.densities.frequencies.shape
-        True
     """
 
     frequencies: Float[Array, " F"]
@@ -55,14 +50,7 @@ class Densities:
 def power_density(
     signals: Float[Array, "T n"], fs: float
 ) -> tuple[Float[Array, " F"], Float[Array, "F n"]]:
-    """Frequencies in Hz and power spectral densities of signals, by Welch's method.
-
-    Example:
-        >>> from lfrtorch.analysis.densities import power_density
-        >>> f, density = power_density(record.y, record.fs)
-        >>> float(f[-1]), np.allclose(density.sum() * f[1], record.y.var(), rtol=0.2)
-        (50.0, True)
-    """
+    """Frequencies in Hz and power spectral densities of signals, by Welch's method."""
     T = len(signals)
     segment = min(SEGMENT, T, max(SHORTEST, T // 8))
     f, density = scipy.signal.welch(signals, fs, nperseg=segment, axis=0)
@@ -72,15 +60,8 @@ def power_density(
 def noise_of_periods(records: Sequence[Record]) -> Float[Array, " ny"] | None:
     """Standard deviation of the noise in the outputs, from the differences between periods.
 
-    None if no record has two periods, if an input does not repeat, if the periods differ, or if
-    the differences are not steady: those of a transient or a disturbance are no noise.
-
-    Example:
-        >>> from lfrtorch.analysis.densities import noise_of_periods
-        >>> noise = 0.1 * np.random.default_rng(0).standard_normal(800)
-        >>> twice = lfrtorch.Record(np.tile(u, 2), np.tile(y, 2) + noise, period=400)
-        >>> noise_of_periods([twice]).round(2).tolist()
-        [0.1]
+    None if no record has two periods, if an input does not repeat, if the periods differ, or if the
+    differences are not steady: those of a transient or a disturbance are no noise.
     """
     spectra = _steady_spectra(records)
     return None if spectra is None else np.sqrt(_noise_power(spectra).sum(axis=0))
@@ -89,13 +70,7 @@ def noise_of_periods(records: Sequence[Record]) -> Float[Array, " ny"] | None:
 def noise_density(
     record: Record,
 ) -> tuple[Float[Array, " F"], Float[Array, "F ny"]] | None:
-    """Frequencies in Hz and power spectral densities of that noise, or None.
-
-    Example:
-        >>> from lfrtorch.analysis.densities import noise_density
-        >>> noise_density(record) is None  # it has one period
-        True
-    """
+    """Frequencies in Hz and power spectral densities of that noise, or None."""
     spectra = _steady_spectra([record])
     if spectra is None:
         return None

@@ -1,9 +1,9 @@
-"""Derivatives of a simulated output with what the data can tell of the parameters, along a record.
+"""Derivatives of a simulated output along a record, by the parameters that the data can tell.
 
-The columns are those of ``gauge``: the other parameters are held, which changes no output. A start
-state moves along with the parameters. That of a periodic record is its end; one that is estimated
-is that which fits best: with rows X of the start state, J of the parameters and weights W it moves
-by dx0 = -(W X)⁺ W J dθ. Then rows of the model's output are J + X dx0/dθ.
+The columns are those of ``gauge``: the other parameters are held, which changes no output. The
+start state moves with the parameters: the one of a periodic record is its end; an estimated one is
+the one that fits best, which moves by dx0 = -(W X)⁺ W J dθ for rows X of the start state, J of the
+parameters and weights W. Rows of the model's output are then J + X dx0/dθ.
 """
 
 from __future__ import annotations
@@ -28,21 +28,13 @@ SEEN = 1e-9
 
 
 class Gradients:
-    """Rows dy/dθ of one record, block by block, normalised.
+    """Rows dy/dθ of one record, block by block, normalised; the model is in float64.
 
     Args:
-        model: in float64.
-        record: how it starts, too.
         kept: the columns, by their place in θ.
         fitted: whether an estimated start was fitted together with the parameters. Otherwise it
             follows from the skipped samples, as in ``Model.simulate``.
         hold: whether to keep the rows, rather than compute them at each pass.
-
-    Example:
-        >>> from lfrtorch.analysis.gradients import Gradients
-        >>> along = Gradients(model, record, torch.arange(model.parameter_count), fitted=True)
-        >>> [rows.shape for _, rows in along.blocks()]
-        [torch.Size([400, 1, 21])]
     """
 
     def __init__(
@@ -142,13 +134,6 @@ class Gradients:
 
 
 def root(G: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
-    """R with R Rᵀ = G, of a matrix that is positive semidefinite but for rounding errors.
-
-    Example:
-        >>> from lfrtorch.analysis.gradients import root
-        >>> R = root(torch.diag(torch.tensor([4.0, -1e-9])))
-        >>> (R @ R.mT).round(decimals=3).tolist()
-        [[4.0, 0.0], [0.0, 0.0]]
-    """
+    """R with R Rᵀ = G, of a matrix that is positive semidefinite but for rounding errors."""
     values, vectors = torch.linalg.eigh((G + G.mT) / 2)
     return vectors * values.clamp_min(0.0).sqrt()

@@ -11,10 +11,8 @@ from numpy.typing import ArrayLike
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
-from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.resolvent import gain_jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +95,8 @@ def response_band(model: LinearModel, frequencies: ArrayLike) -> ResponseBand:
         >>> lfrtorch.analysis.response_band(bla, [0.0, 10.0]).std.shape
         (2, 1, 1)
     """
-    covariance = _covariance(model)
-    response = model.frf(frequencies)
     f = np.atleast_1d(reals("frequencies", frequencies))
-    z = np.exp(2j * np.pi * f / model.fs)
-    J = gain_jacobian(model.A, model.B, model.C, z)
-    parts = np.stack([J.real, J.imag], axis=-2)
-    of = np.einsum("...ip,pq,...jq->...ij", parts, covariance, parts, optimize=True)
-    return ResponseBand(f, response, of)
+    return ResponseBand(f, model.frf(f), model.frf_covariance(f))
 
 
 @typed()
@@ -125,7 +117,7 @@ def pole_bands(model: LinearModel) -> tuple[PoleBand, ...]:
         1
     """
     nx = model.nx
-    covariance = _covariance(model)[: nx * nx, : nx * nx]
+    covariance = model.known_covariance[: nx * nx, : nx * nx]
     poles, right = np.linalg.eig(model.A)
     left = np.linalg.pinv(right)
     found = []
@@ -156,12 +148,3 @@ def pole_bands(model: LinearModel) -> tuple[PoleBand, ...]:
 def _std(gradient: Array, covariance: Array) -> float:
     variance = gradient @ covariance @ gradient
     return math.sqrt(variance) if variance > 0 else 0.0 * float(variance)
-
-
-def _covariance(model: LinearModel) -> Array:
-    if model.covariance is None:
-        raise InputError(
-            "the covariance of this model is not known: take one of estimate_bla, or of "
-            "lfrtorch.analysis.uncertainty(model, records).linearise()."
-        )
-    return model.covariance

@@ -11,7 +11,7 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import quantity
-from lfrtorch._support.types import Array
+from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.operating_point import (
     StateSpace,
     double,
@@ -81,15 +81,18 @@ def linearise(
 
 
 def linear_part(model: Model) -> LinearModel:
-    """A, Bu, Cy and Dyu of a model, in physical units: what it is without its static map.
-
-    Example:
-        >>> from lfrtorch.analysis.linearisation import linear_part
-        >>> linear_part(model).nx
-        1
-    """
+    """A, Bu, Cy and Dyu of a model, in physical units: the model without its static map."""
     system = linear_part_of(double(model.lfr.cell))
     return _linear_model(model, system, model.scaler.u_offset, model.scaler.y_offset)
+
+
+def poles_at_rest(model: Model) -> Complex:
+    """Poles (nx,) of the model linearised at rest at the inputs' offsets, or at x = 0."""
+    cell = double(model.lfr.cell)
+    u = cell.A.new_zeros(cell.nu)
+    x = equilibrium(cell, u)
+    at = linearised_at(cell, u, u.new_zeros(cell.nx) if x is None else x)
+    return np.asarray(np.linalg.eigvals(at.A), complex)
 
 
 def _linear_model(model: Model, system: StateSpace, u0: Array, y0: Array) -> LinearModel:
@@ -99,13 +102,7 @@ def _linear_model(model: Model, system: StateSpace, u0: Array, y0: Array) -> Lin
 
 
 def vector(name: str, given: ArrayLike, size: int, expected: str) -> Array:
-    """The numbers of an argument; refuse another shape and numbers that are not finite.
-
-    Example:
-        >>> from lfrtorch.analysis.linearisation import vector
-        >>> vector("u", 0.5, 1, "the model has {} input(s)").tolist()
-        [0.5]
-    """
+    """The numbers of an argument; refuse another shape and numbers that are not finite."""
     found = np.atleast_1d(reals(name, given))
     if found.shape != (size,) or not np.isfinite(found).all():
         raise InputError(
@@ -115,16 +112,18 @@ def vector(name: str, given: ArrayLike, size: int, expected: str) -> Array:
 
 
 def _no_rest(model: Model, u0: Array, still: Tensor | None) -> str:
-    scaler, missing = model.scaler, f"no state at rest was found under {_levels(model.inputs, u0)}"
+    scaler, inputs = model.scaler, model.inputs
+    missing = f"no state at rest was found under {levels_of(inputs, u0, ' = ')}"
     if still is None:
-        offsets = _levels(model.inputs, scaler.u_offset)
+        offsets = levels_of(inputs, scaler.u_offset, " = ")
         near = f"; the offsets are {offsets}.\nGive an input nearer to these"
     else:
-        at = _levels(model.inputs, scaler.u_offset + scaler.u_scale * still.numpy())
+        at = levels_of(inputs, scaler.u_offset + scaler.u_scale * still.numpy(), " = ")
         near = f": the model integrates.\nGive no input for where it stands still, {at}"
     return f"{missing}{near}, or a state: linearise(model, u, x=...)."
 
 
-def _levels(channels: tuple[Channel, ...], values: Array) -> str:
+def levels_of(channels: tuple[Channel, ...], values: Array, sign: str = " ") -> str:
+    """Values with the names and units of their channels."""
     pairs = zip(channels, values, strict=True)
-    return ", ".join(f"{c.name} = {quantity(float(v), c.unit)}" for c, v in pairs)
+    return ", ".join(f"{c.name}{sign}{quantity(float(v), c.unit)}" for c, v in pairs)

@@ -84,37 +84,20 @@ class LPV:
     def scheduling(
         self, x: Float[Array, "*axes nx"], u: Float[Array, "*axes nu"]
     ) -> Float[Array, "*axes P"]:
-        """p of states and inputs.
-
-        Example:
-            >>> form = lfrtorch.analysis.lpv(model)
-            >>> form.scheduling(np.zeros(1), np.zeros(1)).shape
-            (4,)
-        """
+        """Return p of states and inputs."""
         zeta = (x - self.x0) @ self.Cz.T + (u - self.u0) @ self.Dzu.T
         points = zeta.reshape(int(np.prod(zeta.shape[:-1])), len(self.Cz))
         return self.slopes(points).reshape(*zeta.shape[:-1], len(self.bounds))
 
     def at(self, p: Float[Array, " P"]) -> tuple[Array, Array, Array, Array]:
-        """A(p), B(p), C(p) and D(p).
-
-        Example:
-            >>> form = lfrtorch.analysis.lpv(model)
-            >>> A, B, C, D = form.at(form.bounds.mean(axis=1))
-        """
+        """A(p), B(p), C(p) and D(p)."""
         A, B, C, D = (M[0] + np.tensordot(p, M[1:], 1) for M in (self.A, self.B, self.C, self.D))
         return A, B, C, D
 
     def step(
         self, x: Float[Array, " nx"], u: Float[Array, " nu"]
     ) -> tuple[Float[Array, " nx"], Float[Array, " ny"]]:
-        """Next state and output.
-
-        Example:
-            >>> x_next, y = lfrtorch.analysis.lpv(model).step(np.zeros(1), np.ones(1))
-            >>> np.allclose(y, model.simulate([1.0])[0])
-            True
-        """
+        """Next state and output."""
         A, B, C, D = self.at(self.scheduling(x, u))
         dx, du = x - self.x0, u - self.u0
         return self.x_next0 + A @ dx + B @ du, self.y0 + C @ dx + D @ du
@@ -262,11 +245,6 @@ def gauss_legendre(static: Module | None) -> tuple[Float[Array, " n"], Float[Arr
     """Nodes and weights of a rule for integrals of a map's slope from 0 to 1.
 
     The slope of a polynomial is one in t, for which few nodes are exact.
-
-    Example:
-        >>> from lfrtorch.analysis.lpv_form import gauss_legendre
-        >>> [part.tolist() for part in gauss_legendre(lfrtorch.Polynomial(1, 1, degree=1))]
-        [[0.5], [1.0]]
     """
     found = known(static)
     nodes = (found.degree + 1) // 2 if isinstance(found, Polynomial) else NODES

@@ -24,6 +24,7 @@ from lfrtorch._support.drawing import (
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import percent
 from lfrtorch._support.types import Array
+from lfrtorch.analysis.canonical_form import nearest_affine, whitening
 from lfrtorch.analysis.linearisation import linear_part, linearise
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import static_slope
@@ -48,27 +49,15 @@ GRID = 121
 LOWEST, FREQUENCIES = 1e-3, 500
 """First frequency relative to half the sampling frequency, and how many."""
 
-FLAT = 1e-9
-"""Least variance of z in a direction, relative to the largest."""
-
 HEIGHT, LEAST_HEIGHT = 2.7, 3.6
 """Of a panel, and of the figure, in inches."""
 
 
 class Visited(NamedTuple):
-    """Where the static map is used, and the affine map that is the nearest to it there.
+    """Where the static map is used, and its nearest affine map there.
 
-    Args:
-        z: inputs (S, nz).
-        slope, offset: of w = slope z + offset, (nw, nz) and (nw,).
-        nonlinear: part of the rms of w (about its mean) that this leaves, (nw,).
-        known: whether z are those of data.
-
-    Example:
-        >>> from lfrtorch.analysis.model_plots import visited
-        >>> where = visited(model, model.lfr.cell, record)
-        >>> where.known, where.nonlinear.shape
-        (True, (1,))
+    z (S, nz) are its inputs and w = slope z + offset is that map; ``nonlinear`` is the part of the
+    rms of each w (about its mean) that it leaves; ``known`` says whether z are from data.
     """
 
     z: Float[Array, "S nz"]
@@ -79,13 +68,7 @@ class Visited(NamedTuple):
 
 
 def model_figure(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
-    """See :func:`lfrtorch.analysis.plot`.
-
-    Example:
-        >>> from lfrtorch.analysis.model_plots import model_figure
-        >>> len(model_figure(model).axes)  # a response, the poles, a map over its density
-        4
-    """
+    """See :func:`lfrtorch.analysis.plot`."""
     systems = {"linear part": linear_part(model)}
     with suppress(InputError):  # it may have no rest at the offsets
         systems["at rest"] = linearise(model)
@@ -106,16 +89,7 @@ def model_figure(model: Model, records: Record | Sequence[Record] | None = None)
 
 
 def static_figure(model: Model, records: Record | Sequence[Record] | None = None) -> Figure:
-    """The last part of that figure alone: the nonlinearity of the static map.
-
-    Raises:
-        ValueError: as ``lfrtorch.analysis.plot``, or a model without a static map.
-
-    Example:
-        >>> from lfrtorch.analysis.model_plots import static_figure
-        >>> len(static_figure(model, record).axes)  # a map over its density
-        2
-    """
+    """The last part of that figure alone: the nonlinearity of the static map."""
     cell = double(model.lfr.cell)
     if not cell.nw:
         raise InputError("the model is linear and has no static map to draw.")
@@ -127,14 +101,7 @@ def static_figure(model: Model, records: Record | Sequence[Record] | None = None
 
 
 def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | None) -> Visited:
-    """Inputs of the static map along simulations, and its nearest affine map there.
-
-    Example:
-        >>> from lfrtorch.analysis.model_plots import visited
-        >>> found = visited(model, model.lfr.cell, record)
-        >>> found.z.shape, found.slope.shape
-        ((400, 1), (1, 1))
-    """
+    """Inputs of the static map along simulations, and its nearest affine map there."""
     if records is None:
         noise = np.random.default_rng(0).standard_normal((NOISE_SAMPLES, cell.nu))
         signals = [model.scaler.u_offset + model.scaler.u_scale * noise]
@@ -148,11 +115,10 @@ def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | No
             "the model diverges under white noise of the training inputs' rms; give records."
         )  # fmt: skip
     w = _static(cell, z)
-    affine = np.hstack([z, np.ones((len(z), 1))])
-    solution: Array = np.asarray(np.linalg.lstsq(affine, w, rcond=None)[0], dtype=np.float64)
+    slope, offset = nearest_affine(z, w)
     deviation = np.std(w, axis=0)
-    left = rms(w - affine @ solution, axis=0) / np.where(deviation > 0, deviation, 1.0)
-    return Visited(z, solution[:-1].T, solution[-1], left, records is not None)
+    left = rms(w - z @ slope.T - offset, axis=0) / np.where(deviation > 0, deviation, 1.0)
+    return Visited(z, slope, offset, left, records is not None)
 
 
 @torch.no_grad()
@@ -246,29 +212,14 @@ def _maps(part: Figure | SubFigure, cell: LFRCell, where: Visited, count: int) -
 def most_nonlinear(cell: LFRCell, where: Visited, j: int) -> tuple[Float[Array, " S"], float]:
     """Where z is along the direction in which output j of the static map changes its slope most.
 
-    It is the leading eigenvector of the mean of g gᵀ, g the slope less its mean, in coordinates in
-    which z has unit covariance.
-
-    Returns:
-        Coordinates of the samples, and the part of the mean of |g|² that lies in that direction: if
-        it is 100 %, the nonlinearity is a function of one variable.
-
-    References:
-        Constantine, "Active Subspaces", SIAM, 2015.
-
-    Example:
-        >>> from lfrtorch.analysis.model_plots import most_nonlinear, visited
-        >>> where = visited(model, model.lfr.cell, record)
-        >>> at, share = most_nonlinear(model.lfr.cell, where, 0)
-        >>> at.shape, round(share, 6)  # of one z
-        ((400,), 1.0)
+    It is the leading eigenvector of the mean of g gᵀ, g the slope less its mean, where z has unit
+    covariance (Constantine, "Active Subspaces", SIAM, 2015). The second result is the part of the
+    mean of |g|² in that direction: 100 % of a nonlinearity that is a function of one variable.
     """
-    centred = where.z - where.z.mean(axis=0)
-    powers, axes = np.linalg.eigh(centred.T @ centred / len(centred))
-    scale = np.sqrt(np.maximum(powers, FLAT * powers[-1]))
+    T = whitening(where.z)
     J = static_slope(cell, torch.as_tensor(where.z)[None])[0, :, j].numpy()
-    g = (J - J.mean(axis=0)) @ (axes * scale)
+    g = (J - J.mean(axis=0)) @ np.linalg.inv(T)
     shares, directions = np.linalg.eigh(g.T @ g / len(g))
     total = float(shares.sum())
-    at = (centred @ axes / scale) @ directions[:, -1]
+    at = (where.z - where.z.mean(axis=0)) @ T.T @ directions[:, -1]
     return at, float(shares[-1]) / total if total > 0 else 1.0

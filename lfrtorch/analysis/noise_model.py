@@ -35,20 +35,7 @@ FADED, LONGEST = 1e-4, 2048
 
 
 class Spectra:
-    """Spectra of residuals and of what the fit took of the noise, summed over stretches.
-
-    Args:
-        longest: samples of the longest block.
-        ny: outputs.
-
-    Example:
-        >>> from lfrtorch.analysis.noise_model import Spectra
-        >>> spectra = Spectra(1000, 1)
-        >>> white = np.random.default_rng(0).standard_normal((1000, 1))
-        >>> spectra.add(white, np.ones((1000, 1, 1)) / 1000**0.5)
-        >>> bool(0.9 < spectra.autocovariance()[0, 0] < 1.1)
-        True
-    """
+    """Spectra of residuals and of what the fit took of the noise, summed over stretches."""
 
     def __init__(self, longest: int, ny: int) -> None:
         self.segment = min(SEGMENT, longest)
@@ -66,7 +53,7 @@ class Spectra:
             self.left += counted - taken.sum(axis=2)
 
     def autocovariance(self) -> Float[Array, "L ny"]:
-        """Of the noise, by lag."""
+        """Autocovariance of the noise, by lag."""
         n = 2 * self.segment
         L = max(2, self.segment // RESOLUTION)
         taper = np.zeros((n, 1))
@@ -84,13 +71,6 @@ class NoiseModel:
     Args:
         a: coefficients 1, a1, a2 ... of each output.
         covariance: of ε.
-
-    Example:
-        >>> from lfrtorch.analysis.noise_model import NoiseModel
-        >>> noise = NoiseModel((np.array([1.0, -0.5]),), np.array([[0.75]]))  # of unit variance
-        >>> V = noise.coloured(np.eye(3)[:, None])
-        >>> (V.T @ V).round(3)[0].tolist()
-        [1.0, 0.5, 0.25]
     """
 
     a: tuple[Array, ...]
@@ -115,15 +95,6 @@ def colours(spectra: Spectra) -> tuple[tuple[Array, ...], Float[Array, " ny"]]:
     """Autoregressive coefficients of each output's noise and the variances of ε, by Yule-Walker.
 
     Akaike's criterion chooses the orders.
-
-    Example:
-        >>> from lfrtorch.analysis.noise_model import Spectra, colours
-        >>> spectra = Spectra(1000, 1)
-        >>> e = signal.lfilter([1.0], [1.0, -0.8], np.random.default_rng(0).standard_normal(1000))
-        >>> spectra.add(e[:, None], np.ones((1000, 1, 1)) / 1000**0.5)
-        >>> (a,), variances = colours(spectra)
-        >>> bool(abs(a[1] + 0.8) < 0.1), bool(abs(variances[0] - 1) < 0.1)
-        (True, True)
     """
     found, variances = [], []
     for c, n in zip(spectra.autocovariance().T, spectra.samples, strict=True):
@@ -145,13 +116,7 @@ def colours(spectra: Spectra) -> tuple[tuple[Array, ...], Float[Array, " ny"]]:
 
 
 def innovations(a: Sequence[Array], errors: Float[Array, "m ny"]) -> Float[Array, "m ny"]:
-    """ε of residuals e.
-
-    Example:
-        >>> from lfrtorch.analysis.noise_model import innovations
-        >>> innovations([np.array([1.0, -0.5])], np.array([[1.0], [0.5]])).ravel().tolist()
-        [1.0, 0.0]
-    """
+    """ε of residuals e."""
     each = [scipy.signal.lfilter(own, [1.0], e) for own, e in zip(a, errors.T, strict=True)]
     return np.stack(each, axis=1)
 

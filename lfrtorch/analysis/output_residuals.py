@@ -35,7 +35,7 @@ class OutputResiduals:
         record: its name.
         output: the channel.
         inputs: channels of the inputs.
-        error: measured less simulated output, after the skip window.
+        error: measured less simulated output, after the skip window, (S,).
         fit: 100 (1 - |y - y_hat| / |y - mean y|) in %, as MATLAB's ``compare`` gives it; NaN for a
             constant output.
         whiteness: correlation of the error with its own past.
@@ -44,14 +44,7 @@ class OutputResiduals:
         odd: of error times simulated output with the square of each input: odd ones, or a gain.
         densities: spectra of output, error and noise.
         noise: standard deviation of the noise, if the record repeats.
-
-    Shape:
-        error: (S,) for S scored samples.
-
-    Example:
-        >>> (part,) = lfrtorch.analysis.residuals(bla, record).parts
-        >>> part.error.shape, bool(part.rms < record.y.std()), sorted(part.p)
-        ((400,), True, ['even', 'inputs', 'odd', 'white'])
+        exact: whether the error is one of rounding.
     """
 
     record: str
@@ -136,13 +129,7 @@ def _where(found: Correlation) -> str:
 
 
 def runs(lags: Integers) -> str:
-    """Numbers that rise as runs, the first ones if they are many.
-
-    Example:
-        >>> from lfrtorch.analysis.output_residuals import runs
-        >>> runs(np.array([0, 1, 2, 5, 8, 9, 12]))
-        '0 to 2, 5, 8 to 9, ...'
-    """
+    """Ascending numbers as runs, the first ones if they are many."""
     parts = np.split(lags, 1 + np.flatnonzero(np.diff(lags) > 1))
     said = [f"{p[0]} to {p[-1]}" if len(p) > 1 else f"{p[0]}" for p in parts[:RUNS] if len(p)]
     return ", ".join(said + ["..."] * (len(parts) > RUNS))

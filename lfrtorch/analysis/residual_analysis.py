@@ -202,14 +202,7 @@ def residuals(
 def of_simulation(
     record: Record, y_hat: Float[Array, "T ny"], *, lags: int | None = None
 ) -> tuple[OutputResiduals, ...]:
-    """The residuals of each output of a record that is simulated already.
-
-    Example:
-        >>> from lfrtorch.analysis.residual_analysis import of_simulation
-        >>> (part,) = of_simulation(record, record.y)
-        >>> part.fit, part.verdict
-        (100.0, 'no error beyond rounding')
-    """
+    """The residuals of each output of a record, from its simulated output."""
     y, u = record.y[record.skip :], record.u[record.skip :]
     if len(y) < SHORTEST:
         raise InputError(
@@ -261,13 +254,7 @@ def of_simulation(
 
 
 def probability(p: float) -> str:
-    """A probability in two digits, or that it is below the least one printed.
-
-    Example:
-        >>> from lfrtorch.analysis.residual_analysis import probability
-        >>> probability(0.1234), probability(1e-9)
-        ('0.12', '< 0.0001')
-    """
+    """A probability in two digits, or that it is below the least one printed."""
     return number(p, 2) if p >= LEAST else f"< {LEAST:.4f}"
 
 

@@ -26,12 +26,6 @@ def residual_figure(parts: Sequence[OutputResiduals]) -> Figure:
     """Correlations and spectra of the outputs of one record, the first four, a row each.
 
     Grey is where the correlations of 99 % of the lags are if nothing is left.
-
-    Example:
-        >>> from lfrtorch.analysis.residual_plots import residual_figure
-        >>> figure = residual_figure(lfrtorch.analysis.residuals(bla, record).of("record"))
-        >>> [ax.get_title() for ax in figure.axes][:2]
-        ['errors with themselves', 'errors with the inputs']
     """
     parts = parts[:MOST_OUTPUTS]
     figure = Figure(figsize=(WIDTH, HEIGHT * len(parts) + 0.6), layout="constrained")

@@ -39,21 +39,7 @@ LONGEST = 1 << 13
 def start_error(model: Model, record: Record, y_hat: Float[Array, "T ny"]) -> float | None:
     """RMS error, physical units, that the uncertainty of the start state adds in scored samples.
 
-    Args:
-        model: that simulates.
-        record: with an estimated start, which is fitted to the samples that it skips.
-        y_hat: its simulated output.
-
-    Returns:
-        None if no start state is estimated, or from more than half of ``LONGEST`` samples.
-
-    Example:
-        >>> from dataclasses import replace
-        >>> from lfrtorch.analysis.start_uncertainty import start_error
-        >>> test = replace(record[200:], start="estimated", skip=20)
-        >>> y_hat = model.simulate(test)
-        >>> start_error(model, test, y_hat) < 0.1 * lfrtorch.rmse(test, y_hat)
-        True
+    None if no start state is estimated from skipped samples, or from more than half of ``LONGEST``.
     """
     N, T = record.skip, min(record.samples, LONGEST)
     if record.start != "estimated" or not 0 < N <= LONGEST // 2 or not np.isfinite(y_hat).all():

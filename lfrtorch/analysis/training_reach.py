@@ -8,33 +8,25 @@ import numpy as np
 from jaxtyping import Float
 
 from lfrtorch._support.types import Array
+from lfrtorch.analysis.canonical_form import whitening
 
 FARTHEST = 0.99
 """Part of the training samples whose surprise is below 1."""
-
-FLAT = 1e-12
-"""Least variance of z in a direction, relative to the largest."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingReach:
     """How far the training data went: in the static map's input z, and in what they tell of y.
 
-    Two distances count, whichever is larger, each relative to that of 99 % of the training samples:
-    that of z from the middle of its cloud, in standard deviations of the cloud, and the standard
-    deviation of the simulated output. The first says that the static map is asked where it was not
-    seen, the second that dynamics are, too, as of another band of frequencies.
+    Two distances count, whichever is larger, each relative to the one of 99 % of the training
+    samples. The first is z from the middle of its cloud, in standard deviations of the cloud: it
+    says that the static map is asked where it was not seen. The second is the standard deviation of
+    the simulated output: it tells of dynamics, too, as of another band of frequencies.
 
     Args:
         middle: mean of z.
         white: so that white (z - middle) has unit covariance.
         farthest: of 99 % of the training samples: both distances, and then the larger ratio.
-
-    Example:
-        >>> from lfrtorch.analysis.training_reach import TrainingReach
-        >>> reach = TrainingReach.of(np.linspace(-1, 1, 101)[:, None], np.ones((101, 1)))
-        >>> reach.surprises(np.array([[0.0], [2.0]]), np.ones((2, 1))).round(1).tolist()
-        [1.0, 2.0]
     """
 
     middle: Float[Array, " nz"]
@@ -45,9 +37,7 @@ class TrainingReach:
     def of(cls, z: Float[Array, "S nz"], variance: Float[Array, "S ny"]) -> TrainingReach:
         """From z and the variances of the outputs at the training samples."""
         middle = z.mean(axis=0)
-        values, vectors = np.linalg.eigh((z - middle).T @ (z - middle) / len(z))
-        least = max(FLAT * values.max(initial=0.0), 1e-300)
-        white = vectors.T / np.sqrt(np.maximum(values, least))[:, None]
+        white = whitening(z)
         found = cls(middle, white, (1.0, 1.0, 1.0))
         far = [float(np.quantile(d, FARTHEST)) or 1.0 for d in found._distances(z, variance)]
         found = cls(middle, white, (far[0], far[1], 1.0))

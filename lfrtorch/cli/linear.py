@@ -22,9 +22,9 @@ import lfrtorch
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.roots import frequency_and_damping, remark
 from lfrtorch._support.tables import in_lines, in_percent, percent
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.poles import frequency_and_damping, remark
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import configured, limit_threads, loaded

@@ -195,13 +195,39 @@ class LinearModel:
             >>> bool(bla.frf_std([0.0])[0, 0, 0] < 0.1 * abs(bla.frf([0.0])[0, 0, 0]))
             True
         """
+        variance = np.trace(self.frf_covariance(frequencies), axis1=-2, axis2=-1)
+        return np.sqrt(np.maximum(variance, 0.0))
+
+    def frf_covariance(self, frequencies: ArrayLike) -> Array:
+        """Covariance of the real and the imaginary part of the frequency response.
+
+        Shape:
+            frequencies: (F,) in Hz -> (F, ny, nu, 2, 2); physical units.
+
+        Raises:
+            ValueError: a model without covariance.
+
+        Example:
+            >>> bla.frf_covariance([0.0, 10.0]).shape
+            (2, 1, 1, 2, 2)
+        """
+        J = gain_jacobian(self.A, self.B, self.C, self._z(frequencies))
+        parts, of = np.stack([J.real, J.imag], axis=-2), self.known_covariance
+        return np.einsum("...ip,pq,...jq->...ij", parts, of, parts, optimize=True)
+
+    @property
+    def known_covariance(self) -> Array:
+        """The covariance of the matrices' entries.
+
+        Raises:
+            ValueError: it is not known.
+        """
         if self.covariance is None:
             raise InputError(
-                "the covariance of this model is not known: estimate_bla finds it in a refinement."
+                "the covariance of this model is not known: take one of estimate_bla, or of "
+                "lfrtorch.analysis.uncertainty(model, records).linearise()."
             )
-        J = gain_jacobian(self.A, self.B, self.C, self._z(frequencies))
-        variance = np.einsum("foip,pq,foiq->foi", J, self.covariance, J.conj(), optimize=True)
-        return np.sqrt(np.maximum(variance.real, 0.0))
+        return self.covariance
 
     def simulate(self, data: Record | ArrayLike) -> Array:
         """Simulated output (T, ny) in physical units, from the record's kind of initial state.

@@ -14,6 +14,7 @@ import jinja2
 import numpy as np
 import torch
 
+from lfrtorch._support.roots import frequency_and_damping, remark
 from lfrtorch._support.tables import (
     UNKNOWN,
     Cell,
@@ -28,7 +29,7 @@ from lfrtorch._support.tables import (
 )
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
-from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest, remark
+from lfrtorch.analysis.linearisation import poles_at_rest
 from lfrtorch.analysis.residual_analysis import LEGEND as RESIDUALS_LEGEND
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import Dataset

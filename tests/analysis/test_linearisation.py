@@ -13,8 +13,7 @@ from reference import measure, random_cell, random_model
 
 import lfrtorch
 from lfrtorch.analysis import linearise
-from lfrtorch.analysis.linearisation import linear_part
-from lfrtorch.analysis.poles import poles_at_rest
+from lfrtorch.analysis.linearisation import linear_part, poles_at_rest
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import linearise as along
 from lfrtorch.engine.nonlinearity import Polynomial

@@ -13,8 +13,9 @@ import pytest
 import torch
 
 import lfrtorch
+from lfrtorch._support.roots import frequency_and_damping
 from lfrtorch._support.tables import number
-from lfrtorch.analysis.poles import frequency_and_damping, poles_at_rest
+from lfrtorch.analysis.linearisation import poles_at_rest
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.records import Channel, Record
