@@ -110,9 +110,7 @@ def structure(model: Model, records: Record | Sequence[Record]) -> Structure:
     cell, scaler = double(form.model.lfr.cell), model.scaler
     bent, adds = form.bends >= MINOR, form.shares >= MINOR
     assert cell.static is not None
-    A, Bw, Cz, Cy, Dyw = (
-        np.asarray(p.detach().numpy()) for p in (cell.A, cell.Bw, cell.Cz, cell.Cy, cell.Dyw)
-    )
+    A, _, Bw, Cz, _, Cy, _, Dyw = cell.matrices()
     stable = float(spectral_radius(cell.A.detach())) < 1.0
     parts: list[tuple[Array, ...]] = []
     for record in as_records(records):

@@ -116,10 +116,7 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
             "the static map is affine over the records: nothing of it is nonlinear. "
             "Give a model that was fitted, or records of larger inputs."
         )
-    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = (
-        np.asarray(p.detach().numpy())
-        for p in (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
-    )
+    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
     A, Bu = A + Bw @ slope @ Cz, Bu + Bw @ slope @ Dzu
     Cy, Dyu = Cy + Dyw @ slope @ Cz, Dyu + Dyw @ slope @ Dzu
     # w in coordinates of unit covariance, turned to the directions of its response in y.

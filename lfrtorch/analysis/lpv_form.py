@@ -189,10 +189,7 @@ def lpv(
         y0, x_next0 = (each.numpy() for each in cell(v0, x0))
         z0 = cell.internal(v0, x0)[0].numpy()
     left, right, bounds, slopes = _slopes(cell, z0, schedule)
-    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = (
-        np.asarray(p.detach().numpy())
-        for p in (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
-    )
+    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
 
     def affine(M: Array, into: Array, of: Array) -> Array:
         """M, and what each p multiplies: a column of ``left`` times a row of ``right``."""

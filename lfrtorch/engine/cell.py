@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.types import Array
 
 
 def check_dtype(dtype: torch.dtype) -> None:
     """Refuse what a model does not compute in with a ValueError."""
     if dtype not in (torch.float32, torch.float64):
         raise InputError(f"dtype is {dtype!r}; give torch.float64 or torch.float32.")
+
+
+class Matrices(NamedTuple):
+    """The linear block of a cell as arrays of float64."""
+
+    A: Array
+    Bu: Array
+    Bw: Array
+    Cz: Array
+    Dzu: Array
+    Cy: Array
+    Dyu: Array
+    Dyw: Array
 
 
 class LFRCell(nn.Module):
@@ -109,6 +125,11 @@ class LFRCell(nn.Module):
         """Input z and output w of the static nonlinearity."""
         z = x @ self.Cz.mT + u @ self.Dzu.mT
         return z, (z if self.static is None else self.static(z))
+
+    def matrices(self) -> Matrices:
+        """The linear block as arrays."""
+        weights = (self.get_parameter(name) for name in Matrices._fields)
+        return Matrices(*(w.detach().cpu().double().numpy() for w in weights))
 
     def check(self) -> None:
         """Refuse weights that do not fit each other, which machine code would not notice.

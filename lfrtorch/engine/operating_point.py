@@ -9,7 +9,6 @@ from __future__ import annotations
 from copy import deepcopy
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -57,7 +56,8 @@ def double(cell: LFRCell) -> LFRCell:
 
 def linear_part(cell: LFRCell) -> StateSpace:
     """A, Bu, Cy and Dyu: the model without its static nonlinearity."""
-    return _arrays(cell.A, cell.Bu, cell.Cy, cell.Dyu)
+    A, Bu, _, _, _, Cy, Dyu, _ = cell.matrices()
+    return StateSpace(A, Bu, Cy, Dyu)
 
 
 @torch.no_grad()
@@ -67,14 +67,10 @@ def linearised_at(cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"
     With J = ∂w/∂z they are A + Bw J Cz, Bu + Bw J Dzu, Cy + Dyw J Cz and Dyu + Dyw J Dzu.
     """
     z, _ = cell.internal(u, x)
-    J = static_slope(cell, z[None, None])[0, 0]
-    Bw, Dyw = cell.Bw @ J, cell.Dyw @ J
-    return _arrays(
-        cell.A + Bw @ cell.Cz,
-        cell.Bu + Bw @ cell.Dzu,
-        cell.Cy + Dyw @ cell.Cz,
-        cell.Dyu + Dyw @ cell.Dzu,
-    )
+    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
+    J = static_slope(cell, z[None, None])[0, 0].double().cpu().numpy()
+    Bw, Dyw = Bw @ J, Dyw @ J
+    return StateSpace(A + Bw @ Cz, Bu + Bw @ Dzu, Cy + Dyw @ Cz, Dyu + Dyw @ Dzu)
 
 
 @torch.no_grad()
@@ -128,7 +124,3 @@ def _newton(
             return None
         x, gap = closer, left
     return None
-
-
-def _arrays(*matrices: Tensor) -> StateSpace:
-    return StateSpace(*(np.asarray(m.detach().double().cpu().numpy()) for m in matrices))

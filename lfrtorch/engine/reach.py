@@ -89,10 +89,7 @@ class _Loop:
     def __init__(
         self, cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]
     ) -> None:
-        A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = (
-            p.detach().numpy()
-            for p in (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
-        )
+        A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
         self.A, self.Bu, self.Bw, self.Cz, self.Dzu = A, Bu, Bw, Cz, Dzu
         self._amplitude, self._x0 = amplitude, x0
         first = cell.static.Wz.detach().numpy() if is_network(cell.static) else Cz[:, :0]

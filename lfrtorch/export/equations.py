@@ -159,15 +159,11 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
     model = model.to_model() if isinstance(model, LinearModel) else model
     cell, s = folded(model.lfr.cell), model.scaler
     weights = {} if cell.static is None else cell.static.state_dict()
+    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
+    y_scale = s.y_scale[:, None]
     found = Equations(
-        A=numbers(cell.A),
-        Bu=numbers(cell.Bu) / s.u_scale,
-        Bw=numbers(cell.Bw),
-        Cz=numbers(cell.Cz),
-        Dzu=numbers(cell.Dzu) / s.u_scale,
-        Cy=numbers(cell.Cy) * s.y_scale[:, None],
-        Dyu=numbers(cell.Dyu) * s.y_scale[:, None] / s.u_scale,
-        Dyw=numbers(cell.Dyw) * s.y_scale[:, None],
+        A=A, Bu=Bu / s.u_scale, Bw=Bw, Cz=Cz, Dzu=Dzu / s.u_scale,
+        Cy=Cy * y_scale, Dyu=Dyu * y_scale / s.u_scale, Dyw=Dyw * y_scale,
         u_offset=np.asarray(s.u_offset, dtype=np.float64),
         y_offset=np.asarray(s.y_offset, dtype=np.float64),
         x_rest=np.empty(0),
@@ -176,7 +172,7 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         fs=model.fs,
         inputs=model.inputs,
         outputs=model.outputs,
-    )
+    )  # fmt: skip
     parts = [*vars(found).values(), *found.weights.values()]
     if not all(np.isfinite(part).all() for part in parts if isinstance(part, np.ndarray)):
         raise InputError("the model has weights that are not finite; nothing can be exported.")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lfrtorch.analysis.lpv_form import gauss_legendre, lpv
+from lfrtorch.engine.cell import Matrices
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.export.equations import check_name, equations
 from lfrtorch.export.rendering import rendered
@@ -48,7 +49,7 @@ def matlab_function(
     check_name(name)
     model = model.to_model() if isinstance(model, LinearModel) else model
     e, form = equations(model), lpv(model)
-    found: dict[str, Any] = {letters: getattr(e, letters) for letters in MATRICES}
+    found: dict[str, Any] = {letters: getattr(e, letters) for letters in Matrices._fields}
     found |= {n: w if w.ndim == 2 else w[:, None] for n, w in e.weights.items()}
     offsets = {name: getattr(e, name)[:, None] for name in ("u_offset", "y_offset", "x_rest")}
     found |= offsets | {"fs": e.fs}
@@ -84,7 +85,3 @@ def matlab_function(
     known["schedule"] = form.schedule
     known |= e.sizes
     return rendered("model.m", **known), rendered("model_lpv.m", **known), found
-
-
-MATRICES = ("A", "Bu", "Bw", "Cz", "Dzu", "Cy", "Dyu", "Dyw")
-"""Of the linear block."""

@@ -94,10 +94,7 @@ class Differences:
     @classmethod
     def _about(cls, cell: LFRCell, J: Array, left: Array, right: Array) -> Differences:
         """∂w/∂z = J + left diag(δ) right, |δ| <= 1."""
-        A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = (
-            _array(p)
-            for p in (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
-        )
+        A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
         return cls(
             A=A + Bw @ J @ Cz,
             B=Bw @ left,
