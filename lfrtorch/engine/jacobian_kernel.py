@@ -49,7 +49,7 @@ def jacobian_rows(
     d_w = np.zeros((nw, n_weights), rows.dtype)
     # S(k+1) = M(k) X(k) and dy(k) = N(k) X(k) with X = [S; direct terms of w], M = [F Bw] and
     # N = [H Dyw], padded with zeros to whole tiles.
-    M, X, X_next = tiled(nx, nw, c1 - c0, rows.dtype)
+    M, X, X_next = _tiled(nx, nw, c1 - c0, rows.dtype)
     N = np.zeros((ny, M.shape[1]), rows.dtype)
     copy_to(Bw, M, nx)
     copy_to(Dyw, N, nx)
@@ -57,8 +57,8 @@ def jacobian_rows(
         for c in range(c1 - c0):
             X[i, c] = S[i, c0 + c]
     for k in range(B):
-        add_slope(A, M, J, k, Cz)
-        add_slope(Cy, N, J, k, Cz)
+        _add_slope(A, M, J, k, Cz)
+        _add_slope(Cy, N, J, k, Cz)
         for q in range(nw):
             for n in range(len(z_own)):
                 X[nx + q, z_own[n, 0]] = J[k, q, z_own[n, 1]] * v[k, z_own[n, 2]]
@@ -71,7 +71,7 @@ def jacobian_rows(
             else:
                 for c in range(s0, s1):
                     X[nx + q, c - c0] = by_weight[k, q, c - first]
-        state_rows(M, X, X_next)
+        _state_rows(M, X, X_next)
         _output_rows(N, X, rows, k, c0)
         for n in range(len(x_own)):
             X_next[x_own[n, 1], x_own[n, 0]] += v[k, x_own[n, 2]]
@@ -93,7 +93,7 @@ _TILE = 4
 
 
 @njit(nogil=True)
-def tiled(nx, nw, columns, dtype):
+def _tiled(nx, nw, columns, dtype):
     """M of nx rows and X, X_next of nx + nw, all zero and padded to whole tiles."""
     depth = _TILE * (-(-(nx + nw) // _TILE))
     M = np.zeros((_TILE * (-(-nx // _TILE)), depth), dtype)
@@ -124,7 +124,7 @@ def network_by_weight(Ww, slope, h, z, k, q, d_w, first):
 
 
 @njit(nogil=True, inline="always")
-def add_slope(constant, M, J, k, Cz):
+def _add_slope(constant, M, J, k, Cz):
     """M[:, :nx] = constant + M[:, nx:] J(k) Cz."""
     n, nx = constant.shape
     for i in range(n):
@@ -151,7 +151,7 @@ def between(entries, c0, c1):
 
 
 @njit(nogil=True, fastmath={"contract"})
-def state_rows(M, X, out):
+def _state_rows(M, X, out):
     """out[:len(M)] = M @ X, tile by tile: 16 coefficients stay in registers."""
     for i in range(0, len(M), 4):
         ya, yb, yc, yd = out[i], out[i + 1], out[i + 2], out[i + 3]

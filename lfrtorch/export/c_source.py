@@ -8,9 +8,15 @@ import numpy as np
 
 from lfrtorch._support.types import Array
 from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.export.equations import Equations, check_name, equations
-from lfrtorch.export.observer_equations import KalmanNoise, SteadyGain, observer_equations
-from lfrtorch.export.rendering import rendered
+from lfrtorch.export.equations import (
+    Equations,
+    KalmanNoise,
+    SteadyGain,
+    check_name,
+    equations,
+    observer_equations,
+    rendered,
+)
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -55,18 +61,18 @@ def c_source(
     check_name(name)
     e = equations(model)
     known = {"name": name, "NAME": name.upper(), "ts": repr(1.0 / e.fs), **e.sizes}
-    known |= {"about": comment(e.about(name)), "static": e.static, "arrays": list(_arrays(e))}
+    known |= {"about": _comment(e.about(name)), "static": e.static, "arrays": list(_arrays(e))}
     known["rest"] = bool(e.x_rest.size)
     match observer_equations(model, observer):
         case SteadyGain(K=K):
             known["K"] = True
-            known["arrays"].append(constant("K", "NX * NY", K))
+            known["arrays"].append(_constant("K", "NX * NY", K))
         case KalmanNoise(G=G, U=U):
             known["G"] = True
             known["arrays"].append("/* G times G transposed: covariance of y's and x's noise. */")
-            known["arrays"].append(constant("G", "NG * NG", G))
+            known["arrays"].append(_constant("G", "NG * NG", G))
             known["arrays"].append("/* U0 times U0 transposed: covariance of x in the data. */")
-            known["arrays"].append(constant("U0", "NX * NX", U))
+            known["arrays"].append(_constant("U0", "NX * NX", U))
     inner = {"NZ": e.sizes["nz"], "NW": e.sizes["nw"]} if e.static else {}
     match e.static:
         case Network():
@@ -89,13 +95,13 @@ def _arrays(e: Equations) -> Iterator[str]:
     ):  # fmt: skip
         value = getattr(e, name)
         if value.size:
-            yield constant(name, size, value)
+            yield _constant(name, size, value)
     sizes = {"Wz": "NN * NZ", "bz": "NN", "Ww": "NW * NN", "bw": "NW", "C": "NW * NM"}
     for name, weight in e.weights.items():
-        yield constant(name, sizes[name], weight)
+        yield _constant(name, sizes[name], weight)
     if isinstance(e.static, Polynomial):
         growth, slopes = (
-            braces([[f"{{{', '.join(map(str, row))}}}" for row in rows]])
+            _braces([[f"{{{', '.join(map(str, row))}}}" for row in rows]])
             for rows in (e.static.growth, e.static.slopes)
         )
         yield "/* Monomial i + 1 is one monomial times one z. */"
@@ -104,13 +110,13 @@ def _arrays(e: Equations) -> Iterator[str]:
         yield f"static const int slopes[NS][4] = {slopes};"
 
 
-def constant(name: str, size: str, value: Array) -> str:
+def _constant(name: str, size: str, value: Array) -> str:
     """A vector or a matrix, row by row."""
     rows = [[repr(float(number)) for number in row] for row in np.atleast_2d(value)]
-    return f"static const double {name}[{size}] = {braces(rows)};"
+    return f"static const double {name}[{size}] = {_braces(rows)};"
 
 
-def braces(rows: Sequence[Sequence[str]]) -> str:
+def _braces(rows: Sequence[Sequence[str]]) -> str:
     """Numbers in braces, each row from a new line; each of them is read back to the same bits."""
     lines = []
     for row in rows:
@@ -124,12 +130,12 @@ def braces(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(["{", *lines, "}"])
 
 
-def comment(lines: Sequence[str]) -> str:
+def _comment(lines: Sequence[str]) -> str:
     """Lines as a comment."""
-    return "\n".join(["/*", *(f" * {plain(line)}".rstrip() for line in lines), " */"])
+    return "\n".join(["/*", *(f" * {_plain(line)}".rstrip() for line in lines), " */"])
 
 
-def plain(text: str) -> str:
+def _plain(text: str) -> str:
     """A text that neither ends a comment of C nor begins one."""
     for pair in ("*/", "/*", "??"):
         text = text.replace(pair, " ".join(pair))

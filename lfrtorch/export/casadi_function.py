@@ -8,8 +8,13 @@ import numpy as np
 
 from lfrtorch._support.optional import imported
 from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.export.equations import Equations, check_name, equations
-from lfrtorch.export.observer_equations import KalmanNoise, observer_equations
+from lfrtorch.export.equations import (
+    Equations,
+    KalmanNoise,
+    check_name,
+    equations,
+    observer_equations,
+)
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model

@@ -20,18 +20,15 @@ from lfrtorch._support.types import Array
 from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.nonlinearity import Network, Polynomial, known
 from lfrtorch.engine.operating_point import double, equilibrium
+from lfrtorch.extended_kalman_filter import NoiseCovariance, data_root
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
+from lfrtorch.model import NO_OBSERVER, Model
 from lfrtorch.records import Channel
 
 
 @dataclass(frozen=True, eq=False)
 class Own:
-    """w = f(z) of a class of the user's own.
-
-    Args:
-        module: f, on the CPU in float64.
-    """
+    """w = f(z) of a class of the user's own; the module is on the CPU in float64."""
 
     module: Module
 
@@ -87,10 +84,8 @@ class Equations:
     def about(self, name: str, place: str = "{0}[{1}]") -> list[str]:
         """What a reader of the export should know: equations, channels, units, offsets, rate.
 
-        Args:
-            name: of the export.
-            place: how its language writes a channel, with its letter {0} and its number, which
-                counts from 0 as {1} and from 1 as {2}.
+        ``place`` is how its language writes a channel, with its letter {0} and its number, which
+        counts from 0 as {1} and from 1 as {2}.
         """
         match self.static:
             case Network(activation=name_of_sigma, sigma=sigma):
@@ -113,8 +108,8 @@ class Equations:
             f"    y      = Cy x + Dyu v{w} + y_offset",
             f"    x_next = A x + Bu v{bw}",
             "",
-            *signals(place, "u", self.inputs, self.u_offset),
-            *signals(place, "y", self.outputs, self.y_offset),
+            *_signals(place, "u", self.inputs, self.u_offset),
+            *_signals(place, "y", self.outputs, self.y_offset),
         ]
 
     def description(self, name: str) -> dict[str, Any]:
@@ -132,7 +127,7 @@ class Equations:
         }
 
 
-def signals(place: str, letter: str, channels: Sequence[Channel], offset: Array) -> list[str]:
+def _signals(place: str, letter: str, channels: Sequence[Channel], offset: Array) -> list[str]:
     """A line for each channel: its place, name, unit and operating point."""
     lines = [
         f"{place.format(letter, i, i + 1)}: {channel}, operating point {number:.6g}"
@@ -147,15 +142,7 @@ def printable(text: str) -> str:
 
 
 def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
-    """The equations of a model.
-
-    Args:
-        model: nonlinear or linear.
-        own: whether a static map of the user's own class is taken as it is.
-
-    Raises:
-        ValueError: otherwise such a map, or weights that are not finite.
-    """
+    """The equations of a model; ``own`` lets a static map of the user's own class pass."""
     model = model.to_model() if isinstance(model, LinearModel) else model
     cell, s = folded(model.lfr.cell), model.scaler
     weights = {} if cell.static is None else cell.static.state_dict()
@@ -167,7 +154,7 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         u_offset=np.asarray(s.u_offset, dtype=np.float64),
         y_offset=np.asarray(s.y_offset, dtype=np.float64),
         x_rest=np.empty(0),
-        static=static_map(cell.static, own),
+        static=_static_map(cell.static, own),
         weights={name: numbers(weight) for name, weight in weights.items()},
         fs=model.fs,
         inputs=model.inputs,
@@ -180,8 +167,8 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
     return found if rest is None else replace(found, x_rest=numbers(rest))
 
 
-def static_map(static: Module | None, own: bool) -> Network | Polynomial | Own | None:
-    """f, as far as this package knows its equations."""
+def _static_map(static: Module | None, own: bool) -> Network | Polynomial | Own | None:
+    """f, if its equations are known or it may be of the user's own class."""
     if static is None or known(static) is not None:
         return known(static)
     if own:
@@ -197,6 +184,47 @@ def numbers(weight: Tensor) -> Array:
     return weight.detach().cpu().double().numpy()
 
 
+@dataclass(frozen=True, eq=False)
+class SteadyGain:
+    """x+ = f(x, u) + K (y - y_hat), K: (nx, ny)."""
+
+    K: Array
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanNoise:
+    """G Gᵀ = [R Sᵀ; S Q], (ny + nx) squared, and U Uᵀ = P0, (nx, nx): of the states in the data."""
+
+    G: Array
+    U: Array
+
+
+def observer_equations(
+    model: Model | LinearModel, observer: bool | NoiseCovariance
+) -> SteadyGain | KalmanNoise | None:
+    """What an observer has besides the model; None for no observer."""
+    if observer is False:
+        return None
+    model = model.to_model() if isinstance(model, LinearModel) else model
+    if isinstance(observer, NoiseCovariance):
+        cell = model.lfr.cell
+        return KalmanNoise(observer.root(cell.nx, cell.ny), data_root(cell))
+    if model.K is None:
+        raise InputError(NO_OBSERVER)
+    return SteadyGain(np.ascontiguousarray(numbers(model.K) / model.scaler.y_scale))
+
+
+def rendered(template: str, **known: Any) -> str:
+    """A template of this room's folder ``templates``, filled."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("lfrtorch.export"),
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+    )  # fmt: skip
+    return environment.get_template(template).render(known)
+
+
 RESERVED = {
     "case", "catch", "classdef", "else", "elseif", "end", "function", "otherwise", "parfor",
     "persistent", "spmd", "switch", "hess", "jac", "null",
@@ -205,7 +233,7 @@ RESERVED = {
 
 
 def check_name(name: str) -> None:
-    """Refuse what is no identifier in each of the languages with a ValueError."""
+    """Refuse a name that is no identifier in each of the languages."""
     word = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and "__" not in name
     if not word or keyword.iskeyword(name) or name in RESERVED:
         raise InputError(

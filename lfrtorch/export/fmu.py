@@ -13,8 +13,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
-from lfrtorch.export.equations import Equations, equations, printable
-from lfrtorch.export.rendering import rendered
+from lfrtorch.export.equations import Equations, equations, printable, rendered
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
@@ -50,15 +49,15 @@ def write_fmu(model: Model | LinearModel, path: str | Path, name: str = "model")
         f"{name}.c": source,
         f"{name}_fmu.c": rendered("fmu.c", **known),
     }
-    binary = compiled(files, name)
+    binary = _compiled(files, name)
     with ZipFile(path, "w", ZIP_DEFLATED) as archive:
-        archive.writestr("modelDescription.xml", description(e, name, guid))
+        archive.writestr("modelDescription.xml", _description(e, name, guid))
         archive.writestr(f"binaries/linux64/{name}.so", binary)
         for file, text in files.items():
             archive.writestr(f"sources/{file}", text)
 
 
-def compiled(files: dict[str, str], name: str) -> bytes:
+def _compiled(files: dict[str, str], name: str) -> bytes:
     """The shared library of the sources."""
     machine = platform.system(), platform.machine()
     if machine != ("Linux", "x86_64"):
@@ -82,7 +81,7 @@ def compiled(files: dict[str, str], name: str) -> bytes:
         return (Path(folder) / "made.so").read_bytes()
 
 
-def description(e: Equations, name: str, guid: str) -> bytes:
+def _description(e: Equations, name: str, guid: str) -> bytes:
     """modelDescription.xml."""
     root = ElementTree.Element(
         "fmiModelDescription",
@@ -103,7 +102,7 @@ def description(e: Equations, name: str, guid: str) -> bytes:
             ElementTree.SubElement(listed, "Unit", name=printable(one))
     ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(1.0 / e.fs))
     listed = ElementTree.SubElement(root, "ModelVariables")
-    for number, (label, symbol, causality, start) in enumerate(variables(e)):
+    for number, (label, symbol, causality, start) in enumerate(_variables(e)):
         variable = ElementTree.SubElement(
             listed, "ScalarVariable", name=label, valueReference=str(number), causality=causality
         )
@@ -122,7 +121,7 @@ def description(e: Equations, name: str, guid: str) -> bytes:
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
-def variables(e: Equations) -> list[tuple[str, str, str, float | None]]:
+def _variables(e: Equations) -> list[tuple[str, str, str, float | None]]:
     """Name, unit, causality and start of each variable, in the order of the value references."""
     starts = e.u_offset.tolist()
     found: list[tuple[str, str, str, float | None]] = [

@@ -9,8 +9,7 @@ import numpy as np
 from lfrtorch.analysis.lpv_form import gauss_legendre, lpv
 from lfrtorch.engine.cell import Matrices
 from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.export.equations import check_name, equations
-from lfrtorch.export.rendering import rendered
+from lfrtorch.export.equations import check_name, equations, rendered
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 

@@ -30,19 +30,9 @@ ROUNDING = 1e-11
 def traced(static: Own, nz: int) -> Any:
     """The graph z (n, nz) -> w (n, nw) of a map, an ``onnx.ModelProto``.
 
-    Args:
-        static: the map.
-        nz: its inputs.
-
     Raises:
-        ValueError: onnx is not installed, or a map whose graph cannot be made, or is another map:
-            a ``forward`` that branches in Python on values, or computes in float32.
-
-    Example:
-        >>> from lfrtorch.export.equations import Own
-        >>> from lfrtorch.export.traced_map import traced
-        >>> [node.op_type for node in traced(Own(torch.nn.Tanh()), nz=2).graph.node]
-        ['Tanh']
+        ValueError: onnx is not installed, or a map whose graph cannot be made, or is another map: a
+            ``forward`` that branches in Python on values, or computes in float32.
     """
     onnx = imported("onnx", "onnx")
     generator = torch.Generator().manual_seed(0)
