@@ -10,6 +10,7 @@ from typing import Any, final
 import numpy as np
 import torch
 from jaxtyping import Float
+from numba import njit
 from numpy.typing import ArrayLike
 from torch import Tensor
 
@@ -18,7 +19,6 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.sample_scaling import innovation, normalise, restored
 from lfrtorch.engine.simulation import is_compiled, kernel_arguments
 from lfrtorch.engine.simulation_kernel import simulate_record
 from lfrtorch.records import Channel, Scaler
@@ -87,7 +87,7 @@ class StateObserver(ABC):
             ValueError: another number of inputs, or one that is not finite.
         """
         given = _sample(u, self._inputs, "u")
-        if not normalise(given, self._u_offset, self._u_scale, self._u_now):
+        if not _normalise(given, self._u_offset, self._u_scale, self._u_now):
             raise InputError(f"u is {given}; give finite numbers.")
         if self._call is not None:
             self._x_next.fill(np.nan)  # no trajectory that this one could meet
@@ -97,7 +97,7 @@ class StateObserver(ABC):
                 y, x = self._cell(torch.as_tensor(self._u[0]), torch.as_tensor(self._x[0, :1]))
             self._y_hat[:], self._x_next[:] = y[0].numpy(), x[0].numpy()
         self._predicted = True
-        return restored(self._y_hat, self._y_offset, self._y_scale)
+        return _restored(self._y_hat, self._y_offset, self._y_scale)
 
     def update(self, y: ArrayLike | None) -> Float[Array, " ny"]:
         """Go on to the next sample; returns the error of the prediction, y - y_hat.
@@ -112,11 +112,11 @@ class StateObserver(ABC):
         if not self._predicted:
             raise InputError("nothing was predicted at this sample: call predict(u) before.")
         given = np.full(len(self._outputs), np.nan) if y is None else _sample(y, self._outputs, "y")
-        if not innovation(given, self._y_offset, self._y_scale, self._y_hat, self._y_now, self._e):
+        if not _innovation(given, self._y_offset, self._y_scale, self._y_hat, self._y_now, self._e):
             raise InputError(f"y is {given}; give finite numbers, or NaN for a missing output.")
         self._go_on(self._y_now, self._e)
         self._predicted = False
-        return restored(self._e, self._zero, self._y_scale)
+        return _restored(self._e, self._zero, self._y_scale)
 
     @abstractmethod
     def _go_on(self, y: Float[Array, " ny"], e: Float[Array, " ny"]) -> None:
@@ -169,4 +169,35 @@ def _sample(values: ArrayLike, channels: tuple[Channel, ...], name: str) -> Arra
     if found.size != len(channels) or found.ndim > 1:
         names = ", ".join(channel.name for channel in channels)
         raise InputError(f"{name} has the shape {found.shape}; give a number for each of {names}.")
+    return found
+
+
+# A call of NumPy takes as long as a small model's step.
+@njit(cache=True, nogil=True, error_model="numpy")
+def _normalise(given, offset, scale, out):
+    """Write (given - offset) / scale into out; returns whether all given is finite."""
+    finite = True
+    for i in range(len(out)):
+        finite = finite and math.isfinite(given[i])
+        out[i] = (given[i] - offset[i]) / scale[i]
+    return finite
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _innovation(given, offset, scale, predicted, out, e):
+    """The same, with e = out - predicted; returns whether none is infinite: NaN is missing."""
+    _normalise(given, offset, scale, out)
+    known = True
+    for i in range(len(out)):
+        known = known and not math.isinf(given[i])
+        e[i] = out[i] - predicted[i]
+    return known
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _restored(normalised, offset, scale):
+    """Physical values of normalised ones."""
+    found = np.empty(len(scale))
+    for i in range(len(scale)):
+        found[i] = offset[i] + scale[i] * normalised[i]
     return found

@@ -15,9 +15,9 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import engineering, number, table
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import levels_of, vector
+from lfrtorch.analysis.reach import reach
 from lfrtorch.engine.beyond_linear import Beyond, folded
 from lfrtorch.engine.operating_point import double
-from lfrtorch.engine.reach import reach
 from lfrtorch.engine.static_enclosure import Interval
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
@@ -66,7 +66,7 @@ def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) ->
     """What the states and outputs of a model stay within, whatever the input of an amplitude.
 
     It is reached by the worst input of a linear model, and may be far from that of a nonlinear one.
-    The mathematics are in ``lfrtorch/engine/reach.py``.
+    The mathematics are in ``lfrtorch/analysis/reach.py``.
 
     Args:
         model: with a stable A, and a network of tanh, sigmoid or rbf; or linear.

@@ -32,25 +32,15 @@ def listed(channels: Sequence[Channel]) -> str:
     return ", ".join([*map(str, channels[:LISTED]), *more])
 
 
-def levels(channels: Sequence[Channel], offset: Array, scale: Array) -> str:
-    """Offset and rms about it of each channel, the first ones if they are many."""
-    numbers = [
-        f"{number(0.0 if abs(o) < ROUNDING * s else o)} ± {number(s)}"
-        for o, s in zip(offset, scale, strict=True)
-    ]
-    return _each(channels, numbers)
-
-
-def offsets(channels: Sequence[Channel], offset: Array) -> str:
-    """Offset of each channel, the first ones if they are many."""
-    return _each(channels, [number(o) for o in offset])
-
-
-def _each(channels: Sequence[Channel], numbers: Sequence[str]) -> str:
-    said = [
-        f"{channel.name} {value} {channel.unit}".rstrip()
-        for channel, value in zip(channels[:LISTED], numbers, strict=False)
-    ]
+def levels(channels: Sequence[Channel], offset: Array, scale: Array | None = None) -> str:
+    """Offset of each channel and rms about it, the first ones if they are many."""
+    said = []
+    for i, channel in enumerate(channels[:LISTED]):
+        value = number(offset[i])
+        if scale is not None:
+            small = abs(offset[i]) < ROUNDING * scale[i]
+            value = f"{number(0.0 if small else offset[i])} ± {number(scale[i])}"
+        said.append(f"{channel.name} {value} {channel.unit}".rstrip())
     return ", ".join(said + ["..."] * (len(channels) > LISTED))
 
 
@@ -72,35 +62,33 @@ def system_lines(
         roots = frequency_and_damping(np.linalg.eigvals(system.A).astype(complex), fs)
         count = max(count, len(roots))
         kept = sorted(roots, key=lambda root: -(root["radius"] or 0.0))[:MOST_POLES]
-        shown = [root for root in roots if root in kept]
         head += [f"{name}: pole (Hz)" if name else "pole (Hz)", "damping", "radius"]
         columns.append(
             [
                 [number(root["frequency"], 4), number(root["damping"], 3), radius(root["radius"])]
-                for root in shown
+                for root in roots
+                if root in kept
             ]
         )
-    rows = [
-        [text for part in row for text in part]
-        for row in zip_longest(*columns, fillvalue=["", "", ""])
-    ]
+    found = zip_longest(*columns, fillvalue=["", "", ""])
+    rows = [[text for part in row for text in part] for row in found]
     lines = ["", *table(head, rows).splitlines()]
     if count > MOST_POLES:
         lines.append(f"The {MOST_POLES} poles of the largest radius; a pair counts once.")
     pairs = [(i, j) for i in range(len(outputs)) for j in range(len(inputs))]
-    gains = {name: _gain(system) for name, system in systems.items()}
-    heads = [f"{name}: gain" if name else "gain" for name in systems]
+    units = [_unit(outputs[i].unit, inputs[j].unit) for i, j in pairs[:MOST_GAINS]]
+    gains = [_gain(system) for system in systems.values()]
+    head = ["constant input", *["unit"] * any(units)]
+    head += [f"{name}: gain" if name else "gain" for name in systems]
     body: list[list[Cell]] = [
         [
             f"{outputs[i].name} / {inputs[j].name}",
-            _unit(outputs[i].unit, inputs[j].unit),
-            *(None if gain is None else float(gain[i, j]) for gain in gains.values()),
+            *[unit] * any(units),
+            *(None if gain is None else float(gain[i, j]) for gain in gains),
         ]
-        for i, j in pairs[:MOST_GAINS]
+        for (i, j), unit in zip(pairs, units, strict=False)
     ]
-    units = any(row[1] for row in body)
-    kept_cells = [row if units else [row[0], *row[2:]] for row in body]
-    lines += ["", *table(["constant input", *["unit"] * units, *heads], kept_cells).splitlines()]
+    lines += ["", *table(head, body).splitlines()]
     if len(pairs) > MOST_GAINS:
         lines.append(f"The first {MOST_GAINS} of {len(pairs)} gains.")
     return lines

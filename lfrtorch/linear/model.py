@@ -19,7 +19,7 @@ from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.description import in_columns, listed, offsets, system_lines
+from lfrtorch.engine.description import in_columns, levels, listed, system_lines
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.operating_point import StateSpace
 from lfrtorch.linear.resolvent import frequency_response, gain_jacobian
@@ -121,8 +121,8 @@ class LinearModel:
         fit = self.fit
         facts = [
             ("sampled at", f"{self.fs:g} Hz"),
-            ("inputs", offsets(self.inputs, self.u_offset)),
-            ("outputs", offsets(self.outputs, self.y_offset)),
+            ("inputs", levels(self.inputs, self.u_offset)),
+            ("outputs", levels(self.outputs, self.y_offset)),
             ("order", f"{self.nx}"),
             ("fit", fit and f"{fit.criterion} error {number(fit.rmse)} (normalised), {fit.reason}"),
         ]
