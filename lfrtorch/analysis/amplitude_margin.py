@@ -12,7 +12,7 @@ from lfrtorch.records import Record
 LOUDER = (1.25, 1.5, 2.0)
 """Amplitudes at which a model is tried, relative to those of the data."""
 
-RUNAWAY = 100.0
+_RUNAWAY = 100.0
 """A model diverges if its output exceeds this many times the rms in the data."""
 
 
@@ -41,7 +41,7 @@ def largest_stable_amplitude(model: Model, records: Sequence[Record]) -> float:
         for record in records:
             y = model.simulate(offset + factor * (record.u - offset))
             far = np.abs((y - model.scaler.y_offset) / scale)
-            if not (far < RUNAWAY * factor).all():  # NaN counts
+            if not (far < _RUNAWAY * factor).all():  # NaN counts
                 return found
         found = factor
     return found

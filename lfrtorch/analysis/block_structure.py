@@ -29,13 +29,13 @@ from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
-SMALL = 0.1
+_SMALL = 0.1
 """Parts of an rms below this count as none."""
 
-MINOR = 0.01
+_MINOR = 0.01
 """Directions of z and w with less than this part of the nonlinearity do not count."""
 
-POINTS, STARTS, SWEEPS = 400, 5, 300
+_POINTS, _STARTS, _SWEEPS = 400, 5, 300
 """Samples of the slope that branches are fitted to, random starts of that fit, and its sweeps."""
 
 
@@ -108,7 +108,7 @@ def structure(model: Model, records: Record | Sequence[Record]) -> Structure:
     """
     form = canonical(model, records)
     cell, scaler = double(form.model.lfr.cell), model.scaler
-    bent, adds = form.bends >= MINOR, form.shares >= MINOR
+    bent, adds = form.bends >= _MINOR, form.shares >= _MINOR
     assert cell.static is not None
     A, _, Bw, Cz, _, Cy, _, Dyw = cell.matrices()
     stable = float(spectral_radius(cell.A.detach())) < 1.0
@@ -134,15 +134,15 @@ def structure(model: Model, records: Record | Sequence[Record]) -> Structure:
 
 
 def _name(loop: float, before: float, after: float, coupling: float, branches: int) -> str:
-    if loop >= SMALL:
+    if loop >= _SMALL:
         return "feedback"
-    if before < SMALL:
-        return "static" if after < SMALL else "Hammerstein"
-    if after < SMALL:
+    if before < _SMALL:
+        return "static" if after < _SMALL else "Hammerstein"
+    if after < _SMALL:
         return "Wiener"
     if branches == 1:
         return "Wiener-Hammerstein"
-    return "parallel" if coupling < SMALL else "coupled"
+    return "parallel" if coupling < _SMALL else "coupled"
 
 
 def _states(A: Array, driven: Float[Array, "T nx"]) -> Float[Array, "T nx"]:
@@ -167,7 +167,7 @@ def _slopes(
     cell = model.lfr.cell
     points = np.zeros((len(z), len(bent)))
     points[:, bent] = z
-    points = points[:: 1 + len(points) // POINTS]
+    points = points[:: 1 + len(points) // _POINTS]
     return static_slope(cell, torch.as_tensor(points)[None])[0].numpy()[:, :, bent]
 
 
@@ -185,10 +185,10 @@ def _branches(
     T = R.reshape(-1, nw, nz)
     n, size, generator = max(nw, nz), float(np.linalg.norm(T)), np.random.default_rng(0)
     best = (np.eye(n, nz), np.eye(nw, n), 0.0 if size == 0 else np.inf)
-    for _ in range(STARTS if size > 0 else 0):
+    for _ in range(_STARTS if size > 0 else 0):
         W, V = generator.standard_normal((nw, n)), generator.standard_normal((n, nz))
         left = np.inf
-        for _ in range(SWEEPS):
+        for _ in range(_SWEEPS):
             G = _solved(T.reshape(len(T), -1), _products(W.T, V))
             W = _solved(T.transpose(1, 0, 2).reshape(nw, -1), _products(G.T, V))
             V = _solved(T.transpose(2, 0, 1).reshape(nz, -1), _products(G.T, W.T)).T

@@ -35,10 +35,10 @@ from lfrtorch.records import Record, as_records
 MOST_SAMPLES = 16_384
 """Of each record that the covariances and the response to w are taken over, its last ones."""
 
-ANGLES = 1024
+_ANGLES = 1024
 """Frequencies of impulse responses and of the observability Gramian."""
 
-FLAT = 1e-12
+_FLAT = 1e-12
 """Least variance in a direction that is scaled to 1, relative to the largest."""
 
 
@@ -111,7 +111,7 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     slope, constant = nearest_affine(z_all, w_all)
     beyond = [w_r - z_r @ slope.T - constant for w_r, z_r in zip(w, z, strict=True)]
     left = np.concatenate(beyond)
-    if not np.sum(left**2) > FLAT * np.sum(w_all**2):
+    if not np.sum(left**2) > _FLAT * np.sum(w_all**2):
         raise InputError(
             "the static map is affine over the records: nothing of it is nonlinear. "
             "Give a model that was fitted, or records of larger inputs."
@@ -130,7 +130,7 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
     bent = np.sqrt(power)[:, None] * (W @ (J - slope) @ _inverse(Z))
     bends, turn = _ordered(np.einsum("swi,swj->ij", bent, bent) / len(bent))
     Z = turn.T @ Z
-    circle = np.exp(2j * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)
+    circle = np.exp(2j * np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES)
     Z = _signs(frequency_response(A, Bu, Z @ Cz, Z @ Dzu, circle), 1)[:, None] * Z
     into_y = frequency_response(A, Bw @ _inverse(W), Cy, Dyw @ _inverse(W), circle)
     W = _signs(into_y, 2)[:, None] * W
@@ -181,7 +181,7 @@ def whitening(signal: Float[Array, "S n"]) -> Float[Array, "n n"]:
     """T such that T s has unit covariance."""
     centred = signal - signal.mean(axis=0)
     power, axes = np.linalg.eigh(centred.T @ centred / len(centred))
-    least = max(FLAT * float(power.max(initial=0.0)), 1e-300)
+    least = max(_FLAT * float(power.max(initial=0.0)), 1e-300)
     return (axes / np.sqrt(np.maximum(power, least))).T
 
 

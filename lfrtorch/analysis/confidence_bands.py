@@ -45,13 +45,13 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, as_records, as_signal
 
-TRUNCATION = 1e-8
+_TRUNCATION = 1e-8
 """Singular values of J, of columns of unit length, that count as zero relative to the largest."""
 
-HELD = 1 << 25
+_HELD = 1 << 25
 """Numbers in the rows of a record up to which they are held rather than computed again."""
 
-UNFINISHED = 1.0
+_UNFINISHED = 1.0
 """Distance to the minimum in standard errors, rms over the directions, that is remarked on."""
 
 
@@ -317,7 +317,7 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
     none = cell.A.new_zeros(0, cell.nx)
     kept = reduction(cell, none, coordinates=not given, fixed=fixed_parameters(cell)).kept
     size = sum(record.y.size for record in listed) * (len(kept) + cell.nx)
-    every = [Gradients(model, r, kept, fitted=True, hold=size <= HELD) for r in listed]
+    every = [Gradients(model, r, kept, fitted=True, hold=size <= _HELD) for r in listed]
     for along in every:
         if not torch.isfinite(along.errors.square().sum()):
             raise InputError(
@@ -384,7 +384,7 @@ def _directions(
     scale = torch.linalg.vector_norm(J, dim=0)
     scale[scale == 0] = 1.0
     U, s, Vh = torch.linalg.svd(J / scale, full_matrices=False)
-    least = TRUNCATION * s[0]
+    least = _TRUNCATION * s[0]
     seen = s.clamp_min(least)
     step, cost = float((U.mT @ r)[s >= least].square().sum()), float(r.square().sum())
     rank = int((s >= least).sum())
@@ -455,7 +455,7 @@ def _weighted_step(
         by = torch.where(power > 0, power, torch.inf).rsqrt().unsqueeze(-1)
         for _, rows, errors in along.weighted():
             total.fold((torch.cat([rows @ W, -errors.unsqueeze(-1)], -1) * by).flatten(0, 1))
-    return W @ torch.linalg.pinv(total.R[:K, :K], rtol=TRUNCATION) @ total.R[:K, K]
+    return W @ torch.linalg.pinv(total.R[:K, :K], rtol=_TRUNCATION) @ total.R[:K, K]
 
 
 def _dependent(
@@ -508,7 +508,7 @@ def _doubts(
             f"the residuals of {part.output.name} in record '{part.record}' depend on {what} "
             "still: the model is too small, and the bands are too narrow, as they know noise only."
         )
-    if left[0] > UNFINISHED:
+    if left[0] > _UNFINISHED:
         found.append(
             f"the fit is not at its minimum: a step would be {number(left[0], 2)} standard errors "
             f"long and lower the squared error by {percent(left[1])}; bands are about the minimum."

@@ -28,23 +28,19 @@ from lfrtorch.least_squares.certificate import SLOWEST, Certificate, Differences
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
 
-LOCAL = 500
+_LOCAL = 500
 """Most points at which the model is linearised to find out why there is no certificate."""
 
-CLOSE, FARTHEST = 1.02, 2.0**20
+_CLOSE, _FARTHEST = 1.02, 2.0**20
 """Factors: to within the first the largest amplitude is found, to within the second of the data's
 rms it is looked for."""
 
-LEAST, HALVINGS = 1e-3, 9
+_LEAST, _HALVINGS = 1e-3, 9
 """The rate is looked for between this part of the best possible 1 - ρ and all of it, by so many
 halvings of the logarithm."""
 
-SLOW = 2
+_SLOW = 2
 """Ratio of the time to forget to that of the spectral radius, above which a hint is given."""
-
-SMALLER = (
-    "For inputs of an amplitude the rate may be far smaller: contraction(model, amplitude=...)."
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,8 +171,13 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
     )  # fmt: skip
     proven = gain(physical)
     proven = math.nan if proven is None else proven
-    slow = np.isinf(size).all() and rate**SLOW > _radius(system)
-    hint = SMALLER if slow and cell.static is not None else ""
+    slow = np.isinf(size).all() and rate**_SLOW > _radius(system)
+    hint = ""
+    if slow and cell.static is not None:
+        hint = (
+            "For inputs of an amplitude the rate may be far smaller: "
+            "contraction(model, amplitude=...)."
+        )
     return Contraction(size, rate, proven, found.P, hint, model.inputs, model.outputs)
 
 
@@ -211,7 +212,7 @@ def _steepest(cell: LFRCell, slopes: Enclosure) -> tuple[float, str]:
 
     Only z that some state and input bring about are tried.
     """
-    every = max(1, len(slopes.centres) // LOCAL)
+    every = max(1, len(slopes.centres) // _LOCAL)
     z = torch.as_tensor(slopes.centres[::every])
     onto = torch.cat([cell.Cz, cell.Dzu], dim=1).detach()
     z = z @ (onto @ torch.linalg.pinv(onto)).mT
@@ -230,7 +231,7 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
         return _proof(cell, _slopes_of(cell, np.full(cell.nu, factor)))
 
     try:
-        at_rest = attempt(1.0 / FARTHEST)
+        at_rest = attempt(1.0 / _FARTHEST)
     except InputError as error:  # z has no bounds
         text = str(error).split("\n", 1)[0]
         return nothing, f"{reason}\nNor is there one for an amplitude: {text}"
@@ -239,8 +240,8 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
             nothing,
             f"{at_rest}\nSo it is within the bounds that are proven for the smallest inputs.",
         )
-    low, high, best = 1.0 / FARTHEST, FARTHEST, at_rest
-    while high > CLOSE * low:
+    low, high, best = 1.0 / _FARTHEST, _FARTHEST, at_rest
+    while high > _CLOSE * low:
         factor = math.sqrt(low * high)
         proof = attempt(factor)
         if isinstance(proof, str):
@@ -252,7 +253,7 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
 
 def _slow(system: Differences) -> float:
     """The largest rate that counts."""
-    return max(SLOWEST, 1.0 - LEAST * (1.0 - _radius(system)))
+    return max(SLOWEST, 1.0 - _LEAST * (1.0 - _radius(system)))
 
 
 def _radius(system: Differences) -> float:
@@ -263,8 +264,8 @@ def _radius(system: Differences) -> float:
 def _fastest(system: Differences, slow: Certificate) -> tuple[float, Certificate]:
     """The smallest rate that is proven, with its certificate."""
     rate, found, best = _slow(system), slow, _radius(system)
-    low, high = LEAST, 1.0
-    for _ in range(HALVINGS):
+    low, high = _LEAST, 1.0
+    for _ in range(_HALVINGS):
         part = math.sqrt(low * high)
         tried = 1.0 - part * (1.0 - best)
         closer = certificate(system, tried)

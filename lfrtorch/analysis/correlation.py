@@ -18,16 +18,16 @@ from lfrtorch._support.checks import integer
 from lfrtorch._support.powers import near_one
 from lfrtorch._support.types import Array, Integers
 
-LAGS, LEAST = 25, 5
+_LAGS, LEAST = 25, 5
 """Lags of a test, as in MATLAB's ``resid``, and the fewest of a short record."""
 
-SAMPLES_A_LAG = 40
+_SAMPLES_A_LAG = 40
 """Samples for each lag of a short record: with 20 the test of whiteness rejects 1.5 % at 1 %."""
 
-BOUND = 0.99
+_BOUND = 0.99
 """Probability that a correlation of independent signals at one lag is within its bounds."""
 
-NO_POWER = 1e-24
+_NO_POWER = 1e-24
 """Power of the prediction errors over that of the signal from which on they are rounding errors."""
 
 
@@ -145,7 +145,7 @@ def whitened(x: Float[Array, " T"]) -> Float[Array, " S"]:
     T = len(x)
     forward = backward = best = x - x.mean()
     power = _dot(best, best)
-    least_power, order = NO_POWER * power, 0
+    least_power, order = _NO_POWER * power, 0
     criterion = 0.0  # T log(power) + 2 order, relative to that of order 0
     least = 0.0
     while order < min(10 * math.log10(T), T // 4):
@@ -176,7 +176,7 @@ def _correlated(
     if not size > 0:
         return np.zeros(len(lags)), np.zeros(len(lags)), np.zeros(len(lags))
     scores = np.divide(sums, deviations, out=np.zeros(len(lags)), where=deviations > 0)
-    z = -float(ndtri((1.0 - BOUND) / 2))
+    z = -float(ndtri((1.0 - _BOUND) / 2))
     return sums / size, z * deviations / size, scores
 
 
@@ -192,6 +192,6 @@ def _dot(a: Float[Array, " T"], b: Float[Array, " T"]) -> float:
 def lags_for(T: int, lags: int | None = None) -> int:
     """Number of lags in a test of T samples."""
     if lags is None:
-        return min(LAGS, max(LEAST, T // SAMPLES_A_LAG))
+        return min(_LAGS, max(LEAST, T // _SAMPLES_A_LAG))
     integer("lags", lags, 1)
     return min(lags, T // 2)

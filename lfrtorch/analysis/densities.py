@@ -13,16 +13,16 @@ from lfrtorch._support.types import Array
 from lfrtorch.linear.spectra import Spectra, spectra_of_periods
 from lfrtorch.records import Record
 
-SEGMENT, SHORTEST = 4096, 16
+_SEGMENT, SHORTEST = 4096, 16
 """Most and fewest samples of a segment that a power spectral density is averaged over."""
 
-STRETCHES = 256
+_STRETCHES = 256
 """Most frequencies of the density of noise, which is a mean over the lines about each."""
 
-PARTS = 10
+_PARTS = 10
 """Parts of time in which the differences between periods are looked at."""
 
-STEADY = 4.0
+_STEADY = 4.0
 """Power of the differences between periods in a tenth of them over the median of all tenths, from
 which on they are no noise but a transient or a disturbance."""
 
@@ -52,7 +52,7 @@ def power_density(
 ) -> tuple[Float[Array, " F"], Float[Array, "F n"]]:
     """Frequencies in Hz and power spectral densities of signals, by Welch's method."""
     T = len(signals)
-    segment = min(SEGMENT, T, max(SHORTEST, T // 8))
+    segment = min(_SEGMENT, T, max(SHORTEST, T // 8))
     f, density = scipy.signal.welch(signals, fs, nperseg=segment, axis=0)
     return f, density
 
@@ -75,7 +75,7 @@ def noise_density(
     if spectra is None:
         return None
     power = _noise_power(spectra)
-    width = -(-len(power) // STRETCHES)
+    width = -(-len(power) // _STRETCHES)
     whole = len(power) // width * width
     lines = np.arange(1, len(power) + 1)
     f = spectra.frequencies(lines)[:whole].reshape(-1, width).mean(axis=1)
@@ -107,5 +107,5 @@ def _steady(record: Record, N: int) -> bool:
         return True
     periods = record.y[record.samples - count * N :].reshape(count, N, -1)
     power = np.diff(periods, axis=0).reshape((count - 1) * N, -1) ** 2
-    parts = np.array([part.mean(axis=0) for part in np.array_split(power, min(PARTS, len(power)))])
-    return bool(np.all(parts.max(axis=0) <= STEADY * np.median(parts, axis=0)))
+    parts = np.array([part.mean(axis=0) for part in np.array_split(power, min(_PARTS, len(power)))])
+    return bool(np.all(parts.max(axis=0) <= _STEADY * np.median(parts, axis=0)))

@@ -23,7 +23,7 @@ from lfrtorch.least_squares.simulation_errors import SimulationErrors
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
-SEEN = 1e-9
+_SEEN = 1e-9
 """Directions of a start state that move the output by less than this part of others stay."""
 
 
@@ -112,7 +112,7 @@ class Gradients:
         for rows in self._start_rows():
             total.fold(rows)
         R = total.R[:nx]
-        self._inverse = torch.linalg.pinv(R[:, :nx], rtol=SEEN)
+        self._inverse = torch.linalg.pinv(R[:, :nx], rtol=_SEEN)
         return -self._inverse @ R[:, nx:]
 
     def start_factor(self, noise: NoiseModel) -> Float[Tensor, "nx m"]:

@@ -29,10 +29,10 @@ from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network, known
 from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.model import Model
 
-NODES = 32
+_NODES = 32
 """Of the Gauss-Legendre rule for a static map whose integral is not known."""
 
-ROUNDING = 1e-14
+_ROUNDING = 1e-14
 """Error of f(z) - f(z0), relative to both, that is left alone: over a small ζ it would be large."""
 
 Slopes = Callable[[Float[Array, "S nz"]], Float[Array, "S P"]]
@@ -244,7 +244,7 @@ def gauss_legendre(static: Module | None) -> tuple[Float[Array, " n"], Float[Arr
     The slope of a polynomial is one in t, for which few nodes are exact.
     """
     found = known(static)
-    nodes = (found.degree + 1) // 2 if isinstance(found, Polynomial) else NODES
+    nodes = (found.degree + 1) // 2 if isinstance(found, Polynomial) else _NODES
     t, weight = np.polynomial.legendre.leggauss(nodes)
     return (t + 1.0) / 2, weight / 2
 
@@ -260,7 +260,7 @@ def _left_over(
     assert cell.static is not None
     f = cell.static(torch.as_tensor(np.concatenate([z0[None], z0 + zeta]))).numpy()
     error = f[1:] - f[0] - np.einsum("swz,sz->sw", delta, zeta)
-    error[np.abs(error) <= ROUNDING * (np.abs(f[1:]) + np.abs(f[0]))] = 0.0
+    error[np.abs(error) <= _ROUNDING * (np.abs(f[1:]) + np.abs(f[0]))] = 0.0
     power = np.sum(zeta**2, axis=1, keepdims=True)
     along = np.divide(zeta, power, out=np.zeros_like(zeta), where=power > 0)
     return error[:, :, None] * along[:, None, :]

@@ -34,22 +34,16 @@ from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
-MOST_CHANNELS, MOST_MAPS = 4, 4
+_MOST_CHANNELS, _MOST_MAPS = 4, 4
 """Frequency responses and outputs of the static map that are drawn."""
 
-MOST_SAMPLES = 20_000
+_MOST_SAMPLES = 20_000
 """Samples of the data that say where the static map is drawn."""
 
-NOISE_SAMPLES = 4000
-"""Samples of white noise that do, without data."""
-
-GRID = 121
+_GRID = 121
 """Points of a curve, and of each side of a plane."""
 
-LOWEST, FREQUENCIES = 1e-3, 500
-"""First frequency relative to half the sampling frequency, and how many."""
-
-HEIGHT, LEAST_HEIGHT = 2.7, 3.6
+_HEIGHT, _LEAST_HEIGHT = 2.7, 3.6
 """Of a panel, and of the figure, in inches."""
 
 
@@ -73,9 +67,9 @@ def model_figure(model: Model, records: Record | Sequence[Record] | None = None)
     with suppress(InputError):  # it may have no rest at the offsets
         systems["at rest"] = linearise(model)
     cell = double(model.lfr.cell)
-    pairs = [(i, j) for i in range(cell.ny) for j in range(cell.nu)][:MOST_CHANNELS]
-    maps = min(cell.nw, MOST_MAPS)
-    height = max(LEAST_HEIGHT, HEIGHT * max(len(pairs), -(-maps // 2)))
+    pairs = [(i, j) for i in range(cell.ny) for j in range(cell.nu)][:_MOST_CHANNELS]
+    maps = min(cell.nw, _MOST_MAPS)
+    height = max(_LEAST_HEIGHT, _HEIGHT * max(len(pairs), -(-maps // 2)))
     widths = [4.5, 3.5, *([4.0 if maps == 1 else 6.5] if maps else [])]
     figure = Figure(figsize=(sum(widths), height), layout="constrained")
     parts: NDArray[np.object_] = figure.subfigures(
@@ -93,8 +87,8 @@ def static_figure(model: Model, records: Record | Sequence[Record] | None = None
     cell = double(model.lfr.cell)
     if not cell.nw:
         raise InputError("the model is linear and has no static map to draw.")
-    maps = min(cell.nw, MOST_MAPS)
-    size = (5.0 if maps == 1 else 7.5), max(LEAST_HEIGHT, HEIGHT * -(-maps // 2))
+    maps = min(cell.nw, _MOST_MAPS)
+    size = (5.0 if maps == 1 else 7.5), max(_LEAST_HEIGHT, _HEIGHT * -(-maps // 2))
     figure = Figure(figsize=size, layout="constrained")
     _maps(figure, cell, visited(model, cell, records), maps)
     return figure
@@ -103,12 +97,12 @@ def static_figure(model: Model, records: Record | Sequence[Record] | None = None
 def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | None) -> Visited:
     """Inputs of the static map along simulations, and its nearest affine map there."""
     if records is None:
-        noise = np.random.default_rng(0).standard_normal((NOISE_SAMPLES, cell.nu))
+        noise = np.random.default_rng(0).standard_normal((4000, cell.nu))
         signals = [model.scaler.u_offset + model.scaler.u_scale * noise]
     else:
         signals = as_records(records)
     z = np.concatenate([model.signals(one).z[0].double().numpy() for one in signals])
-    z = z[:: 1 + len(z) // MOST_SAMPLES]
+    z = z[:: 1 + len(z) // _MOST_SAMPLES]
     if not np.isfinite(z).all():
         raise InputError(
             "the model diverges on the records; give others." if records is not None else
@@ -133,11 +127,9 @@ def _responses(
     """Magnitudes of the channels of each system."""
     first = next(iter(systems.values()))
     resonances = np.concatenate([np.abs(np.angle(s.poles)) for s in systems.values()])
-    last = first.fs / 2
-    f = np.union1d(
-        np.geomspace(LOWEST * last, last, FREQUENCIES), resonances * first.fs / (2 * np.pi)
-    )
-    f = f[f >= LOWEST * last]
+    lowest, last = 5e-4 * first.fs, first.fs / 2
+    f = np.union1d(np.geomspace(lowest, last, 500), resonances * first.fs / (2 * np.pi))
+    f = f[f >= lowest]
     axes = part.subplots(len(pairs), 1, squeeze=False, sharex=True)
     for ax, (i, j) in zip(axes[:, 0], pairs, strict=True):
         for name, system in systems.items():
@@ -177,7 +169,7 @@ def _maps(part: Figure | SubFigure, cell: LFRCell, where: Visited, count: int) -
     def beyond(points: Float[Array, "S nz"]) -> Float[Array, "S nw"]:
         return _static(cell, points) - points @ where.slope.T - where.offset
 
-    sides = [np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)]
+    sides = [np.linspace(a, b, _GRID) for a, b in zip(low, high, strict=True)]
     for j, ax in enumerate(axes[:count]):
         title = f"w{j + 1}: {percent(where.nonlinear[j])} nonlinear"
         if nz == 1:
@@ -191,7 +183,7 @@ def _maps(part: Figure | SubFigure, cell: LFRCell, where: Visited, count: int) -
             ax.patch.set_visible(False)
         elif nz == 2:
             plane = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
-            values = beyond(plane.reshape(-1, 2))[:, j].reshape(GRID, GRID)
+            values = beyond(plane.reshape(-1, 2))[:, j].reshape(_GRID, _GRID)
             reach = float(np.abs(values).max()) or 1.0
             image = ax.pcolormesh(
                 *sides, values.T, cmap="coolwarm", vmin=-reach, vmax=reach, rasterized=True

@@ -18,19 +18,19 @@ from jaxtyping import Float
 
 from lfrtorch._support.types import Array
 
-SEGMENT = 1024
+_SEGMENT = 1024
 """Longest stretch of which a spectrum is taken, in samples."""
 
-RESOLUTION = 8
+_RESOLUTION = 8
 """Spectra are smoothed by a window of so many times fewer lags than a stretch has samples."""
 
 LEAST = 0.1
 """Least part 1 - ρ of the noise that is taken to be left in the residuals."""
 
-NO_POWER = 1e-24
+_NO_POWER = 1e-24
 """Power of the prediction errors, over that of the residuals, that is a rounding error."""
 
-FADED, LONGEST = 1e-4, 2048
+_FADED, _LONGEST = 1e-4, 2048
 """An impulse response ends where so little is left of it, and after so many samples."""
 
 
@@ -38,7 +38,7 @@ class Spectra:
     """Spectra of residuals and of what the fit took of the noise, summed over stretches."""
 
     def __init__(self, longest: int, ny: int) -> None:
-        self.segment = min(SEGMENT, longest)
+        self.segment = min(_SEGMENT, longest)
         self.residual, self.left = np.zeros((2, self.segment + 1, ny))
         self.samples = np.zeros(ny)
 
@@ -55,7 +55,7 @@ class Spectra:
     def autocovariance(self) -> Float[Array, "L ny"]:
         """Autocovariance of the noise, by lag."""
         n = 2 * self.segment
-        L = max(2, self.segment // RESOLUTION)
+        L = max(2, self.segment // _RESOLUTION)
         taper = np.zeros((n, 1))
         taper[:L, 0] = 1.0 - np.arange(L) / L
         taper[n - L + 1 :] = taper[1:L][::-1]
@@ -105,7 +105,7 @@ def colours(spectra: Spectra) -> tuple[tuple[Array, ...], Float[Array, " ny"]]:
                 break
             a = np.r_[1.0, -scipy.linalg.solve_toeplitz(c[:order], c[1 : order + 1])]
             power = a @ c[: order + 1]
-            if not power > NO_POWER * c[0]:
+            if not power > _NO_POWER * c[0]:
                 break
             criterion = n * math.log(power / c[0]) + 2 * order
             if criterion < least:
@@ -125,5 +125,5 @@ def _memory(a: Array) -> int:
     """Samples in which the impulse response of 1 / a fades."""
     radius = np.abs(np.roots(a)).max(initial=0.0)
     if radius >= 1.0:
-        return LONGEST
-    return min(LONGEST, math.ceil(math.log(FADED) / math.log(max(radius, 1e-3))))
+        return _LONGEST
+    return min(_LONGEST, math.ceil(math.log(_FADED) / math.log(max(radius, 1e-3))))

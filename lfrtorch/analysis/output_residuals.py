@@ -23,9 +23,6 @@ ROUNDING = 1e-12
 SLIGHT = 0.1
 """Correlations below this are of 1 % of the power at most: long records show them, and few mind."""
 
-RUNS = 3
-"""Most runs of lags that a sentence lists."""
-
 
 @dataclass(frozen=True, eq=False)
 class OutputResiduals:
@@ -123,13 +120,13 @@ class OutputResiduals:
 def _where(found: Correlation) -> str:
     """The largest correlation with its lag, and the lags beyond the bounds."""
     value, bound = found.at(found.largest)
-    beyond = f"; beyond it at lags {runs(found.outside)}" if len(found.outside) > 1 else ""
+    beyond = f"; beyond it at lags {_runs(found.outside)}" if len(found.outside) > 1 else ""
     slight = "slightly, " if abs(value) < SLIGHT else ""
     return f"{slight}{value:.2f} at lag {found.largest} (bound {bound:.2f}{beyond})"
 
 
-def runs(lags: Integers) -> str:
-    """Ascending numbers as runs, the first ones if they are many."""
+def _runs(lags: Integers) -> str:
+    """Ascending numbers as runs, the first three."""
     parts = np.split(lags, 1 + np.flatnonzero(np.diff(lags) > 1))
-    said = [f"{p[0]} to {p[-1]}" if len(p) > 1 else f"{p[0]}" for p in parts[:RUNS] if len(p)]
-    return ", ".join(said + ["..."] * (len(parts) > RUNS))
+    said = [f"{p[0]} to {p[-1]}" if len(p) > 1 else f"{p[0]}" for p in parts[:3] if len(p)]
+    return ", ".join(said + ["..."] * (len(parts) > 3))

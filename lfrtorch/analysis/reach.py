@@ -31,16 +31,16 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.static_enclosure import Enclosure, Interval, enclosure, everywhere
 
-LONGEST = 2**16
+_LONGEST = 2**16
 """Most samples of an impulse response that are summed; slower ones have a looser bound."""
 
-REST = 1e-4
-"""The rest of the sums is below this part of the states' rms, or they have ``LONGEST`` samples."""
+_REST = 1e-4
+"""The rest of the sums is below this part of the states' rms, or they have ``_LONGEST`` samples."""
 
-BLOCK = 256
+_BLOCK = 256
 """Samples of impulse responses that are computed together."""
 
-SHRINKS, ROUNDS = 0.99, 50
+_SHRINKS, _ROUNDS = 0.99, 50
 """The bounds are final if none shrinks below this part in a round, or after so many."""
 
 
@@ -66,7 +66,7 @@ def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]
     K = np.zeros((cell.nw, cell.nz))
     found = loop.bounds(K, enclosure(cell.static, everywhere(cell.nz)).w)
     closed = False
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         inside = enclosure(cell.static, *loop.signals(found)[2:])
         if closed:
             K = inside.J.middle
@@ -74,7 +74,7 @@ def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]
                 break
             inside = enclosure(cell.static, *loop.signals(found)[2:], K)
         before, found = found, found.within(loop.bounds(K, inside.w))
-        if (found.radius >= SHRINKS * before.radius).all():
+        if (found.radius >= _SHRINKS * before.radius).all():
             if closed:
                 break
             closed = True
@@ -133,13 +133,13 @@ def _moved(
     nx = len(A)
     samples = _samples(A, B * radius)
     powers = [C]
-    for _ in range(BLOCK - 1):
+    for _ in range(_BLOCK - 1):
         powers.append(powers[-1] @ A)
-    H, over_block = np.stack(powers), np.linalg.matrix_power(A, BLOCK)
+    H, over_block = np.stack(powers), np.linalg.matrix_power(A, _BLOCK)
     X = np.column_stack([B * radius, d])
     spread, farthest = np.zeros(len(C)), np.zeros(nx)
     low, high = np.full(len(C), np.inf), np.full(len(C), -np.inf)
-    for _ in range(samples // BLOCK):
+    for _ in range(samples // _BLOCK):
         G = H @ X
         free, more = G[..., -1], np.abs(G[..., :-1]).sum(axis=-1)
         after = spread + np.cumsum(more, axis=0)
@@ -166,10 +166,10 @@ def _moved(
 def _samples(A: Float[Array, "nx nx"], B: Float[Array, "nx n"]) -> int:
     """Samples, a power of 2, after which little is left of the impulse responses."""
     samples, power, gramian = 1, A, B @ B.T
-    while samples < LONGEST:
+    while samples < _LONGEST:
         rms = np.sqrt(gramian.diagonal())
-        rest = _rest(np.abs(power)) if samples >= BLOCK else None
-        if rest is not None and (rest @ rms <= REST * (rms + REST * rms.max())).all():
+        rest = _rest(np.abs(power)) if samples >= _BLOCK else None
+        if rest is not None and (rest @ rms <= _REST * (rms + _REST * rms.max())).all():
             break
         gramian = gramian + power @ gramian @ power.T
         samples, power = 2 * samples, power @ power

@@ -36,13 +36,13 @@ from lfrtorch.records import Record, as_records
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LEAST = 1e-4
+_LEAST = 1e-4
 """Smallest probability that is printed."""
 
 SHORTEST = 20
 """Fewest scored samples of a record."""
 
-MOST_ROWS = 24
+_MOST_ROWS = 24
 """Most rows of a printed table, those of the least fit."""
 
 LEGEND = (
@@ -88,8 +88,8 @@ class Residuals:
     def rows(self) -> tuple[list[str], list[list[str | int | float]]]:
         """Head and rows of the table, the parts in their order; of many those of the least fit."""
         shown = self.parts
-        if len(shown) > MOST_ROWS:
-            kept = {id(part) for part in sorted(shown, key=_goodness)[:MOST_ROWS]}
+        if len(shown) > _MOST_ROWS:
+            kept = {id(part) for part in sorted(shown, key=_goodness)[:_MOST_ROWS]}
             shown = tuple(part for part in shown if id(part) in kept)
         known = any(part.noise is not None for part in shown)
         head = ["record", "output", "samples", "fit (%)", "rms", "bias", *["noise"] * known]
@@ -255,7 +255,7 @@ def of_simulation(
 
 def probability(p: float) -> str:
     """A probability in two digits, or that it is below the least one printed."""
-    return number(p, 2) if p >= LEAST else f"< {LEAST:.4f}"
+    return number(p, 2) if p >= _LEAST else f"< {_LEAST:.4f}"
 
 
 def _goodness(part: OutputResiduals) -> float:

@@ -13,22 +13,14 @@ from lfrtorch._support.tables import factor_of
 from lfrtorch.analysis.correlation import Correlation
 from lfrtorch.analysis.output_residuals import OutputResiduals
 
-MOST_OUTPUTS = 4
-"""Outputs in one figure."""
-
-WIDTH, HEIGHT = 11.0, 2.8
-"""Width of the figure, and height of an output, in inches."""
-
-NOISE = "#cc79a7"
-
 
 def residual_figure(parts: Sequence[OutputResiduals]) -> Figure:
     """Correlations and spectra of the outputs of one record, the first four, a row each.
 
     Grey is where the correlations of 99 % of the lags are if nothing is left.
     """
-    parts = parts[:MOST_OUTPUTS]
-    figure = Figure(figsize=(WIDTH, HEIGHT * len(parts) + 0.6), layout="constrained")
+    parts = parts[:4]
+    figure = Figure(figsize=(11.0, 2.8 * len(parts) + 0.6), layout="constrained")
     grid = figure.subplots(len(parts), 4, squeeze=False)
     for part, (past, linear, squares, spectra) in zip(parts, grid, strict=True):
         names = [channel.name for channel in part.inputs]
@@ -76,7 +68,7 @@ def _spectra(ax: Axes, part: OutputResiduals) -> None:
     f = densities.frequencies
     lines = [(f, densities.output, "output", OUTPUT), (f, densities.error, "error", NL_LFR)]
     if densities.noise is not None and densities.noise_frequencies is not None:
-        lines.append((densities.noise_frequencies, densities.noise, "noise", NOISE))
+        lines.append((densities.noise_frequencies, densities.noise, "noise", "#cc79a7"))
     for at, density, label, colour in lines:
         shown = np.where(np.isfinite(density) & (density > 0), density, np.nan)
         level = 10.0 * np.log10(shown)

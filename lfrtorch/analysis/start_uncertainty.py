@@ -39,7 +39,7 @@ LONGEST = 1 << 13
 def start_error(model: Model, record: Record, y_hat: Float[Array, "T ny"]) -> float | None:
     """RMS error, physical units, that the uncertainty of the start state adds in scored samples.
 
-    None if no start state is estimated from skipped samples, or from more than half of ``LONGEST``.
+    None if no start state is estimated from skipped samples, or from too many.
     """
     N, T = record.skip, min(record.samples, LONGEST)
     if record.start != "estimated" or not 0 < N <= LONGEST // 2 or not np.isfinite(y_hat).all():

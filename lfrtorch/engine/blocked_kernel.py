@@ -24,10 +24,10 @@ from lfrtorch.engine.linear_recurrence import NOTHING
 SAMPLES = 12
 """Samples in a block: 8 to 16 are as fast for 12 to 28 states; the responses then fit in cache."""
 
-WIDER = 2
+_WIDER = 2
 """Samples after which the responses, which grow, are copied to wider room."""
 
-TOGETHER = 32
+_TOGETHER = 32
 """Least columns of a product, but for the last one."""
 
 
@@ -143,12 +143,12 @@ def _responses(AT, Cz, CyT, DywT, J, M, room, P, QW):
     latest, (now, after) = np.eye(nx, dtype=P.dtype), room
     for done in range(len(J)):
         b, at = len(J) - 1 - done, nx + done * ny
-        if done % WIDER == 0:
-            wider = now[: (nx + nw) * (width + WIDER * ny)].reshape(nx + nw, width + WIDER * ny)
+        if done % _WIDER == 0:
+            wider = now[: (nx + nw) * (width + _WIDER * ny)].reshape(nx + nw, width + _WIDER * ny)
             wider[:] = 0.0
             copy_to(latest[:nx], wider, 0)
             latest, now, after = wider, after, now
-            width += WIDER * ny
+            width += _WIDER * ny
         for i in range(nx):
             for t in range(width):
                 P[i, b, t] = latest[i, t]
@@ -200,10 +200,10 @@ def _sorted(x_entries, n_z, n_y, C, nx):
         at[x_entries[n, 1]] += 1
     edges = [0]
     for i in range(1, nx + 1):
-        if start[i] - edges[-1] >= TOGETHER or (i == nx and n_x > edges[-1]):
+        if start[i] - edges[-1] >= _TOGETHER or (i == nx and n_x > edges[-1]):
             edges.append(start[i])
     while edges[-1] < len(column):
-        edges.append(min(edges[-1] + TOGETHER, len(column)))
+        edges.append(min(edges[-1] + _TOGETHER, len(column)))
     return column, start, np.array(edges)
 
 

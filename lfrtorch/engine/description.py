@@ -13,35 +13,35 @@ from lfrtorch._support.types import Array
 from lfrtorch.engine.operating_point import StateSpace
 from lfrtorch.records import Channel
 
-MOST_POLES, MOST_GAINS = 6, 4
+_MOST_POLES, _MOST_GAINS = 6, 4
 """Rows of the tables; of more poles those of the largest radius."""
 
-INTEGRATES = 1e-9
+_INTEGRATES = 1e-9
 """Distance of a pole from 1 up to which there is no gain at rest."""
 
-ROUNDING = 1e-12
+_ROUNDING = 1e-12
 """An offset below this part of the rms about it is a rounding error."""
 
-LISTED = 4
+_LISTED = 4
 """Most channels of a side that a line names."""
 
 
 def listed(channels: Sequence[Channel]) -> str:
     """The channels with their units, the first ones if they are many."""
-    more = ["..."] * (len(channels) > LISTED)
-    return ", ".join([*map(str, channels[:LISTED]), *more])
+    more = ["..."] * (len(channels) > _LISTED)
+    return ", ".join([*map(str, channels[:_LISTED]), *more])
 
 
 def levels(channels: Sequence[Channel], offset: Array, scale: Array | None = None) -> str:
     """Offset of each channel and rms about it, the first ones if they are many."""
     said = []
-    for i, channel in enumerate(channels[:LISTED]):
+    for i, channel in enumerate(channels[:_LISTED]):
         value = number(offset[i])
         if scale is not None:
-            small = abs(offset[i]) < ROUNDING * scale[i]
+            small = abs(offset[i]) < _ROUNDING * scale[i]
             value = f"{number(0.0 if small else offset[i])} ± {number(scale[i])}"
         said.append(f"{channel.name} {value} {channel.unit}".rstrip())
-    return ", ".join(said + ["..."] * (len(channels) > LISTED))
+    return ", ".join(said + ["..."] * (len(channels) > _LISTED))
 
 
 def in_columns(facts: Sequence[tuple[str, str | None]]) -> list[str]:
@@ -61,7 +61,7 @@ def system_lines(
     for name, system in systems.items():
         roots = frequency_and_damping(np.linalg.eigvals(system.A).astype(complex), fs)
         count = max(count, len(roots))
-        kept = sorted(roots, key=lambda root: -(root["radius"] or 0.0))[:MOST_POLES]
+        kept = sorted(roots, key=lambda root: -(root["radius"] or 0.0))[:_MOST_POLES]
         head += [f"{name}: pole (Hz)" if name else "pole (Hz)", "damping", "radius"]
         columns.append(
             [
@@ -73,10 +73,10 @@ def system_lines(
     found = zip_longest(*columns, fillvalue=["", "", ""])
     rows = [[text for part in row for text in part] for row in found]
     lines = ["", *table(head, rows).splitlines()]
-    if count > MOST_POLES:
-        lines.append(f"The {MOST_POLES} poles of the largest radius; a pair counts once.")
+    if count > _MOST_POLES:
+        lines.append(f"The {_MOST_POLES} poles of the largest radius; a pair counts once.")
     pairs = [(i, j) for i in range(len(outputs)) for j in range(len(inputs))]
-    units = [_unit(outputs[i].unit, inputs[j].unit) for i, j in pairs[:MOST_GAINS]]
+    units = [_unit(outputs[i].unit, inputs[j].unit) for i, j in pairs[:_MOST_GAINS]]
     gains = [_gain(system) for system in systems.values()]
     head = ["constant input", *["unit"] * any(units)]
     head += [f"{name}: gain" if name else "gain" for name in systems]
@@ -89,15 +89,15 @@ def system_lines(
         for (i, j), unit in zip(pairs, units, strict=False)
     ]
     lines += ["", *table(head, body).splitlines()]
-    if len(pairs) > MOST_GAINS:
-        lines.append(f"The first {MOST_GAINS} of {len(pairs)} gains.")
+    if len(pairs) > _MOST_GAINS:
+        lines.append(f"The first {_MOST_GAINS} of {len(pairs)} gains.")
     return lines
 
 
 def _gain(system: StateSpace) -> Array | None:
     """C (I - A)⁻¹ B + D; None of a system that integrates."""
     A, B, C, D = system
-    if (np.abs(np.linalg.eigvals(A) - 1.0) < INTEGRATES).any():
+    if (np.abs(np.linalg.eigvals(A) - 1.0) < _INTEGRATES).any():
         return None
     return C @ np.linalg.solve(np.eye(len(A)) - A, B) + D
 

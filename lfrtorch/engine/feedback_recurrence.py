@@ -102,6 +102,7 @@ def _matrices(weights: Weights) -> list[NDArray]:
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _forwards(r, A, Bw, Cz, J, g, s):
     m = min(r, len(A) - 1)  # which model
+    # Transposed, so that inner loops run over neighbours in memory: vector instructions.
     AT, BwT, Cz, J, g, s = A[m].T.copy(), Bw[m].T.copy(), Cz[m], J[r], g[r], s[r]
     nw, nx = BwT.shape
     for k in range(len(g)):
@@ -160,6 +161,6 @@ def _transition(r, A, Bw, Cz, J, Phi):
         X, X_next = X_next, X
         if k % 256 == 255:
             flush(X)
-            if not X.any():
+            if not X.any():  # faded: it stays 0
                 break
     copy_to(X.T, Phi, 0)

@@ -18,35 +18,35 @@ from lfrtorch.engine.linear_recurrence import linear_recurrence
 from lfrtorch.engine.linearised import linearise
 from lfrtorch.engine.simulation import Trajectory, simulate, simulate_near
 
-ITERATIONS, HALVINGS, TOLERANCE = 20, 6, 1e-10
+ITERATIONS, _HALVINGS, _TOLERANCE = 20, 6, 1e-10
 """Most Gauss-Newton steps, trials in a step, and the relative decrease that ends the search."""
 
-SEEN = 1e-9
+_SEEN = 1e-9
 """A direction of the initial state is estimated if it moves the weighted output by this much."""
 
-FADED = 1e-12
-"""Part of an initial state that the output does not tell from nothing: far below SEEN."""
+_FADED = 1e-12
+"""Part of an initial state that the output cannot tell: far below ``_SEEN``."""
 
 BLOCK = 1 << 11
 """Samples, of all records together, whose rows are folded into the triangular factor at once."""
 
-PASSES, FLAT = 8, 1e-4
+PASSES, _FLAT = 8, 1e-4
 """Passes that estimate the prior's weight, and its least variance relative to the largest."""
 
-ODD = 1e-3
+_ODD = 1e-3
 """Least part of the cost that the prior must add to make a difference."""
 
-FAR = 0.1
+_FAR = 0.1
 """Ratio of squared errors at which a state that the training data have not seen is believed. On
 50 samples of measurements it is 0.2 or more where the state is wrong for the rest of the record."""
 
-FAR_BETTER = 0.25
+_FAR_BETTER = 0.25
 """Ratio of squared errors at which the state that the beginning of a record tells is better."""
 
-AWAY = 100.0
+_AWAY = 100.0
 """Growth of xᵀ P⁻¹ x after the samples that tell a state, at which the model runs away from it."""
 
-BEGINNING = 8
+_BEGINNING = 8
 """Least outputs of a beginning for each state."""
 
 
@@ -68,10 +68,10 @@ def start_from_beginning(
         return (weight * (trajectory.y - y)).square().sum(dim=(1, 2)).nan_to_num(math.inf)
 
     best, T = simulate(cell, u, estimated_start(cell, u, y, weight)), u.shape[1] // 2
-    while T * cell.ny >= BEGINNING * cell.nx:
+    while T * cell.ny >= _BEGINNING * cell.nx:
         begun = estimated_start(cell, u[:, :T], y[:, :T], weight[:, :T])
         found = simulate_near(cell, u, begun, best)
-        better = squares(found) < FAR_BETTER * squares(best)
+        better = squares(found) < _FAR_BETTER * squares(best)
         if better.any():
             found = _fitted_start(cell, u, y, weight, u.new_zeros(len(u), cell.nx, cell.nx), found)
             pairs = zip(found, best, strict=True)
@@ -92,7 +92,7 @@ def estimated_start(
     Least squares alone follows the noise if samples are few and states many, and the model's
     errors, which are as slow as its states. So a normal prior adds x0ᵀ P⁻¹ x0 to the squared errors
     over their variance, see ``state_moments``; PASSES estimate that variance. The state of least
-    squares is taken if it is FAR better, as a system may begin far from where the training data
+    squares is taken if it is far better, as a system may begin far from where the training data
     have been, or if the prior makes no difference, as with far more samples than states. From a
     state after which the model runs away, though it does not from rest, the simulation begins at
     rest instead.
@@ -102,7 +102,7 @@ def estimated_start(
     # Prior: P = axes diag(moments) axesᵀ, so that |white x0|² = x0ᵀ P⁻¹ x0.
     moments, axes = torch.linalg.eigh(state_moments(cell, u))
     known = moments[:, -1] > 0
-    moments = torch.where(known[:, None], moments.clamp_min(FLAT * moments[:, -1:]), 1.0)
+    moments = torch.where(known[:, None], moments.clamp_min(_FLAT * moments[:, -1:]), 1.0)
     white = torch.where(known[:, None, None], axes.mT / moments.sqrt().unsqueeze(-1), 0.0)
     # Nothing after the last sample with a weight tells the state.
     last = int(weight.count_nonzero(dim=(0, 2)).nonzero().max()) + 1 if counted.any() else 1
@@ -115,7 +115,7 @@ def estimated_start(
     free = _fitted_start(cell, u, y, weight, u.new_zeros(R, nx, nx), rest)
     stayed = ~free.x[:, 0].any(dim=1)  # Gauss-Newton may fail on many states
     odd = (white @ free.x[:, 0].unsqueeze(-1)).square().sum(dim=(1, 2))
-    if not (known & (stayed | (odd > ODD * counted))).any():
+    if not (known & (stayed | (odd > _ODD * counted))).any():
         return _staying(cell, whole, free.x, white)
     probable = rest
     for _ in range(PASSES):
@@ -125,7 +125,7 @@ def estimated_start(
         if torch.equal(probable.x[:, 0], last.x[:, 0]):
             break  # all passes that follow would find the same
     lost = ~torch.isfinite(squares(probable))
-    better = ~known | lost | ((squares(free) < FAR * squares(probable)) & (counted > 2 * nx))
+    better = ~known | lost | ((squares(free) < _FAR * squares(probable)) & (counted > 2 * nx))
     found = torch.where(better[:, None, None], free.x, probable.x)
     return _staying(cell, whole, found, white)
 
@@ -145,9 +145,9 @@ def _staying(
     if u.shape[1] < x.shape[1]:
         return x0
     there = farthest(simulate(cell, u, x0).x)
-    away = there > AWAY * near
+    away = there > _AWAY * near
     if away.any():
-        away &= there > AWAY * farthest(simulate(cell, u, torch.zeros_like(x0)).x)
+        away &= there > _AWAY * farthest(simulate(cell, u, torch.zeros_like(x0)).x)
     return torch.where(away.unsqueeze(1), 0.0, x0)
 
 
@@ -185,20 +185,20 @@ def _fitted_start(
 
     x0 = best.x[:, 0].clone()
     cost = squares(best, x0)
-    seen = SEEN * weight.abs().amax()
+    seen = _SEEN * weight.abs().amax()
     for _ in range(ITERATIONS):
         rows, errors = _factor(cell, weight, weight * (best.y - y), prior, best)
         usable = torch.isfinite(rows).all(dim=(1, 2)) & torch.isfinite(cost)
         rows, errors = (torch.where(usable[:, None, None], t, 0.0) for t in (rows, errors))
         # A state that the output does not show stays where it is.
-        step = -(torch.linalg.pinv(rows, atol=seen, rtol=SEEN) @ errors).squeeze(-1)
+        step = -(torch.linalg.pinv(rows, atol=seen, rtol=_SEEN) @ errors).squeeze(-1)
         before = cost
         # A step that should lower the cost by less than its rounding is not worth a trial.
         promised = (rows @ step.unsqueeze(-1)).square().sum(dim=(1, 2))
         waiting = usable & (promised > torch.finfo(cost.dtype).eps * cost)
         if not waiting.any():
             break
-        for _ in range(HALVINGS):
+        for _ in range(_HALVINGS):
             trial = simulate_near(cell, u, x0 + step, best)
             trial_cost = squares(trial, x0 + step)
             better = waiting & (trial_cost < cost)  # False for NaN
@@ -210,7 +210,7 @@ def _fitted_start(
             if not waiting.any():
                 break
             step = step / 4
-        if not (cost < (1.0 - TOLERANCE) * before).any():
+        if not (cost < (1.0 - _TOLERANCE) * before).any():
             break
     return best
 
@@ -242,6 +242,6 @@ def _factor(
         folded = torch.linalg.qr(torch.where(lost[:, None, None], 0.0, stacked), mode="r").R
         folded[lost] = torch.nan
         Phi = Phis[:, -1]
-        if Phi.abs().amax() < FADED:
+        if Phi.abs().amax() < _FADED:
             break
     return folded[..., :-1], folded[..., -1:]

@@ -41,7 +41,7 @@ def jacobian_rows(
     network = nn > 0
     n_weights = nn * (nz + 1 + nw) + nw if network else by_weight.shape[2]
     x_own, z_own, y_own = (
-        between(x_entries, c0, c1), between(z_entries, c0, c1), between(y_entries, c0, c1)
+        _between(x_entries, c0, c1), _between(z_entries, c0, c1), _between(y_entries, c0, c1)
     )  # fmt: skip
     s0 = min(max(first, c0), c1)
     s1 = max(min(first + n_weights, c1), s0)
@@ -139,7 +139,7 @@ def _add_slope(constant, M, J, k, Cz):
 
 
 @njit(nogil=True)
-def between(entries, c0, c1):
+def _between(entries, c0, c1):
     """The entries whose column lies between c0 and c1, counted from c0."""
     own, count = np.empty_like(entries), 0
     for n in range(len(entries)):

@@ -101,7 +101,7 @@ def correct(e, H, G, x, U, w_hat):
         for j in range(total):
             M[known + nx + i, j] = G[ny + i, j]
         w_hat[i] = 0.0
-    reflect(M, known)
+    _reflect(M, known)
     log_p = 0.0
     for a in range(known):
         for b in range(a):
@@ -123,14 +123,14 @@ def propagate(F, M, known, U):
         for n in range(nx):
             for j in range(N.shape[1]):
                 N[i, j] += F[i, n] * M[known + n, known + j]
-    reflect(N, nx)
+    _reflect(N, nx)
     for i in range(nx):
         for j in range(nx):
             U[i, j] = N[i, j]
 
 
 @njit(nogil=True, error_model="numpy")
-def reflect(M, rows):
+def _reflect(M, rows):
     """M times an orthogonal matrix, in place, that makes its first rows lower triangular."""
     for k in range(rows):
         square = 0.0

@@ -20,7 +20,7 @@ from lfrtorch.engine.linearised import linearise, spectral_radius
 MAX_NEWTON = 20
 """Iterations after which Newton's method is given up; from a nearby trajectory it needs 3 or 4."""
 
-UPDATE_ROUNDING = 1.0
+_UPDATE_ROUNDING = 1.0
 """The states count as found after an update below this many √eps, relative to 1 + max |x|.
 
 Convergence is quadratic, so the error left is about eps: the rounding of the loop over time.
@@ -47,7 +47,7 @@ def newton_states(
         Lim, Zhu, Selfridge and Kasim, "Parallelizing non-linear sequential models over the sequence
         length", ICLR 2024.
     """
-    tolerance = UPDATE_ROUNDING * torch.finfo(u.dtype).eps ** 0.5
+    tolerance = _UPDATE_ROUNDING * torch.finfo(u.dtype).eps ** 0.5
     x = x0.unsqueeze(1).expand(-1, u.shape[1] + 1, -1) if guess is None else guess
     driven = u @ cell.Bu.mT
     transition, found = cell.A, torch.zeros(len(u), dtype=torch.bool)  # before the first iteration

@@ -26,9 +26,6 @@ from lfrtorch.engine.static_jacobian import (
     Weights,
 )
 
-BYTES = 1000
-"""What Python's lists take for a monomial of a polynomial, about."""
-
 
 class Kernel(NamedTuple):
     """A map as ``simulation_kernel`` takes it: w = last h + offset, h = σ(first z + bias).
@@ -171,7 +168,7 @@ class Polynomial(Module):
         for name, size in (("nz", nz), ("nw", nw), ("degree", degree)):
             integer(name, size, 1)
         check_memory(
-            nw * math.comb(nz + degree, degree) * BYTES,
+            nw * math.comb(nz + degree, degree) * 1000,  # bytes of Python's lists, about
             f"a polynomial with nz={nz}, nw={nw} and degree={degree}",
             "give smaller ones",
         )

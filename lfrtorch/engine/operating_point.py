@@ -19,17 +19,17 @@ from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.simulation import simulate
 from lfrtorch.records import Scaler
 
-MAX_NEWTON, HALVINGS = 50, 30
+_MAX_NEWTON, HALVINGS = 50, 30
 """Most steps of Newton's method, and most times that a step is halved."""
 
-TOLERANCE = 1e-10
+_TOLERANCE = 1e-10
 """Largest |f(x, u) - x| relative to 1 + max |x| at rest (states have unit rms)."""
 
 SINGULAR = 1e-12
 """Singular values of I - F below this part of the largest are those of integrators: any of their
 states may be at rest."""
 
-SETTLING = 1000
+_SETTLING = 1000
 """Samples that a simulation has to come near its rest, if Newton's method does not find one."""
 
 
@@ -82,7 +82,7 @@ def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] 
     """
     x = _newton(cell, u, u.new_zeros(cell.nx))
     if x is None:
-        constant = u.expand(1, SETTLING, -1).contiguous()
+        constant = u.expand(1, _SETTLING, -1).contiguous()
         end = simulate(cell, constant, u.new_zeros(1, cell.nx)).x[0, -1]
         x = _newton(cell, u, end) if torch.isfinite(end).all() else None
     return x
@@ -92,9 +92,9 @@ def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] 
 def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"] | None:
     """The input next to u under which an integrating model is at rest, or None."""
     identity, x = torch.eye(cell.nx, dtype=u.dtype), u.new_zeros(cell.nx)
-    for _ in range(MAX_NEWTON):
+    for _ in range(_MAX_NEWTON):
         gap = cell(u, x)[1] - x
-        if gap.abs().max() <= TOLERANCE * (1.0 + x.abs().max()):
+        if gap.abs().max() <= _TOLERANCE * (1.0 + x.abs().max()):
             return u
         at = linearised_at(cell, u, x)
         rows = torch.cat([identity - torch.as_tensor(at.A), -torch.as_tensor(at.B)], dim=1)
@@ -109,8 +109,8 @@ def _newton(
     """The rest that Newton's method comes to from x."""
     identity = torch.eye(cell.nx, dtype=u.dtype)
     gap = cell(u, x)[1] - x
-    for _ in range(MAX_NEWTON):
-        if gap.abs().max() <= TOLERANCE * (1.0 + x.abs().max()):
+    for _ in range(_MAX_NEWTON):
+        if gap.abs().max() <= _TOLERANCE * (1.0 + x.abs().max()):
             return x
         F = torch.as_tensor(linearised_at(cell, u, x).A)
         step = torch.linalg.pinv(identity - F, rtol=SINGULAR) @ gap

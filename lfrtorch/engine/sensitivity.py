@@ -43,10 +43,10 @@ from lfrtorch.engine.parameter_layout import DirectTerms, layout
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.engine.static_jacobian import NetworkJacobian, StaticJacobian
 
-FADED = 1e-18
+_FADED = 1e-18
 """An initial state is forgotten when less than this fraction of it is left."""
 
-BLOCK, BLOCK_BYTES = 8192, 1 << 24
+BLOCK, _BLOCK_BYTES = 8192, 1 << 24
 """Most samples, of all records together, and bytes in a block of rows on the CPU: a block that
 leaves the cache before it is used takes up to 15 % longer."""
 
@@ -167,7 +167,7 @@ class Linearisation:
         samples = PASS
         if compiled:
             row = self._ny * (len(kept) + nx * initial_state + spare) * self.u.element_size()
-            samples = min(BLOCK, max(1, BLOCK_BYTES // max(1, row)))
+            samples = min(BLOCK, max(1, _BLOCK_BYTES // max(1, row)))
         Phi = self.state.new_empty(R, nx, nx * initial_state)
         # Blocks do not depend on the number of threads, and so neither do sums over them.
         together = 1 if compiled else R
@@ -188,7 +188,7 @@ class Linearisation:
                 if initial_state and time.stop == self.u.shape[1]:
                     Phi[records] = S[:, :, len(kept) :]
                     # If it has faded, fewer blocks are enough.
-                    if records.stop == R and Phi.abs().amax() >= FADED:
+                    if records.stop == R and Phi.abs().amax() >= _FADED:
                         self._known_transition = Phi, self._times
                 yield Rows(records, time, rows, S)
 
@@ -260,7 +260,7 @@ class Linearisation:
         for block in self._blocks():
             times.append(block.time)
             Phi = transition(self.weights, block.static.J, Phi)
-            if Phi.abs().amax() < FADED:
+            if Phi.abs().amax() < _FADED:
                 break
         self._known_transition = Phi, times
         return Phi, times

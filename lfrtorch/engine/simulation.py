@@ -22,23 +22,23 @@ from lfrtorch.engine.simulation_kernel import simulate_record
 PERIODIC_TOLERANCE = 1e-10
 """Largest |x(T) - x(0)| relative to 1 + max |x| that counts as periodic (states have unit rms)."""
 
-PERIODIC_ROUNDING = 100.0
+_PERIODIC_ROUNDING = 100.0
 """The same in multiples of the rounding error, which decides for dtypes of fewer digits."""
 
-MET_ROUNDING = 4.0
+_MET_ROUNDING = 4.0
 """Two trajectories have met if their states differ by at most this many rounding errors."""
 
-SETTLING_PERIODS = 3
+_SETTLING_PERIODS = 3
 """Periods simulated forward before Newton's method takes over; a well damped model needs one."""
 
-CLOSER = 1e-2
+_CLOSER = 1e-2
 """The monodromy is kept if it foretells a change to this part; for Newton's method the change has
 to be below this part of the states, too."""
 
-MAX_PERIODS = 30
+_MAX_PERIODS = 30
 """Most passes over the record in search of the periodic steady state."""
 
-EXPLODED = 10.0
+_EXPLODED = 10.0
 """States of an unstable trajectory beyond so many times those of the first pass are lost."""
 
 
@@ -105,7 +105,7 @@ def steady_state(
     Other cells try Newton's method over all of time first. While the trajectory is unstable, as it
     is near a rest that it leaves, the passes go on. A periodic solution that is not stable counts
     as diverged (its record has NaN samples), unless the search begins right on it: no simulation
-    would settle to it. So does a record that has not settled after ``MAX_PERIODS`` passes.
+    would settle to it. So does a record that has not settled after ``_MAX_PERIODS`` passes.
 
     Args:
         cell: the model.
@@ -123,13 +123,13 @@ def steady_state(
     # `settled` and `lost` tell for each record whether it is periodic, or will never be.
     identity = torch.eye(cell.nx, dtype=u.dtype, device=u.device)
     eps = torch.finfo(u.dtype).eps
-    tolerance = max(PERIODIC_TOLERANCE, PERIODIC_ROUNDING * eps)
+    tolerance = max(PERIODIC_TOLERANCE, _PERIODIC_ROUNDING * eps)
     trajectory = simulate(cell, u, x0)
     lost = torch.zeros(len(u), dtype=torch.bool, device=u.device)  # diverged, or unstable
     settled, size = lost, u.new_ones(len(u))
     transition, unstable, last = None, lost.clone(), u.new_full((len(u),), torch.inf)
     foretold = torch.zeros_like(x0)
-    for passes in range(MAX_PERIODS + 1):
+    for passes in range(_MAX_PERIODS + 1):
         end = trajectory.x[:, -1].clone()
         if passes == 0:
             size = 1.0 + trajectory.x.abs().amax(dim=(1, 2))  # of states that hardly change
@@ -137,21 +137,21 @@ def steady_state(
         change = (end - x0).abs().amax(dim=1)
         settled = change <= tolerance * size
         lost |= settled & unstable  # no simulation would stay there
-        if (settled | lost).all() or passes == MAX_PERIODS:
+        if (settled | lost).all() or passes == _MAX_PERIODS:
             break
-        if passes < SETTLING_PERIODS:
+        if passes < _SETTLING_PERIODS:
             closer = end
         else:
             # Where it foretold the change to two digits, it is kept.
             miss = (end - x0 - foretold).abs().amax(dim=1)
-            near = (miss <= CLOSER * last) & (unstable | (last <= CLOSER * size))
+            near = (miss <= _CLOSER * last) & (unstable | (last <= _CLOSER * size))
             if transition is None or not near[~settled & ~lost].all():
                 transition = monodromy(cell, trajectory.z)
                 radius = spectral_radius(transition)
                 unstable = ~settled & ~(radius < 1.0)  # comparisons with NaN are False
                 # A linear model stays unstable, and a large radius makes states of rounding errors.
                 lost |= unstable & ((cell.static is None) | ~(radius < 1.0 / eps))
-            lost |= unstable & (end.abs().amax(dim=1) > EXPLODED * size)
+            lost |= unstable & (end.abs().amax(dim=1) > _EXPLODED * size)
             last = change
             # x(T) = end + Φ d for the initial state x0 + d, and x(T) = x0 + d is wanted.
             gap = (end - x0).unsqueeze(-1)
@@ -214,7 +214,7 @@ def _compiled(
         sizes = ((T + 1, cell.nx), (T, cell.nz), (T, cell.nw), (T, cell.ny))
         near = Trajectory(*(u.new_full((R, *size), torch.nan) for size in sizes))
     near.x[:, 0] = x0
-    met_within = MET_ROUNDING * torch.finfo(u.dtype).eps
+    met_within = _MET_ROUNDING * torch.finfo(u.dtype).eps
     simulated = folded(cell)
     arguments = [to_numpy(u), *kernel_arguments(simulated), met_within]
     spread(simulate_record, R, *arguments, *(signal.numpy() for signal in near))

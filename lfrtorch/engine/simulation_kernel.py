@@ -44,7 +44,7 @@ def simulate_record(
             for n in range(len(h)):
                 h[n] = bz[n]
             for j in range(z.shape[1]):
-                for n in range(len(h)):
+                for n in range(len(h)):  # neighbours in memory
                     h[n] += WzT[j, n] * z[k, j]
             activate(activation, h)
         for i in range(w.shape[1]):
@@ -83,6 +83,7 @@ def affine(C, x, D, u, out):
 
 @njit(nogil=True, fastmath={"contract", "reassoc"})
 def _dot(a, b):
+    # Sums in any order become vector instructions; the states' sums keep theirs.
     total = a.dtype.type(0)
     for n in range(len(a)):
         total += a[n] * b[n]

@@ -23,10 +23,10 @@ from lfrtorch._support.types import Array
 from lfrtorch.engine.activations import FAR
 from lfrtorch.engine.nonlinearity import Network
 
-CELLS = 2**12
+_CELLS = 2**12
 """Most cells of a box."""
 
-ACTIVE = np.linspace(-4.0, 4.0, 17)
+_ACTIVE = np.linspace(-4.0, 4.0, 17)
 """Where σ bends."""
 
 ROUNDING = 1e-12
@@ -154,11 +154,11 @@ def _hull(each: Interval) -> Interval:
 def _cells(z: Interval, Wz: Float[Array, "nn nz"], bz: Float[Array, " nn"]) -> Interval:
     """Cells (C, nz) that cover a box: half of them alike, half where the neurons bend."""
     nz = len(z.low)
-    each = math.floor(CELLS ** (1.0 / nz) + 1e-9)
+    each = math.floor(_CELLS ** (1.0 / nz) + 1e-9)
     edges = []
     for j, (low, high) in enumerate(zip(*z, strict=True)):
         steep = np.abs(Wz[:, j]) > 1.0 / FAR
-        bends = (np.subtract.outer(ACTIVE, bz[steep]) / Wz[steep, j]).ravel()
+        bends = (np.subtract.outer(_ACTIVE, bz[steep]) / Wz[steep, j]).ravel()
         bends = bends[(bends > low) & (bends < high)]
         inner = [np.empty(0)]
         if each > 1 and len(bends):

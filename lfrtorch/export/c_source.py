@@ -21,7 +21,7 @@ from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
-LINE = 96
+_LINE = 96
 """Most columns of a line of numbers."""
 
 
@@ -122,7 +122,7 @@ def _braces(rows: Sequence[Sequence[str]]) -> str:
     for row in rows:
         line = "   "
         for number in row:
-            if len(line) + len(number) + 2 > LINE:
+            if len(line) + len(number) + 2 > _LINE:
                 lines.append(line)
                 line = "   "
             line += f" {number},"

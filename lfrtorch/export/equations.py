@@ -225,7 +225,7 @@ def rendered(template: str, **known: Any) -> str:
     return environment.get_template(template).render(known)
 
 
-RESERVED = {
+_RESERVED = {
     "case", "catch", "classdef", "else", "elseif", "end", "function", "otherwise", "parfor",
     "persistent", "spmd", "switch", "hess", "jac", "null",
 }  # fmt: skip
@@ -235,7 +235,7 @@ RESERVED = {
 def check_name(name: str) -> None:
     """Refuse a name that is no identifier in each of the languages."""
     word = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and "__" not in name
-    if not word or keyword.iskeyword(name) or name in RESERVED:
+    if not word or keyword.iskeyword(name) or name in _RESERVED:
         raise InputError(
             f"name is {name!r}; give letters, digits and single underscores, a letter first, and "
             "no keyword of a language, as name=engine."

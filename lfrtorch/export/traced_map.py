@@ -17,13 +17,13 @@ from lfrtorch.export.equations import Own
 OPSET, IR = 17, 8
 """Operators and file format of 2022, which every runtime since then reads."""
 
-SAMPLES = (1, 5, 64)
+_SAMPLES = (1, 5, 64)
 """Of the inputs on which the graph is compared with the map."""
 
-LARGEST = 3.0
+_LARGEST = 3.0
 """Standard deviation of the loudest of them; z is of about unit size."""
 
-ROUNDING = 1e-11
+_ROUNDING = 1e-11
 """Largest error of the graph, relative to 1 and to the largest w."""
 
 
@@ -37,7 +37,7 @@ def traced(static: Own, nz: int) -> Any:
     onnx = imported("onnx", "onnx")
     generator = torch.Generator().manual_seed(0)
     file: Any = io.BytesIO()  # which it takes, whatever its types say
-    z = torch.randn(max(SAMPLES), nz, generator=generator, dtype=torch.float64)
+    z = torch.randn(max(_SAMPLES), nz, generator=generator, dtype=torch.float64)
     # Since torch 2.9 another exporter is the default, which needs one package more.
     older: dict[str, Any]
     older = {"dynamo": False} if "dynamo" in inspect.signature(torch.onnx.export).parameters else {}
@@ -54,14 +54,14 @@ def traced(static: Own, nz: int) -> Any:
         raise _refused(static, "Its forward branches in Python on values; use torch.where.")
     model = onnx.load_from_string(file.getvalue())
     run = imported("onnx.reference", "onnx").ReferenceEvaluator(model).run
-    for scale, count in zip(np.linspace(LARGEST, 0.0, len(SAMPLES) + 1), SAMPLES, strict=False):
+    for scale, count in zip(np.linspace(_LARGEST, 0.0, len(_SAMPLES) + 1), _SAMPLES, strict=False):
         point = float(scale) * z[:count]
         with torch.no_grad():
             expected = static.module(point).numpy()
         (found,) = run(None, {"z": point.numpy()})
         size = max(1.0, np.abs(np.nan_to_num(expected)).max())
         if found.shape != expected.shape or not np.allclose(
-            found, expected, rtol=0, atol=ROUNDING * size, equal_nan=True
+            found, expected, rtol=0, atol=_ROUNDING * size, equal_nan=True
         ):
             raise _refused(
                 static,
