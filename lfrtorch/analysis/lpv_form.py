@@ -218,8 +218,8 @@ def _slopes(
         bounds = np.tile(static.sigma.slope_bounds, (len(Wz), 1))
         return Ww, Wz, bounds, lambda zeta: _mean_slopes(static, z0, zeta)
     left, right = np.repeat(np.eye(nw), nz, axis=1), np.tile(np.eye(nz), (nw, 1))
-    known = _bounds(static) if is_network(static) else np.array([-np.inf, np.inf])
-    bounds = np.broadcast_to(known, (nw, nz, 2)).reshape(-1, 2)
+    found = _bounds(static) if is_network(static) else np.array([-np.inf, np.inf])
+    bounds = np.broadcast_to(found, (nw, nz, 2)).reshape(-1, 2)
     return left, right, bounds, lambda zeta: _delta(cell, z0, zeta).reshape(len(zeta), -1)
 
 
@@ -234,8 +234,7 @@ def _delta(
     t, weight = gauss_legendre(static)
     points = z0 + t[:, None, None] * zeta
     delta = np.tensordot(weight, static_slope(cell, torch.as_tensor(points)).numpy(), 1)
-    exact = known(static) is not None
-    return delta if exact else delta + _left_over(cell, z0, zeta, delta)
+    return delta if known(static) else delta + _left_over(cell, z0, zeta, delta)
 
 
 def gauss_legendre(static: Module | None) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

@@ -28,7 +28,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.engine.nonlinearity import Network, is_network
 from lfrtorch.engine.static_enclosure import Enclosure, Interval, enclosure, everywhere
 
 _LONGEST = 2**16
@@ -57,29 +57,28 @@ class Reach:
 
 def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]) -> Reach:
     """Bounds of all signals for |u| <= amplitude, normalised; the cell is in float64 on the CPU."""
-    _check(cell)
-    loop = _Loop(cell, amplitude, x0)
-    nothing = np.empty(0)
-    if not is_network(cell.static):
-        found = loop.bounds(np.zeros((0, 0)), Interval(nothing, nothing))
-        return Reach(*loop.signals(found)[:3], Interval(nothing, nothing), None)
+    static = _bounded_map(cell)
+    loop = _Loop(cell, static, amplitude, x0)
     K = np.zeros((cell.nw, cell.nz))
-    found = loop.bounds(K, enclosure(cell.static, everywhere(cell.nz)).w)
+    if static is None:
+        nothing = Interval(np.empty(0), np.empty(0))
+        return Reach(*loop.signals(loop.bounds(K, nothing))[:3], nothing, None)
+    found = loop.bounds(K, enclosure(static, everywhere(cell.nz)).w)
     closed = False
     for _ in range(_ROUNDS):
-        inside = enclosure(cell.static, *loop.signals(found)[2:])
+        inside = enclosure(static, *loop.signals(found)[2:])
         if closed:
             K = inside.J.middle
             if not _is_stable(loop.closed(K)):
                 break
-            inside = enclosure(cell.static, *loop.signals(found)[2:], K)
+            inside = enclosure(static, *loop.signals(found)[2:], K)
         before, found = found, found.within(loop.bounds(K, inside.w))
         if (found.radius >= _SHRINKS * before.radius).all():
             if closed:
                 break
             closed = True
     x, y, z, a = loop.signals(found)
-    inside = enclosure(cell.static, z, a)
+    inside = enclosure(static, z, a)
     return Reach(x, y, z, inside.w, inside)
 
 
@@ -87,13 +86,18 @@ class _Loop:
     """The linear part of a model with the rows that are bounded: x, y, z and, if nz > 1, Wz z."""
 
     def __init__(
-        self, cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]
+        self,
+        cell: LFRCell,
+        static: Network | None,
+        amplitude: Float[Array, " nu"],
+        x0: Float[Array, " nx"],
     ) -> None:
         A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
         self.A, self.Bu, self.Bw, self.Cz, self.Dzu = A, Bu, Bw, Cz, Dzu
         self._amplitude, self._x0 = amplitude, x0
-        first = cell.static.Wz.detach().numpy() if is_network(cell.static) else Cz[:, :0]
-        Wz = first if cell.nz > 1 else first[:0]
+        Wz = np.zeros((0, cell.nz))
+        if static is not None and cell.nz > 1:  # one z bounds its neurons itself
+            Wz = static.Wz.detach().numpy()
         self.C = np.concatenate([np.eye(cell.nx), Cy, Cz, Wz @ Cz])
         self.Du = np.concatenate([np.zeros((cell.nx, cell.nu)), Dyu, Dzu, Wz @ Dzu])
         self.Dw = np.zeros((len(self.C), cell.nw))
@@ -192,18 +196,19 @@ def _is_stable(A: Float[Array, "nx nx"]) -> bool:
     return np.abs(np.linalg.eigvals(A)).max() < 1.0
 
 
-def _check(cell: LFRCell) -> None:
-    """Refuse a model whose bound would be infinite."""
+def _bounded_map(cell: LFRCell) -> Network | None:
+    """The static map; refuse a model whose bound would be infinite."""
+    static = cell.static
     *names, last = (name for name, sigma in ACTIVATIONS.items() if sigma.bounded)
     bounded = f"{', '.join(names)} or {last}"
-    if cell.static is not None and not is_network(cell.static):
+    if static is not None and not is_network(static):
         raise InputError(
-            f"the static map is a {type(cell.static).__name__}, which is not known to be bounded; "
+            f"the static map is a {type(static).__name__}, which is not known to be bounded; "
             f"a proven bound needs a network of {bounded}."
         )
-    if is_network(cell.static) and not cell.static.sigma.bounded:
+    if static is not None and not static.sigma.bounded:
         raise InputError(
-            f"the static map is a network of {cell.static.activation}, which is not bounded; a "
+            f"the static map is a network of {static.activation}, which is not bounded; a "
             f"proven bound needs one of {bounded}."
         )
     largest = float(np.abs(np.linalg.eigvals(cell.A.detach().numpy())).max())
@@ -212,3 +217,4 @@ def _check(cell: LFRCell) -> None:
             f"A is not stable, |eigenvalue| {largest:.6g}: a small input may make the states grow "
             "without bound.\nA fit with trainer.guarantee=stable keeps the eigenvalues within 1."
         )
+    return static

@@ -6,7 +6,7 @@ Compiled code serves the CPU; other devices form F and use ``scan``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -31,30 +31,28 @@ from lfrtorch.engine.linearised import PASS, linearise_at, static_slope
 Weights = Mapping[str, Tensor]
 
 
-def forwards(
+def states(
     weights: Weights,
     J: Float[Tensor, "R T nw nz"],
     g: Float[Tensor, "R T nx"],
-    s0: Float[Tensor, "R nx"],
+    known: Float[Tensor, "R nx"],
+    *,
+    backwards: bool = False,
 ) -> Float[Tensor, "R T+1 nx"]:
-    """All states of s(k+1) = F(k) s(k) + g(k), s(0) = s0."""
-    if not has_kernels(J):
-        F = linearise_at(weights, J).F
-        return linear_recurrence(F, g.unsqueeze(-1), s0.unsqueeze(-1)).squeeze(-1)
-    return _states(_forwards, weights, J, g, s0, 0)
+    """All states of s(k+1) = F(k) s(k) + g(k) from the known s(0).
 
-
-def backwards(
-    weights: Weights,
-    J: Float[Tensor, "R T nw nz"],
-    g: Float[Tensor, "R T nx"],
-    end: Float[Tensor, "R nx"],
-) -> Float[Tensor, "R T+1 nx"]:
-    """All costates of s(k) = F(k)ᵀ s(k+1) + g(k), s(T) = end."""
-    if not has_kernels(J):
-        F = linearise_at(weights, J).F
-        return scan(F.mT.flip(1), g.unsqueeze(-1).flip(1), end.unsqueeze(-1)).squeeze(-1).flip(1)
-    return _states(_backwards, weights, J, g, end, -1)
+    Backwards, all costates of s(k) = F(k)ᵀ s(k+1) + g(k) from the known s(T).
+    """
+    if has_kernels(J):
+        s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
+        s[:, -1 if backwards else 0] = known
+        kernel = _backwards if backwards else _forwards
+        spread(kernel, len(g), *_matrices(weights), to_numpy(J), to_numpy(g), s.numpy())
+        return s
+    F, g, known = linearise_at(weights, J).F, g.unsqueeze(-1), known.unsqueeze(-1)
+    if backwards:
+        return scan(F.mT.flip(1), g.flip(1), known).squeeze(-1).flip(1)
+    return scan(F, g, known).squeeze(-1)
 
 
 def transition(
@@ -76,21 +74,6 @@ def monodromy(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx 
     for part in z.split(max(1, PASS // len(z)), dim=1):
         Phi = transition(weights, static_slope(cell, part), Phi)
     return Phi
-
-
-def _states(
-    kernel: Callable[..., None],
-    weights: Weights,
-    J: Float[Tensor, "R T nw nz"],
-    g: Float[Tensor, "R T nx"],
-    known: Float[Tensor, "R nx"],
-    at: int,
-) -> Float[Tensor, "R T+1 nx"]:
-    """Run a kernel from the states that are known at one time."""
-    s = g.new_empty(len(g), g.shape[1] + 1, g.shape[2])
-    s[:, at] = known
-    spread(kernel, len(g), *_matrices(weights), to_numpy(J), to_numpy(g), s.numpy())
-    return s
 
 
 def _matrices(weights: Weights) -> list[NDArray]:

@@ -34,7 +34,7 @@ from torch import Tensor
 from lfrtorch._support.threads import spread, workers
 from lfrtorch.engine.blocked_kernel import blocked_rows
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.feedback_recurrence import backwards, forwards, transition
+from lfrtorch.engine.feedback_recurrence import states, transition
 from lfrtorch.engine.jacobian_kernel import jacobian_rows
 from lfrtorch.engine.linear_recurrence import has_kernels, linear_recurrence, to_numpy
 from lfrtorch.engine.linearised import PASS, Linearised, linearise_at, of_static
@@ -213,10 +213,10 @@ class Linearisation:
         for block in self._blocks():
             J, v = block.static.J, block.v
             d_w = _apply(J, v @ d_z.mT) + block.static.tangent(d_static)
-            states = forwards(W, J, v @ d_x.mT + d_w @ W["Bw"].mT, s)
-            s, states = states[:, -1], states[:, :-1]
-            d_w += _apply(J, states @ W["Cz"].mT)
-            yield states @ W["Cy"].mT + v @ d_y.mT + d_w @ W["Dyw"].mT, s
+            every = states(W, J, v @ d_x.mT + d_w @ W["Bw"].mT, s)
+            s, d_states = every[:, -1], every[:, :-1]
+            d_w += _apply(J, d_states @ W["Cz"].mT)
+            yield d_states @ W["Cy"].mT + v @ d_y.mT + d_w @ W["Dyw"].mT, s
 
     @torch.no_grad()
     def adjoint(self, e: Float[Tensor, "R T ny"]) -> Adjoint:
@@ -272,7 +272,7 @@ class Linearisation:
         W, J = self.weights, block.static.J
         e = e[:, block.time]
         g = e @ W["Cy"] + _apply(J.mT, e @ W["Dyw"]) @ W["Cz"]  # Hᵀ e
-        return backwards(W, J, g, end)
+        return states(W, J, g, end, backwards=True)
 
     def _blocks(self, *, backwards: bool = False) -> Iterator[_Block]:
         """All records, block by block in time, or at once if they are few."""
@@ -320,9 +320,9 @@ class Linearisation:
         E = block.weights["Dyw"].unsqueeze(-3) @ d_w
         G[..., x[:, 1], x[:, 0]] += v[..., x[:, 2]]
         E[..., y[:, 1], y[:, 0]] += v[..., y[:, 2]]
-        states = linear_recurrence(block.linearised.F, G, S)
-        rows[..., :C] = block.linearised.H @ states[:, :-1] + E
-        return states[:, -1]
+        every = linear_recurrence(block.linearised.F, G, S)
+        rows[..., :C] = block.linearised.H @ every[:, :-1] + E
+        return every[:, -1]
 
     def _rows_compiled(
         self, block: _Block, columns: DirectTerms, S: Tensor, rows: Tensor

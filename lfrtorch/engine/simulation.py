@@ -74,7 +74,10 @@ def simulate(
     if is_compiled(cell, u):
         return _compiled(cell, u, x0, None)
     x = newton_states(cell, u, x0, guess=guess)
-    return _with_loop_where_lost(cell, u, x0, x)
+    lost = ~torch.isfinite(x).all(dim=(1, 2))
+    if lost.any():
+        x = torch.where(lost[:, None, None], _loop(cell, u, x0), x)
+    return signals(cell, u, x)
 
 
 def simulate_near(
@@ -173,19 +176,6 @@ def is_compiled(cell: LFRCell, u: Tensor) -> bool:
     """Whether machine code simulates the cell on the device of ``u``."""
     static = base_of(cell.static)
     return (static is None or known(static) is not None) and has_kernels(u)
-
-
-def _with_loop_where_lost(
-    cell: LFRCell,
-    u: Float[Tensor, "R T nu"],
-    x0: Float[Tensor, "R nx"],
-    x: Float[Tensor, "R T+1 nx"],
-) -> Trajectory:
-    """The trajectory of the states x; records that are not finite are simulated step by step."""
-    lost = ~torch.isfinite(x).all(dim=(1, 2))
-    if lost.any():
-        x = torch.where(lost[:, None, None], _loop(cell, u, x0), x)
-    return signals(cell, u, x)
 
 
 def _loop(

@@ -7,7 +7,7 @@ import torch
 from torch.testing import assert_close
 
 from lfrtorch.engine import feedback_recurrence, linear_recurrence
-from lfrtorch.engine.feedback_recurrence import backwards, forwards, transition
+from lfrtorch.engine.feedback_recurrence import states, transition
 from lfrtorch.engine.linearised import linearise_at
 
 pytestmark = pytest.mark.numeric
@@ -56,8 +56,8 @@ def test_they_are_the_recurrences_of_the_products(
     assert_near = partial(assert_close, rtol=1e-9, atol=1e-9)
     if dtype == torch.float32:
         assert_near = partial(assert_close, rtol=1e-3, atol=1e-3)
-    assert_near(forwards(W, J, g, s0), torch.stack(ahead, 1))
-    assert_near(backwards(W, J, g, s0), torch.stack(back[::-1], 1))
+    assert_near(states(W, J, g, s0), torch.stack(ahead, 1))
+    assert_near(states(W, J, g, s0, backwards=True), torch.stack(back[::-1], 1))
     eye = torch.eye(nx, dtype=dtype).expand(R, nx, nx)
     assert_near(transition(W, J[:, :21], eye), Phi)
     # In two parts it is the same.
@@ -73,7 +73,7 @@ def test_what_has_faded_is_zero_and_what_overflows_is_not_finite():
     assert transition(W, none, eye).abs().max() < 1e-30
     assert not torch.isfinite(transition(W | {"A": 10.0 * eye[0]}, none, eye)).all()
     assert (
-        feedback_recurrence.forwards(W, none, torch.zeros(1, 4000, 3).double(), eye[:, 0])[0, -1]
+        feedback_recurrence.states(W, none, torch.zeros(1, 4000, 3).double(), eye[:, 0])[0, -1]
         .abs()
         .max()
         < 1e-30
