@@ -1,4 +1,21 @@
-"""Proven bounds of states and outputs for all inputs of an amplitude."""
+"""Proven bounds of states and outputs for all inputs of an amplitude.
+
+x is the response of a stable linear system to u and w. About their middles, with A x̄ + Bw w̄ = x̄::
+
+    x(k) = x̄ + Aᵏ (x(0) - x̄) + Σ_j<k Aʲ (Bu δu(k-1-j) + Bw δw(k-1-j))
+
+so that |δu| <= r brings any row c of it no further than Σ_j |c Aʲ Bu| r, the sum of the impulse
+response's moduli; likewise w, as the map is bounded. That bounds z, which bounds w more tightly,
+and so on. With w = K z + δw the loop is closed through K first, as soon as z is bounded: then the
+rest of the map is small, and so are the bounds.
+
+The sums end after N samples. With M = Aᴺ the rest of them is at most |M| (I - |M|)⁻¹ times the sums
+of the states, entry by entry.
+
+References:
+    Dahleh and Diaz-Bobillo, "Control of Uncertain Systems: A Linear Programming Approach", Prentice
+    Hall 1995 (norms of impulse responses as gains of amplitudes).
+"""
 
 from __future__ import annotations
 
@@ -15,12 +32,26 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import engineering, number, table
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import levels_of, vector
-from lfrtorch.analysis.reach import reach
+from lfrtorch.engine.activations import ACTIVATIONS
 from lfrtorch.engine.beyond_linear import Beyond, folded
+from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.nonlinearity import Network, is_network
 from lfrtorch.engine.operating_point import double
-from lfrtorch.engine.static_enclosure import Interval
+from lfrtorch.engine.static_enclosure import Enclosure, Interval, enclosure, everywhere
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
+
+_LONGEST = 2**16
+"""Most samples of an impulse response that are summed; slower ones have a looser bound."""
+
+_REST = 1e-4
+"""The rest of the sums is below this part of the states' rms, or they have ``_LONGEST`` samples."""
+
+_BLOCK = 256
+"""Samples of impulse responses that are computed together."""
+
+_SHRINKS, _ROUNDS = 0.99, 50
+"""The bounds are final if none shrinks below this part in a round, or after so many."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +97,7 @@ def bound(model: Model, amplitude: ArrayLike, *, x0: ArrayLike | None = None) ->
     """What the states and outputs of a model stay within, whatever the input of an amplitude.
 
     It is reached by the worst input of a linear model, and may be far from that of a nonlinear one.
-    The mathematics are in ``lfrtorch/analysis/reach.py``.
+    The mathematics stand at the head of ``lfrtorch/analysis/bounds.py``.
 
     Args:
         model: with a stable A, and a network of tanh, sigmoid or rbf; or linear.
@@ -125,3 +156,179 @@ def amplitudes(given: ArrayLike, nu: int) -> Array:
             "or one for each, in physical units and not negative."
         )
     return np.broadcast_to(found, nu).copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Bounds of all signals, normalised, and what the static map does in them."""
+
+    x: Interval
+    y: Interval
+    z: Interval
+    w: Interval
+    map: Enclosure | None
+
+
+def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]) -> Reach:
+    """Bounds of all signals for |u| <= amplitude, normalised; the cell is in float64 on the CPU."""
+    static = _bounded_map(cell)
+    loop = _Loop(cell, static, amplitude, x0)
+    K = np.zeros((cell.nw, cell.nz))
+    if static is None:
+        nothing = Interval(np.empty(0), np.empty(0))
+        return Reach(*loop.signals(loop.bounds(K, nothing))[:3], nothing, None)
+    found = loop.bounds(K, enclosure(static, everywhere(cell.nz)).w)
+    closed = False
+    for _ in range(_ROUNDS):
+        inside = enclosure(static, *loop.signals(found)[2:])
+        if closed:
+            K = inside.J.middle
+            if not _is_stable(loop.closed(K)):
+                break
+            inside = enclosure(static, *loop.signals(found)[2:], K)
+        before, found = found, found.within(loop.bounds(K, inside.w))
+        if (found.radius >= _SHRINKS * before.radius).all():
+            if closed:
+                break
+            closed = True
+    x, y, z, a = loop.signals(found)
+    inside = enclosure(static, z, a)
+    return Reach(x, y, z, inside.w, inside)
+
+
+class _Loop:
+    """The linear part of a model with the rows that are bounded: x, y, z and, if nz > 1, Wz z."""
+
+    def __init__(
+        self,
+        cell: LFRCell,
+        static: Network | None,
+        amplitude: Float[Array, " nu"],
+        x0: Float[Array, " nx"],
+    ) -> None:
+        A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
+        self.A, self.Bu, self.Bw, self.Cz, self.Dzu = A, Bu, Bw, Cz, Dzu
+        self._amplitude, self._x0 = amplitude, x0
+        Wz = np.zeros((0, cell.nz))
+        if static is not None and cell.nz > 1:  # one z bounds its neurons itself
+            Wz = static.Wz.detach().numpy()
+        self.C = np.concatenate([np.eye(cell.nx), Cy, Cz, Wz @ Cz])
+        self.Du = np.concatenate([np.zeros((cell.nx, cell.nu)), Dyu, Dzu, Wz @ Dzu])
+        self.Dw = np.zeros((len(self.C), cell.nw))
+        self.Dw[cell.nx : cell.nx + cell.ny] = Dyw
+        self._ends = np.cumsum([cell.nx, cell.ny, cell.nz])
+
+    def signals(self, rows: Interval) -> tuple[Interval, Interval, Interval, Interval | None]:
+        """Bounds of x, y, z and Wz z; None without the last."""
+        low, high = (np.split(side, self._ends) for side in rows)
+        x, y, z, a = (Interval(*pair) for pair in zip(low, high, strict=True))
+        return x, y, z, (a if len(a.low) else None)
+
+    def closed(self, K: Float[Array, "nw nz"]) -> Float[Array, "nx nx"]:
+        """A with the loop closed through K."""
+        return self.A + self.Bw @ K @ self.Cz
+
+    def bounds(self, K: Float[Array, "nw nz"], w: Interval) -> Interval:
+        """Bounds of the rows if w - K z stays in an interval."""
+        A, Bu = self.closed(K), self.Bu + self.Bw @ K @ self.Dzu
+        C, Du = self.C + self.Dw @ K @ self.Cz, self.Du + self.Dw @ K @ self.Dzu
+        rest = np.linalg.solve(np.eye(len(A)) - A, self.Bw @ w.middle)
+        radius = np.concatenate([self._amplitude, w.radius])
+        moved = _moved(A, np.hstack([Bu, self.Bw]), C, radius, self._x0 - rest)
+        middle = C @ rest + self.Dw @ w.middle
+        direct = np.abs(np.hstack([Du, self.Dw])) @ radius
+        return Interval(middle + moved.low - direct, middle + moved.high + direct).wider()
+
+
+def _moved(
+    A: Float[Array, "nx nx"],
+    B: Float[Array, "nx n"],
+    C: Float[Array, "rows nx"],
+    radius: Float[Array, " n"],
+    d: Float[Array, " nx"],
+) -> Interval:
+    """Bounds of C x over all time for x+ = A x + B v, |v| <= radius, x(0) = d; C begins with I."""
+    nx = len(A)
+    samples = _samples(A, B * radius)
+    powers = [C]
+    for _ in range(_BLOCK - 1):
+        powers.append(powers[-1] @ A)
+    H, over_block = np.stack(powers), np.linalg.matrix_power(A, _BLOCK)
+    X = np.column_stack([B * radius, d])
+    spread, farthest = np.zeros(len(C)), np.zeros(nx)
+    low, high = np.full(len(C), np.inf), np.full(len(C), -np.inf)
+    for _ in range(samples // _BLOCK):
+        G = H @ X
+        free, more = G[..., -1], np.abs(G[..., :-1]).sum(axis=-1)
+        after = spread + np.cumsum(more, axis=0)
+        before = after - more
+        low = np.minimum(low, (free - before).min(axis=0))
+        high = np.maximum(high, (free + before).max(axis=0))
+        spread, X = after[-1], over_block @ X
+        farthest = np.maximum(farthest, np.abs(free[:, :nx]).max(axis=0))
+    # What comes later, entry by entry.
+    M = np.abs(np.linalg.matrix_power(A, samples))
+    power, states, later = np.linalg.matrix_power(A, samples), spread[:nx], np.zeros(nx)
+    while (rest := _rest(M)) is None:
+        states = states + M @ states
+        later = np.maximum(later, M @ farthest)
+        farthest = np.maximum(farthest, later)
+        power = power @ power
+        M = np.abs(power)
+    states = states + rest @ states
+    later = np.maximum(later, rest @ farthest)
+    end = spread + np.abs(C) @ (states - spread[:nx] + later)
+    return Interval(np.minimum(low, -end), np.maximum(high, end))
+
+
+def _samples(A: Float[Array, "nx nx"], B: Float[Array, "nx n"]) -> int:
+    """Samples, a power of 2, after which little is left of the impulse responses."""
+    samples, power, gramian = 1, A, B @ B.T
+    while samples < _LONGEST:
+        rms = np.sqrt(gramian.diagonal())
+        rest = _rest(np.abs(power)) if samples >= _BLOCK else None
+        if rest is not None and (rest @ rms <= _REST * (rms + _REST * rms.max())).all():
+            break
+        gramian = gramian + power @ gramian @ power.T
+        samples, power = 2 * samples, power @ power
+    return samples
+
+
+def _rest(M: Float[Array, "nx nx"]) -> Float[Array, "nx nx"] | None:
+    """M + M² + .. = M (I - M)⁻¹ for M >= 0, or None: some q > 0 with M q < q proves it."""
+    if not (M.sum(axis=1) < np.inf).all():
+        return None
+    try:
+        total = np.linalg.inv(np.eye(len(M)) - M)
+    except np.linalg.LinAlgError:
+        return None
+    q = total.sum(axis=1)
+    return M @ total if (q > 0).all() and (M @ q < q).all() and (total >= 0).all() else None
+
+
+def _is_stable(A: Float[Array, "nx nx"]) -> bool:
+    return np.abs(np.linalg.eigvals(A)).max() < 1.0
+
+
+def _bounded_map(cell: LFRCell) -> Network | None:
+    """The static map; refuse a model whose bound would be infinite."""
+    static = cell.static
+    *names, last = (name for name, sigma in ACTIVATIONS.items() if sigma.bounded)
+    bounded = f"{', '.join(names)} or {last}"
+    if static is not None and not is_network(static):
+        raise InputError(
+            f"the static map is a {type(static).__name__}, which is not known to be bounded; "
+            f"a proven bound needs a network of {bounded}."
+        )
+    if static is not None and not static.sigma.bounded:
+        raise InputError(
+            f"the static map is a network of {static.activation}, which is not bounded; a "
+            f"proven bound needs one of {bounded}."
+        )
+    largest = float(np.abs(np.linalg.eigvals(cell.A.detach().numpy())).max())
+    if largest >= 1.0:
+        raise InputError(
+            f"A is not stable, |eigenvalue| {largest:.6g}: a small input may make the states grow "
+            "without bound.\nA fit with trainer.guarantee=stable keeps the eigenvalues within 1."
+        )
+    return static

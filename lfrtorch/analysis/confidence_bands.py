@@ -148,11 +148,15 @@ class Uncertainty:
     @property
     def covariance(self) -> Float[Array, "P P"]:
         """Of all free parameters, in the order of ``model.lfr``; 0 for those that are held."""
-        P = sum(p.numel() for p in self.model.lfr.parameters() if p.requires_grad)
-        found = np.zeros((P, P))
-        kept = self.kept.numpy()
-        found[np.ix_(kept, kept)] = (self.factor @ self.factor.mT).numpy()
-        return found
+        wide = np.concatenate([*self._factors().values()])
+        return wide @ wide.T
+
+    def _factors(self) -> dict[str, Array]:
+        """Rows of a factor of that covariance, by the name of the parameter."""
+        free = {n: p.numel() for n, p in self.model.lfr.cell.named_parameters() if p.requires_grad}
+        wide = np.zeros((sum(free.values()), self.factor.shape[1]))
+        wide[self.kept.numpy()] = self.factor.numpy()
+        return dict(zip(free, np.split(wide, np.cumsum([*free.values()])[:-1]), strict=True))
 
     def simulate(self, data: Record | ArrayLike) -> Band:
         """Simulated output with its band, and how far the input is from the data.
@@ -203,19 +207,11 @@ class Uncertainty:
             >>> bool(pole.frequency > 0), bool(pole.frequency_std > 0)
             (True, True)
         """
-        cell, found = self.model.lfr.cell, linear_part(self.model)
-        first, places = 0, {}
-        for name, p in cell.named_parameters():
-            if p.requires_grad:
-                places[name] = first + np.arange(p.numel())
-                first += p.numel()
-        wide = np.zeros((first, self.factor.shape[1]))
-        wide[self.kept.numpy()] = self.factor.numpy()
-        parts = [
-            wide[places[n]] if n in places else np.zeros((getattr(cell, n).numel(), wide.shape[1]))
-            for n in ("A", "Bu", "Cy", "Dyu")
-        ]
-        return self._with_covariance(found, np.concatenate(parts))
+        factors, names = self._factors(), ("A", "Bu", "Cy", "Dyu")
+        sizes = [self.model.lfr.cell.get_parameter(name).numel() for name in names]
+        held = [np.zeros((size, self.factor.shape[1])) for size in sizes]
+        parts = [factors.get(name, none) for name, none in zip(names, held, strict=True)]
+        return self._with_covariance(linear_part(self.model), np.concatenate(parts))
 
     def linearise(self, u: ArrayLike | None = None) -> LinearModel:
         """The model about its rest, as ``lfrtorch.analysis.linearise``, with its covariance.

@@ -14,9 +14,8 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import factor_of, number
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.bounds import amplitudes
+from lfrtorch.analysis.bounds import amplitudes, reach
 from lfrtorch.analysis.linearisation import levels_of
-from lfrtorch.analysis.reach import reach
 from lfrtorch.engine.activations import FAR
 from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
