@@ -36,7 +36,7 @@ _MINOR = 0.01
 """Directions of z and w with less than this part of the nonlinearity do not count."""
 
 _POINTS, _STARTS, _SWEEPS = 400, 5, 300
-"""Samples of the slope that branches are fitted to, random starts of that fit, and its sweeps."""
+"""Slopes that branches are fitted to, random starts of that fit, and its sweeps."""
 
 
 @dataclass(frozen=True, eq=False)

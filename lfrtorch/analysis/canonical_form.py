@@ -33,7 +33,7 @@ from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
 MOST_SAMPLES = 16_384
-"""Of each record that the covariances and the response to w are taken over, its last ones."""
+"""Most samples of a record, its last ones, for covariances and the response to w."""
 
 _ANGLES = 1024
 """Frequencies of impulse responses and of the observability Gramian."""

@@ -49,10 +49,10 @@ _TRUNCATION = 1e-8
 """Singular values of J, of columns of unit length, that count as zero relative to the largest."""
 
 _HELD = 1 << 25
-"""Numbers in the rows of a record up to which they are held rather than computed again."""
+"""Most numbers in the rows of the records that are kept rather than computed again."""
 
 _UNFINISHED = 1.0
-"""Distance to the minimum in standard errors, rms over the directions, that is remarked on."""
+"""Distance to the minimum in standard errors, rms over the directions, that makes a doubt."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class Band:
 
     @property
     def surprise(self) -> float:
-        """That of the record: 99 % of its samples are below."""
+        """Surprise of the record: 99 % of its samples are below."""
         return float(np.quantile(self.surprises, FARTHEST))
 
     def interval(
@@ -147,7 +147,7 @@ class Uncertainty:
 
     @property
     def covariance(self) -> Float[Array, "P P"]:
-        """Of all free parameters, in the order of ``model.lfr``; 0 for those that are held."""
+        """Covariance of all free parameters, in the order of ``model.lfr``; 0 for held ones."""
         wide = np.concatenate([*self._factors().values()])
         return wide @ wide.T
 
@@ -436,14 +436,14 @@ def _noise(
 
 
 def _ratio(product: Float[Array, "ny ny"], left: Float[Array, " ny"]) -> Float[Array, "ny ny"]:
-    """Covariance from the products of residuals and what is left of their numbers."""
+    """Covariance of the residuals, from their products and their degrees of freedom."""
     return product / np.sqrt(np.outer(left, left))
 
 
 def _weighted_step(
     every: Sequence[Gradients], W: Float[Tensor, "K K"], sizes: Sequence[NoiseModel]
 ) -> Float[Tensor, " K"]:
-    """The Gauss-Newton step of a fit in which each record counts by one over its noise."""
+    """Gauss-Newton step of a fit that weights each record by one over its noise."""
     K = len(W)
     total = QRAccumulator()
     for along, own in zip(every, sizes, strict=True):
@@ -457,7 +457,7 @@ def _weighted_step(
 def _dependent(
     every: Sequence[Gradients], model: Model, step: Float[Tensor, " K"] | None = None
 ) -> list[tuple[OutputResiduals, str]]:
-    """Residuals that depend on the inputs, and how; those after a step of the parameters."""
+    """Residuals that depend on the inputs, and how, after a step of the parameters."""
     parts = []
     for along in every:
         if along.record.samples - along.record.skip < SHORTEST:
@@ -487,7 +487,7 @@ def _doubts(
     rank: int,
     left: tuple[float, float],
 ) -> tuple[str, ...]:
-    """What speaks against the bands, in sentences."""
+    """Sentences that say why the bands may be wrong."""
     found = []
     wrong = _dependent(every, model)
     if wrong and len(every) > 1:

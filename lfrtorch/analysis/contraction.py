@@ -39,7 +39,7 @@ _LEAST, _HALVINGS = 1e-3, 9
 halvings of the logarithm."""
 
 _SLOW = 2
-"""Ratio of the time to forget to that of the spectral radius, above which a hint is given."""
+"""Time to forget, over the one that the spectral radius allows, above which a hint is given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ _Proof = tuple[Differences, Certificate]
 
 
 def _slopes_of(cell: LFRCell, amplitude: Array | None) -> Enclosure | None:
-    """What the static map does for inputs of an amplitude, or for all; None without a map."""
+    """Enclosure of the static map for inputs of an amplitude, or for all; None without a map."""
     if amplitude is None:
         return enclosure(cell.static, everywhere(cell.nz)) if is_network(cell.static) else None
     return reach(cell, amplitude, np.zeros(cell.nx)).map
@@ -251,7 +251,7 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
 
 
 def _slow(system: Differences) -> float:
-    """The largest rate that counts."""
+    """Largest rate that counts as contraction."""
     return max(SLOWEST, 1.0 - _LEAST * (1.0 - _radius(system)))
 
 

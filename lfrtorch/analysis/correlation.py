@@ -28,7 +28,7 @@ _BOUND = 0.99
 """Probability that a correlation of independent signals at one lag is within its bounds."""
 
 _NO_POWER = 1e-24
-"""Power of the prediction errors over that of the signal from which on they are rounding errors."""
+"""Power of prediction errors over the signal's power, below which it is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Correlation:
 
     @property
     def largest(self) -> int:
-        """Lag from 0 on whose correlation is the furthest beyond its bound."""
+        """Lag from 0 on with the largest correlation relative to its bound."""
         part = np.where(self.lags >= 0, np.abs(self.values) / np.maximum(self.bounds, 1e-300), -1.0)
         return int(self.lags[np.argmax(part)])
 

@@ -24,7 +24,7 @@ from lfrtorch.model import Model
 from lfrtorch.records import Record
 
 _SEEN = 1e-9
-"""Directions of a start state that move the output by less than this part of others stay."""
+"""Directions of a start state that move the output by less than this, relative to others, stay."""
 
 
 class Gradients:
@@ -93,7 +93,7 @@ class Gradients:
             yield time, rows
 
     def weighted(self) -> Iterator[tuple[slice, Float[Tensor, "m ny K"], Float[Tensor, "m ny"]]]:
-        """The K columns and the errors as they count in a fit, real and imaginary if by line."""
+        """The K columns and the errors, weighted as in a fit; real, then imaginary if by line."""
         K, group = len(self.kept), self.group
         for time, rows in self.blocks():
             part, errors = rows[None, ..., :K], self.errors[None, time]

@@ -1,4 +1,4 @@
-"""The linear models inside a nonlinear one: its linear part, and what it is about a point."""
+"""Linear models of a nonlinear one: its linear part, and its linearisation about a point."""
 
 from __future__ import annotations
 

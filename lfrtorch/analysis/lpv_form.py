@@ -30,10 +30,10 @@ from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.model import Model
 
 _NODES = 32
-"""Of the Gauss-Legendre rule for a static map whose integral is not known."""
+"""Nodes of the Gauss-Legendre rule for a static map whose integral is not known."""
 
 _ROUNDING = 1e-14
-"""Error of f(z) - f(z0), relative to both, that is left alone: over a small ζ it would be large."""
+"""Error of f(z) - f(z0), relative to both, that is one of rounding."""
 
 Slopes = Callable[[Float[Array, "S nz"]], Float[Array, "S P"]]
 
@@ -84,7 +84,7 @@ class LPV:
     def scheduling(
         self, x: Float[Array, "*axes nx"], u: Float[Array, "*axes nu"]
     ) -> Float[Array, "*axes P"]:
-        """Return p of states and inputs."""
+        """Compute p of states and inputs."""
         zeta = (x - self.x0) @ self.Cz.T + (u - self.u0) @ self.Dzu.T
         points = zeta.reshape(int(np.prod(zeta.shape[:-1])), len(self.Cz))
         return self.slopes(points).reshape(*zeta.shape[:-1], len(self.bounds))
@@ -255,7 +255,7 @@ def _left_over(
     zeta: Float[Array, "S nz"],
     delta: Float[Array, "S nw nz"],
 ) -> Float[Array, "S nw nz"]:
-    """The least change of Δ that makes f(z0) + Δ ζ exact."""
+    """Least change of Δ that makes f(z0) + Δ ζ exact."""
     assert cell.static is not None
     f = cell.static(torch.as_tensor(np.concatenate([z0[None], z0 + zeta]))).numpy()
     error = f[1:] - f[0] - np.einsum("swz,sz->sw", delta, zeta)

@@ -44,7 +44,7 @@ _GRID = 121
 """Points of a curve, and of each side of a plane."""
 
 _HEIGHT, _LEAST_HEIGHT = 2.7, 3.6
-"""Of a panel, and of the figure, in inches."""
+"""Height of a panel, and least height of the figure, in inches."""
 
 
 class Visited(NamedTuple):

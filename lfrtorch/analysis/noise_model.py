@@ -28,7 +28,7 @@ LEAST = 0.1
 """Least part 1 - ρ of the noise that is taken to be left in the residuals."""
 
 _NO_POWER = 1e-24
-"""Power of the prediction errors, over that of the residuals, that is a rounding error."""
+"""Power of prediction errors over the residuals' power, below which it is rounding."""
 
 _FADED, _LONGEST = 1e-4, 2048
 """An impulse response ends where so little is left of it, and after so many samples."""

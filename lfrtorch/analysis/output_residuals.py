@@ -15,13 +15,13 @@ from lfrtorch.metrics import rms
 from lfrtorch.records import Channel
 
 LEVEL = 0.01
-"""Probability of a test up to which its hypothesis, independence, is given up."""
+"""Significance level of the tests of independence."""
 
 ROUNDING = 1e-12
 """Errors below this part of the output's rms are rounding errors, and so are such means."""
 
 SLIGHT = 0.1
-"""Correlations below this are of 1 % of the power at most: long records show them, and few mind."""
+"""Correlations below this are 1 % of the power at most; only long records show them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class OutputResiduals:
 
     @property
     def verdict(self) -> str:
-        """What is left in the error, in words."""
+        """What the tests find in the error, as a sentence."""
         if self.diverges:
             return "the simulation diverges"
         if self.exact:

@@ -1,4 +1,4 @@
-"""What the errors of a simulation still hold: are they white, and independent of the inputs?"""
+"""Residual analysis: are the errors of a simulation white, and independent of the inputs?"""
 
 from __future__ import annotations
 

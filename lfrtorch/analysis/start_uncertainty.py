@@ -32,7 +32,7 @@ from lfrtorch.model import Model
 from lfrtorch.records import Record
 
 LONGEST = 1 << 13
-"""Samples at the beginning of a record whose free responses are looked at; then they stay."""
+"""Samples at the beginning of a record whose free responses are computed."""
 
 
 @torch.no_grad()
@@ -65,7 +65,7 @@ def start_error(model: Model, record: Record, y_hat: Float[Array, "T ny"]) -> fl
 
 
 def _autocovariance(e: Float[Array, " M"], lags: int) -> Float[Array, " lags"]:
-    """Of errors about 0; beyond their number 0."""
+    """Autocovariance of errors about 0; 0 beyond their number."""
     spectrum = np.abs(np.fft.rfft(e, 2 * len(e))) ** 2
     found = np.fft.irfft(spectrum, 2 * len(e))[: min(lags, len(e))] / len(e)
     return np.pad(found, (0, lags - len(found)))

@@ -35,7 +35,7 @@ class TrainingReach:
 
     @classmethod
     def of(cls, z: Float[Array, "S nz"], variance: Float[Array, "S ny"]) -> TrainingReach:
-        """From z and the variances of the outputs at the training samples."""
+        """Build it from z and the variances of the outputs at the training samples."""
         middle = z.mean(axis=0)
         white = whitening(z)
         found = cls(middle, white, (1.0, 1.0, 1.0))
@@ -45,7 +45,7 @@ class TrainingReach:
         return cls(middle, white, (far[0], far[1], both))
 
     def surprises(self, z: Float[Array, "T nz"], variance: Float[Array, "T ny"]) -> Array:
-        """How far samples are: 1 is as far as 99 % of the training samples go."""
+        """Surprise of each sample: 1 is as far as 99 % of the training samples go."""
         a, b, both = self.farthest
         of_z, of_y = self._distances(z, variance)
         return np.maximum(of_z / a, of_y / b) / both

@@ -68,7 +68,7 @@ class Activation:
 
     @property
     def bounded(self) -> bool:
-        """Whether |σ| has a bound."""
+        """Whether σ is bounded."""
         return bool(np.abs(self.values(np.array([-FAR, FAR]))).max() < FAR)
 
     @property

@@ -50,7 +50,7 @@ class Beyond(Module):
 
 
 def base_of(static: Module | None) -> Module | None:
-    """The map itself, or f of a ``Beyond``."""
+    """A map, or f of a ``Beyond``."""
     return base_of(static.base) if isinstance(static, Beyond) else static
 
 

@@ -19,10 +19,10 @@ from torch import Tensor
 from lfrtorch.engine.cell import LFRCell
 
 STRUCTURES = ("free", "wiener", "hammerstein", "wiener_hammerstein", "parallel")
-"""What ``LFRCell.structure`` may be."""
+"""Values of ``LFRCell.structure``."""
 
 IN_SERIES = ("wiener_hammerstein", "parallel")
-"""Those with states before and after the static map, as many of each."""
+"""Structures with as many states before the static map as after it."""
 
 
 def zeros_of(cell: LFRCell) -> dict[str, Tensor]:

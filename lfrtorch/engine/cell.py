@@ -14,7 +14,7 @@ from lfrtorch._support.types import Array
 
 
 def check_dtype(dtype: torch.dtype) -> None:
-    """Refuse what a model does not compute in with a ValueError."""
+    """Refuse any dtype but float32 and float64 with a ValueError."""
     if dtype not in (torch.float32, torch.float64):
         raise InputError(f"dtype is {dtype!r}; give torch.float64 or torch.float32.")
 
@@ -99,9 +99,9 @@ class LFRCell(nn.Module):
         identity = torch.zeros(nx, nx, device=device, dtype=dtype).fill_diagonal_(1.0)
         self.register_buffer("state_covariance", identity)
         self.structure = "free"
-        """Of which blocks the model is made, see ``block_form``; a fit keeps to it."""
+        """Blocks that the model is made of, see ``block_form``; a fit keeps to them."""
         self.past_outputs = 0
-        """Number of inputs, the last ones, that are measured outputs; their Dzu and Dyu stay 0."""
+        """Number of last inputs that are measured outputs; their Dzu and Dyu stay 0."""
         self._check_shapes()
 
     def forward(
@@ -203,7 +203,7 @@ class LFRCell(nn.Module):
             )
 
     def free_feedthrough(self, *, z: bool, y: bool) -> None:
-        """Which of z and y a fit lets the input act on at once; zeros elsewhere stay zeros.
+        """Choose whether a fit lets the input act on z and y at once; zeros elsewhere stay zeros.
 
         On y it acts through w, too, so without ``y`` that path is closed: at Dzu, or else at Dyw.
         """

@@ -14,7 +14,7 @@ from lfrtorch.engine.operating_point import StateSpace
 from lfrtorch.records import Channel
 
 _MOST_POLES, _MOST_GAINS = 6, 4
-"""Rows of the tables; of more poles those of the largest radius."""
+"""Most rows of the tables; poles of the largest radius are kept."""
 
 _INTEGRATES = 1e-9
 """Distance of a pole from 1 up to which there is no gain at rest."""
@@ -45,7 +45,7 @@ def levels(channels: Sequence[Channel], offset: Array, scale: Array | None = Non
 
 
 def in_columns(facts: Sequence[tuple[str, str | None]]) -> list[str]:
-    """Lines of a name and what is said of it; those without a text are left out."""
+    """Lines of names with their texts; names without a text are left out."""
     width = max(len(name) for name, _ in facts)
     return [f"{name:<{width}}  {text}" for name, text in facts if text]
 
@@ -95,7 +95,7 @@ def system_lines(
 
 
 def _gain(system: StateSpace) -> Array | None:
-    """C (I - A)⁻¹ B + D; None of a system that integrates."""
+    """C (I - A)⁻¹ B + D; None if the system integrates."""
     A, B, C, D = system
     if (np.abs(np.linalg.eigvals(A) - 1.0) < _INTEGRATES).any():
         return None

@@ -34,20 +34,20 @@ PASSES, _FLAT = 8, 1e-4
 """Passes that estimate the prior's weight, and its least variance relative to the largest."""
 
 _ODD = 1e-3
-"""Least part of the cost that the prior must add to make a difference."""
+"""Least part of the cost that the prior adds if it makes a difference."""
 
 _FAR = 0.1
 """Ratio of squared errors at which a state that the training data have not seen is believed. On
 50 samples of measurements it is 0.2 or more where the state is wrong for the rest of the record."""
 
 _FAR_BETTER = 0.25
-"""Ratio of squared errors at which the state that the beginning of a record tells is better."""
+"""Ratio of squared errors below which the state from a record's beginning is refined."""
 
 _AWAY = 100.0
-"""Growth of xᵀ P⁻¹ x after the samples that tell a state, at which the model runs away from it."""
+"""Growth of xᵀ P⁻¹ x, after the samples that tell the state, that means a runaway."""
 
 _BEGINNING = 8
-"""Least outputs of a beginning for each state."""
+"""Least number of outputs in a beginning, for each state."""
 
 
 @torch.no_grad()

@@ -33,7 +33,7 @@ from lfrtorch.engine.simulation_kernel import activate, affine, slope_of
 def filter_record(
     u, y, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth, G, x, U
 ):
-    """Take x and U over all samples; returns log p(y). NaN in y is a missing output.
+    """Filter all samples: x and U go to the end, and log p(y) is returned; NaN in y is missing.
 
     The weights between y and G are those that ``simulate_record`` takes, of one model.
 
@@ -73,9 +73,9 @@ def filter_record(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def correct(e, H, G, x, U, w_hat):
-    """Let x know the output; write the noise of the states into w_hat.
+    """Update x by the output; write the expected noise of the states into w_hat.
 
-    Returns M, the number of known outputs and log p(e). A missing output is NaN in e.
+    Returns the reflected M, the number of known outputs and log p(e). NaN in e is a missing output.
 
     Shape:
         e: (ny,), H: (ny, nx), G: (ny + nx, ny + nx), x, w_hat: (nx,), U: (nx, nx).

@@ -17,7 +17,7 @@ from torch import Tensor
 from lfrtorch._support.threads import spread
 
 NOTHING = 1e-30
-"""Size of what is set to 0, for states of unit size."""
+"""Entries below this are set to 0; states have unit size."""
 
 COMPILED_ON = {"cpu"}
 """Devices that have compiled kernels; all else runs in torch, parallel in time."""

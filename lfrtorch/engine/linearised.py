@@ -25,7 +25,7 @@ class Linearised(NamedTuple):
 
 @torch.no_grad()
 def linearise(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Linearised:
-    """F and H of a trajectory, of which only the input z of the static nonlinearity matters."""
+    """F and H along a trajectory, which depend on the input z of the static map alone."""
     return linearise_at(dict(cell.named_parameters()), static_slope(cell, z))
 
 

@@ -106,7 +106,7 @@ def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"
 def _newton(
     cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"]
 ) -> Float[Tensor, " nx"] | None:
-    """The rest that Newton's method comes to from x."""
+    """State at rest that Newton's method finds from x."""
     identity = torch.eye(cell.nx, dtype=u.dtype)
     gap = cell(u, x)[1] - x
     for _ in range(_MAX_NEWTON):

@@ -23,7 +23,7 @@ PERIODIC_TOLERANCE = 1e-10
 """Largest |x(T) - x(0)| relative to 1 + max |x| that counts as periodic (states have unit rms)."""
 
 _PERIODIC_ROUNDING = 100.0
-"""The same in multiples of the rounding error, which decides for dtypes of fewer digits."""
+"""The same in rounding errors, which decides in float32."""
 
 _MET_ROUNDING = 4.0
 """Two trajectories have met if their states differ by at most this many rounding errors."""
@@ -39,7 +39,7 @@ _MAX_PERIODS = 30
 """Most passes over the record in search of the periodic steady state."""
 
 _EXPLODED = 10.0
-"""States of an unstable trajectory beyond so many times those of the first pass are lost."""
+"""An unstable trajectory is lost if its states exceed those of the first pass by this factor."""
 
 
 class Trajectory(NamedTuple):
@@ -90,7 +90,7 @@ def simulate_near(
 
 
 def signals(cell: LFRCell, u: Float[Tensor, "R T nu"], x: Float[Tensor, "R T+1 nx"]) -> Trajectory:
-    """The trajectory of given states."""
+    """Trajectory with the given states."""
     z, w = cell.internal(u, x[:, :-1])
     return Trajectory(x, z, w, x[:, :-1] @ cell.Cy.mT + u @ cell.Dyu.mT + w @ cell.Dyw.mT)
 
@@ -181,7 +181,7 @@ def is_compiled(cell: LFRCell, u: Tensor) -> bool:
 def _loop(
     cell: LFRCell, u: Float[Tensor, "R T nu"], x0: Float[Tensor, "R nx"]
 ) -> Float[Tensor, "R T+1 nx"]:
-    """States, one step after another, of any static map on any device."""
+    """States, simulated step by step: any static map, any device."""
     states = [x0.unsqueeze(1)]
     for u_k in u.split(1, dim=1):
         states.append(cell(u_k, states[-1])[1])

@@ -27,14 +27,14 @@ _CELLS = 2**12
 """Most cells of a box."""
 
 _ACTIVE = np.linspace(-4.0, 4.0, 17)
-"""Where σ bends."""
+"""Values of v at which neurons get their own cells."""
 
 ROUNDING = 1e-12
-"""What is added to intervals, relative to their width and their distance from 0."""
+"""Widening of intervals, relative to the size of their ends."""
 
 
 class Interval(NamedTuple):
-    """Numbers between low and high, entry by entry."""
+    """Intervals of numbers, entry by entry."""
 
     low: Array
     high: Array
@@ -50,11 +50,11 @@ class Interval(NamedTuple):
         return (self.high - self.low) / 2
 
     def within(self, other: Interval) -> Interval:
-        """What both have in common."""
+        """Intersection of two intervals."""
         return Interval(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
 
     def wider(self) -> Interval:
-        """The same, less than rounding errors wider."""
+        """The interval, widened by more than rounding errors."""
         more = ROUNDING * (np.abs(self.low) + np.abs(self.high))
         return Interval(self.low - more, self.high + more)
 
@@ -147,7 +147,7 @@ def _range(
 
 
 def _hull(each: Interval) -> Interval:
-    """The interval that holds those of all cells."""
+    """Hull of the intervals of all cells."""
     return Interval(each.low.min(axis=0), each.high.max(axis=0))
 
 

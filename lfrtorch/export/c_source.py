@@ -117,7 +117,7 @@ def _constant(name: str, size: str, value: Array) -> str:
 
 
 def _braces(rows: Sequence[Sequence[str]]) -> str:
-    """Numbers in braces, each row from a new line; each of them is read back to the same bits."""
+    """Numbers in braces, a line or more for each row; they are read back to the same bits."""
     lines = []
     for row in rows:
         line = "   "

@@ -113,7 +113,7 @@ class Equations:
         ]
 
     def description(self, name: str) -> dict[str, Any]:
-        """What a file of numbers alone does not say, for JSON."""
+        """Name, rate, state at rest and channels, for JSON."""
         sides = ("inputs", self.inputs, self.u_offset), ("outputs", self.outputs, self.y_offset)
         return {
             "name": name,
@@ -202,7 +202,7 @@ class KalmanNoise:
 def observer_equations(
     model: Model | LinearModel, observer: bool | NoiseCovariance
 ) -> SteadyGain | KalmanNoise | None:
-    """What an observer has besides the model; None for no observer."""
+    """Gain or noise of an observer; None for no observer."""
     if observer is False:
         return None
     model = model.to_model() if isinstance(model, LinearModel) else model
@@ -229,7 +229,7 @@ _RESERVED = {
     "case", "catch", "classdef", "else", "elseif", "end", "function", "otherwise", "parfor",
     "persistent", "spmd", "switch", "hess", "jac", "null",
 }  # fmt: skip
-"""Words of MATLAB and CasADi that are no name, beside those of Python."""
+"""Keywords of MATLAB and CasADi, in addition to Python's."""
 
 
 def check_name(name: str) -> None:

@@ -62,7 +62,7 @@ def _sample(e: Equations, graph: Graph) -> None:
     v = graph.node("Sub", "u", graph.constant("u_offset", e.u_offset), to="v")
 
     def combined(to: str, matrices: dict[str, str], *offset: str) -> str:
-        """The sum of matrices times signals, which are rows, and perhaps an offset."""
+        """Sum of matrices times signals, which are rows, and perhaps an offset."""
         terms = [
             graph.node("MatMul", signal, graph.constant(letters, getattr(e, letters).T))
             for letters, signal in matrices.items()

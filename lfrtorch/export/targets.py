@@ -1,4 +1,4 @@
-"""The exports by the names that the command line has for them."""
+"""Exports by their names on the command line."""
 
 from __future__ import annotations
 

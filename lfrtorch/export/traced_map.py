@@ -18,7 +18,7 @@ OPSET, IR = 17, 8
 """Operators and file format of 2022, which every runtime since then reads."""
 
 _SAMPLES = (1, 5, 64)
-"""Of the inputs on which the graph is compared with the map."""
+"""Numbers of inputs on which graph and map are compared."""
 
 _LARGEST = 3.0
 """Standard deviation of the loudest of them; z is of about unit size."""
