@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 import torch
 from exported import MODELS, check_run, check_step, inputs
-from numpy.typing import ArrayLike
 from reference import SIGMA, random_cell, random_model
 from torch import Tensor
 
 import lfrtorch
-from lfrtorch._support.types import Array
 from lfrtorch.analysis import lpv
-from lfrtorch.engine.activations import ACTIVATIONS
 
 pytestmark = pytest.mark.numeric
 
@@ -75,30 +72,6 @@ def test_parameters_stay_within_their_bounds_however_loud_the_input(name: str):
             p = form.scheduling(model.signals(u).x[0, :-1].numpy(), u)
             assert (p >= form.bounds[:, 0] - 1e-12).all()
             assert (p <= form.bounds[:, 1] + 1e-12).all()
-
-
-@pytest.mark.parametrize("activation", SIGMA)
-def test_mean_slopes_are_exact_and_become_the_slope(activation: str):
-    v = np.linspace(-6.0, 6.0, 41)[:, None]
-    far = np.array([-40.0, -3.0, -1.0, -0.4, 0.5, 1.0, 2.0, 40.0])
-    sigma = SIGMA[activation]
-
-    def mean_slope(v: Array, d: ArrayLike) -> Array:
-        return ACTIVATIONS[activation].mean_slope(*np.broadcast_arrays(v, np.asarray(d)))
-
-    value = sigma(torch.as_tensor(v + far)) - sigma(torch.as_tensor(v))
-    np.testing.assert_allclose(mean_slope(v, far) * far, value, rtol=1e-12, atol=1e-13)
-    at = torch.as_tensor(v, dtype=torch.float64).requires_grad_()
-    sigma(at).sum().backward()
-    assert at.grad is not None
-    smooth = np.abs(v) > 1e-3 if activation == "relu" else np.full(v.shape, True)
-    for near in (0.0, 1e-15, -1e-9):
-        found = mean_slope(v, near)
-        np.testing.assert_allclose(found[smooth], at.grad.numpy()[smooth], atol=3e-9)
-    low, high = ACTIVATIONS[activation].slope_bounds
-    slopes = mean_slope(v, np.linspace(-50.0, 50.0, 301))
-    assert low - 1e-12 <= slopes.min()
-    assert slopes.max() <= high + 1e-12
 
 
 def test_what_cannot_be_scheduled_is_refused():
