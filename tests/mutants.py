@@ -50,6 +50,7 @@ TESTS: dict[str, str] = {
     "engine/simulation_kernel": "engine/simulation engine/nonlinearity",
     "engine/initial_state": "engine/initial_state least_squares/problem",
     "engine/linearised": "engine/sensitivity engine/simulation",
+    "engine/activations": "engine/activations engine/nonlinearity engine/static_jacobian",
     "engine/static_jacobian": "engine/static_jacobian engine/sensitivity",
     "engine/jacobian_kernel": "engine/sensitivity least_squares/problem",
     "engine/sensitivity": "engine/sensitivity least_squares/problem",
