@@ -142,18 +142,20 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
         True
     """
     cell = folded(double(model.lfr.cell))
-    if cell.static is not None and not is_network(cell.static):
+    static = cell.static
+    if static is not None and not is_network(static):
         raise InputError(
-            f"the static map is a {type(cell.static).__name__}, whose slopes are not known to be "
+            f"the static map is a {type(static).__name__}, whose slopes are not known to be "
             "bounded; a certificate needs a network, or no map."
         )
     scale = model.scaler.u_scale
     if amplitude is not None:
         size = amplitudes(amplitude, cell.nu)
-        proof = _proof(cell, _slopes_of(cell, size / scale))
+        proof = _proof(cell, _slopes_within(cell, size / scale))
     else:
         size = np.full(cell.nu, np.inf)
-        proof = _proof(cell, _slopes_of(cell, None))
+        anywhere = None if static is None else enclosure(static, everywhere(cell.nz))
+        proof = _proof(cell, anywhere)
         if isinstance(proof, str):
             size, proof = _largest(cell, proof)
             size = size * scale
@@ -172,7 +174,7 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
     proven = math.nan if proven is None else proven
     slow = np.isinf(size).all() and rate**_SLOW > _radius(system)
     hint = ""
-    if slow and cell.static is not None:
+    if slow and static is not None:
         hint = (
             "For inputs of an amplitude the rate may be far smaller: "
             "contraction(model, amplitude=...)."
@@ -183,10 +185,8 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
 _Proof = tuple[Differences, Certificate]
 
 
-def _slopes_of(cell: LFRCell, amplitude: Array | None) -> Enclosure | None:
-    """Enclosure of the static map for inputs of an amplitude, or for all; None without a map."""
-    if amplitude is None:
-        return enclosure(cell.static, everywhere(cell.nz)) if is_network(cell.static) else None
+def _slopes_within(cell: LFRCell, amplitude: Array) -> Enclosure | None:
+    """Enclosure of the static map for inputs of an amplitude; None without a map."""
     return reach(cell, amplitude, np.zeros(cell.nx)).map
 
 
@@ -227,7 +227,7 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
     nothing = np.zeros(cell.nu)
 
     def attempt(factor: float) -> _Proof | str:
-        return _proof(cell, _slopes_of(cell, np.full(cell.nu, factor)))
+        return _proof(cell, _slopes_within(cell, np.full(cell.nu, factor)))
 
     try:
         at_rest = attempt(1.0 / _FARTHEST)

@@ -171,14 +171,14 @@ def lpv(
         ((2, 1, 1), True)
     """
     cell, s = folded(double(model.lfr.cell)), model.scaler
-    network = is_network(cell.static)
+    network = cell.static if is_network(cell.static) else None
     if schedule not in (None, "neurons", "map"):
         raise InputError(f"schedule is {schedule!r}; give 'neurons' or 'map'.")
-    if schedule == "neurons" and not network:
+    if schedule == "neurons" and network is None:
         raise InputError(
             "schedule is 'neurons', and the static map is no network; give schedule='map'."
         )
-    schedule = schedule or ("neurons" if network else "map")
+    schedule = schedule or ("map" if network is None else "neurons")
     u0 = s.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
     v0 = torch.as_tensor((u0 - s.u_offset) / s.u_scale)
     if x is not None:
@@ -188,7 +188,7 @@ def lpv(
     with torch.no_grad():
         y0, x_next0 = (each.numpy() for each in cell(v0, x0))
         z0 = cell.internal(v0, x0)[0].numpy()
-    left, right, bounds, slopes = _slopes(cell, z0, schedule)
+    left, right, bounds, slopes = _slopes(cell, network, z0, schedule)
     A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
 
     def affine(M: Array, into: Array, of: Array) -> Array:
@@ -207,34 +207,36 @@ def lpv(
 
 
 def _slopes(
-    cell: LFRCell, z0: Float[Array, " nz"], schedule: str
+    cell: LFRCell, network: Network | None, z0: Float[Array, " nz"], schedule: str
 ) -> tuple[Array, Array, Float[Array, "P 2"], Slopes]:
     """L (nw, P), R (P, nz), bounds and p(ζ) of Δ = L diag(p) R."""
-    nw, nz, static = cell.nw, cell.nz, cell.static
-    if static is None:
+    nw, nz = cell.nw, cell.nz
+    if cell.static is None:
         return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 2)), lambda zeta: zeta
-    if is_network(static) and schedule == "neurons":
-        Wz, Ww = _matrices(static)
-        bounds = np.tile(static.sigma.slope_bounds, (len(Wz), 1))
-        return Ww, Wz, bounds, lambda zeta: _mean_slopes(static, z0, zeta)
+    if network is not None and schedule == "neurons":
+        Wz, Ww = _matrices(network)
+        bounds = np.tile(network.sigma.slope_bounds, (len(Wz), 1))
+        return Ww, Wz, bounds, lambda zeta: _mean_slopes(network, z0, zeta)
     left, right = np.repeat(np.eye(nw), nz, axis=1), np.tile(np.eye(nz), (nw, 1))
-    found = _bounds(static) if is_network(static) else np.array([-np.inf, np.inf])
+    found = np.array([-np.inf, np.inf]) if network is None else _bounds(network)
     bounds = np.broadcast_to(found, (nw, nz, 2)).reshape(-1, 2)
-    return left, right, bounds, lambda zeta: _delta(cell, z0, zeta).reshape(len(zeta), -1)
+    return left, right, bounds, lambda zeta: _delta(cell, network, z0, zeta).reshape(len(zeta), -1)
 
 
 def _delta(
-    cell: LFRCell, z0: Float[Array, " nz"], zeta: Float[Array, "S nz"]
+    cell: LFRCell,
+    network: Network | None,
+    z0: Float[Array, " nz"],
+    zeta: Float[Array, "S nz"],
 ) -> Float[Array, "S nw nz"]:
     """Δ(ζ)."""
-    static = cell.static
-    if is_network(static):
-        Wz, Ww = _matrices(static)
-        return Ww @ (_mean_slopes(static, z0, zeta)[..., None] * Wz)
-    t, weight = gauss_legendre(static)
+    if network is not None:
+        Wz, Ww = _matrices(network)
+        return Ww @ (_mean_slopes(network, z0, zeta)[..., None] * Wz)
+    t, weight = gauss_legendre(cell.static)
     points = z0 + t[:, None, None] * zeta
     delta = np.tensordot(weight, static_slope(cell, torch.as_tensor(points)).numpy(), 1)
-    return delta if known(static) else delta + _left_over(cell, z0, zeta, delta)
+    return delta if known(cell.static) else delta + _left_over(cell, z0, zeta, delta)
 
 
 def gauss_legendre(static: Module | None) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
