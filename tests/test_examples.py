@@ -72,3 +72,16 @@ def test_one_page_comes_to_the_cost_of_the_package_from_the_same_start():
     # The costs, 1/144 of the start's, are 0.1 % apart: the package accelerates its steps.
     assert errors[-1] < 0.1 * errors[0]
     assert (errors[-1] * y_std[0]) ** 2 == pytest.approx(history[-1].train ** 2, rel=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.numeric
+def test_optuna_searches_around_identify(capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("optuna", reason="needs optuna: pip install optuna")
+    found = runpy.run_path(str(EXAMPLES / "optuna_search.py"))
+    study = found["study"]
+    assert len(study.trials) == 10
+    assert study.best_value == min(trial.value for trial in study.trials)
+    assert study.best_value < 0.011  # the noise is 0.01 rms
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"{study.best_params}\nBetter than the linear model")

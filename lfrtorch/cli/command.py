@@ -6,14 +6,13 @@ import sys
 from importlib import import_module
 from importlib.metadata import version
 
-from lfrtorch.cli import CONF, compare, preview_words, search
+from lfrtorch.cli import CONF, compare, preview_words
 from lfrtorch.cli.interrupts import at_once, handled
 
 COMMANDS = {
     "preview": "look at measurements before any fit",
     "linear": "frequency response and best linear approximation",
     "fit": "identify a nonlinear LFR model, from records to report",
-    "search": "settings of fit that validate best",
     "compare": "many runs in one table and one page",
     "evaluate": "score a saved model on a dataset",
     "simulate": "run a saved model on the inputs of files",
@@ -21,7 +20,7 @@ COMMANDS = {
 }
 """Modules of this room, in the order in which a user meets them, and what they do."""
 
-PARSERS = {"preview": preview_words.parser, "search": search.parser, "compare": compare.parser}
+PARSERS = {"preview": preview_words.parser, "compare": compare.parser}
 """What reads the words of commands that have no settings."""
 
 

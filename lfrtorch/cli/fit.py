@@ -14,7 +14,7 @@ import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 from functools import partial
@@ -52,7 +52,7 @@ from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.observer import Watching
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.trainer import FitResult, Monitor, StoppedError
+from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -74,14 +74,12 @@ def run(
     folder: Path,
     command: str = "",
     ranks: Ranks | None = None,
-    monitor: Callable[[], Monitor] | None = None,
 ) -> float:
     """One run, its files written into ``folder`` by the first process; returns the validation RMSE.
 
     Args:
         cfg, folder, command: the settings, where the files go, and what the user typed.
         ranks: the processes that share the fit.
-        monitor: makes what is called after each iteration, too, of a fit of one start.
 
     Raises:
         ProcessLostError, TerminatedError: the fit ended early, and what it had found is written.
@@ -97,7 +95,7 @@ def run(
     kept = folder / SNAPSHOTS if cfg.resume or ranks.rank == 0 else None
     snapshots = Snapshots(kept, writes=ranks.rank == 0)
     first = ranks.rank == 0
-    files = _Folder(cfg, folder, monitor, least=snapshots.least) if first else None
+    files = _Folder(cfg, folder, least=snapshots.least) if first else None
     with Termination() as stop, resumable(folder):
         try:
             found = identify(
@@ -161,12 +159,11 @@ class _Folder(Terminal):
         self,
         cfg: DictConfig,
         folder: Path,
-        monitor: Callable[[], Monitor] | None,
         *,
         least: float,
     ) -> None:
         super().__init__(cfg)
-        self.folder, self._monitor, self._least = folder, monitor, least
+        self.folder, self._least = folder, least
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
@@ -186,8 +183,7 @@ class _Folder(Terminal):
         printing, watch = super().begin(dataset, settings, linear, models)
         if len(models) == 1:
             self._boards = []
-            own = [] if self._monitor is None else [self._monitor()]
-            return Watching([[*printing[0], self.board, keep, *own]], watch)
+            return Watching([[*printing[0], self.board, keep]], watch)
         self._boards = [
             TensorBoard(self.folder / STARTS / f"{i:02d}", finalist=True, say=self.note)
             for i in range(len(models))
@@ -217,9 +213,7 @@ def main(cfg: DictConfig) -> float:
     return launched(cfg, folder, command)
 
 
-def launched(
-    cfg: DictConfig, folder: Path, command: str, monitor: Callable[[], Monitor] | None = None
-) -> float:
+def launched(cfg: DictConfig, folder: Path, command: str) -> float:
     """One run, by all processes that torchrun started; errors of users end the program."""
     rank = os.environ.get("RANK", "0")
     with ExitStack() as stack:
@@ -230,7 +224,7 @@ def launched(
         ranks = stack.enter_context(connect(cfg.device, cfg.timeout))
         if ranks.rank > 0:
             stack.enter_context(redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
-        return run(cfg, common(folder, ranks), command, ranks, monitor)
+        return run(cfg, common(folder, ranks), command, ranks)
     raise AssertionError  # user_errors does not return
 
 

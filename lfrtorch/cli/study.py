@@ -46,9 +46,6 @@ from lfrtorch.cli.run_folder import SNAPSHOTS
 LOG, FAILED, LOCK = "log.txt", "failed.txt", ".lock"
 """In the folder of a run: what it printed, why it failed, and what says that a process is at it."""
 
-PRUNED = "pruned"
-"""How the reason begins if a search ended a run, which is no failure."""
-
 NOT_COMPARED = ("overwrite", "resume")
 """Words that are not about what a run computes."""
 
@@ -177,8 +174,7 @@ def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, h
         value, end = _apart(work, cfg, folder / LOG, lock)
         if value is None:
             (folder / FAILED).write_text(f"{end}\n", encoding="utf-8")
-            said = end if end.startswith(PRUNED) else f"failed: {end}"
-            print(f"{folder.name}: {said}", flush=True)
+            print(f"{folder.name}: failed: {end}", flush=True)
             return math.nan
         took = tables.quantity(time.perf_counter() - begun, "s")
         print(f"{folder.name}: error {tables.number(value)}, {took}", flush=True)
@@ -198,12 +194,8 @@ def done(folder: Path, words: Sequence[str]) -> float | None:
 
 
 @contextmanager
-def alone(folder: Path, *, wait: bool = True) -> Iterator[Connection | None]:
+def alone(folder: Path) -> Iterator[Connection | None]:
     """No other process is at this run: one that is left of a study that was killed ends first.
-
-    Args:
-        folder: of the run.
-        wait: for that one; else a BlockingIOError.
 
     The open file is locked until all processes that have it close it. It is a connection, since
     these may be handed to another process.
@@ -214,7 +206,7 @@ def alone(folder: Path, *, wait: bool = True) -> Iterator[Connection | None]:
         yield None
         return
     with Connection(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)) as lock:
-        fcntl.flock(lock.fileno(), fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        fcntl.flock(lock.fileno(), fcntl.LOCK_EX)
         yield lock
 
 

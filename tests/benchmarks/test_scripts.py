@@ -24,7 +24,6 @@ SCRIPTS = [
     "parts",
     "planted_sizes",
     "refit",
-    "search",
     "starts",
     "tanks",
 ]
