@@ -18,14 +18,12 @@ from lfrtorch._support.paths import real
 
 if TYPE_CHECKING:
     from lfrtorch.records import Record
-    from lfrtorch.reporting.comparison import Comparison
 
 ABOUT = """Compare runs: a table on the terminal, and comparison.html, .md and .csv.
 
     lfrtorch compare runs/study
     lfrtorch compare runs/study runs/boucwen/DATE out=compared
     lfrtorch compare runs/study +bench=boucwen
-    lfrtorch compare runs/run data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750
 
 All runs in the folders, and in those below them, that came to their end are read. Runs of different
 data have tables of their own.
@@ -48,44 +46,42 @@ def parser() -> argparse.ArgumentParser:
 
 def launch() -> None:
     """The command line."""
+    from lfrtorch.cli.composition import check_words
     from lfrtorch.cli.errors import user_errors
 
     words = parser().parse_args().words
-    outs = [word.removeprefix("out=") for word in words if word.startswith("out=")]
+    settings = [word for word in words if _is_setting(word)]
+    outs = [word.removeprefix("out=") for word in settings if word.startswith("out=")]
+    data = [word for word in settings if not word.startswith("out=")]
     with user_errors():
-        settings = [word for word in words if is_setting(word) and not word.startswith("out=")]
-        folders = [Path(word) for word in words if not is_setting(word)]
-        run(folders, *outs[-1:], record=chosen(settings) if settings else None)
+        check_words("evaluate", data)
+        record = _record("evaluate", data) if data else None
+        run([Path(word) for word in words if word not in settings], *outs[-1:], record=record)
 
 
-def is_setting(word: str) -> bool:
+def _is_setting(word: str) -> bool:
     """Whether it is NAME=VALUE, and no folder: those of a study have such names, as a/nn=5."""
     name, given, _ = word.partition("=")
     return bool(given) and "/" not in name and not Path(word).is_dir()
 
 
-def chosen(words: Sequence[str]) -> Record | None:
-    """The record of the data that words choose, as those of ``lfrtorch fit``."""
-    from lfrtorch.cli.composition import check_words, composed
-    from lfrtorch.cli.config import one_record
-    from lfrtorch.cli.quotes import quoted
-
-    check_words("evaluate", words)
-    return one_record(composed("evaluate", [quoted(word) for word in words]))
-
-
-def of_best_run(compared: Comparison) -> Record | None:
-    """The record of the data of the best run; None of Python's runs, and if it is not there now."""
+def _record(command: str, words: Sequence[str]) -> Record | None:
+    """The first record of the data that words choose which was not fitted."""
     from lfrtorch.cli.composition import composed
     from lfrtorch.cli.config import one_record
     from lfrtorch.cli.quotes import quoted
+
+    return one_record(composed(command, [quoted(word) for word in words]))
+
+
+def _record_of_run(folder: Path) -> Record | None:
+    """The record of a run's data; None of Python's runs, and if it is not there now."""
     from lfrtorch.cli.run_folder import OVERRIDES, words_of
 
-    folder = compared.runs[0].folder
     if not (folder / OVERRIDES).is_file():
         return None
     try:
-        return one_record(composed("config", [quoted(word) for word in words_of(folder)]))
+        return _record("config", words_of(folder))
     except (LfrtorchError, OSError) as error:
         print(
             f"note: the data of '{folder}' cannot be read ({brief(error)}), so the page shows no "
@@ -104,14 +100,12 @@ def run(folders: list[Path], out: str | Path | None = None, record: Record | Non
     """
     from lfrtorch.reporting import comparison
 
-    for folder in folders:
-        if not folder.is_dir():
-            raise InputError(f"'{folder}' is no folder; give those of runs.")
-    if not folders:
-        raise InputError("no folder is given; give those of runs.")
+    for folder in folders or [Path()]:
+        if not (folders and folder.is_dir()):
+            raise InputError(f"'{folder}' is no folder of runs; give one or several.")
     found = comparison.compare(folders)
     target = Path(os.path.commonpath([real(path) for path in folders]) if out is None else out)
-    records = {one.name: record or of_best_run(one) for one in found}
+    records = {one.name: record or _record_of_run(one.runs[0].folder) for one in found}
     comparison.write(found, target, records)
     print("\n\n".join(map(str, found)))
     print(f"\nFigures and all runs: {target / 'comparison.html'}, comparison.md and comparison.csv")

@@ -108,7 +108,7 @@ def figures(
     """All figures of a run by file name."""
     drawn = {}
     for record in dataset.tests or dataset.validation:
-        drawn |= run_figures.of_record(record, model.simulate(record))[0]
+        drawn |= run_figures.of_record(record, {"linear": model.simulate(record)})[0]
     drawn["frequency_response"] = linear_plots.frequency_response(model, frf)
     drawn["poles_and_zeros"] = linear_plots.poles_and_zeros(model)
     if scan is not None:

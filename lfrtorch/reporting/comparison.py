@@ -1,9 +1,7 @@
-"""Runs side by side: a table, and a page with their errors against size, seed and time."""
+"""Runs side by side: a table, and a page with their errors against size and over seeds."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import os
@@ -12,9 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+import pandas as pd
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 
@@ -28,7 +25,6 @@ from lfrtorch.model import check_channels, load
 from lfrtorch.records import Record
 from lfrtorch.reporting import html, plots
 from lfrtorch.reporting.scores import unit_of
-from lfrtorch.reporting.several_models import COLOURS, short, side_by_side
 from lfrtorch.score_window import with_window
 
 SEEDS = ("seed", "data.seed")
@@ -40,19 +36,21 @@ SHOWN = 20
 BOXES = 30
 """Most settings whose boxes are drawn, the best by their median."""
 
-WIDE = 50
-"""Ratio of the values of a word from which on their axis is logarithmic."""
+LONGEST = 40
+"""Characters of a setting in a figure."""
 
 CAPTIONS = {
     "parameters": "Validation error by parameters",
-    "time": "Validation error by time",
     "seeds": "Validation error over seeds",
-    "words": "Validation error by words",
-    "simulations": "Best models on one record: about the largest error, and spectra of the errors",
+    "close_up": "Best models on one record, about the largest error of the best one",
+    "density": "Spectra of their errors",
 }
 """Of the figures."""
 
-LEGEND = "*: no run with as few parameters has a smaller validation error."
+LEGEND = (
+    "*: no run with as few parameters has a smaller validation error. Median: over the seeds of a "
+    "setting; runs that diverge are the worst."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,132 +125,102 @@ class Comparison:
             groups.setdefault(label or "all runs", []).append(run)
         if len(groups) == len(self.runs):
             return {}
-        medians = {label: _quartiles(runs)[1] for label, runs in groups.items()}
-        return {label: groups[label] for label in sorted(groups, key=medians.__getitem__)}
+        return dict(sorted(groups.items(), key=lambda one: _median(one[1])))
 
     def rows(self) -> tuple[list[str], list[list[Cell]]]:
-        """Head and rows of the table of runs."""
+        """Head and rows of the table; the median is that of a setting over its seeds."""
         tests = list(dict.fromkeys(name for run in self.runs for name in run.tests))
+        medians = {run.folder: _median(runs) for runs in self.settings.values() for run in runs}
         factor, unit = self._scale
-        shown = f" ({unit})" if unit else ""
-        head = ["run", "", "parameters", f"validation{shown}"]
-        head += [f"{name}{shown}" for name in tests] + ["time (s)", "outcome"]
-        rows: list[list[Cell]] = [
-            [
-                self._name(run),
-                "*" if run in self.front else "",
-                run.parameters,
-                times(factor, run.error),
-                *(times(factor, run.tests.get(name)) for name in tests),
-                run.seconds,
-                run.outcome,
-            ]
-            for run in self.runs
-        ]
-        return head, rows
+        head = ["run", "", "parameters", f"validation{unit}", *["median"] * bool(medians)]
+        rows: list[list[Cell]] = []
+        for run in self.runs:
+            errors = [run.error, *[medians.get(run.folder)] * bool(medians)]
+            errors += [run.tests.get(name) for name in tests]
+            front = "*" if run in self.front else ""
+            shown = (times(factor, error) for error in errors)
+            rows.append([self._name(run), front, run.parameters, *shown, run.seconds, run.outcome])
+        return [*head, *(f"{name}{unit}" for name in tests), "time (s)", "outcome"], rows
 
-    def summary(self) -> tuple[list[str], list[list[Cell]]]:
-        """Head and rows of the table of settings: quartiles of their validation errors."""
-        factor, unit = self._scale
-        head = ["setting", "runs", "parameters", f"best{f' ({unit})' if unit else ''}"]
-        head += ["lower quartile", "median", "upper quartile", "time (s)"]
-        rows: list[list[Cell]] = [
-            [
-                label,
-                len(runs),
-                runs[0].parameters,
-                times(factor, runs[0].error),
-                *(times(factor, value) for value in _quartiles(runs)),
-                float(np.median([run.seconds for run in runs])),
-            ]
-            for label, runs in self.settings.items()
-        ]
-        return head, rows
-
-    def simulations(self, record: Record) -> Figure | None:
-        """A record, simulated by the best runs, one of each setting; None if no model fits to it.
+    def simulations(self, record: Record) -> dict[str, Array]:
+        """Simulations of a record by the best runs, one of each setting, and by a linear model.
 
         Args:
             record: of the same channels as the models; others are left out.
         """
-        record = with_window(record)
         best = {label: runs[0] for label, runs in self.settings.items()}
         best = best or {self._name(run): run for run in self.runs}
         found: dict[str, Array] = {}
         linear: dict[str, Array] = {}
         for label, run in sorted(best.items(), key=lambda one: _worst_last(one[1].error)):
-            if len(found) == len(COLOURS):
+            if len(found) == len(plots.COLOURS):
                 break
+            shown = _short(label)
+            shown += f" ({len(found) + 1})" * (shown in found)
             try:
                 model = load(run.folder)
                 check_channels(model, record)
-                found[label] = model.simulate(record)
+                found[shown] = model.simulate(record)
                 if not linear and (run.folder / "linear").is_dir():
                     bla = LinearModel.load(run.folder)
                     linear[f"linear (nx {bla.nx})"] = bla.simulate(record)
             except (InputError, OSError, IndexError):
                 continue
-        return side_by_side(record, found, linear) if found else None
+        return linear | found if found else {}
 
     def figures(self, record: Record | None = None) -> dict[str, Figure]:
-        """Errors against parameters and time, and boxes of each setting, by name.
+        """Errors against parameters, boxes of each setting, and simulations, by name.
 
         Args:
             record: that the best models simulate. Default: none.
         """
-        drawn = {"parameters": self._against("parameters", "parameters", front=True)}
-        drawn["time"] = self._against("seconds", "time of the fit (s)")
+        drawn = {"parameters": self._by_parameters()}
         if self.settings:
             drawn["seeds"] = self._boxes()
-        numbers = {name: found for name in self.varied if (found := self._numbers(name))}
-        if numbers:
-            drawn["words"] = self._over(numbers)
-        if record is not None and (figure := self.simulations(record)):
-            drawn["simulations"] = figure
+        simulated = {} if record is None else self.simulations(record := with_window(record))
+        if record is not None and simulated:
+            for view in (plots.close_up, plots.density):
+                drawn[view.__name__] = view(record, simulated)
         return drawn
 
     def __str__(self) -> str:
         head, rows = self.rows()
         parts = [f"{self.name}: RMSE of {len(rows)} run{'s' * (len(rows) > 1)}"]
-        if self.settings:
-            parts.append(table(*self.summary()))
         parts.append(table(head, rows[:SHOWN]))
         more = len(rows) - SHOWN
         parts.append(LEGEND + f" {more} more runs are in the files." * (more > 0))
         return "\n\n".join(parts)
 
-    @cached_property
-    def _root(self) -> Path:
-        return Path(os.path.commonpath([run.folder.parent for run in self.runs]))
-
     def _name(self, run: Compared) -> str:
         """The folder of a run below the one that all are in."""
-        return str(run.folder.relative_to(self._root))
+        root = os.path.commonpath([run.folder.parent for run in self.runs])
+        return str(run.folder.relative_to(root))
 
     @property
     def _scale(self) -> tuple[float, str]:
+        """Factor of the errors, and their unit in brackets."""
         units = {run.unit for run in self.runs}
-        return engineering([run.error for run in self.runs], units.pop() if len(units) == 1 else "")
+        unit = units.pop() if len(units) == 1 else ""
+        factor, unit = engineering([run.error for run in self.runs], unit)
+        return factor, f" ({unit})" if unit else ""
 
-    def _against(self, field: str, label: str, *, front: bool = False) -> Figure:
-        factor, unit = self._scale
+    def _by_parameters(self) -> Figure:
+        factor, _ = self._scale
         figure = Figure(figsize=(7, 4), layout="constrained")
         ax = figure.subplots()
-        values = [getattr(run, field) for run in self.runs]
-        ax.set(yscale="log", xscale="linear" if front else "log")
-        ax.plot(values, [factor * run.error for run in self.runs], ".", color=NL_LFR, alpha=0.6)
-        if front:
-            at = [run.parameters for run in self.front], [factor * r.error for r in self.front]
-            ax.step(*at, where="post", color=OUTPUT, lw=1, label="fewest parameters for the error")
-            ax.legend()
-        ax.set_xlabel(label)
-        if not front:
-            plain_ticks(ax.xaxis)
-        _error_axis(ax.yaxis, unit)
+        ax.set(yscale="log", xlabel="parameters")
+        points, front = (
+            ([run.parameters for run in runs], [factor * run.error for run in runs])
+            for runs in (self.runs, self.front)
+        )
+        ax.plot(*points, ".", color=NL_LFR, alpha=0.6)
+        ax.step(*front, where="post", color=OUTPUT, lw=1, label="fewest parameters for the error")
+        ax.legend()
+        self._label(ax.yaxis)
         return figure
 
     def _boxes(self) -> Figure:
-        factor, unit = self._scale
+        factor, _ = self._scale
         labels = list(self.settings)[:BOXES]
         errors = [
             [factor * run.error for run in self.settings[label] if math.isfinite(run.error)]
@@ -260,33 +228,16 @@ class Comparison:
         ]
         figure = Figure(figsize=(7, 1 + 0.3 * len(labels)), layout="constrained")
         ax = figure.subplots()
-        ax.boxplot(errors, tick_labels=[*map(short, labels)], orientation="horizontal", sym=".")
+        ax.boxplot(errors, tick_labels=[*map(_short, labels)], orientation="horizontal", sym=".")
         ax.invert_yaxis()  # the best one above
         ax.set_xscale("log")
-        _error_axis(ax.xaxis, unit)
+        self._label(ax.xaxis)
         return figure
 
-    def _numbers(self, name: str) -> list[float]:
-        """The values of a word, none if they are not all numbers or are two alone."""
-        try:
-            found = [float(run.words.get(name, "")) for run in self.runs]
-        except ValueError:
-            return []
-        return found if len(set(found)) > 2 else []
-
-    def _over(self, numbers: Mapping[str, Sequence[float]]) -> Figure:
-        """The errors against the value of each word."""
-        factor, unit = self._scale
-        figure = Figure(figsize=(7, 2.2 * -(-len(numbers) // 2)), layout="constrained")
-        grid = figure.subplots(-(-len(numbers) // 2), 2, sharey=True, squeeze=False)
-        for ax in grid.flat[len(numbers) :]:
-            ax.remove()
-        for ax, (name, values) in zip(grid.flat, numbers.items(), strict=False):
-            wide = min(values) > 0 and max(values) > WIDE * min(values)
-            ax.set(xlabel=name, xscale="log" if wide else "linear", yscale="log")
-            ax.plot(values, [factor * run.error for run in self.runs], ".", color=NL_LFR, alpha=0.6)
-            _error_axis(ax.yaxis, unit)
-        return figure
+    def _label(self, axis: Axis) -> None:
+        axis.set_label_text(f"validation RMSE{self._scale[1]}")
+        plain_ticks(axis)
+        axis.grid(True, which="both", alpha=0.2)
 
 
 def compare(folders: Sequence[str | Path]) -> list[Comparison]:
@@ -317,13 +268,9 @@ def compare(folders: Sequence[str | Path]) -> list[Comparison]:
         listed = ", ".join(f"'{folder}'" for folder in folders)
         raise InputError(f"no run came to its end in {listed}; give folders with metrics.json.")
     groups: dict[str, list[Compared]] = {}
-    for path in files:
-        run = _read(path)
+    for run in sorted(map(_read, files), key=lambda run: _worst_last(run.error)):
         groups.setdefault(run.dataset, []).append(run)
-    return [
-        Comparison(name, sorted(runs, key=lambda run: _worst_last(run.error)))
-        for name, runs in groups.items()
-    ]
+    return [Comparison(name, runs) for name, runs in groups.items()]
 
 
 def write(
@@ -350,14 +297,12 @@ def write(
     images, parts, records = {}, [], records or {}
     for number, one in enumerate(comparisons):
         figures = one.figures(records.get(one.name))
-        drawn = {f"{number}_{name}": plots.png(figure) for name, figure in figures.items()}
-        images |= drawn
+        images |= {f"{number}_{name}": plots.png(figure) for name, figure in figures.items()}
         parts.append(
             {
                 "name": one.name,
                 "runs": one.rows(),
-                "settings": one.summary() if one.settings else None,
-                "figures": [(name, CAPTIONS[name.partition("_")[2]]) for name in drawn],
+                "figures": [(f"{number}_{name}", CAPTIONS[name]) for name in figures],
             }
         )
     texts = {
@@ -382,7 +327,7 @@ def _read(path: Path) -> Compared:
             folder=path.parent,
             dataset=found["bench"],
             words={name.lstrip("+"): value for name, _, value in words},
-            parameters=found["parameters_net"],
+            parameters=found["parameters_net"] + 0,
             error=_float(judged["rmse"]),
             tests={name: _float(score["rmse"]) for name, score in found["scores"].items()},
             linear=_float(judged["lti_rmse"]),
@@ -391,13 +336,7 @@ def _read(path: Path) -> Compared:
             seconds=_float(found["fit"]["seconds"]),
             outcome=found["fit"]["reason"],
         )
-        numbers = (run.parameters, run.error, run.linear, run.seconds, *run.tests.values())
-        numbers += (run.linear_nx or 0,)
-        texts = (run.dataset, run.unit, run.outcome)
-        if not all(isinstance(number, int | float) for number in numbers):
-            raise TypeError("a number is none")
-        if not all(isinstance(text, str) for text in texts):
-            raise TypeError("a text is none")
+        "".join([run.dataset, run.unit, run.outcome])  # a TypeError if one is no text
     except (OSError, LookupError, AttributeError, TypeError, ValueError, RecursionError) as error:
         raise InputError(
             f"'{path}' is not of a run ({type(error).__name__}: {brief(error)}); leave its folder "
@@ -412,19 +351,19 @@ def _worst_last(error: float) -> tuple[bool, float]:
 
 
 def _float(value: float | None) -> float:
-    return math.nan if value is None else value
+    return math.nan if value is None else 1.0 * value
 
 
-def _quartiles(runs: Sequence[Compared]) -> list[float]:
+def _median(runs: Sequence[Compared]) -> float:
     """Of the validation errors; runs that diverged are the worst."""
     errors = sorted(run.error if math.isfinite(run.error) else math.inf for run in runs)
-    return [float(np.quantile(errors, q, method="inverted_cdf")) for q in (0.25, 0.5, 0.75)]
+    return errors[(len(errors) - 1) // 2]
 
 
-def _error_axis(axis: Axis, unit: str) -> None:
-    axis.set_label_text(f"validation RMSE{f' ({unit})' if unit else ''}")
-    plain_ticks(axis)
-    axis.grid(True, which="both", alpha=0.2)
+def _short(label: str) -> str:
+    """Beginning and end of a setting, for a figure."""
+    half = LONGEST // 2
+    return label if len(label) <= LONGEST else f"{label[:half]}…{label[-half:]}"
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
@@ -435,14 +374,13 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
 def _csv(comparisons: Sequence[Comparison]) -> str:
     """All runs with the words that differ, errors in the units of their records."""
     names = list(dict.fromkeys(name for one in comparisons for name in one.varied))
-    tests = list(dict.fromkeys(n for one in comparisons for run in one.runs for n in run.tests))
-    stream = io.StringIO()
-    file = csv.writer(stream, lineterminator="\n")
     fields = ["parameters", "error", "linear", "linear_nx", "unit", "seconds", "outcome"]
-    file.writerow(["folder", "dataset", *names, *fields, *(f"test {name}" for name in tests)])
-    for one in comparisons:
-        for run in one.runs:
-            own: list[Any] = [run.words.get(name, "") for name in names]
-            own += [getattr(run, field) for field in fields]
-            file.writerow([run.folder, run.dataset, *own, *(run.tests.get(n, "") for n in tests)])
-    return stream.getvalue()
+    rows = [
+        {"folder": run.folder, "dataset": run.dataset}
+        | {name: run.words.get(name, "") for name in names}
+        | {field: getattr(run, field) for field in fields}
+        | {f"test {name}": error for name, error in run.tests.items()}
+        for one in comparisons
+        for run in one.runs
+    ]
+    return pd.DataFrame(rows).to_csv(index=False, lineterminator="\n")

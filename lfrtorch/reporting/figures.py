@@ -8,7 +8,6 @@ from contextlib import suppress
 from matplotlib.figure import Figure
 
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.types import Array
 from lfrtorch.analysis.model_plots import static_figure
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.trainer import FitResult
@@ -62,25 +61,21 @@ def of_records(simulated: Sequence[Response], dataset: Dataset) -> tuple[dict[st
     views: Views = {}
     for response in shown[:MOST_RECORDS]:
         record = response.record
-        own, views[record.name] = of_record(record, response.y_linear, response.y_hat)
+        own, views[record.name] = of_record(record, response.simulated)
         drawn |= own
     for response in shown[MOST_RECORDS:]:
         if response.use == "test":
-            record, signals = response.record, (response.record, response.y_linear, response.y_hat)
-            drawn[record.name] = plots.errors(*signals)
+            record = response.record
+            drawn[record.name] = plots.errors(record, response.simulated)
             if not plots.is_whole(record):
-                drawn[f"{record.name}_density"] = plots.density(*signals)
+                drawn[f"{record.name}_density"] = plots.density(record, response.simulated)
     return drawn, views
 
 
 def of_record(
-    record: Record, y_linear: Array, y_hat: Array | None = None
+    record: Record, simulated: plots.Simulated
 ) -> tuple[dict[str, Figure], dict[str, str]]:
-    """All views of a record by file name, and captions of those of its first outputs.
-
-    Shape:
-        y_linear, y_hat: (T, ny), simulated outputs; without an NL-LFR there is no y_hat.
-    """
+    """All views of a record by file name, and captions of those of its first outputs."""
     name, ny = record.name, len(record.outputs)
     whole = plots.is_whole(record)
     spectrum = plots.spectrum if whole else plots.density
@@ -97,7 +92,7 @@ def of_record(
         outputs = range(first, min(first + MOST_OUTPUTS, ny))
         for view, draw, caption in views:
             page = f"_{first + 1}_to_{outputs[-1] + 1}" if first else ""
-            drawn[f"{name}{view}{page}"] = draw(record, y_linear, y_hat, outputs)
+            drawn[f"{name}{view}{page}"] = draw(record, simulated, outputs)
             if not first:
                 captions[f"{name}{view}"] = caption + more
     return drawn, captions

@@ -88,8 +88,9 @@ class TensorBoard:
             self._scalar("stability/spectral_radius_A", radius, one.iteration)
         self._waiting = []
         if self.record is not None and self.y_linear is not None and step % self.every == 0:
-            y_hat, signals = model.simulate(self.record), model.signals(self.record)
-            self.figure("signals/response", plots.response(self.record, self.y_linear, y_hat), step)
+            simulated = {"linear": self.y_linear, "NL-LFR": model.simulate(self.record)}
+            self.figure("signals/response", plots.response(self.record, simulated), step)
+            signals = model.signals(self.record)
             drawn = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
             self.figure("signals/static_map", drawn, step)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from lfrtorch._support.drawing import (
+    CHANNELS,
     LINEAR,
     NL_LFR,
     OUTPUT,
@@ -37,7 +38,11 @@ SWINGS = 8
 CLOSE_UP, LARGEST_PART = (50, 2000), 0.25
 """Fewest and most samples of a close-up, and its largest part of a record if it has more."""
 
-NL_LFR_NAME = "NL-LFR"
+Simulated = Mapping[str, Array]
+"""Outputs (T, ny) by the name of their model; a linear one's begins with ``linear``."""
+
+COLOURS = tuple(colour for colour in CHANNELS if colour != LINEAR)
+"""Of the models that are not linear; there are no more of them in a figure."""
 
 FAR = 10.0
 """Deviations of the output up to which errors are counted in their distribution."""
@@ -56,16 +61,16 @@ BEYOND = 1.0
 """Ranges of the measured output that are drawn beyond it, if a model runs away."""
 
 
-def errors(record: Record, y_linear: Array, y_hat: Array | None = None) -> Figure:
+def errors(record: Record, simulated: Simulated) -> Figure:
     """The spectrum of whole periods in steady state, and else the response against time.
 
     Example:
         >>> from lfrtorch.reporting import plots
-        >>> figure = plots.errors(record, bla.simulate(record), model.simulate(record))
+        >>> figure = plots.errors(record, {"linear": bla.simulate(record)})
         >>> figure.axes[0].get_xlabel()  # the record is a whole period: its spectrum
         'frequency (Hz)'
     """
-    return (spectrum if is_whole(record) else response)(record, y_linear, y_hat)
+    return (spectrum if is_whole(record) else response)(record, simulated)
 
 
 def is_whole(record: Record) -> bool:
@@ -81,25 +86,21 @@ def is_whole(record: Record) -> bool:
     return record.start == "periodic" and not record.skip
 
 
-def spectrum(
-    record: Record,
-    y_linear: Array,
-    y_hat: Array | None = None,
-    outputs: Sequence[int] | None = None,
-) -> Figure:
+def spectrum(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
     """Magnitude of the measured output and of the errors against frequency, one panel an output.
 
     Args:
         record: the measurement.
-        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        simulated: outputs in physical units, by the names of their models.
         outputs: numbers of those that are drawn. Default: all.
 
     Shape:
-        y_linear, y_hat: (T, ny).
+        simulated: (T, ny) each.
 
     Example:
         >>> from lfrtorch.reporting import plots
-        >>> figure = plots.spectrum(record, bla.simulate(record), model.simulate(record))
+        >>> simulated = {"linear": bla.simulate(record), "NL-LFR": model.simulate(record)}
+        >>> figure = plots.spectrum(record, simulated)
         >>> [line.get_label() for line in figure.axes[0].lines]
         ['output', 'linear error', 'NL-LFR error']
     """
@@ -107,7 +108,7 @@ def spectrum(
     y = record.y[record.skip :]
     f = np.fft.rfftfreq(len(y), 1.0 / record.fs)
     for i, ax in axes.items():
-        for signal, label, colour in _signals(record, y_linear, y_hat, i):
+        for signal, label, colour, _ in _signals(record, simulated, i):
             ax.plot(f[1:-1], _decibel(signal)[1:-1], ".", ms=2, color=colour, label=label)
         unit = record.outputs[i].unit or "1"
         ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {unit})", xlim=(0, f[-1]))
@@ -116,35 +117,30 @@ def spectrum(
     return figure
 
 
-def density(
-    record: Record,
-    y_linear: Array,
-    y_hat: Array | None = None,
-    outputs: Sequence[int] | None = None,
-) -> Figure:
+def density(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
     """Power spectral density of the measured output and of the errors, one panel an output.
 
     By Welch's method: for records that are no whole periods.
 
     Args:
         record: the measurement.
-        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        simulated: outputs in physical units, by the names of their models.
         outputs: numbers of those that are drawn. Default: all.
 
     Shape:
-        y_linear, y_hat: (T, ny).
+        simulated: (T, ny) each.
 
     Example:
         >>> from lfrtorch.reporting import plots
-        >>> figure = plots.density(record[:300], bla.simulate(record[:300]))
+        >>> figure = plots.density(record[:300], {"linear": bla.simulate(record[:300])})
         >>> figure.savefig("density.png")
     """
     figure, axes = _panels(record, outputs)
     for i, ax in axes.items():
-        for signal, label, colour in _signals(record, y_linear, y_hat, i):
+        for signal, label, colour, style in _signals(record, simulated, i):
             f, power = power_density(signal[:, None], record.fs)
             level = 10.0 * np.log10(np.maximum(power[:, 0], np.finfo(float).tiny))
-            ax.plot(f[1:], level[1:], color=colour, label=label)
+            ax.plot(f[1:], level[1:], style, color=colour, label=label)
         unit = factor_of(record.outputs[i].unit or "1")
         per = f"{unit}²/Hz" if record.fs != 1.0 else f"{unit}²"
         ax.set(ylabel=f"{record.outputs[i].name} (dB, re 1 {per})", xlim=(0, record.fs / 2))
@@ -153,35 +149,30 @@ def density(
     return figure
 
 
-def response(
-    record: Record,
-    y_linear: Array,
-    y_hat: Array | None = None,
-    outputs: Sequence[int] | None = None,
-) -> Figure:
+def response(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
     """Measured and simulated output against time, and below them the errors; two panels an output.
 
     The legend has the fit of each model, 100 % - NRMSE. The grey stretch is that of the close-up.
 
     Args:
         record: the measurement.
-        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        simulated: outputs in physical units, by the names of their models.
         outputs: numbers of those that are drawn. Default: all.
 
     Shape:
-        y_linear, y_hat: (T, ny).
+        simulated: (T, ny) each.
 
     Example:
         >>> from lfrtorch.reporting import plots
-        >>> figure = plots.response(record, bla.simulate(record))
+        >>> figure = plots.response(record, {"linear": bla.simulate(record)})
         >>> [ax.get_ylabel() for ax in figure.axes]
         ['y', 'error']
         >>> figure.axes[-1].get_xlabel()
         'time in the record (s)'
     """
     whole = slice(0, record.samples - record.skip)
-    figure = _overlay(record, y_linear, y_hat, outputs, whole, WIDE, fits=True)
-    near = worst_stretch(record, y_linear, y_hat, outputs)
+    figure = _overlay(record, simulated, outputs, whole, WIDE, fits=True)
+    near = worst_stretch(record, simulated, outputs)
     if near != whole:
         ends = ((record.skip + end) / record.fs for end in (near.start, near.stop - 1))
         first, last = ends
@@ -190,56 +181,52 @@ def response(
     return figure
 
 
-def close_up(
-    record: Record,
-    y_linear: Array,
-    y_hat: Array | None = None,
-    outputs: Sequence[int] | None = None,
-) -> Figure:
-    """The response about the largest error of the NL-LFR, or of the linear model if it is alone.
+def close_up(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
+    """The response about the largest error of the first model that is not linear.
+
+    If all are, the first one counts.
 
     Args:
         record: the measurement.
-        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        simulated: outputs in physical units, by the names of their models.
         outputs: numbers of those that are drawn. Default: all.
 
     Shape:
-        y_linear, y_hat: (T, ny).
+        simulated: (T, ny) each.
 
     Example:
         >>> from lfrtorch.reporting import plots
-        >>> figure = plots.close_up(record, bla.simulate(record), model.simulate(record))
+        >>> figure = plots.close_up(record, {"NL-LFR": model.simulate(record)})
         >>> len(figure.axes)  # the outputs, and their errors
         2
     """
-    near = worst_stretch(record, y_linear, y_hat, outputs)
-    figure = _overlay(record, y_linear, y_hat, outputs, near, NARROW)
+    near = worst_stretch(record, simulated, outputs)
+    figure = _overlay(record, simulated, outputs, near, NARROW)
     figure.suptitle(f"{record.name}: about the largest error", fontsize="medium")
     return figure
 
 
 def worst_stretch(
-    record: Record,
-    y_linear: Array,
-    y_hat: Array | None = None,
-    outputs: Sequence[int] | None = None,
+    record: Record, simulated: Simulated, outputs: Sequence[int] | None = None
 ) -> slice:
     """Some periods of the output about the largest error, counted from the first scored sample.
 
-    Errors of several outputs are compared relative to the deviation of each. If the model runs
-    away, this is about where it begins.
+    Of the first model that is not linear, or else of the first one. Errors of several outputs are
+    compared relative to the deviation of each. If the model runs away, this is about where it
+    begins.
 
     Example:
         >>> from lfrtorch.reporting import plots
         >>> y_linear = record.y.copy()
         >>> y_linear[300] += 9.0
-        >>> near = plots.worst_stretch(record, y_linear)
+        >>> near = plots.worst_stretch(record, {"linear": y_linear})
         >>> near.start < 300 < near.stop
         True
     """
     columns = list(range(record.y.shape[1]) if outputs is None else outputs)
     y = record.y[record.skip :, columns]
-    found = (y_linear if y_hat is None else y_hat)[record.skip :, columns]
+    first = next((name for name in simulated if not _is_linear(name)), next(iter(simulated)))
+    found = simulated[first][record.skip :, columns]
     deviation = np.std(y, axis=0)
     error = np.abs(y - found) / np.where(deviation > 0, deviation, 1.0)
     error = np.minimum(np.where(np.isfinite(error), error, np.inf), FAR)
@@ -249,15 +236,12 @@ def worst_stretch(
     least, most = CLOSE_UP
     length = min(SWINGS * len(y) / swings, most, LARGEST_PART * len(y))
     length = min(len(y), max(least, int(length)))
-    first = max(0, min(int(row) - length // 2, len(y) - length))
-    return slice(first, first + length)
+    begin = max(0, min(int(row) - length // 2, len(y) - length))
+    return slice(begin, begin + length)
 
 
 def distribution(
-    record: Record,
-    y_linear: Array,
-    y_hat: Array | None = None,
-    outputs: Sequence[int] | None = None,
+    record: Record, simulated: Simulated, outputs: Sequence[int] | None = None
 ) -> Figure:
     """How often which error occurs: density of the errors, logarithmic; one panel an output.
 
@@ -265,15 +249,15 @@ def distribution(
 
     Args:
         record: the measurement.
-        y_linear, y_hat: simulated outputs in physical units; without an NL-LFR there is no y_hat.
+        simulated: outputs in physical units, by the names of their models.
         outputs: numbers of those that are drawn. Default: all.
 
     Shape:
-        y_linear, y_hat: (T, ny).
+        simulated: (T, ny) each.
 
     Example:
         >>> from lfrtorch.reporting import plots
-        >>> figure = plots.distribution(record, bla.simulate(record), model.simulate(record))
+        >>> figure = plots.distribution(record, {"NL-LFR": model.simulate(record)})
         >>> figure.axes[0].get_xlabel()
         'error of y'
     """
@@ -282,7 +266,7 @@ def distribution(
     for i, ax in axes.items():
         output = record.outputs[i]
         y = record.y[record.skip :, i]
-        for error, name, colour in _signals(record, y_linear, y_hat, i)[1:]:
+        for error, name, colour, style in _signals(record, simulated, i)[1:]:
             label = name
             counted = error[np.abs(error) <= (FAR * np.std(y) or np.inf)]
             if np.isfinite(error).all():
@@ -293,7 +277,6 @@ def distribution(
                 continue
             counts, edges = np.histogram(counted, bins=min(80, max(10, len(counted) // 20)))
             share = counts / (len(error) * np.diff(edges))
-            style = "--" if colour == LINEAR else "-"
             ax.stairs(share, edges, color=colour, ls=style, lw=1.2, label=label)
             ax.stairs(share, edges, color=colour, fill=True, alpha=0.15)
         ax.set(yscale="log", ylabel="density, logarithmic", yticks=[])
@@ -376,7 +359,7 @@ def png(figure: Figure) -> bytes:
 
     Example:
         >>> from lfrtorch.reporting import plots
-        >>> plots.png(plots.response(record, bla.simulate(record)))[1:4]
+        >>> plots.png(plots.response(record, {"linear": bla.simulate(record)}))[1:4]
         b'PNG'
     """
     stream = io.BytesIO()
@@ -397,8 +380,7 @@ def _panels(
 
 def _overlay(
     record: Record,
-    y_linear: Array,
-    y_hat: Array | None,
+    simulated: Simulated,
     outputs: Sequence[int] | None,
     part: slice,
     width: float,
@@ -413,16 +395,13 @@ def _overlay(
     )[:, 0]
     scored = slice(record.skip, None)
     t = (record.skip + np.arange(record.samples - record.skip)[part]) / record.fs
-    models = [("linear", y_linear, LINEAR, "--"), (NL_LFR_NAME, y_hat, NL_LFR, "-")]
     for k, i in enumerate(numbers):
         above, below = axes[2 * k : 2 * k + 2]
         y, output = record.y[scored, i], record.outputs[i]
         above.plot(*envelope(t, y[part]), lw=1.6, color=OUTPUT, label="measured")
         reach = 0.0
-        for name, simulated, colour, style in models:
-            if simulated is None:
-                continue
-            own = simulated[scored, i]
+        for name, colour, style in _drawn(simulated):
+            own = simulated[name][scored, i]
             label = f"{name}, {fit_text(y, own)}" if fits else name
             above.plot(*envelope(t, own[part]), style, lw=1.0, color=colour, label=label)
             error = (y - own)[part]
@@ -461,20 +440,29 @@ def fit_text(y: Array, y_hat: Array) -> str:
     return f"fit {100 - missing:.{min(max(digits, 1), 6)}f} %"
 
 
-def _signals(
-    record: Record, y_linear: Array, y_hat: Array | None, i: int
-) -> list[tuple[Array, str, str]]:
-    """Measured output and errors, label and colour; of a model that diverges the label alone."""
+def _signals(record: Record, simulated: Simulated, i: int) -> list[tuple[Array, str, str, str]]:
+    """Output and errors, label, colour, style; of a model that diverges the label alone."""
     y = record.y[record.skip :, i]
-    signals = [(y, "output", OUTPUT)]
-    for name, simulated, colour in (("linear", y_linear, LINEAR), (NL_LFR_NAME, y_hat, NL_LFR)):
-        if simulated is None:
-            continue
-        error, label = y - simulated[record.skip :, i], f"{name} error"
+    signals = [(y, "output", OUTPUT, "-")]
+    for name, colour, style in _drawn(simulated):
+        error, label = y - simulated[name][record.skip :, i], f"{name} error"
         if not np.isfinite(error).all():
             error, label = np.full_like(y, np.nan), f"{name} diverges"
-        signals.append((error, label, colour))
+        signals.append((error, label, colour, style))
     return signals
+
+
+def _is_linear(name: str) -> bool:
+    return name.startswith("linear")
+
+
+def _drawn(simulated: Simulated) -> list[tuple[str, str, str]]:
+    """Name, colour and style of each model."""
+    others = iter(COLOURS)
+    return [
+        (name, LINEAR, "--") if _is_linear(name) else (name, next(others), "-")
+        for name in simulated
+    ]
 
 
 def envelope(t: Array, signal: Array) -> tuple[Array, Array]:

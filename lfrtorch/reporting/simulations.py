@@ -37,6 +37,11 @@ class Response:
     y_hat: Array
 
     @property
+    def simulated(self) -> Mapping[str, Array]:
+        """Both simulations by the names of their models."""
+        return {"linear": self.y_linear, "NL-LFR": self.y_hat}
+
+    @property
     def scored(self) -> Array:
         """Measured output after the skip window (scored samples, ny)."""
         return self.record.y[self.record.skip :]

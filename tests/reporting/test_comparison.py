@@ -6,13 +6,21 @@ import csv
 import json
 import math
 import os
+import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+import lfrtorch
 from lfrtorch.cli import compare as command
+from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import comparison
+
+U = np.random.default_rng(0).standard_normal((200, 1))
+RECORD = Record(U, np.hstack([U, np.tanh(U)]), 10.0, outputs=(Channel("a"), Channel("b", "m")))
 
 ERRORS = {(5, 0): 4e-6, (5, 1): 2e-6, (10, 0): 1e-6, (10, 1): 3e-6, (15, 0): 2e-6, (15, 1): None}
 """By neurons and seed."""
@@ -51,6 +59,10 @@ def test_front_and_settings(study: Path):
     }
     text = str(found)
     assert "validation (µm)" in text
+    head, rows = found.rows()
+    assert head[4] == "median"
+    medians = {str(row[0]).partition(",")[0]: row[4] for row in rows}
+    assert medians == pytest.approx({"nn=10": 1.0, "nn=5": 2.0, "nn=15": 2.0})
     assert text.index("nn=10,seed=0") < text.index("nn=10,seed=1") < text.index("nn=15,seed=1")
 
 
@@ -66,7 +78,7 @@ def test_command_writes_page_and_tables(
     assert len(rows) == len(ERRORS) + 1
     assert {row["nn"] for row in rows if row["dataset"] == "tanks"} == {"5", "10", "15"}
     assert "| nn=5,seed=0 |" in (study / "out" / "comparison.md").read_text()
-    assert (study / "out" / "comparison.html").read_text().count("data:image/png") == 6
+    assert (study / "out" / "comparison.html").read_text().count("data:image/png") == 3
 
 
 def test_data_words_choose_the_record_that_is_simulated(
@@ -153,3 +165,71 @@ def test_other_files_of_that_name_are_refused(tmp_path: Path):
     (tmp_path / "metrics.json").write_text("{}")
     with pytest.raises(ValueError, match="is not of a run"):
         comparison.compare([tmp_path])
+
+
+def shown(figure: Any) -> list[list[str]]:
+    return [[line.get_label() for line in ax.lines] for ax in figure.axes]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two settings with two seeds each, as Python writes them."""
+    folder = tmp_path_factory.mktemp("runs")
+    record = Record(U, np.tanh(U), 10.0, outputs=(Channel("b", "m"),))
+    dataset = lfrtorch.Dataset("mine", [record[:100]], [record[100:150]], [record[150:]])
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=2)
+    for nn, seed in ((1, 0), (1, 1), (3, 0), (3, 1)):
+        settings = lfrtorch.Settings(nx=1, nz=1, nn=nn, seed=seed, trainer=trainer)
+        run = lfrtorch.identify(dataset, settings)
+        words = f"lfrtorch fit nn={nn} seed={seed}"
+        lfrtorch.reporting.write(run, folder / f"{nn} {seed}", command=words, draw=False)
+    return folder
+
+
+def test_the_best_run_of_each_setting_simulates_the_record(runs: Path):
+    (found,) = comparison.compare([runs])
+    record = Record(U[150:], np.tanh(U[150:]), 10.0, outputs=(Channel("b", "m"),))
+    drawn = found.figures(record)
+    best = {label: min(each, key=lambda run: run.error) for label, each in found.settings.items()}
+    expected = [
+        (label, lfrtorch.load(run.folder).simulate(record))
+        for label, run in sorted(best.items(), key=lambda one: one[1].error)
+    ]
+    (linear, _), *simulated = found.simulations(record).items()
+    assert linear == "linear (nx 1)"
+    assert [label for label, _ in simulated] == [label for label, _ in expected]
+    assert all(
+        np.array_equal(*pair)
+        for pair in zip(dict(simulated).values(), dict(expected).values(), strict=True)
+    )
+    assert shown(drawn["close_up"])[0] == ["measured", linear, *dict(simulated)]
+    assert shown(drawn["density"])[0][0] == "output"
+
+
+def test_models_of_other_channels_are_left_out(runs: Path):
+    (found,) = comparison.compare([runs])
+    assert not found.simulations(RECORD)
+    assert "close_up" not in found.figures(RECORD)
+
+
+def test_settings_that_are_alike_in_their_first_letters_stay_apart(runs: Path, tmp_path: Path):
+    for source in runs.iterdir():
+        nn, seed = source.name.split()
+        copy = shutil.copytree(source, tmp_path / source.name)
+        metrics = json.loads((copy / "metrics.json").read_text())
+        metrics["command"] = f"lfrtorch fit trainer.tolerance={'1' * 40}{nn} seed={seed}"
+        (copy / "metrics.json").write_text(json.dumps(metrics))
+    (found,) = comparison.compare([tmp_path])
+    record = Record(U[150:], np.tanh(U[150:]), 10.0, outputs=(Channel("b", "m"),))
+    assert len(found.simulations(record)) == 1 + len(found.settings) == 3
+
+
+def test_a_damaged_linear_model_costs_no_page(runs: Path, tmp_path: Path):
+    copy = shutil.copytree(runs, tmp_path / "runs")
+    for linear in copy.glob("*/linear/model.json"):
+        linear.write_text("{")
+    (found,) = comparison.compare([copy])
+    record = Record(U[150:], np.tanh(U[150:]), 10.0, outputs=(Channel("b", "m"),))
+    simulated = found.simulations(record)
+    assert simulated
+    assert not any(label.startswith("linear") for label in simulated)

@@ -16,7 +16,7 @@ Y = np.random.default_rng(0).standard_normal((200, 1))
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """A figure is what it was asked to show."""
     for name in ("response", "close_up", "spectrum", "density", "distribution", "errors"):
-        monkeypatch.setattr(plots, name, lambda *asked, name=name: (name, *asked[3:]))
+        monkeypatch.setattr(plots, name, lambda *asked, name=name: (name, *asked[2:]))
 
 
 def responses(use: str, errors: dict[str, float]) -> list[Response]:
@@ -62,7 +62,7 @@ def test_many_outputs_have_several_files_and_the_first_is_in_the_report():
     y = np.tile(Y, 6)
     outputs = tuple(Channel(f"y{i}") for i in range(6))
     record = Record(Y, y, name="a", outputs=outputs, start="periodic")
-    drawn, captions = figures.of_record(record, y, y)
+    drawn, captions = figures.of_record(record, {"linear": y})
     assert list(captions) == ["a_response", "a_near", "a", "a_distribution"]
     assert drawn["a"] == ("spectrum", range(4))
     assert drawn["a_response_5_to_6"] == ("response", range(4, 6))

@@ -15,6 +15,11 @@ Y = np.column_stack([np.sin(2 * np.pi * 10 * T), 3 * np.cos(2 * np.pi * 20 * T)]
 RECORD = Record(T, Y, 100.0, skip=0, name="lab", outputs=(Channel("a", "m"), Channel("b")))
 
 
+def both(y_linear: np.ndarray, y_hat: np.ndarray | None = None) -> plots.Simulated:
+    """Simulations by their models."""
+    return {"linear": y_linear} | ({} if y_hat is None else {"NL-LFR": y_hat})
+
+
 def drawn(ax: Axes, label: str) -> np.ndarray:
     """(x, y) of the line with a label."""
     (line,) = [line for line in ax.get_lines() if line.get_label() == label]
@@ -34,7 +39,7 @@ def legend(ax: Axes) -> list[str]:
 
 
 def test_spectrum_shows_amplitudes_in_decibel():
-    figure = plots.spectrum(RECORD, 0.9 * Y, Y - 1e-3 * Y)
+    figure = plots.spectrum(RECORD, both(0.9 * Y, Y - 1e-3 * Y))
     first, second = figure.axes
     for ax, frequency, amplitude in ((first, 10.0, 1.0), (second, 20.0, 3.0)):
         for label, scale in (("output", 1.0), ("linear error", 0.1), ("NL-LFR error", 1e-3)):
@@ -53,15 +58,15 @@ def test_figures_of_a_linear_model_have_its_lines_alone():
         (skipped, "s", ["measured", "linear, fit 90.0 %"]),
         (RECORD, "s", ["measured", "linear, fit 90.0 %"]),
     ):
-        figure = plots.errors(record, 0.9 * Y)
+        figure = plots.errors(record, both(0.9 * Y))
         assert labels(figure.axes[0]) == lines
         assert f"({unit})" in figure.axes[-1].get_xlabel()
-    assert labels(plots.close_up(RECORD, 0.9 * Y).axes[0]) == ["measured", "linear"]
+    assert labels(plots.close_up(RECORD, both(0.9 * Y)).axes[0]) == ["measured", "linear"]
 
 
 def test_response_overlays_the_scored_samples_with_the_errors_below():
     record = Record(T, Y, 100.0, skip=100, name="lab", outputs=(Channel("a", "m"), Channel("b")))
-    above, below, *_ = plots.response(record, 0.5 * Y, 0.999 * Y).axes
+    above, below, *_ = plots.response(record, both(0.5 * Y, 0.999 * Y)).axes
     assert labels(above) == ["measured", "linear, fit 50.0 %", "NL-LFR, fit 99.90 %"]
     assert drawn(above, "measured")[0] == pytest.approx([1.0, Y[100, 0]])
     assert len(drawn(above, "measured")) == 300
@@ -73,7 +78,7 @@ def test_response_overlays_the_scored_samples_with_the_errors_below():
 
 def test_small_signals_have_axes_with_a_prefix():
     record = Record(T, 1e-6 * Y, 100.0, outputs=(Channel("a", "m"), Channel("b", "kg")))
-    above, below, other, _ = plots.response(record, 0.9e-6 * Y).axes
+    above, below, other, _ = plots.response(record, both(0.9e-6 * Y)).axes
     assert (above.get_ylabel(), below.get_ylabel(), other.get_ylabel()) == (
         "a (µm)",
         "error (nm)",
@@ -85,20 +90,20 @@ def test_small_signals_have_axes_with_a_prefix():
 def test_a_model_that_runs_away_hides_nothing():
     lost = np.where(np.arange(400)[:, None] < 300, Y, 1e6)
     lost[350:] = np.nan
-    above, below, *_ = plots.response(RECORD, 0.9 * Y, lost).axes
+    above, below, *_ = plots.response(RECORD, both(0.9 * Y, lost)).axes
     assert labels(above)[-1] == "NL-LFR, diverges"
     assert max(above.get_ylim()[1], below.get_ylim()[1]) < 4
-    first, last = plots.close_up(RECORD, 0.9 * Y, lost).axes[-1].get_xlim()
+    first, last = plots.close_up(RECORD, both(0.9 * Y, lost)).axes[-1].get_xlim()
     assert first < 3.0 < last
     for draw in (plots.spectrum, plots.density):
-        assert labels(draw(RECORD, 0.9 * Y, lost).axes[0])[-1] == "NL-LFR diverges"
-    assert legend(plots.distribution(RECORD, 0.9 * Y, lost).axes[0])[-1] == "NL-LFR diverges"
+        assert labels(draw(RECORD, both(0.9 * Y, lost)).axes[0])[-1] == "NL-LFR diverges"
+    assert legend(plots.distribution(RECORD, both(0.9 * Y, lost)).axes[0])[-1] == "NL-LFR diverges"
 
 
 def test_distribution_says_where_most_errors_are():
     error = np.random.default_rng(0).uniform(-1, 1, (100_000, 1))
     record = Record(error, error, outputs=(Channel("a", "m"),))
-    ax = plots.distribution(record, 0.5 * error, 0.998 * error).axes[0]
+    ax = plots.distribution(record, both(0.5 * error, 0.998 * error)).axes[0]
     assert legend(ax) == [
         "linear error: 95 % within ±0.475 m",
         "NL-LFR error: 95 % within ±1.90 mm",
@@ -110,16 +115,16 @@ def test_distribution_says_where_most_errors_are():
 
 
 def test_some_of_many_outputs_are_drawn():
-    figure = plots.response(RECORD, 0.9 * Y, outputs=[1])
+    figure = plots.response(RECORD, both(0.9 * Y), outputs=[1])
     assert [ax.get_ylabel() for ax in figure.axes] == ["b", "error"]
-    assert len(plots.spectrum(RECORD, 0.9 * Y, outputs=[1]).axes) == 1
+    assert len(plots.spectrum(RECORD, both(0.9 * Y), outputs=[1]).axes) == 1
 
 
 def test_density_integrates_to_the_power():
     rng = np.random.default_rng(0)
     y = rng.standard_normal((20_000, 1))
     record = Record(y, y, 100.0, name="lab", outputs=(Channel("a", "m"),))
-    ax = plots.density(record, 0.9 * y, 0.5 * y).axes[0]
+    ax = plots.density(record, both(0.9 * y, 0.5 * y)).axes[0]
     for label, scale in (("output", 1.0), ("linear error", 0.1), ("NL-LFR error", 0.5)):
         line = drawn(ax, label)
         # White: one sided, 2 / fs; a standard deviation of 1.4 % over the band, 4 σ.
@@ -127,7 +132,7 @@ def test_density_integrates_to_the_power():
         assert level == pytest.approx(10 * np.log10(scale**2 * 2 / 100), abs=0.25)
     assert "dB, re 1 m²/Hz" in ax.get_ylabel()
     short = Record(y[:10], y[:10], skip=5)
-    assert len(drawn(plots.density(short, 0 * y[:10], y[:10]).axes[0], "output")) == 2
+    assert len(drawn(plots.density(short, both(0 * y[:10], y[:10])).axes[0], "output")) == 2
 
 
 def test_close_up_is_about_the_largest_error():
@@ -135,14 +140,14 @@ def test_close_up_is_about_the_largest_error():
     y_hat[300, 1] += 2.0
     long = Record(np.tile(T, 10), np.tile(Y, (10, 1)), 100.0, skip=50, name="lab")
     simulated = np.vstack([*[Y] * 5, y_hat, *[Y] * 4])
-    figure = plots.close_up(long, 0 * long.y, simulated)
+    figure = plots.close_up(long, both(0 * long.y, simulated))
     assert len(figure.axes) == 4  # two outputs, and the errors below each
     for ax, name in zip(figure.axes, ("measured", "linear", "measured", "linear"), strict=True):
         line = drawn(ax, name)
         # 50 samples, eight periods of 20 Hz being 40, about 23.00 s
         assert line[[0, -1], 0] == pytest.approx([22.75, 23.24])
     assert drawn(figure.axes[3], "NL-LFR")[25] == pytest.approx([23.0, -2.0])
-    (shaded,) = plots.response(long, 0 * long.y, simulated).axes[0].patches
+    (shaded,) = plots.response(long, both(0 * long.y, simulated)).axes[0].patches
     assert isinstance(shaded, Rectangle)
     assert (shaded.get_x(), shaded.get_width()) == pytest.approx((22.75, 0.49))
 
@@ -150,7 +155,7 @@ def test_close_up_is_about_the_largest_error():
 def test_long_signals_keep_their_extremes():
     y = np.sin(np.arange(100_000))
     y[77_777] = 5.0
-    ax = plots.response(Record(y, y), 0 * y[:, None], y[:, None]).axes[0]
+    ax = plots.response(Record(y, y), both(0 * y[:, None], y[:, None])).axes[0]
     line = drawn(ax, "measured")
     assert len(line) <= plots.MOST_POINTS + 2
     assert line[:, 1].max() == 5.0
@@ -173,3 +178,12 @@ def test_convergence_marks_the_kept_iterate():
     assert drawn(ax, "kept: iteration 2")[0, 0] == 2
     assert "(m)" in ax.get_ylabel()
     assert len(plots.convergence(history[:1], 0).axes[0].get_lines()) == 3
+
+
+def test_each_of_several_models_has_a_line_and_one_that_diverges_no_spectrum():
+    simulated = {"linear": 0.5 * Y, "good": 0.9 * Y, "bad": np.full_like(Y, np.nan)}
+    above, *_ = plots.response(RECORD, simulated).axes
+    assert labels(above) == ["measured", "linear, fit 50.0 %", "good, fit 90.0 %", "bad, diverges"]
+    ax = plots.density(RECORD, simulated).axes[0]
+    assert labels(ax) == ["output", "linear error", "good error", "bad diverges"]
+    assert len({line.get_color() for line in ax.get_lines()}) == 4
