@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import date, datetime, time, timedelta
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.memory import in_bytes
-from lfrtorch._support.types import Array
 from lfrtorch.files.arrays import optional
-from lfrtorch.files.table import BLOCK, Clock, Table
-from lfrtorch.files.text import Layout, Line, is_missing, layout_of, with_thousands
+from lfrtorch.files.text import Layout, Line, TextTable, layout_of, with_point
 
 _HEAD = 1000
 """Rows that tell where the samples begin."""
@@ -30,6 +28,9 @@ _PACKED, _LARGE = 100, 1e8
 """How many times longer a part of that many bytes may be than it is packed: see Apache POI,
 ZipSecureFile, whose limits are 100 times and 1e5 bytes. Sheets of numbers are packed 5 to 20 times.
 """
+
+_DELIMITER = "\t"
+_NO_TEXT = re.compile(r"[\s\"]+")  # in a cell of a line
 
 EXTENSIONS = (".xlsx", ".xlsm")
 
@@ -50,10 +51,11 @@ def workbook(path: Path) -> tuple[Path, str]:
     return (file, sheet) if named else (path, "")
 
 
-class ExcelTable(Table):
-    """A sheet, a row a sample; above may be names, units and what else is not read.
+class ExcelTable(TextTable):
+    """A sheet, a row a sample, read as lines of text; above may be names, units and what else.
 
     It is the first sheet that has samples, or that named behind the path: ``x.xlsx#Run 2``.
+    openpyxl reads row by row; calamine ends the process on a cell whose reference is damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,29 +63,28 @@ class ExcelTable(Table):
         with self._opened() as book:
             names = [one.title for one in book.worksheets]
             if sheet and sheet not in names:
-                raise InputError(f"'{self._file}' has no sheet {sheet!r}; it has {_listed(names)}.")
-            with_samples = []
+                listed = ", ".join(map(repr, names))
+                raise InputError(f"'{self._file}' has no sheet {sheet!r}; it has {listed}.")
+            found = []
             refusal = None
             for one in [sheet] if sheet else names:
                 try:
-                    with_samples.append((one, self._layout(book[one])))
+                    found.append((one, *self._layout(book[one])))
                 except InputError as error:
                     refusal = error
-        if not with_samples:
+        if not found:
             raise refusal or InputError(f"'{self._file}' has no sheet.")
-        self._sheet, (self._head, self._used, clocks) = with_samples[0]
-        super().__init__(
-            path, self._head.headers, units=self._head.units, clocks=self._head.dates | clocks
-        )
-        self.notes = self._head.notes
-        if len(with_samples) > 1:
+        self._sheet, layout, self._used = found[0]
+        self._comma = layout.comma
+        super().__init__(path, replace(layout, comma=False))  # the lines have decimal points
+        if len(found) > 1:
             self.notes += (
-                f"the sheet {self._sheet!r} is read, the first of {len(with_samples)} with "
-                f"samples; '{self._file.name}#{with_samples[1][0]}' is the next",
+                f"the sheet {self._sheet!r} is read, the first of {len(found)} with "
+                f"samples; '{self._file.name}#{found[1][0]}' is the next",
             )
 
-    def _layout(self, sheet: Any) -> tuple[Layout, list[int], set[int]]:
-        """Where what is, the columns in use, and those of them that are times of day."""
+    def _layout(self, sheet: Any) -> tuple[Layout, list[int]]:
+        """Where what is, and the columns in use."""
         rows = list(islice(self._rows(sheet), _HEAD))
         head = [[_text(cell) for cell in row] for row in rows]
         width = max(map(len, head), default=0)
@@ -95,55 +96,37 @@ class ExcelTable(Table):
         ]
         if not lines:
             raise InputError(f"'{self._file}' is empty; give a file with data.")
-        found = layout_of(self._file, "", ";", lines)
+        found = layout_of(self._file, "", _DELIMITER, lines)
         used = used[: len(found.headers)]
-        timed = {
+        clocks = (time, timedelta)
+        timed = (
             i
             for i, k in enumerate(used)
-            if any(k < len(row) and isinstance(row[k], time | timedelta) for row in rows)
-        }
-        return found, used, timed
+            if any(k < len(row) and isinstance(row[k], clocks) for row in rows)
+        )
+        return replace(found, times=frozenset(timed)), used
 
-    def blocks(self, columns: Sequence[int], samples: int = BLOCK) -> Iterator[Array]:
-        """See :meth:`Table.blocks`; empty cells are missing values, empty rows no samples."""
-        clocks = {column: Clock() for column in columns}
-        rows = self._samples()
-        while part := list(islice(rows, samples)):
-            found = np.empty((len(part), len(columns)))
-            for i, column in enumerate(columns):
-                k = self._used[column]
-                cells = [(number, row[k] if k < len(row) else None) for number, row in part]
-                if column in self._head.dates:
-                    times = [self._date(cell, number, column) for number, cell in cells]
-                    found[:, i] = clocks[column](np.array(times, "M8[ns]"))
-                else:
-                    found[:, i] = [self._number(cell, number, column) for number, cell in cells]
-            yield found
+    def _place(self, number: int) -> str:
+        return f"row {number} of sheet {self._sheet!r}"
 
-    def where(self, sample: int) -> str:
-        """The row of a sample."""
-        row = next(islice(self._samples(), sample, None), None)
-        return super().where(sample) if row is None else f"row {row[0]} of sheet {self._sheet!r}"
+    def _is_text(self, line: str) -> str:
+        return super()._is_text(line).partition(_DELIMITER)[0]
 
-    def _samples(self) -> Iterator[tuple[int, Sequence[Any]]]:
-        """Rows that are not empty, with their numbers."""
+    @contextmanager
+    def _stream(self) -> Iterator[Iterable[str]]:
         with self._opened() as book:
-            numbered = enumerate(self._rows(book[self._sheet]), 1)
-            yield from self.without_footer(
-                (
-                    (number, row)
-                    for number, row in numbered
-                    if number >= self._head.first
-                    and any(_text(row[k]) for k in self._used if k < len(row))
-                ),
-                self._words,
-            )
+            yield map(self._line, self._rows(book[self._sheet]))
 
-    def _words(self, row: tuple[int, Sequence[Any]]) -> str:
-        """What a row says that begins with words where numbers are; empty if it is a sample."""
-        cell = row[1][self._used[0]] if len(row[1]) > self._used[0] else None
-        text = cell.strip() if isinstance(cell, str) and self._head.leads else ""
-        return text if text[:1].isalpha() and not is_missing(text) else ""
+    def _line(self, row: Sequence[Any]) -> str:
+        """A row as a line of text."""
+        cells = [self._plain(row[k]) if k < len(row) else "" for k in self._used]
+        return (_DELIMITER.join(cells) if any(cells) else "") + "\n"
+
+    def _plain(self, cell: Any) -> str:
+        """A cell as it stands in a line."""
+        if type(cell) is float:  # nearly all are
+            return repr(cell)
+        return _NO_TEXT.sub(" ", with_point(_text(cell), comma=self._comma))
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
@@ -192,36 +175,6 @@ class ExcelTable(Table):
             f"'{self._file}' is not a readable Excel file ({brief(error)}); save it again as .xlsx."
         )
 
-    def _number(self, cell: Any, row: int, column: int) -> float:
-        if isinstance(cell, int | float):
-            return float(cell)
-        text = _text(cell)
-        if is_missing(text):
-            return np.nan
-        try:
-            if with_thousands(text) and not self._head.comma:
-                raise ValueError
-            return float(text.replace(",", "."))
-        except ValueError:
-            raise self._refusal(text, row, column, "number") from None
-
-    def _date(self, cell: Any, row: int, column: int) -> np.datetime64:
-        text = _text(cell)
-        if is_missing(text):
-            return np.datetime64("NaT")
-        try:
-            when = datetime.fromisoformat(text.replace(",", "."))
-            return np.datetime64(when.replace(tzinfo=None) - (when.utcoffset() or timedelta()))
-        except ValueError:
-            raise self._refusal(text, row, column, "date-time") from None
-
-    def _refusal(self, text: str, row: int, column: int, kind: str) -> InputError:
-        return InputError(
-            f"'{self.path}', row {row} of sheet {self._sheet!r}: {text!r} in column "
-            f"{self.headers[column]!r} is not a {kind}; correct it, or leave the cell empty where "
-            "the value is missing."
-        )
-
 
 def _text(cell: Any) -> str:
     """A cell as a text file would have it; a time of day or a duration in seconds."""
@@ -234,7 +187,3 @@ def _text(cell: Any) -> str:
     if isinstance(cell, date):
         return cell.isoformat()
     return str(int(cell) if isinstance(cell, bool) else cell).strip()
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(map(repr, names))

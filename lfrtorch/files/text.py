@@ -11,6 +11,7 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -70,6 +71,7 @@ class Layout:
     leads: bool  # whether the first column holds numbers or date-times
     rates: dict[str, float]  # sampling frequencies that the lines above the samples say
     notes: tuple[str, ...]
+    times: frozenset[int] = frozenset()  # columns of times of day, which are in seconds
 
 
 class TextTable(Table):
@@ -81,11 +83,11 @@ class TextTable(Table):
     units may stand between, and what is further above is not read.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.layout = _layout(path)
-        layout = self.layout
+    def __init__(self, path: Path, layout: Layout | None = None) -> None:
+        self.layout = layout = layout or _layout(path)
+        clocks = layout.dates | layout.times
         super().__init__(
-            path, layout.headers, units=layout.units, rates=layout.rates, clocks=layout.dates
+            path, layout.headers, units=layout.units, rates=layout.rates, clocks=clocks
         )
         self.notes = layout.notes
 
@@ -128,9 +130,9 @@ class TextTable(Table):
                     values = part[column]
                     found[:, i] = clocks[column](_times(values)) if column in dates else values
                 yield found
+        except InputError:
+            raise
         except (ValueError, *_DAMAGED) as error:  # pandas says which cell, and not where
-            if str(error).startswith(f"'{self.path}'"):
-                raise
             if isinstance(error, ValueError):
                 self._explain(columns)
             raise InputError(
@@ -141,15 +143,24 @@ class TextTable(Table):
         """The line of a sample."""
         for i, line in enumerate(self._lines()):
             if i == sample:
-                return f"line {line.number}"
+                return self._place(line.number)
         return super().where(sample)
+
+    def _place(self, number: int) -> str:
+        """What a user finds a line by."""
+        return f"line {number}"
+
+    @contextmanager
+    def _stream(self) -> Iterator[Iterable[str]]:
+        """Open the file as lines of text."""
+        with _opened(self.path, self.layout.encoding) as stream:
+            yield stream
 
     def _texts(self, count: int) -> Iterator[str]:
         """At most ``count`` lines at a time, from the first sample on, without comments."""
-        with _opened(self.path, self.layout.encoding) as stream:
-            for _ in range(self.layout.first - 1):
-                stream.readline()
-            lines = self.without_footer(stream, self._is_text)
+        with self._stream() as stream:
+            samples = islice(stream, self.layout.first - 1, None)
+            lines = self.without_footer(samples, self._is_text)
             while block := list(_bounded(lines, count)):
                 text = "".join(block)
                 if any(mark in text for mark in _MARKS):
@@ -163,12 +174,12 @@ class TextTable(Table):
         if not (self.layout.leads and (start.isalpha() or start == "*")):
             return ""
         cell = next(iter(_cells(line.rstrip("\r\n"), self.layout.delimiter)), "")
-        known = is_missing(cell) or self._is_number(cell) or _is_date(cell)
+        known = _is_missing(cell) or self._is_number(cell) or _is_date(cell)
         return "" if known else line.strip()
 
     def _lines(self) -> Iterator[Line]:
         """The lines of samples."""
-        with _opened(self.path, self.layout.encoding) as stream:
+        with self._stream() as stream:
             for line in _split(stream, self.layout.delimiter):
                 if line.number >= self.layout.first and not line.comment:
                     yield line
@@ -180,17 +191,17 @@ class TextTable(Table):
             cells = line.cells
             if any(cells[width:]):
                 raise InputError(
-                    f"'{self.path}', line {line.number}: {len(cells)} cells, where there are "
-                    f"{width} columns; give every line the same columns"
+                    f"'{self.path}', {self._place(line.number)}: {len(cells)} cells, where there "
+                    f"are {width} columns; give every line the same columns"
                     + (", and numbers a decimal point." if self.layout.delimiter == "," else ".")
                 )
             for column in sorted(columns):
                 cell = cells[column] if column < len(cells) else ""
                 known = _is_time if column in self.layout.dates else self._is_number
-                if not (is_missing(cell) or known(cell)):
+                if not (_is_missing(cell) or known(cell)):
                     kind = "date-time" if column in self.layout.dates else "number"
                     raise InputError(
-                        f"'{self.path}', line {line.number}: {cell!r} in column "
+                        f"'{self.path}', {self._place(line.number)}: {cell!r} in column "
                         f"{self.headers[column]!r} is not a {kind}; correct it, or leave the cell "
                         "empty where the value is missing."
                     )
@@ -270,7 +281,7 @@ def _decodes(text: bytes, encoding: str) -> bool:
     return True
 
 
-def _split(lines: Iterator[str] | IO[str], delimiter: str) -> Iterator[Line]:
+def _split(lines: Iterable[str], delimiter: str) -> Iterator[Line]:
     """Cells of the lines that are not blank."""
     for number, line in enumerate(lines, 1):
         text = line.rstrip("\r\n")
@@ -327,7 +338,7 @@ def _order(delimiter: str, lines: Sequence[Line]) -> tuple[float, float]:
     commas = (False,) if delimiter == "," else (False, True)
     known = [
         sum(
-            any(_is_number(c, comma) for comma in commas) or _is_date(c) or is_missing(c)
+            any(_is_number(c, comma) for comma in commas) or _is_date(c) or _is_missing(c)
             for c in cells
         )
         / len(cells)
@@ -352,7 +363,7 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> L
         return _is_number(cell, comma) or _is_date(cell)
 
     # Columns that hold numbers or nothing, and the first line that is like them.
-    given = [[cells[i] for cells in whole if not is_missing(cells[i])] for i in range(width)]
+    given = [[cells[i] for cells in whole if not _is_missing(cells[i])] for i in range(width)]
     most = {i for i, cells in enumerate(given) if 2 * sum(map(numeric, cells)) > len(cells)}
     empty = {i for i, cells in enumerate(given) if not cells}
     clean = (
@@ -361,7 +372,7 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> L
         if not line.comment
         and len(line.cells) == width
         and any(numeric(line.cells[c]) for c in most)
-        and all(numeric(line.cells[c]) or is_missing(line.cells[c]) for c in most | empty)
+        and all(numeric(line.cells[c]) or _is_missing(line.cells[c]) for c in most | empty)
     )
     start = next(clean, None)
     if start is None:
@@ -416,7 +427,7 @@ def _decimal_comma(whole: list[list[str]]) -> bool:
             if "." in cell and _NUMBER.fullmatch(cell):
                 points.add(i)
             elif "," in cell and _COMMA.fullmatch(cell):
-                (thousands if with_thousands(cell) else commas).add(i)
+                (thousands if _with_thousands(cell) else commas).add(i)
     return len(commas) > len(points) or bool(thousands and not points)
 
 
@@ -436,7 +447,7 @@ def named_by_numbers(
     """
     numbers = {i: int(cell) for i, cell in enumerate(cells) if _WHOLE.fullmatch(cell)}
     words = [cell for i, cell in enumerate(cells) if i not in numbers and (cell or i)]
-    if any(is_missing(word) or not word[0].isalpha() for word in words):
+    if any(_is_missing(word) or not word[0].isalpha() for word in words):
         return False
     if len(cells) < 2 or len({*numbers.values()}) < len(numbers) or len(below) < LEAST:
         return False
@@ -532,12 +543,18 @@ def _is_time(cell: str) -> bool:
         return False
 
 
-def is_missing(cell: str) -> bool:
+def _is_missing(cell: str) -> bool:
     """Whether a cell says that there is no value."""
     return cell.lower() in _MISSING
 
 
-def with_thousands(cell: str) -> bool:
+def with_point(cell: str, *, comma: bool) -> str:
+    """A number with a decimal point; 5,189 may be in thousands, unless commas are decimal."""
+    decimal = _COMMA.fullmatch(cell) and (comma or not _with_thousands(cell))
+    return cell.replace(",", ".") if decimal else cell
+
+
+def _with_thousands(cell: str) -> bool:
     """Whether a comma may be one between thousands, as in 5,189."""
     return _THOUSANDS.fullmatch(cell) is not None
 

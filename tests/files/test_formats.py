@@ -683,7 +683,7 @@ def test_excel(tmp_path, name):
     expected[6, 0] = 1.5
     assert np.allclose(whole(table, [0, "Druck", "Füllstand"]), expected, **same)
     blocks = list(table.blocks([2, 0], samples=15))
-    assert [len(block) for block in blocks] == [15, 15, 10]
+    assert [len(block) for block in blocks] == [14, 15, 11]  # a block has 15 rows, one empty
     assert np.allclose(np.concatenate(blocks), expected[:, [2, 0]], **same)
     assert table.where(10) == "row 16 of sheet 'Run'"
 
