@@ -16,31 +16,11 @@ from lfrtorch.fitting.trainer import Progress, Round
 from lfrtorch.model import Model
 from lfrtorch.records import common_unit
 
-DIGITS = 4
-"""Significant digits of errors, of which an iteration often moves the fourth alone."""
-
-
-def is_notebook(stream: TextIO | None) -> bool:
-    """Whether the stream is the output of a cell."""
-    return type(stream).__module__.startswith("ipykernel.")
-
-
-def is_live(stream: TextIO | None) -> bool:
-    """Whether a line can be rewritten there: on a terminal, if it is not dumb, and in a notebook.
-
-    Example:
-        >>> import io
-        >>> from lfrtorch.fitting.live_line import is_live
-        >>> is_live(io.StringIO())
-        False
-    """
-    if stream is None:  # a program without a console
-        return False
-    return is_notebook(stream) or (stream.isatty() and os.environ.get("TERM") != "dumb")
+_DIGITS = 4  # of errors: an iteration often moves the fourth alone
 
 
 class LiveLine:
-    """A line that the next text replaces; nothing is shown if the stream cannot rewrite a line.
+    """A line that the next text replaces, on a terminal and in a notebook; elsewhere there is none.
 
     Args:
         stream: where to write. Default: standard output.
@@ -54,21 +34,28 @@ class LiveLine:
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
-        self.stream = sys.stdout if stream is None else stream
-        self.live, self._length, self._cell = is_live(self.stream), 0, None
+        self.stream = sys.stdout if stream is None else stream  # None without a console
+        self._in_cell = type(self.stream).__module__.startswith("ipykernel.")
+        clever = os.environ.get("TERM") != "dumb"
+        terminal = clever and self.stream is not None and self.stream.isatty()
+        self.live = self._in_cell or terminal
+        self._length, self._cell = 0, None
 
     def show(self, text: str) -> None:
         """Replace the line; parts that are too many for the terminal's width are left out."""
-        if not self.live:
-            return
-        if is_notebook(self.stream):
-            self._show_in_cell(text)
-            return
-        width = shutil.get_terminal_size().columns - 1  # a full line would break
-        while len(text) > width and "  " in text.rstrip():
-            text = text.rstrip().rpartition("  ")[0]
-        self._write(f"\r{text[:width].ljust(self._length)}")
-        self._length = len(text[:width])
+        if self._in_cell:
+            # A saved notebook would keep all texts of a stream.
+            display = import_module("IPython.display").display
+            if self._cell is None:
+                self._cell = display({"text/plain": text}, raw=True, display_id=True)
+            else:
+                self._cell.update({"text/plain": text}, raw=True)
+        elif self.live:
+            width = shutil.get_terminal_size().columns - 1  # a full line would break
+            while len(text) > width and "  " in text.rstrip():
+                text = text.rstrip().rpartition("  ")[0]
+            self._write(f"\r{text[:width].ljust(self._length)}")
+            self._length = len(text[:width])
 
     def say(self, text: str) -> None:
         """Replace the line by one that stays."""
@@ -76,31 +63,16 @@ class LiveLine:
         self._write(f"{start}{text.ljust(self._length)}\n")
         self._length = 0
 
-    def clear(self) -> None:
-        """Take the line away, for another one."""
+    def close(self, *, keep: bool = True) -> None:
+        """End the line, if there is one, or take it away for another one."""
         if self._length:
-            self._write(f"\r{' ' * self._length}\r")
-        self._length, self._cell = 0, None
-
-    def close(self) -> None:
-        """End the line, if there is one, so that what is printed next has its own."""
-        if self._length:
-            self._write("\n")
+            self._write("\n" if keep else f"\r{' ' * self._length}\r")
         self._length, self._cell = 0, None
 
     def _write(self, text: str) -> None:
         if self.stream is not None:
             self.stream.write(text)
             self.stream.flush()
-
-    def _show_in_cell(self, text: str) -> None:
-        """In place of the text before: of a stream a saved notebook would keep all of them."""
-        display = import_module("IPython.display").display  # there is a notebook
-        shown = {"text/plain": text}
-        if self._cell is None:
-            self._cell = display(shown, raw=True, display_id=True)
-        else:
-            self._cell.update(shown, raw=True)
 
 
 class ProgressLine:
@@ -131,14 +103,11 @@ class ProgressLine:
             return
         self._unseen = text
         if progress.iteration % self.every == 0:
-            self._say()
+            self.close()
 
     def close(self) -> None:
         """End the line; if the stream cannot rewrite one, show the last iteration."""
         self._line.close()
-        self._say()
-
-    def _say(self) -> None:
         if self._unseen:
             self._line.say(self._unseen)
         self._unseen = ""
@@ -148,34 +117,27 @@ def progress_text(progress: Progress, unit: str) -> str:
     """Iteration, errors (a star marks the best so far), time left, optimiser's scalars."""
     parts = [
         f"{progress.iteration:>{len(str(progress.limit))}}/{progress.limit}",
-        *errors(progress.train, progress.validation, unit, best=progress.best),
+        *_errors(progress, unit, best=progress.best),
     ]
     if progress.iteration:
-        parts.append(f"{duration(progress.seconds_left)} left")
+        parts.append(f"{_duration(progress.seconds_left)} left")
     shown = {"damping": "damping", "gain_ratio": "gain", "gradient_norm": "|gradient|"}
     for key, label in shown.items():
-        if key in progress.report and math.isfinite(progress.report[key]):
-            parts.append(f"{label} {progress.report[key]:.2g}")
+        if math.isfinite(value := progress.report.get(key, math.nan)):
+            parts.append(f"{label} {value:.2g}")
     return "  ".join(parts)
 
 
-def errors(train: float, validation: float, unit: str, *, best: bool = False) -> list[str]:
-    """The errors on training and, if there is one, validation; a star marks the best so far."""
-    shown = quantities([train, validation], unit, DIGITS)
-    parts = [f"train {shown[0]}"]
-    if not math.isnan(validation):
-        parts.append(f"validation {shown[1]}" + ("*" if best else ""))
-    return parts
+def _errors(progress: Progress, unit: str, *, best: bool = False) -> list[str]:
+    """Errors on training and, if there is one, validation; a star marks the best so far."""
+    train, validation = quantities([progress.train, progress.validation], unit, _DIGITS)
+    if math.isnan(progress.validation):
+        return [f"train {train}"]
+    return [f"train {train}", f"validation {validation}" + ("*" if best else "")]
 
 
-def duration(seconds: float) -> str:
-    """A time for people.
-
-    Example:
-        >>> from lfrtorch.fitting.live_line import duration
-        >>> duration(45.2), duration(312.0), duration(7500.0)
-        ('45 s', '5 min', '2 h 05 min')
-    """
+def _duration(seconds: float) -> str:
+    """45 s, 5 min or 2 h 05 min."""
     minutes = round(seconds / 60)
     if seconds < 120:
         return f"{seconds:.0f} s"
@@ -226,10 +188,10 @@ class StartsLine:
             self._best = progress
         total = "" if self.iterations is None else f"/{self.iterations}"
         parts = [f"{count}{total} iterations of {self.starts} starts"]
-        parts += errors(self._best.train, self._best.validation, self.unit)
+        parts += _errors(self._best, self.unit)
         if self.iterations is not None and 0 < count < self.iterations:
             each = (monotonic() - self._clock) / count
-            parts.append(f"{duration(each * (self.iterations - count))} left")
+            parts.append(f"{_duration(each * (self.iterations - count))} left")
         self._line.show("  ".join(parts))
 
     def round(self, ended: Round) -> None:
@@ -238,18 +200,15 @@ class StartsLine:
             return
         judged = [(s.selection, s.validation, s.train) for s in ended.starts]
         found = [next(e for e in each if not math.isnan(e)) for each in judged]
-        numbers = {"best": found[0]}
-        if len(found) > 2:
-            numbers["median"] = median(found)
-        if len(found) > 1:
-            numbers["worst"] = max(found)
-        shown = quantities(list(numbers.values()), self.unit, DIGITS)
-        text = (
+        names = ["best", *["median"] * (len(found) > 2), *["worst"] * (len(found) > 1)]
+        numbers = {"best": found[0], "median": median(found), "worst": max(found)}
+        shown = quantities([numbers[name] for name in names], self.unit, _DIGITS)
+        self._line.say(
             f"round {ended.number} of {ended.count}: {len(found)} start(s) to iteration "
             f"{max(s.iterations for s in ended.starts)}, "
-            + ", ".join(f"{name} {value}" for name, value in zip(numbers, shown, strict=True))
+            + ", ".join(f"{name} {value}" for name, value in zip(names, shown, strict=True))
+            + f", {ended.seconds:.0f} s"
         )
-        self._line.say(f"{text}, {ended.seconds:.0f} s")
 
     def close(self) -> None:
         """End the line, if there is one."""

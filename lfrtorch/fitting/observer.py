@@ -74,14 +74,14 @@ class LineObserver(Observer):
 
     def searching(self) -> Monitor | None:
         """Show a line."""
-        self._said.clear()
+        self._said.close(keep=False)
         return None
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
     ) -> Watching:
         """Follow the iterations."""
-        self._said.clear()
+        self._said.close(keep=False)
         planned = schedule(len(models), settings.trainer.limit, settings.average)
         self._fit = line_of(models, planned)
         return Watching([[self._fit]] * len(models), lambda _: None)
