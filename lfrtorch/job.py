@@ -38,9 +38,9 @@ from lfrtorch.model import Model, check_channels
 from lfrtorch.records import Record
 from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import evidence
+from lfrtorch.reporting.evaluation import HORIZONS, Evaluation, worst_residuals
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
-from lfrtorch.reporting.simulations import respond, worst_residuals
 from lfrtorch.reporting.verdict import judge, reconsidered
 
 SEARCHED_STARTS = 2
@@ -48,9 +48,6 @@ SEARCHED_STARTS = 2
 
 SLOW_SAMPLES = 5000
 """Training samples from which a static map that is not compiled is worth a note."""
-
-SOME = 10
-"""Samples ahead that predictions are judged at, beside one."""
 
 
 @typed("dataset")
@@ -216,16 +213,21 @@ def scored_run(
     if again is not None:
         fitted_to += " and all other estimation records"
         again = replace(again, model=replace(again.model, fitted_to=fitted_to))
-    test_linear = linear_models_of_tests(dataset, settings)
-    last = None if again is None else again.model
-    responses = partial(respond, result.model, linear, dataset, test_linear, refitted=last)
-    judged = simulations = responses()
+    evaluation = Evaluation(
+        dataset=dataset,
+        linear=linear,
+        model=result.model,
+        refitted=None if again is None else again.model,
+        own=linear_models_of_tests(dataset, settings),
+    )
+    judged = simulations = evaluation.simulations
     if settings.noise == "output":
         verdict = judge(result, simulations, linear_nx=linear.nx)
     else:
-        judged = responses(ahead=1)
+        one, some, _ = HORIZONS
+        judged = evaluation.predictions[one]
         views = {
-            f"error {SOME} ahead": responses(ahead=SOME),
+            f"error {some} ahead": evaluation.predictions[some],
             "simulation error": simulations,
         }
         verdict = judge(result, judged, linear_nx=linear.nx, error="prediction error")
@@ -244,9 +246,7 @@ def scored_run(
     )
     numbers = metrics(
         result,
-        linear,
-        dataset,
-        own=test_linear,
+        evaluation,
         seeds=settings.seeds,
         search=size_search,
         verdict=verdict,
@@ -257,12 +257,11 @@ def scored_run(
         dataset=dataset,
         settings=settings,
         linear=linear,
-        test_linear=test_linear,
         order_scan=order_scan,
         size_search=size_search,
         fit=result,
         refit=again,
-        simulations=simulations,
+        evaluation=evaluation,
         residuals=residuals,
         metrics=numbers,
         verdict=verdict,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import hydra
@@ -15,11 +16,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 import lfrtorch
-from lfrtorch import analysis
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
-from lfrtorch.analysis.residual_analysis import SHORTEST
+from lfrtorch.analysis.residual_analysis import SHORTEST, Residuals, of_simulation
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.config import loaded, require_data
@@ -30,6 +30,7 @@ from lfrtorch.cli.simulate import opened
 from lfrtorch.files.load import EVERYTHING, listed_files
 from lfrtorch.model import check_channels
 from lfrtorch.reporting import scores as report
+from lfrtorch.reporting.evaluation import Evaluation
 
 FILES = "lfrtorch.load_records"
 """What reads files of one's own."""
@@ -61,11 +62,19 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
         print(f"note: '{folder}' has no folder linear/, so no linear model is scored")
     elif bla is not None and dataset.linear:
         print("note: the linear model is that of all training records; a run has one a test")
-    scores = report.evaluation(model, bla, dataset, command=command)
+    scored = replace(dataset, train=[])  # which is not scored, and need not be simulated
+    evaluation = Evaluation(dataset=scored, linear=bla, model=model)
+    scores = report.scored(evaluation, command)
     print(f"\n{report.table(scores, dataset.published)}")
-    scored = [r for r in dataset.tests or dataset.validation if r.samples - r.skip >= SHORTEST]
-    if scored:
-        residuals = analysis.residuals(model, scored)
+    use = "test" if dataset.tests else "validation"
+    parts = [
+        part
+        for one in evaluation.simulations
+        if one.use == use and len(one.scored) >= SHORTEST
+        for part in of_simulation(one.record, one.y_hat)
+    ]
+    if parts:
+        residuals = Residuals(tuple(parts))
         scores["residuals"] = residuals.entries()
         print(f"\nResiduals\n\n{residuals}")
     if cfg.out is not None:

@@ -26,14 +26,13 @@ from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import MAIN
-from lfrtorch.cli.linear import finite
 from lfrtorch.cli.words import translated
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import Block, FileStream
 from lfrtorch.files.writer import FORMATS, table_writer
 from lfrtorch.metrics import BlockScores
 from lfrtorch.periods import find_period, find_transient
-from lfrtorch.reporting.scores import of_samples
+from lfrtorch.reporting.scores import finite, of_samples
 from lfrtorch.score_window import PART, WINDOW, score_window, warm_up
 
 BEGINNING = 100

@@ -24,8 +24,8 @@ from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import UNLIKE
 from lfrtorch.metrics import rms
 from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
+from lfrtorch.reporting.evaluation import Response
 from lfrtorch.reporting.explained import explained_parts
-from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import NEITHER, Kind, Verdict
 
 NOISE_LIMITED = 1.1

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from lfrtorch._support.types import Array
-from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.evaluation import Response
 
 AVERAGES = 8
 """Segments for each regressor that a coherence is estimated from, at least."""

@@ -12,10 +12,9 @@ from lfrtorch.analysis.model_plots import static_figure
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.frf import FRF, estimate_frf
-from lfrtorch.linear.model import LinearModel
 from lfrtorch.records import Record
 from lfrtorch.reporting import linear_plots, plots
-from lfrtorch.reporting.simulations import Response, ranked
+from lfrtorch.reporting.evaluation import Evaluation, Response, ranked
 
 MOST_OUTPUTS, MOST_RECORDS = 4, 4
 """Outputs in one figure, and records of which the report has all views."""
@@ -28,19 +27,15 @@ Views = dict[str, dict[str, str]]
 """Captions by the names of records, then of figures."""
 
 
-def of_run(
-    result: FitResult,
-    bla: LinearModel,
-    dataset: Dataset,
-    simulated: Sequence[Response],
-) -> tuple[dict[str, Figure], Views]:
+def of_run(result: FitResult, evaluation: Evaluation) -> tuple[dict[str, Figure], Views]:
     """All figures of a run's folder by file name, and those of the records that the report shows.
 
     The records are the tests; without tests those of validation, and else those of training. The
     first is that with the largest error; of a group that make one score it is the only one.
     """
-    model = result.model
-    drawn, views = of_records(simulated, dataset)
+    model, bla, dataset = result.model, evaluation.linear, evaluation.dataset
+    assert bla is not None
+    drawn, views = of_records(evaluation.simulations, dataset)
     with suppress(InputError):  # a linear model, or one that diverges
         drawn["static_map"] = static_figure(model, dataset.train[0])
     units = {channel.unit for channel in model.outputs}

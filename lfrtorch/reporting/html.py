@@ -6,7 +6,7 @@ import base64
 import math
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, NamedTuple
 
@@ -32,16 +32,14 @@ from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.linearisation import poles_at_rest
 from lfrtorch.analysis.residual_analysis import LEGEND as RESIDUALS_LEGEND
 from lfrtorch.analysis.residual_analysis import Residuals
-from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.size_search import LEGEND, size_table
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.metrics import rms
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.advice import Advice
+from lfrtorch.reporting.evaluation import Evaluation, Score
 from lfrtorch.reporting.scores import (
     REFITTED,
-    counted,
     finalists,
     linear_name,
     neurons,
@@ -50,7 +48,6 @@ from lfrtorch.reporting.scores import (
     published_unit,
     start_matters,
 )
-from lfrtorch.reporting.simulations import Response
 from lfrtorch.reporting.verdict import LINEAR_MODEL, Verdict, of_linear
 
 USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
@@ -68,6 +65,8 @@ Rows = list[Sequence[Cell]]
 class Errors(NamedTuple):
     """RMSE of the linear model and of the NL-LFR, linear / error, and both over the deviation."""
 
+    output: str
+    unit: str
     linear: float
     error: float
     ratio: float
@@ -78,9 +77,7 @@ class Errors(NamedTuple):
 def render(
     metrics: Mapping[str, Any],
     result: FitResult,
-    bla: LinearModel,
-    dataset: Dataset,
-    responses: Sequence[Response],
+    evaluation: Evaluation,
     images: Mapping[str, bytes],
     verdict: Verdict,
     advice: Sequence[Advice],
@@ -94,9 +91,7 @@ def render(
     Args:
         metrics: see :func:`lfrtorch.reporting.scores.metrics`.
         result: the fit.
-        bla: linear model of all training records.
-        dataset: the records and what others reached on them.
-        responses: all records beside their simulations.
+        evaluation: of its model and the linear one on all records.
         images: figures as PNG by name; ``static_map``, ``convergence``, ``frequency_response`` and
             ``poles_and_zeros`` have their places, and those of ``views`` theirs.
         verdict: on the fit, whose colour the page's first lines have.
@@ -106,6 +101,8 @@ def render(
         residuals: of one record, if it has some; ``residuals`` among the images is theirs.
         config: of the run.
     """
+    dataset, bla = evaluation.dataset, evaluation.linear
+    assert bla is not None
     return page(
         "report.html",
         images,
@@ -113,11 +110,11 @@ def render(
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
         sizes=_sizes(metrics),
         verdict=verdict,
-        comparisons=comparisons(responses),
+        comparisons=comparisons(evaluation),
         linear_is_used=verdict.use == LINEAR_MODEL,
         advice=advice,
-        scores=_scores(metrics, dataset, responses),
-        data=_data(dataset, responses),
+        scores=_scores(metrics, evaluation),
+        data=_data(evaluation),
         records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
         residuals=_residuals(residuals),
         linear=_linear(bla, result),
@@ -152,24 +149,25 @@ def page(template: str, images: Mapping[str, bytes], **values: Any) -> str:
     return environment.get_template(template).render(images=inside, **values)
 
 
-def comparisons(responses: Sequence[Response]) -> list[str]:
+def comparisons(evaluation: Evaluation) -> list[str]:
     """How far the NL-LFR came, beside the linear model: a line for each output of a few tests.
 
     Without tests the lines are on the validation records, or else on the training records.
     """
+    responses = evaluation.simulations
     uses = ("test", "validation", "train")
     use = next(use for use in uses if any(response.use == use for response in responses))
     shown = []
     for response in (response for response in responses if response.use == use):
-        channels = [channel for channel in _channels(response) if channel[0] != ALL]
-        for output, unit, of in channels:
-            name = response.record.name + (f", {output}" if len(channels) > 1 else "")
-            shown.append((name, unit, _errors(response, of)))
-    scored = sorted((item for item in shown if item[2].ratio > 0), key=lambda item: item[2].ratio)
+        errors = [each for each in _errors(response.score) if each.output != ALL]
+        for each in errors:
+            name = response.record.name + (f", {each.output}" if len(errors) > 1 else "")
+            shown.append((name, each))
+    scored = sorted((item for item in shown if item[1].ratio > 0), key=lambda item: item[1].ratio)
     if len(shown) <= FEW or not scored:
         return [_line(*item) for item in shown]
-    least, most = (f"{percent(1 / e.ratio)} ({name})" for name, _, e in (scored[-1], scored[0]))
-    relative = [errors.relative for _, _, errors in scored]
+    least, most = (f"{percent(1 / e.ratio)} ({name})" for name, e in (scored[-1], scored[0]))
+    relative = [errors.relative for _, errors in scored]
     line = (
         f"{len(scored)} {use} errors: {least} to {most} of the linear model's, "
         f"NRMSE {percent(min(relative))} to {percent(max(relative))}"
@@ -177,10 +175,10 @@ def comparisons(responses: Sequence[Response]) -> list[str]:
     return [line, *(_line(*item) for item in shown if item not in scored)]
 
 
-def _line(name: str, unit: str, errors: Errors) -> str:
+def _line(name: str, errors: Errors) -> str:
     if not math.isfinite(errors.error):
         return f"{name}: the NL-LFR diverges"
-    error, linear = quantities([errors.error, errors.linear], unit)
+    error, linear = quantities([errors.error, errors.linear], errors.unit)
     relative = percent(errors.relative)
     beside = of_linear(errors.error / errors.linear) if errors.linear > 0 else "not comparable"
     return f"{name}: error {beside} ({error} against {linear}), NRMSE {relative}"
@@ -194,25 +192,22 @@ def _sizes(metrics: Mapping[str, Any]) -> str:
     return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
 
 
-def _scores(
-    metrics: Mapping[str, Any], dataset: Dataset, responses: Sequence[Response]
-) -> dict[str, Any]:
+def _scores(metrics: Mapping[str, Any], evaluation: Evaluation) -> dict[str, Any]:
     sizes = metrics["sizes"]["nz"], metrics["sizes"]["nw"]
-    published = [p for p in dataset.published if p.sizes in (None, sizes)]
-    in_unit = _units(responses, published_unit(published))
-    outputs = responses[0].record.outputs
+    published = [p for p in evaluation.dataset.published if p.sizes in (None, sizes)]
+    compared = {key: _errors(score) for key, score in evaluation.scores.items()}
+    in_unit = _units(compared.values(), published_unit(published))
+    outputs = evaluation.dataset.train[0].outputs
     several, units = len(outputs) > 1, any(channel.unit for channel in outputs)
     what = [*["output"] * several, *["unit"] * (several and units)]
     errors = [linear_name(metrics), "NL-LFR", "ratio", "linear NRMSE", "NRMSE"]
     tests, others = [], []
-    for (use, name), scored in _scored(dataset, responses).items():
-        for row, (channel, unit, of) in enumerate(_channels(scored[0])):
-            factor, shown = in_unit[unit]
-            grouped = name in dataset.groups
-            found = _mean_errors(scored, of) if grouped else _errors(scored[0], of)
-            cells = [*[channel, shown][: len(what)], *_cells(found, factor)]
+    for (use, name), each in compared.items():
+        for row, found in enumerate(each):
+            factor, shown = in_unit[found.unit]
+            cells = [*[found.output, shown][: len(what)], *_cells(found, factor)]
             if use == "test":
-                key = name if row == 0 else f"{name} {channel}"
+                key = name if row == 0 else f"{name} {found.output}"
                 values = [times(factor, p.scores.get(key)) for p in published]
                 known = values if row == 0 else ["" if v is None else v for v in values]
                 tests.append([name if row == 0 else "", *cells, *known])
@@ -237,62 +232,36 @@ def _scores(
     }
 
 
-def _scored(
-    dataset: Dataset, responses: Sequence[Response]
-) -> dict[tuple[str, str], list[Response]]:
-    """The responses of each score, by its use and name."""
-    found: dict[tuple[str, str], list[Response]] = {}
-    for response in responses:
-        found.setdefault((response.use, dataset.score_of(response.record)), []).append(response)
-    return found
-
-
-def _channels(response: Response) -> list[tuple[str, str, slice]]:
-    """Name, unit and columns of each output; before several of one unit all together."""
-    outputs = response.record.outputs
-    units = {channel.unit for channel in outputs}
-    single = [(c.name, c.unit, slice(i, i + 1)) for i, c in enumerate(outputs)]
-    if len(outputs) == 1 or len(units) > 1:
+def _errors(score: Score) -> list[Errors]:
+    """The errors of each output; before several of one unit those of all together."""
+    columns = zip(
+        score.channels,
+        score.lti_rmse_by_output,
+        score.rmse_by_output,
+        score.std_by_output,
+        strict=True,
+    )
+    single = [_compared(c.name, c.unit, *errors) for c, *errors in columns]
+    units = {channel.unit for channel in score.channels}
+    if len(single) == 1 or len(units) > 1:
         return single
-    return [(ALL, units.pop(), slice(None)), *single]
+    assert score.lti_rmse is not None
+    assert score.rmse is not None
+    return [_compared(ALL, units.pop(), score.lti_rmse, score.rmse, score.std), *single]
 
 
-def _units(responses: Sequence[Response], shown: str = "") -> dict[str, tuple[float, str]]:
-    """Of each unit of the outputs a factor and the unit with a prefix, for all of their errors."""
-    errors: dict[str, list[float]] = {}
-    for response in responses:
-        for _, unit, of in _channels(response):
-            found = _errors(response, of)
-            errors.setdefault(unit, []).extend([found.linear, found.error])
-    return {unit: engineering(values, unit, shown) for unit, values in errors.items()}
-
-
-def _errors(response: Response, of: slice) -> Errors:
-    """The errors of some outputs."""
-    linear, error = (
-        float(rms(signal[:, of])) for signal in (response.linear_error, response.error)
-    )
-    deviation = float(np.sqrt(np.mean(np.var(response.scored[:, of], axis=0))))
-    return _compared(linear, error, deviation)
-
-
-def _mean_errors(responses: Sequence[Response], of: slice) -> Errors:
-    """Their means over some outputs, one by one, of several records."""
-
-    def mean(signals: Sequence[Array]) -> float:
-        return float(np.mean([rms(signal[:, of], axis=0) for signal in signals]))
-
-    return _compared(
-        mean([response.linear_error for response in responses]),
-        mean([response.error for response in responses]),
-        mean([response.scored - response.scored.mean(axis=0) for response in responses]),
-    )
-
-
-def _compared(linear: float, error: float, deviation: float) -> Errors:
-    deviation = deviation or math.nan
+def _compared(output: str, unit: str, linear: float, error: float, std: float) -> Errors:
+    std = std or math.nan
     ratio = linear / error if error > 0 else math.nan
-    return Errors(linear, error, ratio, linear / deviation, error / deviation)
+    return Errors(output, unit, linear, error, ratio, linear / std, error / std)
+
+
+def _units(compared: Iterable[Sequence[Errors]], shown: str = "") -> dict[str, tuple[float, str]]:
+    """Of each unit of the outputs a factor and the unit with a prefix, for all of their errors."""
+    values: dict[str, list[float]] = {}
+    for errors in (errors for each in compared for errors in each):
+        values.setdefault(errors.unit, []).extend([errors.linear, errors.error])
+    return {unit: engineering(own, unit, shown) for unit, own in values.items()}
 
 
 def _cells(errors: Errors, factor: float) -> list[Cell]:
@@ -301,8 +270,8 @@ def _cells(errors: Errors, factor: float) -> list[Cell]:
     return [factor * errors.linear, shown, errors.ratio, *relative]
 
 
-def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
-    train = dataset.train
+def _data(evaluation: Evaluation) -> dict[str, Any]:
+    dataset, train = evaluation.dataset, evaluation.dataset.train
     fs, samples = train[0].fs, sum(record.samples for record in train)
     summary = f"{_count(len(train), 'training record')}, {samples} samples"
     summary += f", sampled at {fs:g} Hz: {number(samples / fs)} s." if fs != 1.0 else "."
@@ -318,9 +287,10 @@ def _data(dataset: Dataset, responses: Sequence[Response]) -> dict[str, Any]:
             factor, unit = engineering([moments[1]], channel.unit)
             channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
     records = [
-        [r.name, USES.get(use, use), r.source, r.start, of_samples(counted(r)), r.period]
-        for use, r in ((response.use, response.record) for response in responses)
-    ]
+        [r.name, USES.get(one.use, one.use), r.source, r.start, of_samples(one.score.entry()),
+         r.period]
+        for one, r in ((response, response.record) for response in evaluation.simulations)
+    ]  # fmt: skip
     return {
         "summary": summary,
         "notes": dataset.notes,

@@ -18,7 +18,7 @@ from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.model import Model
 from lfrtorch.reporting import scores
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.evaluation import Evaluation, Response
 from lfrtorch.reporting.verdict import Verdict
 
 
@@ -30,12 +30,11 @@ class Run:
         dataset: the records.
         settings: with the sizes that were chosen in the place of ``"auto"``.
         linear: the best linear approximation of all training records.
-        test_linear: linear models of single tests, by name, see ``Dataset.linear``.
         order_scan, size_search: how nx and the other sizes were chosen; None if they were given.
         fit: the nonlinear fit, of the best start or of the mean of several.
         refit: the fit to all estimation records, if one was asked for. Its model is the run's, and
             is scored on the tests; training and validation errors are those of ``fit.model``.
-        simulations: every record with both simulations.
+        evaluation: both models on every record.
         residuals: of the record with the largest error, as the report shows them.
         metrics: what ``metrics.json`` holds: scores by record, sizes, the fit in numbers.
         verdict: whether the NL-LFR is worth more than the linear model.
@@ -54,12 +53,11 @@ class Run:
     dataset: Dataset
     settings: Settings
     linear: LinearModel
-    test_linear: Mapping[str, LinearModel]
     order_scan: OrderScan | None
     size_search: SizeSearch | None
     fit: FitResult
     refit: FitResult | None = None
-    simulations: list[Response]
+    evaluation: Evaluation
     residuals: Residuals | None = None
     metrics: Mapping[str, Any]
     verdict: Verdict
@@ -69,6 +67,11 @@ class Run:
     def model(self) -> Model:
         """The nonlinear model."""
         return (self.refit or self.fit).model
+
+    @property
+    def simulations(self) -> list[Response]:
+        """Every record with both simulations."""
+        return self.evaluation.simulations
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{name}={size}" for name, size in self.model.sizes.items())

@@ -68,7 +68,7 @@ def write(
         result.iterations,
     )
     if draw:
-        drawn, views = figures.of_run(result, run.linear, dataset, run.simulations)
+        drawn, views = figures.of_run(result, run.evaluation)
         if run.residuals is not None:
             drawn["residuals"] = run.residuals.plot()
         images = {name: plots.png(figure) for name, figure in drawn.items()}
@@ -77,8 +77,8 @@ def write(
                 fresh.write_bytes(image)
             board.image(f"summary/{name}", image, result.iterations)
         page = html.render(
-            metrics, result, run.linear, dataset, run.simulations, images, run.verdict,
-            run.advice, views=views, residuals=run.residuals, config=config,
+            metrics, result, run.evaluation, images, run.verdict, run.advice,
+            views=views, residuals=run.residuals, config=config,
         )  # fmt: skip
         with whole_file(folder / "report.html") as path:
             path.write_text(page, encoding="utf-8")

@@ -25,7 +25,7 @@ from lfrtorch._support.types import Array, Integers
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.metrics import nrmse, rms
 from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
-from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.evaluation import Response
 
 NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
 """What a verdict says is to be used."""
@@ -160,7 +160,7 @@ def judge(
 
     Args:
         result: the fit.
-        responses: see :func:`lfrtorch.reporting.simulations.respond`.
+        responses: see :class:`lfrtorch.reporting.evaluation.Evaluation`.
         linear_nx: order of the linear model, which the sentence names.
         error: what it is called, for example ``"prediction error"``.
     """
@@ -256,6 +256,50 @@ def reconsidered(
     text = f"{better[0].text[:-1]}, {percent(verdict.evidence['ratio'])} one ahead."
     evidence = {**better[0].evidence, "one_ahead": verdict.evidence}
     return replace(better[0], text=text, evidence=evidence)
+
+
+def judge_linear(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Whether a linear model explains what was not fitted: its worst output on the tests.
+
+    Without tests that are scored it is judged on validation, and else on training.
+
+    Args:
+        scores: of all records, see ``lfrtorch.reporting.linear_report.numbers``.
+    """
+    errors = {use: _relative_errors(scores, use) for use in ("test", "validation", "train")}
+    judged = next((use for use, found in errors.items() if found), None)
+    if judged is None:
+        return {"usable": None, "text": "Not judged: nothing is scored."}
+    name, error = max(errors[judged].items(), key=lambda item: item[1])
+    usable = error < EXPLAINS_NOTHING
+    output = "the output" if len(errors[judged]) == 1 else f"'{name}'"
+    size = f"{percent(error)} of the standard deviation of {output}"
+    if not math.isfinite(error):
+        size = f"without bound at {output}"
+    where = "training" if judged == "train" else judged
+    text = f"{'' if usable else 'Not usable: '}on {where} the linear model's error is {size}"
+    fitted_error = errors["train"].get(name)
+    if not usable and judged != "train" and fitted_error is not None:
+        text += f" (in training {percent(fitted_error)})"
+    return {
+        "usable": usable,
+        "text": f"{text[0].upper()}{text[1:]}.",
+        "on": judged,
+        "output": name,
+        "nrmse": error,
+    }
+
+
+def _relative_errors(scores: Sequence[Mapping[str, Any]], use: str) -> dict[str, float]:
+    """Of each output that moves the error over the standard deviation, all records of a use."""
+    powers: dict[str, Array] = {}
+    for s in scores:
+        for o in s["outputs"]:
+            if s["use"] == use and s["scored"] and o["std"] > 0:
+                error = o["rmse"] if math.isfinite(o["rmse"]) else math.inf
+                own = s["scored"] * np.square([error, o["std"]])
+                powers[o["output"]] = powers.get(o["output"], np.zeros(2)) + own
+    return {name: float(np.sqrt(error / own)) for name, (error, own) in powers.items()}
 
 
 def of_linear(ratio: float) -> str:

@@ -13,6 +13,8 @@ from lfrtorch import LinearModel
 from lfrtorch.analysis import start_uncertainty
 from lfrtorch.analysis.start_uncertainty import start_error
 from lfrtorch.model import state_moment
+from lfrtorch.reporting import scores
+from lfrtorch.reporting.evaluation import Evaluation
 
 pytestmark = pytest.mark.numeric
 
@@ -95,7 +97,7 @@ def test_the_table_shows_what_the_start_adds_where_it_matters():
     for name, shown in (("short", True), ("long", False)):
         data = lfrtorch.Dataset("d", [train], [], [records[name]]).with_windows()
         start = lfrtorch.initialise(linear, [train], nz=1, nw=1, nn=2)
-        found = lfrtorch.reporting.scores.evaluation(start, linear, data, command="")
-        table = lfrtorch.reporting.scores.table(found, [])
+        found = scores.scored(Evaluation(dataset=data, linear=linear, model=start))
+        table = scores.table(found, [])
         assert ("from the start" in table) == shown
         assert found["scores"][name]["start_error"] > 0

@@ -122,27 +122,6 @@ def test_numbers_are_those_of_the_system(csv: Path, tmp_path: Path, monkeypatch)
     assert found["scan"] is None
 
 
-def test_a_model_that_explains_nothing_is_called_so():
-    def entry(use: str, rmse: float | None, std: float, output: str = "x") -> dict:
-        return {"use": use, "scored": 50, "outputs": [{"output": output, "rmse": rmse, "std": std}]}
-
-    train, good = entry("train", 0.2, 2.0), entry("test", 1.0, 4.0)
-    assert linear.verdict([train, good])["text"] == (
-        "On test the linear model's error is 25.0 % of the standard deviation of the output."
-    )
-    found = linear.verdict([train, entry("validation", 0.1, 2.0), entry("test", 5.0, 2.0)])
-    assert (found["usable"], found["nrmse"]) == (False, 2.5)
-    assert found["text"].startswith("Not usable: on test ")
-    assert found["text"].endswith(
-        "250 % of the standard deviation of the output (in training 10.0 %)."
-    )
-    assert linear.verdict([train])["on"] == "train"
-    assert not linear.verdict([good, entry("test", None, 1.0, "y")])["usable"]
-    still = entry("test", 0.1, 0.0)  # in which nothing happens
-    assert linear.verdict([train, still])["on"] == "train"
-    assert linear.verdict([still])["usable"] is None
-
-
 @pytest.mark.numeric
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("refine", ["prediction", "frequency"])
@@ -288,21 +267,3 @@ def test_train_takes_the_order_of_a_scan(csv: Path, tmp_path: Path, capsys):
     printed = capsys.readouterr().out
     assert "  chosen" in printed
     assert "BLA: order 2, simulation error" in printed
-
-
-@pytest.mark.parametrize(
-    ("z", "frequency", "damping"),
-    [
-        (0.5, np.log(2) / (2 * np.pi), 1.0),
-        (-0.5, 0.5, np.log(2) / abs(np.log(-0.5 + 0j))),
-        (1j, 0.25, 0.0),
-        (2.0, np.log(2) / (2 * np.pi), -1.0),
-        (1.0, 0.0, None),
-        (0.0, None, 1.0),
-    ],
-)
-def test_frequency_and_damping(z: complex, frequency: float | None, damping: float | None):
-    (root,) = linear.frequency_and_damping(np.array([z], dtype=complex), 1.0)
-    assert root["frequency"] == (None if frequency is None else pytest.approx(frequency))
-    assert root["damping"] == (None if damping is None else pytest.approx(damping))
-    assert root["radius"] == pytest.approx(abs(z))

@@ -9,6 +9,7 @@ import pytest
 import lfrtorch
 from lfrtorch.datasets import fine_steering_mirror
 from lfrtorch.reporting import scores
+from lfrtorch.reporting.evaluation import Evaluation
 
 FILE = "FineSteeringMirror/combined_data.npz"
 LEVELS = 100, 200, 300
@@ -142,7 +143,7 @@ def test_a_score_is_the_mean_over_outputs_realisations_and_periods(tmp_path):
         u_offset=np.zeros(3), y_offset=np.zeros(3),
         inputs=data.train[0].inputs, outputs=data.train[0].outputs,
     ).to_model()  # fmt: skip
-    found = scores.evaluation(model, None, data, command="")
+    found = scores.scored(Evaluation(dataset=data, model=model))
     assert list(found["scores"]) == list(expected)
     for name, offset in expected.items():
         score = found["scores"][name]

@@ -21,7 +21,7 @@ from lfrtorch.reporting.diagnosis import (
     falling,
     noise_of_periods,
 )
-from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.evaluation import Response
 
 pytestmark = pytest.mark.numeric
 
@@ -37,6 +37,10 @@ def test_noise_is_what_differs_between_periods():
     assert found[1] < 1e-12
     assert noise_of_periods([Record(u, y)]) is None
     assert noise_of_periods([Record(u[:500], y[:500], start="periodic")]) is None
+
+
+def with_output(response: Response, y_hat: np.ndarray) -> Response:
+    return replace(response, simulated={**response.simulated, "NL-LFR": y_hat})
 
 
 def history(scores: list[float]) -> list[Progress]:
@@ -64,7 +68,7 @@ def fitted() -> tuple[FitResult, list[Response]]:
         model, history([4.0, 2.0, 1.0]), 2, 1.0, 1.0, "maximum number of iterations", starts
     )
     responses = [
-        Response(r, use, bla.simulate(r), model.simulate(r))
+        Response(r, use, {"linear": bla.simulate(r), "NL-LFR": model.simulate(r)})
         for r, use in ((train, "train"), (test, "test"))
     ]
     return result, responses
@@ -100,11 +104,11 @@ def test_evidence_is_measured_on_the_records(fitted):
 
 def test_a_diverging_simulation_is_evidence_and_no_error(fitted):
     result, responses = fitted
-    lost = replace(responses[1], y_hat=np.full_like(responses[1].y_hat, np.inf))
+    lost = with_output(responses[1], np.full_like(responses[1].y_hat, np.inf))
     found = evidence(result, [responses[0], lost])
     assert found.diverged == ["loud"]
     assert advice.diverges(found) is not None
-    first = replace(responses[0], y_hat=np.full_like(responses[0].y_hat, np.nan))
+    first = with_output(responses[0], np.full_like(responses[0].y_hat, np.nan))
     found = evidence(result, [first, lost])
     assert (found.train, found.linear, found.nonlinear) == (None, None, None)
     assert found.outputs == {}
@@ -167,7 +171,7 @@ def told(resonance, *parts: tuple[str, np.ndarray, np.ndarray], **options) -> st
     for use, error, linear_error in parts:
         u, y = system(len(error))
         record = Record(u, y + error, name=use, **options)
-        responses.append(Response(record, use, record.y - linear_error, y))
+        responses.append(Response(record, use, {"linear": record.y - linear_error, "NL-LFR": y}))
     return "\n".join(map(str, advise(evidence(result, responses, bla=bla))))
 
 
@@ -211,7 +215,9 @@ def test_what_differs_between_periods_is_noise_if_it_is_steady(noisy: bool, reso
     # An error that is as large as the differences would have it.
     size = np.sqrt(np.mean(np.diff(record.y.reshape(2, 1000), axis=0) ** 2) / 2)
     y_hat = y if noisy else record.y + size * WHITE
-    found = evidence(result, [Response(record, "train", 0.0 * y, y_hat)], bla=bla)
+    found = evidence(
+        result, [Response(record, "train", {"linear": 0.0 * y, "NL-LFR": y_hat})], bla=bla
+    )
     assert (advice.at_the_noise(found) is not None) is noisy
 
 

@@ -6,7 +6,7 @@ import pytest
 from lfrtorch.dataset import Dataset
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import figures, plots
-from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.evaluation import Response
 
 DATA = Dataset("lab", [], [], [])
 Y = np.random.default_rng(0).standard_normal((200, 1))
@@ -22,7 +22,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def responses(use: str, errors: dict[str, float]) -> list[Response]:
     """Records by name with an error each."""
     return [
-        Response(Record(Y, Y, name=name), use, 0.5 * Y, Y + error) for name, error in errors.items()
+        Response(Record(Y, Y, name=name), use, {"linear": 0.5 * Y, "NL-LFR": Y + error})
+        for name, error in errors.items()
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 from importlib.metadata import version
 
@@ -13,7 +13,6 @@ import pytest
 import torch
 
 import lfrtorch
-from lfrtorch._support.roots import frequency_and_damping
 from lfrtorch._support.tables import number
 from lfrtorch.analysis.linearisation import poles_at_rest
 from lfrtorch.dataset import Dataset, Published
@@ -22,7 +21,7 @@ from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import html as html_report
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.simulations import Response, worst_residuals
+from lfrtorch.reporting.evaluation import NL_LFR, Evaluation, Response, worst_residuals
 from lfrtorch.reporting.verdict import judge
 
 pytestmark = pytest.mark.numeric
@@ -69,33 +68,34 @@ class Run:
     result: lfrtorch.FitResult
     bla: lfrtorch.LinearModel
     dataset: Dataset
-    responses: list[Response] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        used = {
-            "train": self.dataset.train,
-            "validation": self.dataset.validation,
-            "test": self.dataset.tests,
-        }
-        self.responses = [
-            Response(record, use, self.bla.simulate(record), self.result.model.simulate(record))
-            for use, records in used.items()
-            for record in records
-        ]
+        self.evaluation = Evaluation(dataset=self.dataset, linear=self.bla, model=self.result.model)
+
+    @property
+    def responses(self) -> list[Response]:
+        return self.evaluation.simulations
 
     def page(self, advice: tuple[Advice, ...] = (), search=(), **options) -> Page:
-        metrics = report.metrics(
-            self.result, self.bla, self.dataset, seeds=range(2), command="train.py a=1"
-        )
-        metrics["sizes_search"] = search
+        metrics = report.metrics(self.result, self.evaluation, seeds=range(2))
+        metrics |= {"sizes_search": search, "command": "train.py a=1"}
         images = {"convergence": b"PNG 1", "near": b"PNG 2"}
         views = {record.name: {"near": "a close-up"} for record in self.dataset.tests}
+        verdict = judge(self.result, self.responses, linear_nx=self.bla.nx)
         html = html_report.render(
-            metrics, self.result, self.bla, self.dataset, self.responses, images,
-            judge(self.result, self.responses, linear_nx=self.bla.nx), advice, views=views,
-            **options,
-        )  # fmt: skip
+            metrics, self.result, self.evaluation, images, verdict, advice, views=views, **options
+        )
         return Page(html)
+
+    def lines(self, *responses: Response) -> list[str]:
+        """What is said of all records, or of others."""
+        evaluation = Evaluation(dataset=self.dataset, linear=self.bla, model=self.result.model)
+        vars(evaluation)["simulations"] = list(responses) or self.responses
+        return html_report.comparisons(evaluation)
+
+
+def with_output(response: Response, y_hat: np.ndarray) -> Response:
+    return replace(response, simulated={**response.simulated, NL_LFR: y_hat})
 
 
 def run(outputs: tuple[Channel, ...] = (Channel("v", "V"),), starts: int = 1) -> Run:
@@ -166,7 +166,7 @@ def test_residuals_of_the_worst_record_are_shown(single: Run):
     assert "Residuals: test" in page.text
     assert f"test, v: {found.parts[0].verdict}." in page.text
     assert "Residuals" not in single.page().text
-    lost = [replace(r, y_hat=np.full_like(r.y_hat, math.inf)) for r in single.responses]
+    lost = [with_output(r, np.full_like(r.y_hat, math.inf)) for r in single.responses]
     assert worst_residuals(lost) is None
     (train,) = (r for r in single.responses if r.use == "train")
     kept = worst_residuals([train])
@@ -198,9 +198,7 @@ def test_what_users_named_is_escaped(single: Run):
 def test_a_diverging_test_and_a_resting_one_are_said(single: Run):
     rest = replace(single.dataset.tests[0], y=np.zeros((300, 1)), name="rest")
     changed = Run(single.result, single.bla, replace(single.dataset, tests=[rest]))
-    changed.responses.append(
-        replace(single.responses[-1], y_hat=np.full_like(single.responses[-1].y_hat, math.inf))
-    )
+    changed.responses.append(with_output(single.responses[-1], np.full((300, 1), math.inf)))
     page = changed.page()
     assert "test: the NL-LFR diverges" in page.text
     assert "verdict red" in page.classes
@@ -212,7 +210,7 @@ def test_without_tests_the_verdict_is_on_what_there_is(single: Run):
     validated = Run(single.result, single.bla, replace(single.dataset, tests=[]))
     page = validated.page()
     assert "There is no test record" in page.text
-    (line,) = html_report.comparisons(validated.responses)
+    (line,) = validated.lines()
     assert line.startswith("validation: ")
     assert line in page.text
     model = lfrtorch.initialise(single.bla, single.dataset.train, nz=1, nw=1, nn=3)
@@ -222,7 +220,7 @@ def test_without_tests_the_verdict_is_on_what_there_is(single: Run):
     data = replace(single.dataset, tests=[], validation=[])
     trained = Run(result, single.bla, data)
     page = trained.page()
-    (line,) = html_report.comparisons(trained.responses)  # one iteration may gain nothing
+    (line,) = trained.lines()  # one iteration may gain nothing
     assert line.startswith("train: ")
     assert line in page.text
     assert "the best on training" in page.text
@@ -243,11 +241,11 @@ def test_several_outputs_have_scores_of_their_own():
     assert "test all V" in page.text or "test all mV" in page.text
     assert page.text.count("maximum number of iterations") == 2
     assert "The best of 2 starts" in page.text
-    lines = html_report.comparisons(same.responses)
+    lines = same.lines()
     assert [line.split(":")[0] for line in lines] == ["test, a", "test, b"]
     outputs = (Channel("a", "V"), Channel("b", "m"))
     mixed = [replace(r, record=replace(r.record, outputs=outputs)) for r in same.responses]
-    lines = html_report.comparisons(mixed)
+    lines = same.lines(*mixed)
     assert [line.split(":")[0] for line in lines] == ["test, a", "test, b"]
 
 
@@ -259,8 +257,8 @@ def test_records_of_a_group_have_one_score():
     groups = {"board": ("test", "again")}
     data = replace(same.dataset, tests=tests, groups=groups, published=(other,))
     grouped = Run(same.result, same.bla, data)
-    metrics = report.evaluation(same.result.model, same.bla, data, command="")
-    errors = [report.score(same.result.model, same.bla, record) for record in tests]
+    metrics = report.scored(grouped.evaluation)
+    errors = [r.score for r in grouped.responses if r.use == "test"]
     (score,) = metrics["scores"].values()
     expected = np.mean([each.rmse_by_output for each in errors], axis=0)
     assert score["rmse_by_output"] == pytest.approx(expected)
@@ -283,10 +281,12 @@ def test_many_tests_have_one_verdict(single: Run):
     test = single.responses[-1]
     error = test.record.y - test.y_linear
     many = [
-        replace(test, record=replace(test.record, name=f"t{k}"), y_hat=test.y_linear + error * part)
+        with_output(
+            replace(test, record=replace(test.record, name=f"t{k}")), test.y_linear + error * part
+        )
         for k, part in enumerate((0.5, 0.9, 0.75, math.nan, 0.0))
     ]
-    line, lost = html_report.comparisons(many)
+    line, lost = single.lines(*many)
     assert line.startswith("4 test errors: 10.0 % (t1) to 100 % (t4) of the linear model's")
     assert lost == "t3: the NL-LFR diverges"
 
@@ -297,7 +297,7 @@ def test_many_tests_have_one_verdict(single: Run):
 def test_a_ratio_of_one_plus_rounding_is_no_gain(single: Run, part: float, said: str):
     test = single.responses[-1]
     error = test.record.y - test.y_linear
-    (line,) = html_report.comparisons([replace(test, y_hat=test.record.y - part * error)])
+    (line,) = single.lines(with_output(test, test.record.y - part * error))
     assert f"error {said} of the linear model's" in line
 
 
@@ -320,10 +320,3 @@ def test_poles_at_rest_are_those_of_a_step_away_from_it(single: Run):
     F = torch.func.jacrev(lambda x: cell(u[0, 0], x)[1])(rest)
     expected = np.sort_complex(np.linalg.eigvals(F.detach().numpy()))
     assert np.sort_complex(poles_at_rest(model)) == pytest.approx(expected, abs=1e-9)
-
-
-def test_roots_of_a_known_oscillator():
-    s = 2 * np.pi * 5.0 * np.exp(1j * np.arccos(-0.1))  # 5 Hz, damping 0.1
-    (root,) = frequency_and_damping(np.exp(np.array([s, s.conj()]) / 100.0), 100.0)
-    assert root["frequency"] == pytest.approx(5.0)
-    assert root["damping"] == pytest.approx(0.1)

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import lfrtorch
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import scores as report
+from lfrtorch.reporting.evaluation import Evaluation, Response
 
 pytestmark = pytest.mark.numeric
 
@@ -49,13 +51,19 @@ def result() -> tuple[lfrtorch.FitResult, lfrtorch.LinearModel, Dataset]:
 SEEDS = [7, 1007, 2007]
 
 
+def evaluated(
+    fitted: lfrtorch.FitResult, bla: lfrtorch.LinearModel, data: Dataset, **own: Any
+) -> Evaluation:
+    return Evaluation(dataset=data, linear=bla, model=fitted.model, **own)
+
+
 def test_starts_are_ranked_in_files_and_in_a_table(result):
     _, bla, data = result
     models = [lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=3, seed=seed) for seed in SEEDS]
     fitted = lfrtorch.fit(
         models, data.train, data.validation, trainer=lfrtorch.LevenbergMarquardt(max_iter=4)
     )
-    metrics = report.metrics(fitted, bla, data, seeds=SEEDS)
+    metrics = report.metrics(fitted, evaluated(fitted, bla, data), seeds=SEEDS)
     assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
     assert metrics["starts"] == 3
     assert sorted(start["seed"] for start in metrics["ranking"]) == SEEDS
@@ -74,7 +82,7 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
     fitted, bla, data = result
     data = replace(data, linear={"test": ("train",)})
     own = lfrtorch.estimate_bla(data.train, nx=1)
-    metrics = report.metrics(fitted, bla, data, own={"test": own}, seeds=[0])
+    metrics = report.metrics(fitted, evaluated(fitted, bla, data, own={"test": own}), seeds=[0])
     expected = lfrtorch.rmse(data.tests[0], own.simulate(data.tests[0]))
     assert metrics["scores"]["test"]["lti_rmse"] == expected
     assert metrics["linear"] == {"test": ["train"]}
@@ -84,7 +92,7 @@ def test_a_test_may_have_a_linear_model_of_its_own(result):
 
 def test_metrics_are_what_the_model_scores(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, bla, data, seeds=[0], command="python train.py")
+    metrics = report.metrics(fitted, evaluated(fitted, bla, data), seeds=[0])
     test, validation = data.tests[0], data.validation[0]
     y_hat = fitted.model.simulate(test)
     assert metrics["scores"]["test"] == {
@@ -111,18 +119,21 @@ def test_metrics_are_what_the_model_scores(result):
 
 
 def test_pooled_validation_weighs_samples():
-    scores = [
-        report.Score(3.0, 0, 0, "", "", 110, 10, "validation", 100),
-        report.Score(4.0, 0, 0, "", "", 300, 0, "validation", 300),
+    records = [Record(np.zeros(n), np.zeros(n), skip=n - m) for n, m in ((110, 100), (300, 300))]
+    data = Dataset("two", [], records, [])
+    evaluation = Evaluation(dataset=data)
+    vars(evaluation)["simulations"] = [
+        Response(record, "validation", {"NL-LFR": np.full_like(record.y, error)})
+        for record, error in zip(records, (3.0, 4.0), strict=True)
     ]
     expected = math.sqrt((100 * 9 + 300 * 16) / 400)
-    assert report._pooled([s.rmse for s in scores], scores) == pytest.approx(expected)
-    assert report._pooled([], []) is None
+    assert report._pooled(evaluation, "rmse") == pytest.approx(expected)
+    assert report._pooled(evaluation, "lti_rmse") is None
 
 
 def test_table_shows_published_results_of_these_sizes_only(result):
     fitted, bla, data = result
-    metrics = report.metrics(fitted, bla, data, seeds=[0])
+    metrics = report.metrics(fitted, evaluated(fitted, bla, data), seeds=[0])
     lines = report.table(metrics, data.published).splitlines()
     assert lines[0] == "Simulation RMSE (mV), nx 2, nz 1, nw 1, 3 neurons"
     head, row = lines[2].split(), lines[4].split()
@@ -145,7 +156,7 @@ def test_the_table_says_which_samples_are_scored():
 
 
 def test_what_is_not_finite_becomes_null():
-    assert report._finite({"a": {"b": math.nan}, "c": math.inf, "d": 1.5, "e": "x"}) == {
+    assert report.finite({"a": {"b": math.nan}, "c": math.inf, "d": 1.5, "e": "x"}) == {
         "a": {"b": None},
         "c": None,
         "d": 1.5,

@@ -12,7 +12,7 @@ from lfrtorch._support.reasons import Reason
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.records import Record
 from lfrtorch.reporting import verdict
-from lfrtorch.reporting.simulations import Response
+from lfrtorch.reporting.evaluation import Response
 from lfrtorch.reporting.verdict import Kind, Verdict
 
 judge = partial(verdict.judge, linear_nx=2)
@@ -33,7 +33,14 @@ def response(
     y, error, own = rng.standard_normal((3, 1000, 1))
     part = np.reshape(part, (-1, 1))
     y_hat = y + linear * (part * error + noise * own)
-    return Response(Record(y, y, name=name or use), use, y + linear * error, y_hat)
+    simulated = {"linear": y + linear * error, "NL-LFR": y_hat}
+    return Response(Record(y, y, name=name or use), use, simulated)
+
+
+def cut(whole: Response, samples: int) -> Response:
+    """The beginning of a record with its simulations."""
+    simulated = {name: y[:samples] for name, y in whole.simulated.items()}
+    return Response(whole.record[:samples], whole.use, simulated)
 
 
 TRAIN = response("train", 0.2)
@@ -78,7 +85,7 @@ def test_records_that_were_not_fitted_make_the_verdict(kind, use, colour, said, 
 def test_a_difference_is_judged_by_its_standard_error():
     # Errors that share nothing: 0.93 of the linear model's, by chance or by many samples.
     few, many = (response("test", 0.0, noise=0.93, name=name) for name in ("few", "many"))
-    few = Response(few.record[:60], "test", few.y_linear[:60], few.y_hat[:60])
+    few = cut(few, 60)
     more = [response("test", 0.0, noise=0.93, name="n" * k) for k in range(1, 30)]
     assert judge(result(), [TRAIN, few]).kind == Kind.LINEAR
     assert judge(result(), [TRAIN, many, *more]).kind == Kind.BETTER
@@ -91,7 +98,7 @@ def test_better_in_every_block_is_better_where_one_resonance_has_the_error():
     y = rng.normal(size=(1000, 1))
     own = (0.5 + 0.2 * rng.random((1000, 1))) * linear
     record = Record(np.zeros((1000, 1)), y)
-    found = judge(result(), [Response(record, "test", y - linear, y - own)])
+    found = judge(result(), [Response(record, "test", {"linear": y - linear, "NL-LFR": y - own})])
     assert found.kind == Kind.BETTER, found.text
 
 
@@ -103,8 +110,8 @@ def test_the_standard_error_is_how_far_the_ratio_varies(part: float):
     for _ in range(200):
         shared, own = rng.standard_normal((2, 1000, 1))
         y = rng.standard_normal((1000, 1))
-        parts = y + shared, y + part * (0.8 * shared + 0.6 * own)
-        found.append(judge(result(), [Response(Record(still, y), "test", *parts)]).evidence)
+        parts = {"linear": y + shared, "NL-LFR": y + part * (0.8 * shared + 0.6 * own)}
+        found.append(judge(result(), [Response(Record(still, y), "test", parts)]).evidence)
     ratios, errors = (np.array([each[key] for each in found]) for key in ("ratio", "ratio_std"))
     # 200 draws tell a standard deviation to 5 %, and ten blocks have a bias of 3 %.
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(ratios.std(), rel=0.2)
@@ -171,15 +178,14 @@ def test_what_is_clear_one_sample_ahead_stays():
 
 def test_the_training_error_alone_is_no_verdict():
     assert judge(result(), [response("train", 1.0)]).use == "linear model"
-    short = response("test", 3.0)
-    short = Response(short.record[:5], "test", short.y_linear[:5], short.y_hat[:5])
+    short = cut(response("test", 3.0), 5)
     assert judge(result(), [TRAIN, short]).kind == Kind.UNJUDGED
     assert judge(result(), [short]).kind == Kind.UNJUDGED
 
 
 def test_outputs_that_rest_are_no_error():
     rest = np.zeros((1000, 1))
-    still = Response(Record(rest, rest, name="rest"), "test", rest, rest)
+    still = Response(Record(rest, rest, name="rest"), "test", {"linear": rest, "NL-LFR": rest})
     assert judge(result(), [TRAIN, still]).kind == Kind.LINEAR
 
 
@@ -194,3 +200,24 @@ def test_a_verdict_is_one_line(part: float, linear: float, use: str):
         assert len(found.text) <= 160
         assert found.text.endswith(".")
         assert str(found) == found.text
+
+
+def test_a_linear_model_that_explains_nothing_is_called_so():
+    def entry(use: str, rmse: float, std: float, output: str = "x") -> dict[str, Any]:
+        return {"use": use, "scored": 50, "outputs": [{"output": output, "rmse": rmse, "std": std}]}
+
+    train, good = entry("train", 0.2, 2.0), entry("test", 1.0, 4.0)
+    assert verdict.judge_linear([train, good])["text"] == (
+        "On test the linear model's error is 25.0 % of the standard deviation of the output."
+    )
+    found = verdict.judge_linear([train, entry("validation", 0.1, 2.0), entry("test", 5.0, 2.0)])
+    assert (found["usable"], found["nrmse"]) == (False, 2.5)
+    assert found["text"].startswith("Not usable: on test ")
+    assert found["text"].endswith(
+        "250 % of the standard deviation of the output (in training 10.0 %)."
+    )
+    assert verdict.judge_linear([train])["on"] == "train"
+    assert not verdict.judge_linear([good, entry("test", np.nan, 1.0, "y")])["usable"]
+    still = entry("test", 0.1, 0.0)  # in which nothing happens
+    assert verdict.judge_linear([train, still])["on"] == "train"
+    assert verdict.judge_linear([still])["usable"] is None

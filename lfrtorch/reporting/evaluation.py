@@ -1,0 +1,275 @@
+"""One evaluation of models: every record is simulated once, and all of a report reads what came."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lfrtorch._support.types import Array
+from lfrtorch.analysis.residual_analysis import SHORTEST, Residuals, of_simulation
+from lfrtorch.analysis.start_uncertainty import start_error
+from lfrtorch.dataset import Dataset
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.metrics import nrmse, rmse, rmse_by_output
+from lfrtorch.model import Model
+from lfrtorch.records import Channel, Record, without_coordinates
+from lfrtorch.score_window import fitted
+
+LINEAR, NL_LFR = "linear", "NL-LFR"
+"""Names of the two models."""
+
+HORIZONS = 1, 10, 100
+"""Samples ahead that predictions are scored at."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Simulation errors on one record, or a group of them, after the skip window.
+
+    Args:
+        use: ``"train"``, ``"validation"``, ``"selection"`` or ``"test"``.
+        source: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
+        channels: of the outputs.
+        samples, skip, scored: length of the record, how many samples at its beginning do not count,
+            and how many do.
+        rmse, lti_rmse: of the NL-LFR and of the linear model; None without one of them.
+        std: standard deviation of the measured output over the scored samples.
+        nrmse: rmse over std.
+        rmse_by_output, lti_rmse_by_output, std_by_output: the same of each output.
+        start_error: what the uncertainty of an estimated start state adds to ``rmse``.
+        records: how many the score is of.
+    """
+
+    use: str
+    source: str
+    channels: tuple[Channel, ...]
+    samples: int
+    skip: int
+    scored: int
+    rmse: float | None
+    lti_rmse: float | None
+    std: float
+    nrmse: float | None
+    rmse_by_output: tuple[float, ...]
+    lti_rmse_by_output: tuple[float, ...]
+    std_by_output: tuple[float, ...]
+    start_error: float | None
+    records: int = 1
+
+    def entry(self) -> dict[str, Any]:
+        """For ``metrics.json``: errors of each output and the number of records if several."""
+        names = ("rmse", "lti_rmse", "nrmse")
+        found: dict[str, Any] = {name: getattr(self, name) for name in names}
+        found["unit"] = ", ".join(dict.fromkeys(channel.unit for channel in self.channels))
+        for name in ("source", "samples", "skip", "use", "scored"):
+            found[name] = getattr(self, name)
+        if len(self.channels) > 1:
+            found["outputs"] = [channel.name for channel in self.channels]
+            found["rmse_by_output"] = list(self.rmse_by_output)
+            found["lti_rmse_by_output"] = list(self.lti_rmse_by_output)
+        if self.records > 1:
+            found["records"] = self.records
+        return found | {"start_error": self.start_error}
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What models make of a record, in physical units.
+
+    Args:
+        record: the measurement.
+        use: ``"train"``, ``"validation"``, ``"selection"`` or ``"test"``.
+        simulated: outputs (T, ny) by the names ``"linear"`` and ``"NL-LFR"``, of one model or both.
+        start_error: see :class:`Score`.
+    """
+
+    record: Record
+    use: str
+    simulated: Mapping[str, Array]
+    start_error: float | None = None
+
+    @property
+    def y_linear(self) -> Array:
+        """Output of the linear model (T, ny)."""
+        return self.simulated[LINEAR]
+
+    @property
+    def y_hat(self) -> Array:
+        """Output of the NL-LFR (T, ny)."""
+        return self.simulated[NL_LFR]
+
+    @property
+    def scored(self) -> Array:
+        """Measured output after the skip window (scored samples, ny)."""
+        return self.record.y[self.record.skip :]
+
+    @property
+    def error(self) -> Array:
+        """Error of the NL-LFR after the skip window (scored samples, ny), 0 if y is not valid."""
+        return self.record.errors(self.y_hat)
+
+    @property
+    def linear_error(self) -> Array:
+        """Error of the linear model after the skip window (scored samples, ny), likewise."""
+        return self.record.errors(self.y_linear)
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the NL-LFR's output has samples that are not finite."""
+        return not bool(np.isfinite(self.y_hat).all())
+
+    @cached_property
+    def score(self) -> Score:
+        """Errors of both models; the record says which samples are scored."""
+        record, outputs = self.record, self.simulated.items()
+        errors = {name: rmse(record, y) for name, y in outputs}
+        by_output = {name: tuple(rmse_by_output(record, y).tolist()) for name, y in outputs}
+        counted = [y[there] for y, there in zip(record.y.T, record.scored.T, strict=True)]
+        std = [float(np.std(y - y[0])) if len(y) else math.nan for y in counted]
+        known = np.square([deviation for deviation in std if not math.isnan(deviation)])
+        return Score(
+            use=self.use,
+            source=record.source,
+            channels=record.outputs,
+            samples=record.samples,
+            skip=record.skip,
+            scored=record.scored_samples,
+            rmse=errors.get(NL_LFR),
+            lti_rmse=errors.get(LINEAR),
+            std=float(np.sqrt(np.mean(known))) if len(known) else math.nan,
+            nrmse=nrmse(record, self.y_hat) if NL_LFR in errors else None,
+            rmse_by_output=by_output.get(NL_LFR, ()),
+            lti_rmse_by_output=by_output.get(LINEAR, ()),
+            std_by_output=tuple(std),
+            start_error=self.start_error,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Evaluation:
+    """An NL-LFR and linear models on all records of a dataset, each simulated once.
+
+    Args:
+        dataset: the records.
+        linear: best linear approximation of all training records, if there is one.
+        model: the NL-LFR, if there is one.
+        refitted: that was fitted again to all estimation records, which the tests are simulated by.
+        own: linear models of single tests, by name (see ``Dataset.linear``).
+    """
+
+    dataset: Dataset
+    linear: LinearModel | None = None
+    model: Model | None = None
+    refitted: Model | None = None
+    own: Mapping[str, LinearModel] = field(default_factory=dict)
+
+    @cached_property
+    def simulations(self) -> list[Response]:
+        """All records with both simulations.
+
+        Estimated starts of training records are fitted to all samples, as in the fit.
+        """
+        found = []
+        for use, record in self._records:
+            linear, model = self._models(use, record)
+            driven, added = fitted(record) if use == "train" else record, None
+            simulated = {} if linear is None else {LINEAR: linear.simulate(driven)}
+            if model is not None:
+                simulated[NL_LFR] = y_hat = model.simulate(driven)
+                added = None if use == "train" else start_error(model, record, y_hat)
+            found.append(Response(record, use, simulated, added))
+        return found
+
+    @cached_property
+    def predictions(self) -> dict[int, list[Response]]:
+        """All records with predictions so many samples ahead, of models with K; else nothing."""
+        if self.model is None or self.model.K is None:
+            return {}
+        found: dict[int, list[Response]] = {horizon: [] for horizon in HORIZONS}
+        for use, record in self._records:
+            linear, model = self._models(use, record)
+            driven = without_coordinates(fitted(record) if use == "train" else record)
+            named = {LINEAR: None if linear is None else linear.to_model(), NL_LFR: model}
+            for horizon, responses in found.items():
+                predicted = {
+                    name: each.predict(driven, horizon=horizon)
+                    for name, each in named.items()
+                    if each is not None and each.K is not None
+                }
+                responses.append(Response(record, use, predicted))
+        return found
+
+    @cached_property
+    def scores(self) -> dict[tuple[str, str], Score]:
+        """Simulation errors by the use and the name of a record, or of a group of records."""
+        found: dict[tuple[str, str], list[Score]] = {}
+        for response in self.simulations:
+            name = self.dataset.score_of(response.record)
+            found.setdefault((response.use, name), []).append(response.score)
+        groups = self.dataset.groups
+        return {key: _together(of) if key[1] in groups else of[-1] for key, of in found.items()}
+
+    @property
+    def _records(self) -> list[tuple[str, Record]]:
+        uses = {
+            "train": self.dataset.train,
+            "validation": self.dataset.validation,
+            "selection": self.dataset.selection,
+            "test": self.dataset.tests,
+        }
+        return [(use, record) for use, records in uses.items() for record in records]
+
+    def _models(self, use: str, record: Record) -> tuple[LinearModel | None, Model | None]:
+        """The linear model and the NL-LFR that a record is simulated by."""
+        if use != "test":
+            return self.linear, self.model
+        own = self.own.get(self.dataset.score_of(record), self.linear)
+        return own, self.refitted or self.model
+
+
+def ranked(responses: Sequence[Response]) -> list[Response]:
+    """The tests, without tests validation, else training; the largest error of the NL-LFR first."""
+    uses = [use for use in ("test", "validation", "train") if any(r.use == use for r in responses)]
+
+    def relative(response: Response) -> float:
+        error = response.score.nrmse
+        return error if error is not None and math.isfinite(error) else math.inf
+
+    chosen = (response for response in responses if response.use == uses[0])
+    return sorted(chosen, key=relative, reverse=True)
+
+
+def worst_residuals(responses: Sequence[Response]) -> Residuals | None:
+    """Residuals of the record with the largest error, of those that do not diverge."""
+    for response in ranked(responses):
+        if not response.diverged and len(response.scored) >= SHORTEST:
+            return Residuals(of_simulation(response.record, response.y_hat))
+    return None
+
+
+def _together(scores: Sequence[Score]) -> Score:
+    """The score of a group of records: means of the RMSE of each output of each record."""
+
+    def mean(values: Sequence[Any]) -> float | None:
+        return None if None in values else float(np.mean(values))
+
+    def each(name: str) -> tuple[float, ...]:
+        return tuple(np.mean([getattr(s, f"{name}_by_output") for s in scores], axis=0).tolist())
+
+    errors = {name: each(name) for name in ("rmse", "lti_rmse", "std")}
+    return replace(
+        scores[0],
+        rmse=mean(errors["rmse"]) if errors["rmse"] else None,
+        lti_rmse=mean(errors["lti_rmse"]) if errors["lti_rmse"] else None,
+        std=float(np.mean(errors["std"])),
+        nrmse=mean([s.nrmse for s in scores]),
+        start_error=mean([s.start_error for s in scores]),
+        records=len(scores),
+        **{f"{name}_by_output": values for name, values in errors.items()},
+        **{name: sum(getattr(s, name) for s in scores) for name in ("samples", "skip", "scored")},
+    )

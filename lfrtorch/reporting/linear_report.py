@@ -1,0 +1,176 @@
+"""A linear model alone in numbers, as a table and in figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lfrtorch._support import tables
+from lfrtorch._support.roots import frequency_and_damping, remark
+from lfrtorch._support.tables import in_percent
+from lfrtorch.linear.frf import FRF
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.linear.order_scan import OrderScan
+from lfrtorch.reporting import figures as run_figures
+from lfrtorch.reporting import linear_plots
+from lfrtorch.reporting.evaluation import Evaluation, Response
+from lfrtorch.reporting.scores import finite, of_samples
+from lfrtorch.reporting.verdict import judge_linear
+
+
+def figures(evaluation: Evaluation, frf: FRF | None, scan: OrderScan | None) -> dict[str, Figure]:
+    """All figures of a run by file name."""
+    model, drawn = _model(evaluation), {}
+    use = "test" if evaluation.dataset.tests else "validation"
+    for response in (one for one in evaluation.simulations if one.use == use):
+        drawn |= run_figures.of_record(response.record, response.simulated)[0]
+    drawn["frequency_response"] = linear_plots.frequency_response(model, frf)
+    drawn["poles_and_zeros"] = linear_plots.poles_and_zeros(model)
+    if scan is not None:
+        drawn["order_scan"] = linear_plots.order_scan(scan)
+    if frf is not None and frf.distortion is not None:
+        drawn["distortion"] = linear_plots.distortion(frf)
+    return drawn
+
+
+def numbers(evaluation: Evaluation, frf: FRF | None, scan: OrderScan | None) -> dict[str, Any]:
+    """What linear.json holds; None if a number is not finite or not known."""
+    model = _model(evaluation)
+    fit = model.fit
+    assert fit is not None
+    scores = [_score(one) for one in evaluation.simulations if one.use != "selection"]
+    found: dict[str, Any] = {
+        "bench": evaluation.dataset.name,
+        "nx": model.nx,
+        "fit": {
+            "criterion": fit.criterion,
+            "rmse": fit.rmse,
+            "iterations": fit.iterations,
+            "reason": fit.reason,
+            "seconds": fit.seconds,
+        },
+        "scores": scores,
+        "verdict": judge_linear(scores),
+        "poles": frequency_and_damping(model.poles, model.fs),
+        "zeros": {
+            name: frequency_and_damping(z, model.fs)
+            for name, z in linear_plots.zeros(model).items()
+        },
+        "offsets": [
+            {"channel": channel.name, "offset": float(offset), "unit": channel.unit}
+            for channel, offset in zip(
+                (*model.inputs, *model.outputs), (*model.u_offset, *model.y_offset), strict=True
+            )
+        ],
+        "response_std": [] if model.covariance is None else _uncertainty(model, frf),
+        "frf": None,
+        "scan": None,
+    }
+    if frf is not None:
+        names = "method", "experiments", "periods"
+        found["frf"] = {"lines": len(frf.frequencies)} | {n: getattr(frf, n) for n in names}
+    if scan is not None:
+        found["scan"] = {
+            "orders": scan.orders,
+            "fitted": [None if m.fit is None else m.fit.rmse for m in scan.models],
+            "scores": list(scan.scores),
+            "validated": scan.validated,
+            "chosen": scan.chosen,
+        }
+    return finite(found)
+
+
+def _model(evaluation: Evaluation) -> LinearModel:
+    assert evaluation.linear is not None
+    return evaluation.linear
+
+
+def _score(response: Response) -> dict[str, Any]:
+    """Simulation errors of each output after the skip window."""
+    score = response.score
+    errors = zip(score.channels, score.lti_rmse_by_output, score.std_by_output, strict=True)
+    return {
+        "use": response.use,
+        "record": response.record.name,
+        **{name: getattr(score, name) for name in ("source", "samples", "skip", "scored")},
+        "outputs": [
+            {
+                "output": channel.name,
+                "unit": channel.unit,
+                "rmse": rmse,
+                "std": std,
+                "nrmse": rmse / std if std > 0 else None,
+            }
+            for channel, rmse, std in errors
+        ],
+    }
+
+
+def _uncertainty(model: LinearModel, frf: FRF | None) -> list[dict[str, Any]]:
+    """The largest standard deviation of each channel's response, in the band of the data."""
+    f = linear_plots.frequencies(model, frf)
+    std, size = model.frf_std(f), np.abs(model.frf(f))
+    listed = []
+    for i, output in enumerate(model.outputs):
+        for j, source in enumerate(model.inputs):
+            k = int(np.argmax(std[:, i, j]))
+            largest, there = float(std[k, i, j]), float(size[k, i, j])
+            listed.append(
+                {
+                    "channel": f"{output.name}/{source.name}",
+                    "std": largest,
+                    "frequency": float(f[k]),
+                    "relative": largest / there if there > 0 else None,
+                }
+            )
+    return listed
+
+
+def table(found: Mapping[str, Any]) -> str:
+    """The numbers of a run for people."""
+    fit = found["fit"]
+    parts = [f"Linear model of order {found['nx']}, {fit['criterion']} error"]
+    sources = any(s["source"] != "file" for s in found["scores"])
+    about = ["record", "use", *["source"] * sources]
+    errors: dict[str, list[float | None]] = {}
+    for o in (o for s in found["scores"] for o in s["outputs"]):
+        errors.setdefault(o["unit"], []).append(o["rmse"])
+    prefixed = {unit: tables.engineering(own, unit) for unit, own in errors.items()}
+    scores = [
+        [
+            *(s[key] for key in about),
+            of_samples(s),
+            o["output"],
+            tables.times(prefixed[o["unit"]][0], o["rmse"]),
+            prefixed[o["unit"]][1],
+            in_percent(o["nrmse"]),
+        ]
+        for s in found["scores"]
+        for o in s["outputs"]
+    ]
+    head = [*about, "scored", "output", "RMSE", "unit", "% of std"]
+    parts.append(tables.table(head, scores, digits=4))
+    listed = [["pole", p] for p in found["poles"]]
+    listed += [[f"zero {n}".strip(), z] for n, zeros in found["zeros"].items() for z in zeros]
+    rows = [
+        [what, r["frequency"], r["damping"], tables.radius(r["radius"]),
+         remark(r, pole=what == "pole")]
+        for what, r in listed
+    ]  # fmt: skip
+    parts.append(tables.table(["", "frequency (Hz)", "damping", "radius", ""], rows, digits=4))
+    rows = []
+    for o in found["offsets"]:
+        factor, unit = tables.engineering([o["offset"]], o["unit"])
+        rows.append([o["channel"], factor * o["offset"], unit])
+    parts.append(tables.table(["operating point", "offset", "unit"], rows, digits=4))
+    if found["response_std"]:
+        rows = [
+            [r["channel"], r["std"], in_percent(r["relative"]), r["frequency"]]
+            for r in found["response_std"]
+        ]
+        head = ["response", "largest std", "% of response there", "at (Hz)"]
+        parts.append(tables.table(head, rows, digits=4))
+    return "\n\n".join(parts)
