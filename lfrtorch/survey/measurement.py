@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import Cell, engineering, number, table
 from lfrtorch._support.types import Array
 from lfrtorch.periods import find_period
 from lfrtorch.records import Channel
@@ -35,6 +36,49 @@ class Survey:
     def signals(self) -> tuple[SignalSurvey, ...]:
         """Inputs, then outputs."""
         return self.inputs + self.outputs
+
+    def table(self) -> tuple[list[str], list[list[Cell]]]:
+        """Head and rows, a row a signal."""
+        unit = "1/sample" if self.fs is None else "Hz"
+        head = ["signal", "use", "samples", "missing", "mean", "rms", "min", "max", "% at min"]
+        head += ["% at max", "run", f"from {unit}", f"to {unit}", "period", "periods", "noise"]
+        rows = []
+        for one in self.signals:
+            use = "" if not self.inputs else "input" if one in self.inputs else "output"
+            ends = one.minimum, one.maximum
+            factor, unit = engineering([one.rms], one.channel.unit)
+            noise = None if one.noise is None else number(factor * one.noise, 4)
+            rows.append(
+                [
+                    str(one.channel._replace(unit=unit)),
+                    use,
+                    one.samples,
+                    one.missing,
+                    factor * one.mean,
+                    factor * one.rms,
+                    *(factor * end.value for end in ends),
+                    *(100 * end.samples / one.samples for end in ends),
+                    max(end.run for end in ends),
+                    *(one.band or (None, None)),
+                    one.period,
+                    None if one.period is None else one.samples / one.period,
+                    f"~ {noise}" if one.method == "spectrum" else noise,
+                ]
+            )
+        return head, rows
+
+    def __str__(self) -> str:
+        legend = [
+            "rms: about the mean; run: longest at an extreme; from, to: the band of 99 % of the "
+            "power."
+        ]
+        methods = {one.method for one in self.signals}
+        if "periods" in methods:
+            legend.append("Noise: the scatter from period to period.")
+        if "spectrum" in methods:
+            follows = " that follows no input" if self.inputs else ""
+            legend.append(f"Noise ~: a guess from the quietest part of the spectrum{follows}.")
+        return f"{table(*self.table(), digits=4)}\n{' '.join(legend)}"
 
 
 def survey_measurement(

@@ -16,6 +16,9 @@ from scipy.signal import lfilter
 
 from lfrtorch._support.tables import number
 from lfrtorch.cli import config, preview
+from lfrtorch.files import glance
+from lfrtorch.files.glance import Glance
+from lfrtorch.files.time_stamps import Sampling
 from lfrtorch.records import Channel
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import survey_measurement
@@ -92,7 +95,7 @@ def test_one_command_gives_table_notes_and_figure(file: Path, run):
 def test_numbers_of_small_signals_have_a_prefix(signals):
     small = 1e-5 * signals["level"]
     found = survey_measurement(signals["force"], small, FS, outputs=(Channel("level", "m"),))
-    row = preview.row(found.outputs[0], found)
+    row = found.table()[1][1]
     assert row[0] == "level (µm)"
     assert row[7] == pytest.approx(3.0)
     assert str(row[-1]).startswith(f"~ {number(1e6 * (found.outputs[0].noise or 0), 4)}")
@@ -101,16 +104,14 @@ def test_numbers_of_small_signals_have_a_prefix(signals):
 @pytest.mark.numeric
 def test_numbers_of_the_table(signals):
     found = survey_measurement(signals["force"], signals["level"], FS)
-    row = dict(
-        zip(["mean", "rms", "min", "max"], preview.row(found.outputs[0], found)[4:8], strict=True)
-    )
+    row = dict(zip(["mean", "rms", "min", "max"], found.table()[1][1][4:8], strict=True))
     y = signals["level"]
     assert (row.pop("min"), row.pop("max")) == (np.nanmin(y), 0.3)
     expected = {"mean": np.nanmean(y), "rms": np.nanstd(y)}
     assert row == pytest.approx(expected, rel=1e-9, abs=1e-12)  # sums in another order
     top = np.nansum(y == 0.3)
-    assert preview.row(found.outputs[0], found)[9] == pytest.approx(100 * top / T)
-    assert "~" in preview.numbers(found)
+    assert found.table()[1][1][9] == pytest.approx(100 * top / T)
+    assert "~" in str(found)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -168,8 +169,9 @@ def test_sample_numbers_and_uneven_times(tmp_path: Path, signals, run, monkeypat
 
 
 def test_gaps_in_time_are_drawn():
-    gaps = preview.Gaps(np.array([2, 3]), np.array([1, 2]))
-    drawn = preview.spread(np.arange(4.0)[:, None], gaps)[:, 0]
+    grid = Sampling(1.0, 0.0, np.array([2, 3]), np.array([1, 2]))
+    u, y = np.empty((4, 0)), np.arange(4.0)[:, None]
+    drawn = Glance([], [Channel("y")], u, y, 1.0, [], [], grid).spread()[:, 0]
     assert np.array_equal(np.flatnonzero(np.isnan(drawn)), [2, 4, 5])
 
 
@@ -246,11 +248,11 @@ def test_a_column_of_text_is_left_out(tmp_path: Path, run, monkeypatch):
 
 @pytest.mark.usefixtures("undrawn")
 def test_only_the_beginning_of_a_long_file_is_read(file: Path, run, monkeypatch):
-    monkeypatch.setattr(preview, "LARGEST", 3 * 700)
+    monkeypatch.setattr(glance, "LARGEST", 3 * 700)
     out = run(file, "data.inputs=[force]", "data.outputs=[level]")
     assert "the first 700 samples are read, and no more" in out
     assert f"{file}: 700 samples" in out
-    monkeypatch.setattr(preview, "LARGEST", 3 * T)
+    monkeypatch.setattr(glance, "LARGEST", 3 * T)
     assert "no more" not in run(file, "data.inputs=[force]", "data.outputs=[level]")
 
 
@@ -274,7 +276,7 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
         assert message in refused(capsys, file, word)
     assert "no file is named" in refused(capsys, "data.fs=3")
     for value in ("5", "0.5", "true", "[1]", "{a: 1}"):
-        assert "give a file, a pattern" in refused(capsys, f"data.path={value}")
+        assert "give the path of a file, a pattern" in refused(capsys, f"data.path={value}")
     loud = written(file.parent / "loud.csv", {"y": 1e200 * signals["force"]})
     assert "'y' goes up to 3." in refused(capsys, loud)  # was a traceback of the figure
 
