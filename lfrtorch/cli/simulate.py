@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import hydra
 import numpy as np
@@ -17,35 +16,27 @@ from omegaconf import DictConfig, ListConfig
 
 import lfrtorch
 from lfrtorch._support import checkpoint, tables
-from lfrtorch._support.atomic import refuse_existing, whole_file
+from lfrtorch._support.atomic import refuse_existing
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded, real
-from lfrtorch._support.types import Array
 from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import take_words
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import MAIN
 from lfrtorch.cli.words import translated
+from lfrtorch.file_simulation import (
+    Simulated,
+    Start,
+    estimated_start,
+    notes_on,
+    simulate_file,
+    start_at_rest,
+)
 from lfrtorch.files.load import listed_files
-from lfrtorch.files.stream import Block, FileStream
-from lfrtorch.files.writer import FORMATS, table_writer
-from lfrtorch.metrics import BlockScores
-from lfrtorch.periods import find_period, find_transient
-from lfrtorch.reporting.scores import finite, of_samples
-from lfrtorch.score_window import PART, WINDOW, score_window, warm_up
-
-BEGINNING = 100
-"""Samples in which the transient of a wrong start state would be seen."""
-
-TRANSIENT = 3.0
-"""Error there over that of the rest above which it is."""
-
-LOOKED_AT = 1_000_000
-"""Most samples of a file whose input is looked at for a period."""
-
-FAR = 6.0
-"""Standard deviations of the training input that Gaussian noise and most signals stay within."""
+from lfrtorch.files.stream import FileStream
+from lfrtorch.files.writer import FORMATS
+from lfrtorch.reporting.scores import of_samples
 
 
 def simulate(cfg: DictConfig) -> None:
@@ -69,108 +60,19 @@ def simulate(cfg: DictConfig) -> None:
             if not stream.y:
                 missing = ", ".join(stream.missing)
                 print(f"note: '{path}' has no column {missing}, so nothing is scored")
-            x0, skip = start_state(cfg, model, stream)
-            result = written(model, stream, x0, out, skip, cfg.skip or 0)
+            start = start_state(cfg, model, stream)
+            if start.note:
+                print(start.note)
+            result = simulate_file(model, stream, out, start, asked=cfg.skip or 0)
         print(
             f"{out}: {result.samples} samples, {tables.quantity(time.perf_counter() - clock, 's')}"
         )
-        for note in noted(result, model, cfg):
+        for note in notes_on(result, model, estimated=cfg.start == "estimated"):
             print(f"note: {note}")
         rows += scored(path, model, result) if stream.y else []
     if rows:
         head = ["file", "output", "unit", "scored", "RMSE", "NRMSE (%)"]
         print(f"\n{tables.table(head, rows)}")
-
-
-class Written(NamedTuple):
-    """What is known of a file that was simulated.
-
-    Args:
-        samples, skip: written, and how many at the beginning are not scored.
-        scores: of measured outputs after the skipped samples.
-        settled: the same without the first ``BEGINNING`` of those, either.
-        peaks: largest inputs about the operating point, in standard deviations of the model's
-            training inputs, (nu,).
-    """
-
-    samples: int
-    skip: int
-    scores: BlockScores
-    settled: BlockScores
-    peaks: Array
-
-
-def written(
-    model: lfrtorch.Model,
-    stream: FileStream,
-    x0: Array | None,
-    out: Path,
-    skip: int,
-    asked: int,
-) -> Written:
-    """Simulate a file block by block into another.
-
-    Args:
-        model, stream, x0, out: what is simulated, from where and to where.
-        skip: samples that are not scored.
-        asked: that the user wants to be skipped.
-    """
-    names = [channel.name for channel in model.outputs]
-    scores, settled = (BlockScores(len(names), skip + more) for more in (0, BEGINNING))
-    first, peaks = 0, np.zeros(len(model.inputs))
-    read: list[Block] = []
-
-    def inputs() -> Iterator[Array]:
-        for block in stream.blocks():
-            read[:] = [block]
-            yield block.u
-
-    with whole_file(out) as fresh, table_writer(fresh) as write:
-        for y_hat in lfrtorch.simulate_blocks(model, inputs(), x0=x0):
-            (block,) = read
-            numbers = np.arange(first, first + len(y_hat))
-            found = {stream.clock.name: block.times[:, 0] if stream.times else numbers}
-            for i, name in enumerate(names):
-                found[f"{name}_hat"] = y_hat[:, i]
-                if stream.y:
-                    found[name] = block.y[:, i]
-                    found[f"{name}_error"] = block.y[:, i] - y_hat[:, i]
-            if stream.y:
-                scores.add(block.y, y_hat)
-                settled.add(block.y, y_hat)
-            peaks = np.maximum(peaks, np.abs(model.scaler.normalise_u(block.u)).max(axis=0))
-            write(found)
-            first += len(y_hat)
-        if not first:
-            raise InputError("there are no samples; give a file with data.")
-        if stream.y and first <= asked:
-            raise InputError(
-                f"skip={asked} leaves none of the {first} samples to score; give a smaller one."
-            )
-    return Written(first, skip, scores, settled, peaks)
-
-
-def noted(result: Written, model: lfrtorch.Model, cfg: DictConfig) -> list[str]:
-    """What a user should know before the outputs are used."""
-    notes = [
-        f"the input {channel.name} goes {tables.number(peak)} standard deviations of the training "
-        "input away from its mean: the model extrapolates there"
-        for channel, peak in zip(model.inputs, result.peaks, strict=True)
-        if peak > FAR and model.sizes["nz"]  # a linear model is the same at all amplitudes
-    ]
-    scores, settled = result.scores, result.settled
-    with np.errstate(invalid="ignore"):
-        before = scores.samples * scores.rmse**2 - settled.samples * settled.rmse**2
-        beginning = np.sqrt(before / (scores.samples - settled.samples))
-        transient = (settled.samples >= BEGINNING) & (beginning > TRANSIENT * settled.rmse)
-    if cfg.start != "estimated" and transient.any():
-        ratio = (beginning / settled.rmse)[transient].max()
-        notes.append(
-            f"the error over the first {BEGINNING} scored samples is {tables.number(ratio)} "
-            "times that of the rest: start=estimated finds the start state, skip=N leaves out the "
-            "transient"
-        )
-    return notes
 
 
 def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
@@ -182,82 +84,25 @@ def check_rate(cfg: DictConfig, model: lfrtorch.Model) -> None:
         )
 
 
-def start_state(
-    cfg: DictConfig, model: lfrtorch.Model, stream: FileStream
-) -> tuple[Array | None, int]:
-    """The state to start from, None for zero, and how many samples are not scored.
-
-    How a state was estimated is printed. It is never fitted to samples that are scored.
-    """
+def start_state(cfg: DictConfig, model: lfrtorch.Model, stream: FileStream) -> Start:
+    """The state to start from, as the settings say."""
     if cfg.start == "given":
-        return np.array(cfg.x0, dtype=np.float64), cfg.skip or 0
+        return Start(np.array(cfg.x0, dtype=np.float64), cfg.skip or 0)
     if cfg.start == "zero":
-        return None, from_rest(stream) if stream.y and cfg.skip is None else cfg.skip or 0
-    if not stream.y:
-        raise InputError(
-            "start=estimated needs measured outputs; name their columns with data.outputs=[...], "
-            "or use start=zero."
-        )
-    asked = cfg.estimate or cfg.skip
-    u, y = beginning(stream, asked or PART * WINDOW)
-    if not len(u):
-        return None, 0
-    N = asked or max(1, score_window(len(u)))
-    u, y = u[:N], y[:N]
-    name = stream.table.path.name
-    record = lfrtorch.Record(u, y, fs=model.fs, start="estimated", name=name, valid=np.isfinite(y))
-    trajectory = model.signals(record)
-    fitted = lfrtorch.rmse(record, model.scaler.restore_y(trajectory.y[0].double().numpy()))
-    there, at_rest = map(tables.number, (fitted, lfrtorch.rmse(record, model.simulate(u))))
-    print(
-        f"start: the state is estimated from the first {len(u)} samples of '{name}'; RMSE there "
-        f"{there}, from zero state {at_rest} (they are not scored)"
-    )
-    return trajectory.x[0, 0].numpy(), max(len(u), cfg.skip or 0)
+        return start_at_rest(stream, skip=cfg.skip)
+    return estimated_start(model, stream, samples=cfg.estimate, skip=cfg.skip)
 
 
-def beginning(stream: FileStream, samples: int) -> tuple[Array, Array]:
-    """The first inputs and outputs of a file, fewer if it has no more."""
-    u, y, count = [np.empty((0, len(stream.u)))], [np.empty((0, len(stream.y)))], 0
-    for block in stream.blocks(samples):
-        u.append(block.u.copy())  # of a block with more columns
-        y.append(block.y.copy())
-        count += len(block.u)
-        if count >= samples:
-            break
-    return np.concatenate(u)[:samples], np.concatenate(y)[:samples]
-
-
-def from_rest(stream: FileStream) -> int:
-    """Samples that the score of a file from rest leaves out, as ``lfrtorch.load_records`` does."""
-    samples = sum(len(block.u) for block in stream.blocks())
-    settling = 0
-    if samples <= LOOKED_AT:
-        u, y = beginning(stream, LOOKED_AT)
-        period = find_period(u) if np.isfinite(y).all() else None
-        settling = 0 if period is None else find_transient(y, period)
-    return warm_up(samples, settling)
-
-
-def scored(path: Path, model: lfrtorch.Model, result: Written) -> list[list]:
+def scored(path: Path, model: lfrtorch.Model, result: Simulated) -> list[list[tables.Cell]]:
     """Rows of the table of scores, one an output."""
     scores = result.scores
+    counted = [
+        of_samples({"samples": result.samples, "skip": result.skip, "scored": count})
+        for count in scores.samples.tolist()
+    ]
     return [
-        [
-            path.name,
-            channel.name,
-            channel.unit,
-            of_samples(
-                {
-                    "samples": result.samples,
-                    "skip": result.skip,
-                    "scored": int(scores.samples[i]),
-                }
-            ),
-            finite(scores.rmse[i]),
-            tables.in_percent(finite(scores.nrmse[i])),
-        ]
-        for i, channel in enumerate(model.outputs)
+        [path.name, c.name, c.unit, shown, scores.rmse[i], tables.in_percent(scores.nrmse[i])]
+        for i, (c, shown) in enumerate(zip(model.outputs, counted, strict=True))
     ]
 
 

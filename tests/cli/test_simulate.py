@@ -20,6 +20,7 @@ import lfrtorch
 from lfrtorch._support.types import Array
 from lfrtorch.cli import evaluate, simulate
 from lfrtorch.cli.composition import composed
+from lfrtorch.file_simulation import BEGINNING
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.stream import Block, FileStream
 
@@ -165,7 +166,7 @@ def test_inputs_beyond_those_of_training_are_said(folder: Path, monkeypatch, cap
 @pytest.mark.numeric
 def test_a_wrong_start_state_is_said(folder: Path, monkeypatch, capsys):
     y = Y.copy()
-    y[: simulate.BEGINNING, 1] += 10.0
+    y[:BEGINNING, 1] += 10.0
     csv(folder / "late.csv", u1=U[:, 0], u2=U[:, 1], y1=Y[:, 0], y2=y[:, 1])
     words = ["data.path=late.csv", "data.fs=50", "out=x.csv", "overwrite=true"]
     run(monkeypatch, folder, *words, "skip=0")
