@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import leaderboard
 import numpy as np
 
 import lfrtorch
@@ -36,7 +37,6 @@ from lfrtorch.cli.composition import composed
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets.official import LEGACY
-from lfrtorch.reporting import leaderboard
 from lfrtorch.reporting import scores as report
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,7 +12,7 @@ from reference import random_cell, random_model
 
 from lfrtorch import Record
 from lfrtorch.records import Channel
-from lfrtorch.reporting import leaderboard
+from scripts import leaderboard
 
 pytestmark = pytest.mark.numeric
 MODEL = random_model(random_cell(2, 1, 3, 2, 1, 4), fs=50.0)
