@@ -204,7 +204,7 @@ def test_a_run_is_written_for_people_and_programs(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     logged = []
-    monkeypatch.setattr(plots, "DPI", 40)
+    monkeypatch.setattr(plots, "_DPI", 40)
     monkeypatch.setattr(SummaryWriter, "add_scalar", lambda _, name, *__: logged.append(name))
     run = identify(dataset, settings())
     write(run, tmp_path / "run", command="a notebook")
@@ -325,7 +325,7 @@ def test_one_model_takes_the_place_of_a_mean_if_it_does_as_well(
 def test_a_refit_is_scored_on_tests_and_validation_is_that_before(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(plots, "DPI", 40)
+    monkeypatch.setattr(plots, "_DPI", 40)
     run = identify(dataset, settings(refit=True))
     assert run.refit is not None
     assert run.model is run.refit.model

@@ -188,7 +188,7 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(official, "cache", lambda: tmp_path)
     monkeypatch.setattr(boucwen, "_SWEEP", 3000)  # a test that the README does not score
     monkeypatch.setattr(boucwen, "_PERIOD", 2048)  # and a quarter of the multisines
-    monkeypatch.setattr(plots, "DPI", 40)
+    monkeypatch.setattr(plots, "_DPI", 40)
     defaults = boucwen.load.__kwdefaults__
     assert defaults is not None
     monkeypatch.setitem(defaults, "samples", 2048)

@@ -32,11 +32,8 @@ from lfrtorch.model import check_channels
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.evaluation import Evaluation
 
-FILES = "lfrtorch.load_records"
-"""What reads files of one's own."""
-
-DIVIDES = "data.validation", "data.test"
-"""Words that divide them by use."""
+_FILES = "lfrtorch.load_records"  # what reads files of one's own
+_DIVIDES = "data.validation", "data.test"  # words that divide them by use
 
 
 def evaluate(cfg: DictConfig, command: str = "") -> None:
@@ -53,7 +50,7 @@ def evaluate(cfg: DictConfig, command: str = "") -> None:
             refuse_existing(cfg.out, "overwrite=true")
     folder = str(cfg.checkpoint)
     model, bla = opened(folder), linear_beside(folder)
-    if cfg.data._target_ == FILES:
+    if cfg.data._target_ == _FILES:
         from_files(cfg, model, command)
     dataset = loaded(cfg).with_windows()
     for record in (*dataset.tests, *dataset.validation, *dataset.selection):
@@ -95,7 +92,7 @@ def from_files(cfg: DictConfig, model: lfrtorch.Model, command: str) -> None:
     for side, channels in (("inputs", model.inputs), ("outputs", model.outputs)):
         if cfg.data[side] is None:
             cfg.data[side] = [channel.name for channel in channels]
-    divided = any(word.startswith(f"{name}=") for word in shlex.split(command) for name in DIVIDES)
+    divided = any(word.startswith(f"{name}=") for word in shlex.split(command) for name in _DIVIDES)
     if divided or not cfg.data.path or fitted(cfg.checkpoint, cfg.data.path):
         return
     cfg.data.test = EVERYTHING

@@ -62,8 +62,7 @@ from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.run_files import write
 from lfrtorch.reporting.verdict import LINEAR_MODEL
 
-PRINTED = 5
-"""Most lines of advice that are printed; the report has all."""
+_PRINTED = 5  # most lines of advice that are printed; the report has all
 
 WITHOUT_FILES = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
 """Settings of Hydra for all processes but the first."""
@@ -111,7 +110,7 @@ def run(
             write(
                 found, folder, command=command, config=config, draw=cfg.figures, board=files.board
             )
-            for item in found.advice[:PRINTED]:
+            for item in found.advice[:_PRINTED]:
                 print(f"next: {item.text}\n      ({item.evidence})")
             if found.verdict.use == LINEAR_MODEL:
                 checkpoint = shlex.quote(f"checkpoint={folder / 'linear'}")

@@ -45,14 +45,13 @@ USES = {
 }
 """Where the words of other commands are kept."""
 
-SETTING = re.compile(r"[a-z_.]+=")
-"""What a word NAME=VALUE begins with."""
+_SETTING = re.compile(r"[a-z_.]+=")  # what a word NAME=VALUE begins with
 
 
 def launch(words: Sequence[str] | None = None) -> None:
     """The command line."""
     given = sys.argv[1:] if words is None else words
-    data = [word for word in given if SETTING.match(word) and not os.path.exists(word)]
+    data = [word for word in given if _SETTING.match(word) and not os.path.exists(word)]
     options = parser().parse_args([word for word in given if word not in data])
     with user_errors():
         for word in data:

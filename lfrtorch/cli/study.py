@@ -46,11 +46,8 @@ from lfrtorch.cli.run_folder import SNAPSHOTS
 LOG, FAILED, LOCK = "log.txt", "failed.txt", ".lock"
 """In the folder of a run: what it printed, why it failed, and what says that a process is at it."""
 
-NOT_COMPARED = ("overwrite", "resume")
-"""Words that are not about what a run computes."""
-
-LONGEST = 120
-"""Characters of a folder's name; file systems take 255 bytes."""
+_NOT_COMPARED = ("overwrite", "resume")  # words that are not about what a run computes
+_LONGEST = 120  # characters of a folder's name; file systems take 255 bytes
 
 ATTEMPTS = 3
 """How often the runs that are left are begun if processes are killed that many runs share."""
@@ -89,9 +86,9 @@ def folder_name(varied: str) -> str:
         'data.path=a%2Fb.csv,nn=5'
     """
     name = quote(varied, safe="=,+[]{}:() ") or "run"
-    if len(name) <= LONGEST:
+    if len(name) <= _LONGEST:
         return name
-    return f"{name[: LONGEST - 9]}-{sha256(name.encode()).hexdigest()[:8]}"
+    return f"{name[: _LONGEST - 9]}-{sha256(name.encode()).hexdigest()[:8]}"
 
 
 register_resolver("folder_name", folder_name, replace=True)
@@ -141,7 +138,7 @@ def _same_study(folder: Path, common: Sequence[str]) -> None:
 
 def _compared(words: Sequence[str]) -> list[str]:
     """The words that say what a run computes, in an order of their own."""
-    return sorted(word for word in words if word.partition("=")[0] not in NOT_COMPARED)
+    return sorted(word for word in words if word.partition("=")[0] not in _NOT_COMPARED)
 
 
 def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, hydra: Any) -> float:

@@ -25,20 +25,14 @@ from lfrtorch.reporting.diagnosis import (
 BEYOND_NOISE = 1.5
 """Training error over the noise from which on the model's own share is above the noise."""
 
-TRANSIENT = 3.0
-"""Error in the first twentieth of the scored samples over that in the rest."""
-
-FREE = 0.5
-"""Part of the error's power there that a free response of the linear model must explain."""
+_TRANSIENT = 3.0  # error in the first twentieth of the scored samples over that in the rest
+_FREE = 0.5  # part of the error's power there that a free response of the linear model must explain
 
 ALONE = 1.2
 """Error of the second best start over that of the best above which the best may be luck."""
 
-LOUDER = 1.25
-"""Largest test input over the largest in training above which the model extrapolates."""
-
-FEW = 3
-"""Most records or outputs that are named."""
+_LOUDER = 1.25  # largest test input over the largest in training above which the model extrapolates
+_FEW = 3  # most records or outputs that are named
 
 
 class Advice(NamedTuple):
@@ -82,7 +76,7 @@ def diverges(e: Evidence) -> Advice | None:
     if not e.diverged:
         return None
     ridge = "a larger ridge" if e.ridge else "ridge=1e-3"
-    loud = any(e.louder.get(name, 0.0) > LOUDER for name in e.diverged)
+    loud = any(e.louder.get(name, 0.0) > _LOUDER for name in e.diverged)
     return Advice(
         "The model is not usable yet: "
         + (f"train on inputs as loud as the tests', or use {ridge}." if loud else f"use {ridge}."),
@@ -93,7 +87,7 @@ def diverges(e: Evidence) -> Advice | None:
 
 def starts_in_a_transient(e: Evidence) -> Advice | None:
     """An error at the beginning of the records that another start state removes."""
-    if e.transient is None or e.transient <= TRANSIENT or e.free is None or e.free <= FREE:
+    if e.transient is None or e.transient <= _TRANSIENT or e.free is None or e.free <= _FREE:
         return None
     return Advice(
         "The records do not begin at the model's rest: skip more samples (skip=N), or estimate "
@@ -317,7 +311,7 @@ def one_start(e: Evidence) -> Advice | None:
 
 def tests_are_louder(e: Evidence) -> Advice | None:
     """Tests beyond the amplitudes of the training data."""
-    far = {name: ratio for name, ratio in e.louder.items() if ratio > LOUDER}
+    far = {name: ratio for name, ratio in e.louder.items() if ratio > _LOUDER}
     if not far:
         return None
     ratios = _listed([f"'{name}' up to {number(ratio)} times" for name, ratio in far.items()])
@@ -416,5 +410,5 @@ def _written(change: Mapping[str, Any]) -> str:
 
 def _listed(items: Sequence[str]) -> str:
     """The first of them, and how many more there are."""
-    more = f" and {len(items) - FEW} more" if len(items) > FEW else ""
-    return ", ".join(items[:FEW]) + more
+    more = f" and {len(items) - _FEW} more" if len(items) > _FEW else ""
+    return ", ".join(items[:_FEW]) + more

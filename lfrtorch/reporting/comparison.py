@@ -27,17 +27,10 @@ from lfrtorch.reporting import html, plots
 from lfrtorch.reporting.scores import unit_of
 from lfrtorch.score_window import with_window
 
-SEEDS = ("seed", "data.seed")
-"""Words that differ between repetitions of one setting."""
-
-SHOWN = 20
-"""Most runs that a terminal gets; the files have all."""
-
-BOXES = 30
-"""Most settings whose boxes are drawn, the best by their median."""
-
-LONGEST = 40
-"""Characters of a setting in a figure."""
+_SEEDS = ("seed", "data.seed")  # words that differ between repetitions of one setting
+_SHOWN = 20  # most runs that a terminal gets; the files have all
+_BOXES = 30  # most settings whose boxes are drawn, the best by their median
+_LONGEST = 40  # characters of a setting in a figure
 
 CAPTIONS = {
     "parameters": "Validation error by parameters",
@@ -55,31 +48,18 @@ LEGEND = (
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
-    """A run in numbers.
-
-    Args:
-        folder: of its files.
-        dataset: name of what was identified.
-        words: of its command line, by name.
-        parameters: that the data can tell apart.
-        error: RMSE on the validation records, nan if there are none.
-        tests: RMSE of each test.
-        linear, linear_nx: error there and order of the linear model, if that is known.
-        unit: of the errors, empty if they have several.
-        seconds: that the fit took.
-        outcome: how it ended.
-    """
+    """A run in numbers."""
 
     folder: Path
     dataset: str
-    words: Mapping[str, str]
-    parameters: int
-    error: float
-    tests: Mapping[str, float]
-    linear: float
+    words: Mapping[str, str]  # of its command line, by name
+    parameters: int  # that the data can tell apart
+    error: float  # RMSE on the validation records, nan if there are none
+    tests: Mapping[str, float]  # RMSE of each test
+    linear: float  # error there of the linear model
     linear_nx: int | None
-    unit: str
-    seconds: float
+    unit: str  # of the errors, empty if they have several
+    seconds: float  # that the fit took
     outcome: str
 
 
@@ -101,7 +81,7 @@ class Comparison:
         listed = [run.words for run in self.runs if run.words]  # none of Python's own runs
         names = dict.fromkeys(name for words in listed for name in words)
         found = [n for n in names if len({words.get(n) for words in listed}) > 1]
-        return sorted(found, key=SEEDS.__contains__)
+        return sorted(found, key=_SEEDS.__contains__)
 
     @cached_property
     def front(self) -> list[Compared]:
@@ -121,7 +101,7 @@ class Comparison:
         groups: dict[str, list[Compared]] = {}
         for run in self.runs:
             words = [f"{n}={run.words[n]}" for n in self.varied if n in run.words]
-            label = " ".join(word for word in words if word.partition("=")[0] not in SEEDS)
+            label = " ".join(word for word in words if word.partition("=")[0] not in _SEEDS)
             groups.setdefault(label or "all runs", []).append(run)
         if len(groups) == len(self.runs):
             return {}
@@ -186,8 +166,8 @@ class Comparison:
     def __str__(self) -> str:
         head, rows = self.rows()
         parts = [f"{self.name}: RMSE of {len(rows)} run{'s' * (len(rows) > 1)}"]
-        parts.append(table(head, rows[:SHOWN]))
-        more = len(rows) - SHOWN
+        parts.append(table(head, rows[:_SHOWN]))
+        more = len(rows) - _SHOWN
         parts.append(LEGEND + f" {more} more runs are in the files." * (more > 0))
         return "\n\n".join(parts)
 
@@ -221,7 +201,7 @@ class Comparison:
 
     def _boxes(self) -> Figure:
         factor, _ = self._scale
-        labels = list(self.settings)[:BOXES]
+        labels = list(self.settings)[:_BOXES]
         errors = [
             [factor * run.error for run in self.settings[label] if math.isfinite(run.error)]
             for label in labels
@@ -362,8 +342,8 @@ def _median(runs: Sequence[Compared]) -> float:
 
 def _short(label: str) -> str:
     """Beginning and end of a setting, for a figure."""
-    half = LONGEST // 2
-    return label if len(label) <= LONGEST else f"{label[:half]}…{label[-half:]}"
+    half = _LONGEST // 2
+    return label if len(label) <= _LONGEST else f"{label[:half]}…{label[-half:]}"
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:

@@ -70,8 +70,7 @@ NONLINEAR = 0.1
 """Part that squares and cubes of the outputs explain: 0.39 and 0.93 for the linear models of
 Bouc-Wen and Silverbox, 0.00 and 0.10 for good NL-LFRs."""
 
-BEGINNING = 0.05
-"""Part of a record that is its beginning."""
+_BEGINNING = 0.05  # part of a record that is its beginning
 
 LAST = 5
 """Iterations that the pace of a search is taken from, at least; of a long one the last tenth."""
@@ -79,70 +78,37 @@ LAST = 5
 
 @dataclass(frozen=True)
 class Evidence:
-    """Numbers of a fit; None if one is not known.
+    """Numbers of a fit; None if one is not known."""
 
-    Args:
-        train, linear_train: errors of the NL-LFR and of the linear model on the training records.
-        validation, linear_validation: on those that chose the iterate.
-        outputs: the NL-LFR's error over the linear model's by output, if there are several.
-        parameters, samples: of the model without gauge directions, and scored in training.
-        noise: of the outputs, known or from the differences between periods.
-        linear: part of the training error's power that a linear filter of the inputs explains.
-        nonlinear: part that squares and cubes of the outputs explain beyond that.
-        transient: error at the beginning of the training records over that in the rest.
-        free: part of the error's power at the beginning that a free response of the linear model
-            explains.
-        unlike_chance: probability of so large a ratio of the linear model's errors on validation
-            and in training by chance.
-        risen: middle one of the validation errors after the kept iterate over that of the kept one.
-        fell: training error at the end over that of the kept iterate.
-        falling: part by which the error that chooses fell over a tenth of the iterations, at the
-            pace of the last ones; 0 if the search ended for another reason than its limit.
-        iterations: of the fit.
-        starts: errors of all starts that went to the end, the best first.
-        started: number of starts.
-        continued: whether the fit went on from a model, so that there are no other starts.
-        sizes: nx of the linear model, which relaxations and modes are added to, nz, nw, and nn or
-            degree.
-        searched: whether validation chose them.
-        largest: those that are the largest of a search.
-        trainer: the search.
-        ridge: whether there was one.
-        louder: largest test input over the largest in training, by test.
-        diverged: records on which the NL-LFR diverges.
-        tests: the NL-LFR's error over the linear model's on all tests together.
-        verdict: on the fit, which advice must agree with.
-    """
-
-    train: float | None
-    linear_train: float | None
-    validation: float | None = None
+    train: float | None  # errors on the training records, of the NL-LFR
+    linear_train: float | None  # and of the linear model
+    validation: float | None = None  # on those that chose the iterate
     linear_validation: float | None = None
-    outputs: Mapping[str, float] = field(default_factory=dict)
-    parameters: int = 0
-    samples: int = 0
-    noise: float | None = None
-    linear: float | None = None
-    nonlinear: float | None = None
-    transient: float | None = None
-    free: float | None = None
-    unlike_chance: float = 0.0
-    risen: float = 1.0
-    fell: float = 1.0
-    falling: float = 0.0
+    outputs: Mapping[str, float] = field(default_factory=dict)  # error / linear's, if several
+    parameters: int = 0  # without gauge directions
+    samples: int = 0  # scored in training
+    noise: float | None = None  # of the outputs, known or from the differences between periods
+    linear: float | None = None  # part of the error's power that a filter of the inputs explains
+    nonlinear: float | None = None  # that squares and cubes of the outputs explain beyond that
+    transient: float | None = None  # training error at the beginning over that in the rest
+    free: float | None = None  # part of its power there that a free response explains
+    unlike_chance: float = 0.0  # probability of so unlike linear errors in training and validation
+    risen: float = 1.0  # median validation error after the kept iterate over that of the kept one
+    fell: float = 1.0  # training error at the end over that of the kept iterate
+    falling: float = 0.0  # part by which the error fell lately over a tenth of the iterations
     iterations: int = 0
-    starts: Sequence[float] = ()
+    starts: Sequence[float] = ()  # errors of all starts that went to the end, the best first
     started: int = 1
-    continued: bool = False
-    sizes: Mapping[str, int] = field(default_factory=dict)
-    searched: bool = False
-    largest: Sequence[str] = ()
+    continued: bool = False  # from a model, so that there are no other starts
+    sizes: Mapping[str, int] = field(default_factory=dict)  # nx is that of the linear model
+    searched: bool = False  # whether validation chose them
+    largest: Sequence[str] = ()  # those that are the largest of a search
     trainer: Any = field(default_factory=LevenbergMarquardt)
     ridge: bool = False
-    louder: Mapping[str, float] = field(default_factory=dict)
-    diverged: Sequence[str] = ()
-    tests: float | None = None
-    verdict: Verdict | None = None
+    louder: Mapping[str, float] = field(default_factory=dict)  # largest input / training's, by test
+    diverged: Sequence[str] = ()  # names of records
+    tests: float | None = None  # the NL-LFR's error over the linear model's on all tests together
+    verdict: Verdict | None = None  # which advice must agree with
 
     @property
     def better(self) -> bool:
@@ -417,7 +383,7 @@ def _transient(
         if response.record.start in ("periodic", "estimated"):
             continue
         error = response.error / scale
-        count = math.ceil(BEGINNING * len(error))
+        count = math.ceil(_BEGINNING * len(error))
         first.append(error[:count])
         rest.append(error[count:])
         x, free = np.linalg.matrix_power(bla.A, response.record.skip), []

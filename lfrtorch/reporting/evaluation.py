@@ -20,8 +20,7 @@ from lfrtorch.model import Model
 from lfrtorch.records import Channel, Record, without_coordinates
 from lfrtorch.score_window import fitted
 
-LINEAR, NL_LFR = "linear", "NL-LFR"
-"""Names of the two models."""
+_LINEAR, _NL_LFR = "linear", "NL-LFR"  # names of the two models
 
 HORIZONS = 1, 10, 100
 """Samples ahead that predictions are scored at."""
@@ -96,12 +95,12 @@ class Response:
     @property
     def y_linear(self) -> Array:
         """Output of the linear model (T, ny)."""
-        return self.simulated[LINEAR]
+        return self.simulated[_LINEAR]
 
     @property
     def y_hat(self) -> Array:
         """Output of the NL-LFR (T, ny)."""
-        return self.simulated[NL_LFR]
+        return self.simulated[_NL_LFR]
 
     @property
     def scored(self) -> Array:
@@ -139,12 +138,12 @@ class Response:
             samples=record.samples,
             skip=record.skip,
             scored=record.scored_samples,
-            rmse=errors.get(NL_LFR),
-            lti_rmse=errors.get(LINEAR),
+            rmse=errors.get(_NL_LFR),
+            lti_rmse=errors.get(_LINEAR),
             std=float(np.sqrt(np.mean(known))) if len(known) else math.nan,
-            nrmse=nrmse(record, self.y_hat) if NL_LFR in errors else None,
-            rmse_by_output=by_output.get(NL_LFR, ()),
-            lti_rmse_by_output=by_output.get(LINEAR, ()),
+            nrmse=nrmse(record, self.y_hat) if _NL_LFR in errors else None,
+            rmse_by_output=by_output.get(_NL_LFR, ()),
+            lti_rmse_by_output=by_output.get(_LINEAR, ()),
             std_by_output=tuple(std),
             start_error=self.start_error,
         )
@@ -178,9 +177,9 @@ class Evaluation:
         for use, record in self._records:
             linear, model = self._models(use, record)
             driven, added = fitted(record) if use == "train" else record, None
-            simulated = {} if linear is None else {LINEAR: linear.simulate(driven)}
+            simulated = {} if linear is None else {_LINEAR: linear.simulate(driven)}
             if model is not None:
-                simulated[NL_LFR] = y_hat = model.simulate(driven)
+                simulated[_NL_LFR] = y_hat = model.simulate(driven)
                 added = None if use == "train" else start_error(model, record, y_hat)
             found.append(Response(record, use, simulated, added))
         return found
@@ -194,7 +193,7 @@ class Evaluation:
         for use, record in self._records:
             linear, model = self._models(use, record)
             driven = without_coordinates(fitted(record) if use == "train" else record)
-            named = {LINEAR: None if linear is None else linear.to_model(), NL_LFR: model}
+            named = {_LINEAR: None if linear is None else linear.to_model(), _NL_LFR: model}
             for horizon, responses in found.items():
                 predicted = {
                     name: each.predict(driven, horizon=horizon)

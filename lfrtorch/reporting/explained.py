@@ -11,14 +11,12 @@ import scipy
 from lfrtorch._support.types import Array
 from lfrtorch.reporting.evaluation import Response
 
-AVERAGES = 8
-"""Segments for each regressor that a coherence is estimated from, at least."""
+_AVERAGES = 8  # segments for each regressor that a coherence is estimated from, at least
 
 LONGEST, SHORTEST = 1024, 64
 """Samples of a segment: as long as the memory of an error filter may be, and too few to tell."""
 
-LAGS = 12
-"""Least memory of a filter that is fitted in time, to records too short for segments."""
+_LAGS = 12  # least memory of a filter that is fitted in time, to records too short for segments
 
 SHIFTS = 0.276, 0.382, 0.618, 0.724
 """Parts of the records by which errors are shifted to see what is explained by chance: no fractions
@@ -73,7 +71,7 @@ def coherent_part(
     """
     n = signals[0].shape[1]
     T, shortest = sum(map(len, errors)), min(map(len, errors))
-    most = T / (AVERAGES * (of or n))
+    most = T / (_AVERAGES * (of or n))
     N = 2 ** int(math.log2(max(1, min(LONGEST, most, shortest))))
     if N < SHORTEST:
         return filtered_part(signals, errors, min(int(most), shortest // 2))
@@ -113,7 +111,7 @@ def filtered_part(signals: Sequence[Array], errors: Sequence[Array], lags: int) 
     Returns:
         0 to 1, or None if the memory is too short.
     """
-    if lags < LAGS:
+    if lags < _LAGS:
         return None
     memory = np.concatenate(
         [

@@ -53,11 +53,8 @@ from lfrtorch.reporting.verdict import LINEAR_MODEL, Verdict, of_linear
 USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
 """What the records that are no tests were for."""
 
-FEW = 3
-"""Most tests that the verdict names one by one."""
-
-ALL = "all"
-"""Name of several outputs together."""
+_FEW = 3  # most tests that the verdict names one by one
+_ALL = "all"  # name of several outputs together
 
 Rows = list[Sequence[Cell]]
 
@@ -159,12 +156,12 @@ def comparisons(evaluation: Evaluation) -> list[str]:
     use = next(use for use in uses if any(response.use == use for response in responses))
     shown = []
     for response in (response for response in responses if response.use == use):
-        errors = [each for each in _errors(response.score) if each.output != ALL]
+        errors = [each for each in _errors(response.score) if each.output != _ALL]
         for each in errors:
             name = response.record.name + (f", {each.output}" if len(errors) > 1 else "")
             shown.append((name, each))
     scored = sorted((item for item in shown if item[1].ratio > 0), key=lambda item: item[1].ratio)
-    if len(shown) <= FEW or not scored:
+    if len(shown) <= _FEW or not scored:
         return [_line(*item) for item in shown]
     least, most = (f"{percent(1 / e.ratio)} ({name})" for name, e in (scored[-1], scored[0]))
     relative = [errors.relative for _, errors in scored]
@@ -247,7 +244,7 @@ def _errors(score: Score) -> list[Errors]:
         return single
     assert score.lti_rmse is not None
     assert score.rmse is not None
-    return [_compared(ALL, units.pop(), score.lti_rmse, score.rmse, score.std), *single]
+    return [_compared(_ALL, units.pop(), score.lti_rmse, score.rmse, score.std), *single]
 
 
 def _compared(output: str, unit: str, linear: float, error: float, std: float) -> Errors:

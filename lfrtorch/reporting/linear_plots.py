@@ -25,11 +25,8 @@ MEASURED, MODEL, DIFFERENCE = "#0072b2", "black", "#e69f00"
 TOTAL, NOISE, ODD, EVEN = "#d55e00", "0.5", "#d55e00", "#cc79a7"
 """Of Okabe and Ito's palette, which colour-blind readers tell apart."""
 
-GRID = 500
-"""Frequencies at which a model is drawn, beside those of its poles."""
-
-LOWEST = 1e-3
-"""First frequency of a model drawn alone, relative to half the sampling frequency."""
+_GRID = 500  # frequencies at which a model is drawn, beside those of its poles
+_LOWEST = 1e-3  # first frequency of a model drawn alone, relative to half the sampling frequency
 
 RANGE, ABOVE = 120.0, 30.0
 """Most dB that an axis shows, and above the model: a zero on a grid point is no information, and a
@@ -39,14 +36,9 @@ STRETCHES = 200
 """Parts of the frequency axis: a variance is drawn as its mean over each. Line by line it hid the
 dots of a record of 50000 samples."""
 
-FAR = 2.0
-"""Half width of the z plane that is drawn: sampling puts zeros far out that say little."""
-
-MANY = 2000
-"""Dots from which on they are drawn small."""
-
-TURNS = (1, 1.8, 4.5, 9, 10)
-"""Ticks of a phase: 45, 90, 180 degrees."""
+_FAR = 2.0  # half width of the z plane that is drawn: sampling puts zeros far out that say little
+_MANY = 2000  # dots from which on they are drawn small
+_TURNS = (1, 1.8, 4.5, 9, 10)  # ticks of a phase: 45, 90, 180 degrees
 
 
 def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
@@ -106,7 +98,7 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
             title = f"{output.name} / {source.name}"
             magnitude.set(title=title, ylabel=unit_label("magnitude", output.unit, source.unit))
             phase.set(ylabel="phase (deg)")
-            phase.yaxis.set_major_locator(MaxNLocator(5, steps=TURNS))
+            phase.yaxis.set_major_locator(MaxNLocator(5, steps=_TURNS))
     frequency_axis(grid, f[0], f[-1])
     _legend(figure, grid[0, 0])
     return figure
@@ -135,7 +127,7 @@ def poles_and_zeros(model: LinearModel) -> Figure:
     ax.plot(model.poles.real, model.poles.imag, "x", ms=7, color=MODEL, label="poles")
     every = np.concatenate(list(found.values()))
     reach = np.maximum(np.abs(every.real), np.abs(every.imag))
-    width = min(FAR, 1.1 * float(reach.max(initial=1.0)))
+    width = min(_FAR, 1.1 * float(reach.max(initial=1.0)))
     ax.set(xlim=(-width, width), ylim=(-width, width), aspect="equal")
     if (reach > width).any():
         ax.set_title(f"{(reach > width).sum()} zero(s) beyond the frame")
@@ -244,16 +236,16 @@ def frequencies(model: LinearModel, frf: FRF | None = None) -> Array:
         >>> bool(f[0] > 0), round(float(f[-1]))  # to half the sampling frequency
         (True, 50)
     """
-    lines = np.array([LOWEST, 1.0]) * model.fs / 2 if frf is None else frf.frequencies
+    lines = np.array([_LOWEST, 1.0]) * model.fs / 2 if frf is None else frf.frequencies
     first, last = float(lines[0]), float(lines[-1])
     spaced = np.geomspace if is_wide(first, last) else np.linspace
     resonances = np.abs(np.angle(model.poles)) * model.fs / (2 * np.pi)
-    f = np.union1d(spaced(first, last, GRID), resonances)
+    f = np.union1d(spaced(first, last, _GRID), resonances)
     return f[(f >= first) & (f <= last)]
 
 
 def _dots(ax: Axes, f: Array, level: Array, label: str, colour: str, marker: str = ".") -> None:
-    ax.plot(f, level, marker, ms=2.5 if len(f) < MANY else 1.0, color=colour, label=label)
+    ax.plot(f, level, marker, ms=2.5 if len(f) < _MANY else 1.0, color=colour, label=label)
 
 
 def _mean(f: Array, variance: Array) -> tuple[Array, Array]:

@@ -14,8 +14,7 @@ import torch
 from lfrtorch.dataset import Dataset
 from lfrtorch.records import Record
 
-LONGEST = 10
-"""Seconds that git may take."""
+_LONGEST = 10  # seconds that git may take
 
 
 def origin(dataset: Dataset) -> dict[str, Any]:
@@ -77,7 +76,7 @@ def _git(*words: str) -> str | None:
     """What git says, None if it cannot."""
     try:
         done = subprocess.run(
-            ["git", *words], capture_output=True, text=True, check=True, timeout=LONGEST
+            ["git", *words], capture_output=True, text=True, check=True, timeout=_LONGEST
         )
     except (OSError, subprocess.SubprocessError):
         return None

@@ -1,4 +1,8 @@
-"""Figures of a result: they read signals and histories and compute no model."""
+"""Figures of a result: they read signals and histories and compute no model.
+
+``simulated`` has outputs (T, ny) in physical units by the names of models; ``outputs`` are the
+numbers of those that are drawn, by default of all.
+"""
 
 from __future__ import annotations
 
@@ -26,39 +30,22 @@ from lfrtorch.fitting.trainer import Progress
 from lfrtorch.metrics import rms
 from lfrtorch.records import Record
 
-DPI = 150
-"""Dots per inch of a figure that is written."""
-
-MOST_POINTS = 20_000
-"""Samples drawn of a long signal as a cloud."""
-
-SWINGS = 8
-"""Periods of the output that a close-up shows."""
-
-CLOSE_UP, LARGEST_PART = (50, 2000), 0.25
-"""Fewest and most samples of a close-up, and its largest part of a record if it has more."""
+_DPI = 150  # of a figure that is written
+_MOST_POINTS = 20_000  # samples drawn of a long signal
+_SWINGS = 8  # periods of the output that a close-up shows
+_CLOSE_UP, _LARGEST_PART = (50, 2000), 0.25  # its samples, and its part of a longer record
+_FAR = 10.0  # deviations of the output up to which errors are counted in their distribution
+_TAIL = 0.95  # part of the samples whose errors are no larger than the number in the legend
+_BEYOND = 1.0  # ranges of the measured output that are drawn beyond it, if a model runs away
 
 Simulated = Mapping[str, Array]
-"""Outputs (T, ny) by the name of their model; a linear one's begins with ``linear``."""
+"""Outputs by the name of their model; a linear one's begins with ``linear``."""
 
 COLOURS = tuple(colour for colour in CHANNELS if colour != LINEAR)
 """Of the models that are not linear; there are no more of them in a figure."""
 
-FAR = 10.0
-"""Deviations of the output up to which errors are counted in their distribution."""
-
-HEIGHT = 4.2
-"""Of an output in a figure, in inches."""
-
-WIDE, NARROW = 6.4, 4.4
-"""Widths in inches of figures that stand side by side on a wide page, in a column on a narrow one.
-"""
-
-TAIL = 0.95
-"""Part of the samples whose errors are no larger than the number in the legend."""
-
-BEYOND = 1.0
-"""Ranges of the measured output that are drawn beyond it, if a model runs away."""
+_HEIGHT = 4.2  # of an output in a figure, in inches
+_WIDE, _NARROW = 6.4, 4.4  # of figures that stand side by side on a wide page
 
 
 def errors(record: Record, simulated: Simulated) -> Figure:
@@ -89,14 +76,6 @@ def is_whole(record: Record) -> bool:
 def spectrum(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
     """Magnitude of the measured output and of the errors against frequency, one panel an output.
 
-    Args:
-        record: the measurement.
-        simulated: outputs in physical units, by the names of their models.
-        outputs: numbers of those that are drawn. Default: all.
-
-    Shape:
-        simulated: (T, ny) each.
-
     Example:
         >>> from lfrtorch.reporting import plots
         >>> simulated = {"linear": bla.simulate(record), "NL-LFR": model.simulate(record)}
@@ -122,14 +101,6 @@ def density(record: Record, simulated: Simulated, outputs: Sequence[int] | None 
 
     By Welch's method: for records that are no whole periods.
 
-    Args:
-        record: the measurement.
-        simulated: outputs in physical units, by the names of their models.
-        outputs: numbers of those that are drawn. Default: all.
-
-    Shape:
-        simulated: (T, ny) each.
-
     Example:
         >>> from lfrtorch.reporting import plots
         >>> figure = plots.density(record[:300], {"linear": bla.simulate(record[:300])})
@@ -154,14 +125,6 @@ def response(record: Record, simulated: Simulated, outputs: Sequence[int] | None
 
     The legend has the fit of each model, 100 % - NRMSE. The grey stretch is that of the close-up.
 
-    Args:
-        record: the measurement.
-        simulated: outputs in physical units, by the names of their models.
-        outputs: numbers of those that are drawn. Default: all.
-
-    Shape:
-        simulated: (T, ny) each.
-
     Example:
         >>> from lfrtorch.reporting import plots
         >>> figure = plots.response(record, {"linear": bla.simulate(record)})
@@ -171,8 +134,8 @@ def response(record: Record, simulated: Simulated, outputs: Sequence[int] | None
         'time in the record (s)'
     """
     whole = slice(0, record.samples - record.skip)
-    figure = _overlay(record, simulated, outputs, whole, WIDE, fits=True)
-    near = worst_stretch(record, simulated, outputs)
+    figure = _overlay(record, simulated, outputs, whole, _WIDE, fits=True)
+    near = _worst_stretch(record, simulated, outputs)
     if near != whole:
         ends = ((record.skip + end) / record.fs for end in (near.start, near.stop - 1))
         first, last = ends
@@ -186,27 +149,19 @@ def close_up(record: Record, simulated: Simulated, outputs: Sequence[int] | None
 
     If all are, the first one counts.
 
-    Args:
-        record: the measurement.
-        simulated: outputs in physical units, by the names of their models.
-        outputs: numbers of those that are drawn. Default: all.
-
-    Shape:
-        simulated: (T, ny) each.
-
     Example:
         >>> from lfrtorch.reporting import plots
         >>> figure = plots.close_up(record, {"NL-LFR": model.simulate(record)})
         >>> len(figure.axes)  # the outputs, and their errors
         2
     """
-    near = worst_stretch(record, simulated, outputs)
-    figure = _overlay(record, simulated, outputs, near, NARROW)
+    near = _worst_stretch(record, simulated, outputs)
+    figure = _overlay(record, simulated, outputs, near, _NARROW)
     figure.suptitle(f"{record.name}: about the largest error", fontsize="medium")
     return figure
 
 
-def worst_stretch(
+def _worst_stretch(
     record: Record, simulated: Simulated, outputs: Sequence[int] | None = None
 ) -> slice:
     """Some periods of the output about the largest error, counted from the first scored sample.
@@ -214,14 +169,6 @@ def worst_stretch(
     Of the first model that is not linear, or else of the first one. Errors of several outputs are
     compared relative to the deviation of each. If the model runs away, this is about where it
     begins.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> y_linear = record.y.copy()
-        >>> y_linear[300] += 9.0
-        >>> near = plots.worst_stretch(record, {"linear": y_linear})
-        >>> near.start < 300 < near.stop
-        True
     """
     columns = list(range(record.y.shape[1]) if outputs is None else outputs)
     y = record.y[record.skip :, columns]
@@ -229,12 +176,12 @@ def worst_stretch(
     found = simulated[first][record.skip :, columns]
     deviation = np.std(y, axis=0)
     error = np.abs(y - found) / np.where(deviation > 0, deviation, 1.0)
-    error = np.minimum(np.where(np.isfinite(error), error, np.inf), FAR)
+    error = np.minimum(np.where(np.isfinite(error), error, np.inf), _FAR)
     row, column = np.unravel_index(int(np.argmax(error)), error.shape)
     above = y[:, column] > np.mean(y[:, column])
     swings = max(1, np.count_nonzero(above[1:] != above[:-1])) / 2
-    least, most = CLOSE_UP
-    length = min(SWINGS * len(y) / swings, most, LARGEST_PART * len(y))
+    least, most = _CLOSE_UP
+    length = min(_SWINGS * len(y) / swings, most, _LARGEST_PART * len(y))
     length = min(len(y), max(least, int(length)))
     begin = max(0, min(int(row) - length // 2, len(y) - length))
     return slice(begin, begin + length)
@@ -247,31 +194,23 @@ def distribution(
 
     The legend says in which range the errors of 95 % of the samples are.
 
-    Args:
-        record: the measurement.
-        simulated: outputs in physical units, by the names of their models.
-        outputs: numbers of those that are drawn. Default: all.
-
-    Shape:
-        simulated: (T, ny) each.
-
     Example:
         >>> from lfrtorch.reporting import plots
         >>> figure = plots.distribution(record, {"NL-LFR": model.simulate(record)})
         >>> figure.axes[0].get_xlabel()
         'error of y'
     """
-    figure, axes = _panels(record, outputs, NARROW, sharex=False)
+    figure, axes = _panels(record, outputs, _NARROW, sharex=False)
     figure.suptitle(f"{record.name}: errors", fontsize="medium")
     for i, ax in axes.items():
         output = record.outputs[i]
         y = record.y[record.skip :, i]
         for error, name, colour, style in _signals(record, simulated, i)[1:]:
             label = name
-            counted = error[np.abs(error) <= (FAR * np.std(y) or np.inf)]
+            counted = error[np.abs(error) <= (_FAR * np.std(y) or np.inf)]
             if np.isfinite(error).all():
-                within = float(np.quantile(np.abs(error), TAIL))
-                label = f"{name}: {100 * TAIL:g} % within ±{quantity(within, output.unit)}"
+                within = float(np.quantile(np.abs(error), _TAIL))
+                label = f"{name}: {100 * _TAIL:g} % within ±{quantity(within, output.unit)}"
             if not len(counted):
                 ax.plot([], [], color=colour, label=label)
                 continue
@@ -302,7 +241,7 @@ def static_map(z: Array, w: Array) -> Figure:
         >>> figure.axes[0].get_ylabel()
         'w1'
     """
-    step = max(1, len(z) // MOST_POINTS)
+    step = max(1, len(z) // _MOST_POINTS)
     z, w = z[::step], w[::step]
     nz, nw = z.shape[1], w.shape[1]
     columns = nz if nz > 2 else 1
@@ -363,18 +302,18 @@ def png(figure: Figure) -> bytes:
         b'PNG'
     """
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=DPI)
+    figure.savefig(stream, format="png", dpi=_DPI)
     return stream.getvalue()
 
 
 def _panels(
-    record: Record, outputs: Sequence[int] | None, width: float = WIDE, *, sharex: bool = True
+    record: Record, outputs: Sequence[int] | None, width: float = _WIDE, *, sharex: bool = True
 ) -> tuple[Figure, dict[int, Axes]]:
     """A panel for each output, by its number."""
     numbers = list(range(record.y.shape[1]) if outputs is None else outputs)
-    figure = Figure(figsize=(width, HEIGHT * len(numbers)), layout="constrained")
+    figure = Figure(figsize=(width, _HEIGHT * len(numbers)), layout="constrained")
     axes = figure.subplots(len(numbers), 1, squeeze=False, sharex=sharex)[:, 0]
-    figure.suptitle(_title(record), fontsize="medium")
+    figure.suptitle(f"{record.name} ({record.source})", fontsize="medium")
     return figure, dict(zip(numbers, axes, strict=True))
 
 
@@ -389,7 +328,7 @@ def _overlay(
 ) -> Figure:
     """Measured and simulated outputs of a part of the scored samples, and the errors below."""
     numbers = list(range(record.y.shape[1]) if outputs is None else outputs)
-    figure = Figure(figsize=(width, HEIGHT * len(numbers)), layout="constrained")
+    figure = Figure(figsize=(width, _HEIGHT * len(numbers)), layout="constrained")
     axes = figure.subplots(
         2 * len(numbers), 1, squeeze=False, sharex=True, height_ratios=[2, 1] * len(numbers)
     )[:, 0]
@@ -402,35 +341,29 @@ def _overlay(
         reach = 0.0
         for name, colour, style in _drawn(simulated):
             own = simulated[name][scored, i]
-            label = f"{name}, {fit_text(y, own)}" if fits else name
+            label = f"{name}, {_fit_text(y, own)}" if fits else name
             above.plot(*envelope(t, own[part]), style, lw=1.0, color=colour, label=label)
             error = (y - own)[part]
             below.plot(*envelope(t, error), style, lw=1.0, color=colour, label=name)
             reach = max(reach, np.max(np.abs(error), initial=0.0, where=np.isfinite(error)))
         span = float(np.ptp(y)) or 1.0
         low, high = above.get_ylim()
-        low, high = max(low, y.min() - BEYOND * span), min(high, y.max() + BEYOND * span)
+        low, high = max(low, y.min() - _BEYOND * span), min(high, y.max() + _BEYOND * span)
         unit_axis(above.yaxis, (low, high), output.name, output.unit)
-        reach = 1.1 * min(reach, BEYOND * span) or span
+        reach = 1.1 * min(reach, _BEYOND * span) or span
         unit_axis(below.yaxis, (-reach, reach), "error", output.unit)
         for ax in (above, below):
             ax.margins(x=0)
             ax.grid(True, alpha=0.2)
         legend_above(above)
     figure.align_ylabels(axes)
-    figure.suptitle(_title(record), fontsize="medium")
+    figure.suptitle(f"{record.name} ({record.source})", fontsize="medium")
     axes[-1].set_xlabel("time in the record (s)" if record.fs != 1.0 else "sample of the record")
     return figure
 
 
-def fit_text(y: Array, y_hat: Array) -> str:
-    """How well a simulation follows one output: 100 % - NRMSE, to two digits of the NRMSE.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> plots.fit_text(record.y[:, 0], 1.001 * record.y[:, 0])
-        'fit 99.90 %'
-    """
+def _fit_text(y: Array, y_hat: Array) -> str:
+    """How well a simulation follows one output: 100 % - NRMSE, to two digits of the NRMSE."""
     missing = 100 * float(rms(y - y_hat)) / (float(np.std(y)) or np.nan)
     if not np.isfinite(missing):
         return "diverges" if not np.isfinite(y_hat).all() else "no fit: constant"
@@ -475,7 +408,7 @@ def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
         >>> len(short), bool(short.max() == np.sin(t).max())
         (20000, True)
     """
-    stretch = len(signal) // (MOST_POINTS // 2)
+    stretch = len(signal) // (_MOST_POINTS // 2)
     if stretch < 2:
         return t, signal
     pieces = signal[: len(signal) // stretch * stretch].reshape(-1, stretch)
@@ -485,10 +418,6 @@ def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
 
 def _frequency_axis(record: Record, ax: Axes) -> None:
     ax.set_xlabel("frequency (Hz)" if record.fs != 1.0 else "frequency (1/sample)")
-
-
-def _title(record: Record) -> str:
-    return f"{record.name} ({record.source})"
 
 
 def _decibel(signal: Array) -> Array:

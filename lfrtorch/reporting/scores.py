@@ -23,8 +23,7 @@ from lfrtorch.reporting.verdict import Verdict
 ERRORS = "rmse", "lti_rmse"
 """Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
 
-SEEN = 0.2
-"""Part of an RMSE that an error must have to be told: it makes 2 % of it."""
+_SEEN = 0.2  # part of an RMSE that an error must have to be told: it makes 2 % of it
 
 REFITTED = "Refitted to all estimation records: validation errors are those before it."
 """What is said of a model that was."""
@@ -268,7 +267,7 @@ def of_samples(score: Mapping[str, Any]) -> str:
 def start_matters(score: Mapping[str, Any]) -> bool:
     """Whether the uncertainty of the start state makes a part of the error that is seen."""
     added, error = score["start_error"], score["rmse"]
-    return added is not None and error is not None and added > SEEN * error
+    return added is not None and error is not None and added > _SEEN * error
 
 
 def neurons(sizes: Mapping[str, int]) -> str:

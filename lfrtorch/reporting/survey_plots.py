@@ -15,14 +15,9 @@ from lfrtorch.survey.signal import LEAST, SignalSurvey, longest_run
 
 INPUT, OUTPUT, BAND, CLIPPED = "#0072b2", "0.15", "0.9", "#d55e00"
 
-RANGE = 120.0
-"""Most dB that a spectrum shows."""
-
-STRETCHES = 3000
-"""Parts of the frequency axis: the largest line of each is drawn."""
-
-BELOW = 3.0
-"""The frequency axis begins at the lowest end of a band divided by this."""
+_RANGE = 120.0  # most dB that a spectrum shows
+_STRETCHES = 3000  # parts of the frequency axis: the largest line of each is drawn
+_BELOW = 3.0  # the frequency axis begins at the lowest end of a band divided by this
 
 BINS = 60
 
@@ -76,7 +71,7 @@ def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
     time.set_xlabel("sample" if found.fs is None else "time (s)")
     values.set_xlabel("% of samples")
     lowest = min((one.band[0] for one in found.signals if one.band is not None), default=fs / 100)
-    lines.set(xscale="log", xlim=(lowest / BELOW, fs / 2))
+    lines.set(xscale="log", xlim=(lowest / _BELOW, fs / 2))
     lines.set_xlabel(f"frequency ({'cycles/sample' if found.fs is None else 'Hz'})")
     if title:
         figure.suptitle(title)
@@ -93,10 +88,10 @@ def _spectrum(ax: Axes, one: SignalSurvey, signal: Array, fs: float, colour: str
         return
     part = signal[first : first + length]
     f, power = scipy.signal.periodogram(part, fs, window="hann", scaling="spectrum")
-    edges = np.geomspace(f[1], f[-1], STRETCHES)
+    edges = np.geomspace(f[1], f[-1], _STRETCHES)
     starts = np.unique(np.searchsorted(f, edges[edges <= f[-1]]))
     level = 10 * np.log10(np.maximum(2 * np.maximum.reduceat(power, starts), 1e-300))
     ax.plot(f[starts], level, lw=0.6, color=colour)
     ax.axvspan(*one.band, color=BAND, zorder=0, lw=0)
     top = float(level.max())
-    ax.set_ylim(max(float(level.min()) - 5, top - RANGE), top + 5)
+    ax.set_ylim(max(float(level.min()) - 5, top - _RANGE), top + 5)

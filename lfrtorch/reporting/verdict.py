@@ -33,11 +33,8 @@ NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
 SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
-EQUAL = 5e-4
-"""Difference that three digits do not show, its standard error included."""
-
-CLEAR = 2.0
-"""Ratio of two errors that is no chance, whatever its standard error."""
+_EQUAL = 5e-4  # difference that three digits do not show, its standard error included
+_CLEAR = 2.0  # ratio of two errors that is no chance, whatever its standard error
 
 CONFIDENCE = 0.975
 """Probability of the quantile that a difference must exceed, one-sided; the rest is divided among
@@ -46,8 +43,7 @@ the records that are compared one by one."""
 EXPLAINS_NOTHING = 0.9
 """Error over the output's standard deviation from which on a model is of no use."""
 
-LONGEST_NAME = 28
-"""Characters of a record's name in a sentence."""
+_LONGEST_NAME = 28  # characters of a record's name in a sentence
 
 
 class Kind(StrEnum):
@@ -107,35 +103,27 @@ class Verdict:
         return self.text
 
 
-class Compared(NamedTuple):
-    """The NL-LFR beside the linear model on one record or several, each output counting alike.
+class _Compared(NamedTuple):
+    """The NL-LFR beside the linear model on one record or several, each output counting alike."""
 
-    Args:
-        name: in a sentence, such as ``"test 'sweep'"``.
-        ratio, ratio_std: of their errors, and its standard error.
-        deviations: of the logarithm of the ratio from 0, in standard errors.
-        clear: how many are needed.
-        nrmse, linear_nrmse: errors over the output's standard deviation.
-    """
-
-    name: str
-    ratio: float
-    ratio_std: float
-    deviations: float
-    clear: float
-    nrmse: float
+    name: str  # in a sentence, such as "test 'sweep'"
+    ratio: float  # of their errors
+    ratio_std: float  # its standard error
+    deviations: float  # of the logarithm of the ratio from 0, in standard errors
+    clear: float  # how many are needed
+    nrmse: float  # error over the output's standard deviation
     linear_nrmse: float
 
     @property
     def worse(self) -> bool:
         """Whether the NL-LFR's error is clearly larger."""
-        certain = self.deviations > self.clear or self.ratio >= CLEAR
+        certain = self.deviations > self.clear or self.ratio >= _CLEAR
         return certain and self.ratio > 1.0 + SAME
 
     @property
     def better(self) -> bool:
         """Whether it is clearly smaller."""
-        certain = self.deviations < -self.clear or self.ratio <= 1.0 / CLEAR
+        certain = self.deviations < -self.clear or self.ratio <= 1.0 / _CLEAR
         return certain and self.ratio < 1.0 - SAME
 
 
@@ -202,7 +190,7 @@ def judge(
             f"Better than {linear}: on {whole.name} the NL-LFR's {error} is "
             f"{of_linear(whole.ratio)}"
         )
-    elif abs(whole.ratio - 1.0) + whole.ratio_std < EQUAL:
+    elif abs(whole.ratio - 1.0) + whole.ratio_std < _EQUAL:
         kind, use = Kind.LINEAR, LINEAR_MODEL
         kept = "the fit kept its start, and " * (result.chosen_iteration == 0)
         text = f"As {linear}: {kept}on {whole.name} the errors are the same"
@@ -345,7 +333,7 @@ def _errors(responses: Sequence[Response]) -> list[_Errors]:
     return found
 
 
-def _compared(errors: Sequence[_Errors], among: int = 1) -> Compared:
+def _compared(errors: Sequence[_Errors], among: int = 1) -> _Compared:
     """Both models on some records, each relative to the linear model's error there.
 
     Args:
@@ -369,7 +357,7 @@ def _compared(errors: Sequence[_Errors], among: int = 1) -> Compared:
     power = float(np.dot([e.power for e in errors], samples)) or math.nan
     first = errors[0].response
     several = f"{len(errors)} {_use(first)} records"
-    return Compared(
+    return _Compared(
         name=_name(first) if len(errors) == 1 else several,
         ratio=ratio,
         ratio_std=ratio_std,
@@ -380,7 +368,7 @@ def _compared(errors: Sequence[_Errors], among: int = 1) -> Compared:
     )
 
 
-def _numbers(compared: Compared) -> dict[str, Any]:
+def _numbers(compared: _Compared) -> dict[str, Any]:
     """As ``metrics.json`` has it."""
     numbers = compared._asdict()
     return {"on": numbers.pop("name"), **numbers}
@@ -394,8 +382,8 @@ def _use(response: Response) -> str:
 def _name(response: Response) -> str:
     """A record in a sentence."""
     name, use = response.record.name, _use(response)
-    if len(name) > LONGEST_NAME:
-        name = f"{name[: LONGEST_NAME - 3]}..."
+    if len(name) > _LONGEST_NAME:
+        name = f"{name[: _LONGEST_NAME - 3]}..."
     return use if name in ("", response.use, use) else f"{use} '{name}'"
 
 

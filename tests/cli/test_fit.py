@@ -61,7 +61,7 @@ def short(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFact
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """All figures are drawn, of few pixels."""
-    monkeypatch.setattr(plots, "DPI", 40)
+    monkeypatch.setattr(plots, "_DPI", 40)
 
 
 ROUNDING = 1e-12

@@ -48,7 +48,7 @@ def written(folder: Path, command: str = "lfrtorch fit nn=2 seed=0", reason: str
 def test_folders_have_names_of_a_length_that_file_systems_take():
     long = study.folder_name("data.path=" + "/a" * 300)
     assert long != study.folder_name("data.path=" + "/a" * 301)
-    assert len(long) == study.LONGEST
+    assert len(long) == study._LONGEST
     assert "/" not in long
 
 

@@ -21,7 +21,7 @@ from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import html as html_report
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.evaluation import NL_LFR, Evaluation, Response, worst_residuals
+from lfrtorch.reporting.evaluation import _NL_LFR, Evaluation, Response, worst_residuals
 from lfrtorch.reporting.verdict import judge
 
 pytestmark = pytest.mark.numeric
@@ -95,7 +95,7 @@ class Run:
 
 
 def with_output(response: Response, y_hat: np.ndarray) -> Response:
-    return replace(response, simulated={**response.simulated, NL_LFR: y_hat})
+    return replace(response, simulated={**response.simulated, _NL_LFR: y_hat})
 
 
 def run(outputs: tuple[Channel, ...] = (Channel("v", "V"),), starts: int = 1) -> Run:

@@ -175,10 +175,10 @@ def test_poles_and_zeros_are_where_the_model_has_them():
 
 def test_zeros_far_out_are_counted():
     far = replace(SISO, D=np.array([[1e-3]]))
-    assert np.abs(far.zeros()).max() > linear_plots.FAR
+    assert np.abs(far.zeros()).max() > linear_plots._FAR
     ax = linear_plots.poles_and_zeros(far).axes[0]
     assert ax.get_title() == "1 zero(s) beyond the frame"
-    assert ax.get_xlim() == (-linear_plots.FAR, linear_plots.FAR)
+    assert ax.get_xlim() == (-linear_plots._FAR, linear_plots._FAR)
 
 
 def test_distortion_shows_levels():

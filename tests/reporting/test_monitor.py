@@ -53,7 +53,7 @@ def test_tensorboard_without_a_record_has_scalars_alone(model: lfrtorch.Model, t
 def test_tensorboard_holds_scalars_figures_and_texts(
     model: lfrtorch.Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(plots, "DPI", 40)
+    monkeypatch.setattr(plots, "_DPI", 40)
     board = TensorBoard(tmp_path, RECORD, 0.5 * RECORD.y, every=2)
     for iteration in range(3):
         board(model, step(iteration, damping=0.5))

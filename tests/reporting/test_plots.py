@@ -157,7 +157,7 @@ def test_long_signals_keep_their_extremes():
     y[77_777] = 5.0
     ax = plots.response(Record(y, y), both(0 * y[:, None], y[:, None])).axes[0]
     line = drawn(ax, "measured")
-    assert len(line) <= plots.MOST_POINTS + 2
+    assert len(line) <= plots._MOST_POINTS + 2
     assert line[:, 1].max() == 5.0
     assert abs(line[np.argmax(line[:, 1]), 0] - 77_777) <= 10
 
