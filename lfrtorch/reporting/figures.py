@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from lfrtorch._support.errors import InputError
 from lfrtorch.analysis.model_plots import static_figure
 from lfrtorch.dataset import Dataset
-from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.frf import FRF, estimate_frf
-from lfrtorch.records import Record
+from lfrtorch.records import Record, common_unit
 from lfrtorch.reporting import linear_plots, plots
-from lfrtorch.reporting.evaluation import Evaluation, Response, ranked
+from lfrtorch.reporting.evaluation import Response, ranked
+from lfrtorch.reporting.run import Run
 
 MOST_OUTPUTS, MOST_RECORDS = 4, 4
 """Outputs in one figure, and records of which the report has all views."""
@@ -27,22 +27,22 @@ Views = dict[str, dict[str, str]]
 """Captions by the names of records, then of figures."""
 
 
-def of_run(result: FitResult, evaluation: Evaluation) -> tuple[dict[str, Figure], Views]:
+def of_run(run: Run) -> tuple[dict[str, Figure], Views]:
     """All figures of a run's folder by file name, and those of the records that the report shows.
 
     The records are the tests; without tests those of validation, and else those of training. The
     first is that with the largest error; of a group that make one score it is the only one.
     """
-    model, bla, dataset = result.model, evaluation.linear, evaluation.dataset
-    assert bla is not None
-    drawn, views = of_records(evaluation.simulations, dataset)
+    model, bla, dataset = run.fit.model, run.linear, run.dataset
+    drawn, views = of_records(run.simulations, dataset)
     with suppress(InputError):  # a linear model, or one that diverges
         drawn["static_map"] = static_figure(model, dataset.train[0])
-    units = {channel.unit for channel in model.outputs}
-    unit = units.pop() if len(units) == 1 else ""
-    drawn["convergence"] = plots.convergence(result.history, result.chosen_iteration, unit)
+    unit = common_unit(model.outputs)
+    drawn["convergence"] = plots.convergence(run.fit.history, run.fit.chosen_iteration, unit)
     drawn["frequency_response"] = linear_plots.frequency_response(bla, measured(dataset.train))
     drawn["poles_and_zeros"] = linear_plots.poles_and_zeros(bla)
+    if run.residuals is not None:
+        drawn["residuals"] = run.residuals.plot()
     return drawn, views
 
 

@@ -31,13 +31,12 @@ from lfrtorch._support.types import Array
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.linearisation import poles_at_rest
 from lfrtorch.analysis.residual_analysis import LEGEND as RESIDUALS_LEGEND
-from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.fitting.size_search import LEGEND, size_table
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.records import common_unit
-from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.evaluation import Evaluation, Score
+from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import (
     REFITTED,
     finalists,
@@ -48,18 +47,14 @@ from lfrtorch.reporting.scores import (
     published_unit,
     start_matters,
 )
-from lfrtorch.reporting.verdict import LINEAR_MODEL, Verdict, of_linear
+from lfrtorch.reporting.verdict import LINEAR_MODEL, of_linear
 
-USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
-"""What the records that are no tests were for."""
-
+_USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
 _FEW = 3  # most tests that the verdict names one by one
 _ALL = "all"  # name of several outputs together
 
-Rows = list[Sequence[Cell]]
 
-
-class Errors(NamedTuple):
+class _Errors(NamedTuple):
     """RMSE of the linear model and of the NL-LFR, linear / error, and both over the deviation."""
 
     output: str
@@ -72,54 +67,48 @@ class Errors(NamedTuple):
 
 
 def render(
-    metrics: Mapping[str, Any],
-    result: FitResult,
-    evaluation: Evaluation,
+    run: Run,
     images: Mapping[str, bytes],
-    verdict: Verdict,
-    advice: Sequence[Advice],
     *,
     views: Mapping[str, Mapping[str, str]] | None = None,
-    residuals: Residuals | None = None,
+    command: str = "",
     config: str = "",
 ) -> str:
-    """The page.
+    """The page of a run.
 
     Args:
-        metrics: see :func:`lfrtorch.reporting.scores.metrics`.
-        result: the fit.
-        evaluation: of its model and the linear one on all records.
-        images: figures as PNG by name; ``static_map``, ``convergence``, ``frequency_response`` and
-            ``poles_and_zeros`` have their places, and those of ``views`` theirs.
-        verdict: on the fit, whose colour the page's first lines have.
-        advice: what to try next.
+        run: what was found.
+        images: figures as PNG by name; ``static_map``, ``convergence``, ``frequency_response``,
+            ``poles_and_zeros`` and ``residuals`` have their places, and those of ``views`` theirs.
         views: of each record that is shown, by its name, captions by the names of its figures. The
             first two of the first record follow the verdict.
-        residuals: of one record, if it has some; ``residuals`` among the images is theirs.
-        config: of the run.
+        command, config: that made the run.
     """
-    dataset, bla = evaluation.dataset, evaluation.linear
-    assert bla is not None
+    tried = run.metrics["sizes_search"]
+    groups = [(name, w) for name, w in run.fit.model.lfr.cell.named_parameters() if w.numel()]
     return page(
         "report.html",
         images,
-        name=dataset.name,
+        run=run,
+        metrics=run.metrics,
+        command=command or UNKNOWN,
+        config=config,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
-        sizes=_sizes(metrics),
-        verdict=verdict,
-        comparisons=comparisons(evaluation),
-        linear_is_used=verdict.use == LINEAR_MODEL,
-        advice=advice,
-        scores=_scores(metrics, evaluation),
-        data=_data(evaluation),
+        sizes=_sizes(run.metrics["sizes"]),
+        comparisons=comparisons(run.evaluation),
+        linear_is_used=run.verdict.use == LINEAR_MODEL,
+        scores=_scores(run.metrics, run.evaluation),
+        data=_data(run.evaluation),
         records=[{"name": name, "views": list(own.items())} for name, own in (views or {}).items()],
-        residuals=_residuals(residuals),
-        linear=_linear(bla, result),
-        fit=_fit(metrics, result, bool(dataset.validation)),
-        search=_search(metrics["sizes_search"]),
-        parameters=_parameters(metrics, result),
-        stability=_stability(metrics["stable_to"]),
-        run=_run(metrics, result, bla, config),
+        residuals_legend=RESIDUALS_LEGEND,
+        linear=_linear(run.linear, run.fit),
+        fit=_fit(run),
+        search=(len(tried), size_table(tried), LEGEND.splitlines()),
+        parameters=[
+            [name, " × ".join(map(str, w.shape)), w.numel()] for name, w in groups if w.numel()
+        ],
+        stability=_stability(run.metrics["stable_to"]),
+        facts=_facts(run),
     )
 
 
@@ -172,7 +161,7 @@ def comparisons(evaluation: Evaluation) -> list[str]:
     return [line, *(_line(*item) for item in shown if item not in scored)]
 
 
-def _line(name: str, errors: Errors) -> str:
+def _line(name: str, errors: _Errors) -> str:
     if not math.isfinite(errors.error):
         return f"{name}: the NL-LFR diverges"
     error, linear = quantities([errors.error, errors.linear], errors.unit)
@@ -181,9 +170,8 @@ def _line(name: str, errors: Errors) -> str:
     return f"{name}: error {beside} ({error} against {linear}), NRMSE {relative}"
 
 
-def _sizes(metrics: Mapping[str, Any]) -> str:
+def _sizes(sizes: Mapping[str, int]) -> str:
     """The sizes of the model in words."""
-    sizes = dict(metrics["sizes"])
     degree = sizes.get("degree")
     static = neurons(sizes) if degree is None else f"polynomial of degree {degree}"
     return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
@@ -209,7 +197,7 @@ def _scores(metrics: Mapping[str, Any], evaluation: Evaluation) -> dict[str, Any
                 known = values if row == 0 else ["" if v is None else v for v in values]
                 tests.append([name if row == 0 else "", *cells, *known])
             else:
-                others.append([*([name, USES[use]] if row == 0 else ["", ""]), *cells])
+                others.append([*([name, _USES[use]] if row == 0 else ["", ""]), *cells])
     references = [own_linear(metrics)] if metrics["linear"] else []
     references += [f"{p.label}: {p.reference}" for p in published if tests]
     references += [
@@ -229,7 +217,7 @@ def _scores(metrics: Mapping[str, Any], evaluation: Evaluation) -> dict[str, Any
     }
 
 
-def _errors(score: Score) -> list[Errors]:
+def _errors(score: Score) -> list[_Errors]:
     """The errors of each output; before several of one unit those of all together."""
     columns = zip(
         score.channels,
@@ -247,13 +235,13 @@ def _errors(score: Score) -> list[Errors]:
     return [_compared(_ALL, units.pop(), score.lti_rmse, score.rmse, score.std), *single]
 
 
-def _compared(output: str, unit: str, linear: float, error: float, std: float) -> Errors:
+def _compared(output: str, unit: str, linear: float, error: float, std: float) -> _Errors:
     std = std or math.nan
     ratio = linear / error if error > 0 else math.nan
-    return Errors(output, unit, linear, error, ratio, linear / std, error / std)
+    return _Errors(output, unit, linear, error, ratio, linear / std, error / std)
 
 
-def _units(compared: Iterable[Sequence[Errors]], shown: str = "") -> dict[str, tuple[float, str]]:
+def _units(compared: Iterable[Sequence[_Errors]], shown: str = "") -> dict[str, tuple[float, str]]:
     """Of each unit of the outputs a factor and the unit with a prefix, for all of their errors."""
     values: dict[str, list[float]] = {}
     for errors in (errors for each in compared for errors in each):
@@ -261,7 +249,7 @@ def _units(compared: Iterable[Sequence[Errors]], shown: str = "") -> dict[str, t
     return {unit: engineering(own, unit, shown) for unit, own in values.items()}
 
 
-def _cells(errors: Errors, factor: float) -> list[Cell]:
+def _cells(errors: _Errors, factor: float) -> list[Cell]:
     shown = factor * errors.error if math.isfinite(errors.error) else "diverges"
     relative = percent(errors.linear_relative), percent(errors.relative)
     return [factor * errors.linear, shown, errors.ratio, *relative]
@@ -284,13 +272,12 @@ def _data(evaluation: Evaluation) -> dict[str, Any]:
             factor, unit = engineering([moments[1]], channel.unit)
             channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
     records = [
-        [r.name, USES.get(one.use, one.use), r.source, r.start, of_samples(one.score.entry()),
+        [r.name, _USES.get(one.use, one.use), r.source, r.start, of_samples(one.score.entry()),
          r.period]
         for one, r in ((response, response.record) for response in evaluation.simulations)
     ]  # fmt: skip
     return {
         "summary": summary,
-        "notes": dataset.notes,
         "channels": channels,
         "records": records,
     }
@@ -301,19 +288,6 @@ def _moments(x: Array) -> list[float]:
     mean, deviation = float(np.mean(x)), float(np.std(x))
     mean = 0.0 if abs(mean) < 1e-12 * deviation else mean
     return [mean, deviation, float(np.min(x)), float(np.max(x))]
-
-
-def _residuals(found: Residuals | None) -> dict[str, Any]:
-    if found is None:
-        return {}
-    head, rows = found.rows()
-    return {
-        "record": found.worst,
-        "head": head,
-        "rows": rows,
-        "sentences": found.sentences(),
-        "legend": RESIDUALS_LEGEND,
-    }
 
 
 def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
@@ -327,7 +301,7 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
     caption = "Frequency response of the model, over the measured one if the records give one"
     if bla.covariance is not None:
         caption += "; band: ± 2 standard deviations"
-    poles: Rows = []
+    poles: list[Sequence[Cell]] = []
     for model, values in (("linear", bla.poles), ("NL-LFR", poles_at_rest(result.model))):
         poles += [
             [
@@ -341,11 +315,12 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
     return {"summary": summary, "notes": notes, "caption": f"{caption}.", "poles": poles}
 
 
-def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict[str, Any]:
+def _fit(run: Run) -> dict[str, Any]:
+    metrics = run.metrics
     fit, ranking = metrics["fit"], metrics["ranking"]
     ended, others = finalists(metrics)
     errors = ("train", "validation", "selection")
-    unit = common_unit(result.model.outputs)
+    unit = common_unit(run.model.outputs)
     factor, unit = engineering([start[name] for start in ended for name in errors], unit)
     starts = [
         [s["seed"], s["reason"], s["iterations"], *(times(factor, s[name]) for name in errors)]
@@ -354,7 +329,7 @@ def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict
     label = f" ({unit})" if unit else ""
     head = ["seed", "why it ended", "iterations"]
     head += [f"{name}{label}" for name in ("training", *errors[1:])]
-    judge = "validation" if validated else "training"
+    judge = "validation" if run.dataset.validation else "training"
     summary = (
         f"{fit['reason'].capitalize()}; kept iteration {metrics['chosen_iteration']} of "
         f"{fit['iterations']}, the best on {judge}."
@@ -368,25 +343,6 @@ def _fit(metrics: Mapping[str, Any], result: FitResult, validated: bool) -> dict
     if metrics["refit"] is not None:
         summary += f" {REFITTED}"
     return {"summary": summary, "head": head, "starts": starts, "others": others}
-
-
-def _search(tried: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The sizes that were tried."""
-    head, rows = size_table(tried)
-    count = f"{len(tried)} models were tried; the table has the chosen one and the last round."
-    return {"head": head, "rows": rows, "legend": [count, *LEGEND.splitlines()]}
-
-
-def _parameters(metrics: Mapping[str, Any], result: FitResult) -> dict[str, Any]:
-    return {
-        "summary": f"{metrics['parameters']} parameters, {metrics['parameters_net']} without the "
-        "directions that change the parameters and not the output.",
-        "groups": [
-            [name, " × ".join(map(str, weight.shape)), weight.numel()]
-            for name, weight in result.model.lfr.cell.named_parameters()
-            if weight.numel()
-        ],
-    }
 
 
 def _stability(stable_to: float) -> str:
@@ -403,25 +359,23 @@ def _stability(stable_to: float) -> str:
     )
 
 
-def _run(
-    metrics: Mapping[str, Any], result: FitResult, bla: LinearModel, config: str
-) -> dict[str, Any]:
-    fit = metrics["fit"]
-    weight = result.model.lfr.cell.A
+def _facts(run: Run) -> list[list[str]]:
+    fit, found = run.metrics["fit"], run.linear.fit
+    weight = run.fit.model.lfr.cell.A
     facts = [
         ["time of the fit", f"{number(fit['seconds'])} s"],
         ["an iteration", f"{number(1e3 * fit['seconds_per_iteration'])} ms"],
     ]
-    if bla.fit is not None:
-        facts.append(["time of the linear model", f"{number(bla.fit.seconds)} s"])
-    facts += [
+    if found is not None:
+        facts.append(["time of the linear model", f"{number(found.seconds)} s"])
+    return [
+        *facts,
         ["machine", f"{platform.machine()}, {_count(os.cpu_count() or 1, 'CPU')}"],
         ["threads, device, dtype", f"{torch.get_num_threads()}, {weight.device}, "
          f"{str(weight.dtype).removeprefix('torch.')}"],
         ["platform", platform.platform()],
-        *([name, number_] for name, number_ in metrics["versions"].items()),
+        *([name, known] for name, known in run.metrics["versions"].items()),
     ]  # fmt: skip
-    return {"command": metrics["command"] or UNKNOWN, "facts": facts, "config": config}
 
 
 def _count(n: int, what: str) -> str:

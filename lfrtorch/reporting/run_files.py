@@ -68,18 +68,13 @@ def write(
         result.iterations,
     )
     if draw:
-        drawn, views = figures.of_run(result, run.evaluation)
-        if run.residuals is not None:
-            drawn["residuals"] = run.residuals.plot()
+        drawn, views = figures.of_run(run)
         images = {name: plots.png(figure) for name, figure in drawn.items()}
         for name, image in images.items():
             with whole_file(folder / "figures" / f"{name}.png") as fresh:
                 fresh.write_bytes(image)
             board.image(f"summary/{name}", image, result.iterations)
-        page = html.render(
-            metrics, result, run.evaluation, images, run.verdict, run.advice,
-            views=views, residuals=run.residuals, config=config,
-        )  # fmt: skip
+        page = html.render(run, images, views=views, command=command, config=config)
         with whole_file(folder / "report.html") as path:
             path.write_text(page, encoding="utf-8")
     board.close()

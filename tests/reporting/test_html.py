@@ -21,7 +21,7 @@ from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import html as html_report
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.advice import Advice
-from lfrtorch.reporting.evaluation import _NL_LFR, Evaluation, Response, worst_residuals
+from lfrtorch.reporting.evaluation import Evaluation, Response, worst_residuals
 from lfrtorch.reporting.verdict import judge
 
 pytestmark = pytest.mark.numeric
@@ -76,16 +76,25 @@ class Run:
     def responses(self) -> list[Response]:
         return self.evaluation.simulations
 
-    def page(self, advice: tuple[Advice, ...] = (), search=(), **options) -> Page:
+    def page(self, advice: tuple[Advice, ...] = (), search=(), residuals=None, config="") -> Page:
         metrics = report.metrics(self.result, self.evaluation, seeds=range(2))
-        metrics |= {"sizes_search": search, "command": "train.py a=1"}
+        found = lfrtorch.Run(
+            dataset=self.dataset,
+            settings=lfrtorch.Settings(nx=2),
+            linear=self.bla,
+            order_scan=None,
+            size_search=None,
+            fit=self.result,
+            evaluation=self.evaluation,
+            residuals=residuals,
+            metrics=metrics | {"sizes_search": search},
+            verdict=judge(self.result, self.responses, linear_nx=self.bla.nx),
+            advice=list(advice),
+        )
         images = {"convergence": b"PNG 1", "near": b"PNG 2"}
         views = {record.name: {"near": "a close-up"} for record in self.dataset.tests}
-        verdict = judge(self.result, self.responses, linear_nx=self.bla.nx)
-        html = html_report.render(
-            metrics, self.result, self.evaluation, images, verdict, advice, views=views, **options
-        )
-        return Page(html)
+        options = {"views": views, "command": "train.py a=1", "config": config}
+        return Page(html_report.render(found, images, **options))
 
     def lines(self, *responses: Response) -> list[str]:
         """What is said of all records, or of others."""
@@ -95,7 +104,7 @@ class Run:
 
 
 def with_output(response: Response, y_hat: np.ndarray) -> Response:
-    return replace(response, simulated={**response.simulated, _NL_LFR: y_hat})
+    return replace(response, simulated={**response.simulated, "NL-LFR": y_hat})
 
 
 def run(outputs: tuple[Channel, ...] = (Channel("v", "V"),), starts: int = 1) -> Run:
