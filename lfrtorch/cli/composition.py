@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from difflib import get_close_matches
 from pathlib import Path
 
+import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -18,7 +19,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.cli import CONF
-from lfrtorch.cli.hydra_versions import COMPOSED
+from lfrtorch.cli.errors import user_errors
+from lfrtorch.cli.hydra_versions import COMPOSED, MAIN
 from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.words import GROUPS
 
@@ -38,6 +40,27 @@ def take_words(command: str, whole: Callable[[Sequence[str]], list[str]] = list)
     given = sys.argv[1:]
     sys.argv[1:] = [quoted(word) for word in whole(given)]
     check_words(command, given, sys.argv[1:])
+
+
+def started(
+    command: str,
+    work: Callable[[DictConfig], object],
+    whole: Callable[[Sequence[str]], list[str]] = list,
+) -> None:
+    """Start a command of one run; errors of users end it with a line.
+
+    Args:
+        command, whole: see :func:`take_words`.
+        work: what it does with its settings.
+    """
+
+    def job(cfg: DictConfig) -> None:
+        with user_errors(cfg=cfg):
+            work(cfg)
+
+    with user_errors():
+        take_words(command, whole)
+    hydra.main(**MAIN, config_path=str(CONF), config_name=command)(job)()
 
 
 def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> None:

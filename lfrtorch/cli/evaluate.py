@@ -11,7 +11,6 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
@@ -20,13 +19,10 @@ from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
 from lfrtorch.analysis.residual_analysis import SHORTEST, Residuals, of_simulation
-from lfrtorch.cli import CONF
-from lfrtorch.cli.composition import take_words
+from lfrtorch.cli.composition import started
 from lfrtorch.cli.config import loaded, require_data
-from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.hydra_versions import MAIN
 from lfrtorch.cli.run_folder import CONFIG, program, read_settings
-from lfrtorch.cli.simulate import opened
+from lfrtorch.cli.simulate import chosen, opened
 from lfrtorch.files.load import EVERYTHING, listed_files
 from lfrtorch.model import check_channels
 from lfrtorch.reporting import scores as report
@@ -36,19 +32,16 @@ _FILES = "lfrtorch.load_records"  # what reads files of one's own
 _DIVIDES = "data.validation", "data.test"  # words that divide them by use
 
 
-def evaluate(cfg: DictConfig, command: str = "") -> None:
+def evaluate(cfg: DictConfig) -> None:
     """Print the scores of the checkpoint's model, and write them if that is asked for."""
-    if cfg.checkpoint is None:
-        raise InputError(
-            "no model chosen: add checkpoint=DIR, the folder of a run or of a saved model."
-        )
+    command = shlex.join([*program("scripts/evaluate.py"), *HydraConfig.get().overrides.task])
+    folder = chosen(cfg)
     require_data(cfg)
     if cfg.out is not None:
         if Path(str(cfg.out)).suffix.lower() != ".json":
             raise InputError(f"out is '{cfg.out}'; the scores are JSON: name it FILE.json.")
         if not cfg.overwrite:
             refuse_existing(cfg.out, "overwrite=true")
-    folder = str(cfg.checkpoint)
     model, bla = opened(folder), linear_beside(folder)
     if cfg.data._target_ == _FILES:
         from_files(cfg, model, command)
@@ -127,16 +120,6 @@ def linear_beside(checkpoint: str) -> lfrtorch.LinearModel | None:
     return None if found is None else lfrtorch.LinearModel.load(found)
 
 
-@hydra.main(**MAIN, config_path=str(CONF), config_name="evaluate")
-def main(cfg: DictConfig) -> None:
-    """The command line."""
-    command = shlex.join([*program("scripts/evaluate.py"), *HydraConfig.get().overrides.task])
-    with user_errors(cfg=cfg):
-        evaluate(cfg, command)
-
-
 def launch() -> None:
     """The command."""
-    with user_errors():
-        take_words("evaluate")
-    main()
+    started("evaluate", evaluate)

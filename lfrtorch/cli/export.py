@@ -7,18 +7,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import hydra
 import numpy as np
 from omegaconf import DictConfig
 
 from lfrtorch import export
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.cli import CONF
-from lfrtorch.cli.composition import take_words
-from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.hydra_versions import MAIN
-from lfrtorch.cli.simulate import introduced, opened
+from lfrtorch.cli.composition import started
+from lfrtorch.cli.simulate import chosen, introduced, opened
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -26,14 +22,11 @@ from lfrtorch.model import Model
 
 def written(cfg: DictConfig) -> None:
     """Write the files, and say how they are used."""
-    if cfg.checkpoint is None:
-        raise InputError(
-            "checkpoint is not set: add checkpoint=DIR, the folder of a run or of a saved model."
-        )
+    folder = chosen(cfg)
     if cfg.to is None:
         raise InputError(f"to is not set: add to=c, or another of {', '.join(export.TARGETS)}.")
-    model = opened(str(cfg.checkpoint))
-    print(introduced(str(cfg.checkpoint), model))
+    model = opened(folder)
+    print(introduced(folder, model))
     name, observer = str(cfg.name), observer_of(cfg, model)
     paths = export.write(
         model, str(cfg.to), cfg.out, name=name, overwrite=cfg.overwrite, observer=observer
@@ -67,15 +60,6 @@ def _variances(name: str, given: Any) -> Array:
         ) from None
 
 
-@hydra.main(**MAIN, config_path=str(CONF), config_name="export")
-def main(cfg: DictConfig) -> None:
-    """The command line."""
-    with user_errors(cfg=cfg):
-        written(cfg)
-
-
 def launch() -> None:
     """The command."""
-    with user_errors():
-        take_words("export")
-    main()
+    started("export", written)

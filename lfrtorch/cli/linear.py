@@ -11,7 +11,6 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -19,11 +18,9 @@ import lfrtorch
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
-from lfrtorch.cli import CONF
-from lfrtorch.cli.composition import take_words
+from lfrtorch.cli.composition import started
 from lfrtorch.cli.config import configured, limit_threads, loaded
-from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.hydra_versions import MAIN, instantiate
+from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.run_folder import CONFIG, arguments, no_empty_folder, program
 from lfrtorch.cli.words import Terminal
 from lfrtorch.distributed import Ranks
@@ -89,18 +86,13 @@ def wants_response(cfg: DictConfig, records: Sequence[lfrtorch.Record]) -> bool:
     return cfg.bla.refine == "frequency" or (cfg.bla.refine is None and of_response(records))
 
 
-@hydra.main(**MAIN, config_path=str(CONF), config_name="linear")
-def main(cfg: DictConfig) -> None:
-    """The command line."""
-    run = HydraConfig.get()
-    command = shlex.join([*program("scripts/bla.py"), *run.overrides.task])
-    folder = Path(run.runtime.output_dir)
-    with user_errors(cfg=cfg), no_empty_folder(folder):
-        identify(cfg, folder, command)
-
-
 def launch() -> None:
     """The command, with the settings of the run in ``resume=DIR`` before its words."""
-    with user_errors():
-        take_words("linear", arguments)
-    main()
+
+    def work(cfg: DictConfig) -> None:
+        run = HydraConfig.get()
+        folder = Path(run.runtime.output_dir)
+        with no_empty_folder(folder):
+            identify(cfg, folder, shlex.join([*program("scripts/bla.py"), *run.overrides.task]))
+
+    started("linear", work, arguments)

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import hydra
 import numpy as np
 from omegaconf import DictConfig, ListConfig
 
@@ -20,10 +19,7 @@ from lfrtorch._support.atomic import refuse_existing
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded, real
-from lfrtorch.cli import CONF
-from lfrtorch.cli.composition import take_words
-from lfrtorch.cli.errors import user_errors
-from lfrtorch.cli.hydra_versions import MAIN
+from lfrtorch.cli.composition import started
 from lfrtorch.cli.words import translated
 from lfrtorch.file_simulation import (
     Simulated,
@@ -41,10 +37,11 @@ from lfrtorch.reporting.scores import of_samples
 
 def simulate(cfg: DictConfig) -> None:
     """Simulate every file, write what comes out, and print the scores."""
+    folder = chosen(cfg)
     require(cfg)
     pairs = targets(cfg)
-    model = opened(str(cfg.checkpoint))
-    print(introduced(str(cfg.checkpoint), model))
+    model = opened(folder)
+    print(introduced(folder, model))
     check_rate(cfg, model)
     rows = []
     for path, out in pairs:
@@ -106,6 +103,15 @@ def scored(path: Path, model: lfrtorch.Model, result: Simulated) -> list[list[ta
     ]
 
 
+def chosen(cfg: DictConfig) -> str:
+    """The folder of the model."""
+    if cfg.checkpoint is None:
+        raise InputError(
+            "checkpoint is not set: add checkpoint=DIR, the folder of a run or of a saved model."
+        )
+    return str(cfg.checkpoint)
+
+
 def opened(folder: str) -> lfrtorch.Model:
     """The model of a checkpoint, a linear one as an NL-LFR without static nonlinearity."""
     description, _ = checkpoint.read(folder)
@@ -124,7 +130,6 @@ def introduced(folder: str, model: lfrtorch.Model) -> str:
 def require(cfg: DictConfig) -> None:
     """Say what is missing or wrong on the command line before anything is read."""
     for option, value, example in (
-        ("checkpoint", cfg.checkpoint, "DIR, the folder of a run or of a saved model"),
         ("data.path", cfg.data.path, "FILE, the file of inputs"),
         ("out", cfg.out, "FILE.csv, which is written, or for several files a FOLDER"),
     ):
@@ -192,15 +197,6 @@ def about(path: Path) -> Iterator[None]:
         raise InputError(f"'{path}': {error}") from error
 
 
-@hydra.main(**MAIN, config_path=str(CONF), config_name="simulate")
-def main(cfg: DictConfig) -> None:
-    """The command line."""
-    with user_errors(cfg=cfg):
-        simulate(cfg)
-
-
 def launch() -> None:
     """The command."""
-    with user_errors():
-        take_words("simulate")
-    main()
+    started("simulate", simulate)

@@ -16,7 +16,7 @@ from command_line import configuration, file_overrides
 from reference import measure, random_cell, random_model
 
 import lfrtorch
-from lfrtorch.cli import evaluate, fit
+from lfrtorch.cli import composition, evaluate, fit
 from lfrtorch.dataset import Dataset, Published
 
 MODEL = random_model(random_cell(), fs=50.0)
@@ -55,7 +55,8 @@ def run_folder(tmp_path: Path) -> Path:
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     monkeypatch.setattr(sys, "argv", ["evaluate.py", *words])
-    evaluate.main()
+    monkeypatch.setattr(composition, "take_words", lambda *_: None)  # data of these tests
+    evaluate.launch()
 
 
 @pytest.mark.numeric
@@ -175,7 +176,7 @@ def test_a_run_is_scored_as_it_scored_itself(csv: Path, tmp_path: Path, monkeypa
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([DATA], "no model chosen: add checkpoint=DIR"),
+        ([DATA], "checkpoint is not set: add checkpoint=DIR"),
         (["checkpoint=/nowhere", DATA], "there is no '/nowhere'; give the folder of a run"),
         (["checkpoint=RUN"], "no data chosen: add +bench=boucwen"),
         (["checkpoint=RUN", DATA, "out=scores.txt"], "the scores are JSON: name it FILE.json"),

@@ -408,7 +408,7 @@ def test_a_run_of_before_there_were_structures_goes_on_and_is_scored(
     monkeypatch.setattr(
         sys, "argv", ["evaluate.py", f"checkpoint={folder}", f"out={out}", *file_overrides(csv)]
     )
-    evaluate.main()
+    evaluate.launch()
     scores = json.loads(out.read_text())["scores"]
     assert scores["test"]["rmse"] == pytest.approx(metrics["scores"]["test"]["rmse"], rel=1e-9)
 

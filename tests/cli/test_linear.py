@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 
 import lfrtorch
-from lfrtorch.cli import errors, fit, linear
+from lfrtorch.cli import composition, errors, fit, linear
 from lfrtorch.cli.composition import composed
 from lfrtorch.dataset import Dataset
 from lfrtorch.records import Record
@@ -61,7 +61,8 @@ def overrides(csv: Path, inputs: str, outputs: str, *more: str) -> list[str]:
 def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> dict:
     """linear.json of a run."""
     monkeypatch.setattr(sys, "argv", ["bla.py", f"hydra.run.dir='{folder}'", *words])
-    linear.main()
+    monkeypatch.setattr(composition, "take_words", lambda *_: None)  # data of these tests
+    linear.launch()
     return json.loads((folder / "linear.json").read_text())
 
 

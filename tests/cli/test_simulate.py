@@ -20,6 +20,7 @@ import lfrtorch
 from lfrtorch._support.types import Array
 from lfrtorch.cli import evaluate, simulate
 from lfrtorch.cli.composition import composed
+from lfrtorch.cli.errors import user_errors
 from lfrtorch.file_simulation import BEGINNING
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.stream import Block, FileStream
@@ -52,7 +53,7 @@ def folder(tmp_path: Path) -> Path:
 def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setattr("sys.argv", ["simulate.py", "checkpoint=model", *words])
-    simulate.main()
+    simulate.launch()
 
 
 @cache
@@ -64,7 +65,7 @@ def direct() -> None:
     """The command line without the start of Hydra, which takes a quarter of a second."""
     cfg = copy.deepcopy(usual())
     cfg.merge_with_dotlist(sys.argv[1:])
-    with simulate.user_errors(cfg=cfg):
+    with user_errors(cfg=cfg):
         simulate.simulate(cfg)
 
 
@@ -280,7 +281,7 @@ def test_evaluate_scores_the_same_samples(
     here = [line[3:] for line in lines if line[:1] == ["x.csv"]]
     words = ["data=file", *given, f"data.start={start}", "out=scores.json"]
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "checkpoint=model", *words])
-    evaluate.main()
+    evaluate.launch()
     score = json.loads((folder / "scores.json").read_text())["scores"]["x"]
     skip = {"estimated": min(50, samples // 5), "zero": period or round(samples / 20)}[start]
     said = f"last {samples - skip} of {samples}"
@@ -379,7 +380,7 @@ def test_blocks_give_the_numbers_of_one_simulation(
 def test_user_errors_are_one_message(
     words: list[str], message: str, folder: Path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(simulate, "main", direct)
+    monkeypatch.setattr(simulate, "launch", direct)
     assert message in refused(monkeypatch, capsys, folder, *words)
 
 
@@ -414,7 +415,7 @@ def test_help_says_all(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["simulate.py", "--help"])
     with pytest.raises(SystemExit) as stop:
-        simulate.main()
+        simulate.launch()
     assert stop.value.code == 0
     printed = capsys.readouterr().out
     words = "checkpoint data.path data.inputs data.outputs data.time data.fs start estimate x0 skip"
