@@ -328,7 +328,6 @@ def commands(run: Path, values: Sequence[str]) -> Iterator[Case]:
     data = [f"data.{name}" for name in DATA.split()]
     linear = "nx nx_max threads bla.refine bla.offset bla.feedthrough bla.integrators bla.max_iter "
     linear += "bla.coordinates frf.method noise"
-    seek = [*fit_words(run)[1:], "nn=1,2", "trials=1", "out=s"]
     words = {
         "simulate": ([made, f"data.path={csv}", "out=y.csv"], SIMULATE.split()),
         "export": (
@@ -339,7 +338,6 @@ def commands(run: Path, values: Sequence[str]) -> Iterator[Case]:
         "linear": ([*given, "nx=1", "threads=1", "hydra.run.dir=r"], [*linear.split(), *data]),
         "preview": ([str(csv)], data),
         "compare": ([str(run)], ["out"]),
-        "search": (seek, ["trials", "workers", "objective", "nz", "ridge"]),
     }
     for word, (base, names) in words.items():
         lines = [[*base, f"{name}={value}"] for name in names for value in values]

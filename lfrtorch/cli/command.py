@@ -6,7 +6,7 @@ import sys
 from importlib import import_module
 from importlib.metadata import version
 
-from lfrtorch.cli import CONF, compare, preview_words
+from lfrtorch.cli import CONF
 from lfrtorch.cli.interrupts import at_once, handled
 
 COMMANDS = {
@@ -19,9 +19,6 @@ COMMANDS = {
     "export": "write a saved model as C, CasADi, ONNX, MATLAB, Python or FMU",
 }
 """Modules of this room, in the order in which a user meets them, and what they do."""
-
-PARSERS = {"preview": preview_words.parser, "compare": compare.parser}
-"""What reads the words of commands that have no settings."""
 
 
 def main() -> None:
@@ -43,8 +40,6 @@ def start(command: str) -> None:
     """Start a command; its help comes without what computes, which takes seconds to import."""
     if {"--help", "-h"}.isdisjoint(sys.argv):
         import_module(f"lfrtorch.cli.{command}").launch()
-    elif command in PARSERS:
-        PARSERS[command]().parse_args()
     else:
         import hydra
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
@@ -21,12 +23,13 @@ from lfrtorch._support.errors import InputError
 from lfrtorch.cli import CONF
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import COMPOSED, MAIN
-from lfrtorch.cli.quotes import quoted
+from lfrtorch.cli.quotes import in_quotes, quoted
 from lfrtorch.cli.words import GROUPS
 
 SWEEPS = {"-m", "--multirun"}
 """Options that make several runs of several values."""
 
+_SETTING = re.compile(r"[+~]*[a-z_.]+=")  # what a word NAME=VALUE begins with
 _WITHOUT_DATA = ("export",)  # commands that read no data
 
 
@@ -61,6 +64,17 @@ def started(
     with user_errors():
         take_words(command, whole)
     hydra.main(**MAIN, config_path=str(CONF), config_name=command)(job)()
+
+
+def name_paths(option: str) -> None:
+    """Let an option have the words of the command line that are paths and have no name."""
+    given = sys.argv[1:]
+    named = [w for w in given if w[:1] == "-" or (_SETTING.match(w) and not os.path.exists(w))]
+    paths = [in_quotes(word) for word in given if word not in named]
+    with user_errors():
+        if paths and any(word.startswith(f"{option}=") for word in named):
+            raise InputError(f"{option} is given twice; a path alone is {option}, too.")
+    sys.argv[1:] = [*named, *[f"{option}=[{','.join(paths)}]"] * bool(paths)]
 
 
 def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> None:

@@ -83,7 +83,7 @@ def _name(text: str) -> str:
     name = text.strip()
     if not name or is_read(f"x=[{name}]"):
         return text
-    return text.replace(name, _in_quotes(name))
+    return text.replace(name, in_quotes(name))
 
 
 def _table(text: str) -> str:
@@ -95,9 +95,10 @@ def _table(text: str) -> str:
             return f"{{{text}}}"
         cells += pair.groups()
         position = pair.end()
-    spelt = [cell if cell[0] in "'\"" else _in_quotes(cell) for cell in cells]
+    spelt = [cell if cell[0] in "'\"" else in_quotes(cell) for cell in cells]
     return f"${{table:{','.join(spelt)}}}"
 
 
-def _in_quotes(text: str) -> str:
+def in_quotes(text: str) -> str:
+    """A text as Hydra reads it, whatever is in it."""
     return QuotedString(text, Quote.single).with_quotes()

@@ -101,8 +101,8 @@ def _roles(
     table: Table, inputs: Columns | None, outputs: Columns | None, time: str | int | None
 ) -> tuple[list[tuple[int, ...]], list[str]]:
     """Inputs, outputs and times, and remarks on the choice."""
-    u = table.find(inputs, "data.inputs") if inputs else ()
-    y = table.find(outputs, "data.outputs") if outputs else ()
+    u = () if inputs is None else table.find(inputs, "data.inputs")
+    y = () if outputs is None else table.find(outputs, "data.outputs")
     stamps = () if time is None else table.find(time, "data.time")
     named = [*u, *y, *stamps]
     twice = [table.headers[i] for i in dict.fromkeys(named) if named.count(i) > 1]

@@ -52,9 +52,10 @@ def file(tmp_path: Path, signals, monkeypatch) -> Path:
 
 
 @pytest.fixture
-def run(capsys):
+def run(capsys, monkeypatch):
     def run(*words: str | Path) -> str:
-        preview.launch([str(word) for word in words])
+        monkeypatch.setattr("sys.argv", ["lfrtorch preview", *map(str, words)])
+        preview.launch()
         printed = capsys.readouterr()
         assert printed.err == ""
         return printed.out
@@ -69,8 +70,10 @@ def undrawn(monkeypatch):
 
 
 def refused(capsys, *words: str | Path) -> str:
-    with pytest.raises(SystemExit) as stop:
-        preview.launch([str(word) for word in words])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["lfrtorch preview", *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            preview.launch()
     assert stop.value.code == 1
     return capsys.readouterr().err
 
@@ -116,7 +119,7 @@ def test_numbers_of_the_table(signals):
 
 @pytest.mark.usefixtures("undrawn")
 def test_without_roles_all_columns_are_shown(file: Path, run):
-    out = run(file, "--out", "sub/look.svg")
+    out = run(file, "out=sub/look.svg")
     assert "without data.inputs and data.outputs what lies between them is not" in out
     assert "- 'level' has its largest value 0.3" in out
     assert (file.parent / "sub" / "look.svg").read_text().lstrip().startswith("<?xml")
@@ -183,7 +186,7 @@ def test_several_files_and_patterns(file: Path, signals, run):
     )
     assert out.count("Figure in") == 2
     assert {p.name for p in file.parent.glob("*.png")} == {"lab_preview.png", "other_preview.png"}
-    run(file, file.parent / "other.mat", "--out", "x.png")
+    run(file, file.parent / "other.mat", "out=x.png")
     assert {p.name for p in file.parent.glob("x*")} == {"x_lab.png", "x_other.png"}
 
 
@@ -265,9 +268,9 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
     other = written(file.parent / "ü.csv", {"Füllstand (a)": signals["force"]})
     assert "Füllstand" in run(f"data.path=[{other}]", "data.outputs=[Füllstand (a)]")
     for word, message in (
-        ("data.start=zero", "preview does not read data.start; it takes data.path, data.inputs"),
-        ("nx=2", "preview does not read nx; it takes"),
-        ("data.inputs=a,b", "for several values write data.inputs=[a,b]."),
+        ("data.start=zero", "there is no setting 'data.start'"),
+        ("nx=2", "there is no setting 'nx'"),
+        ("data.inputs=a,b", "for a list write data.inputs=[a,b]"),
         (f"data.path={file}", "data.path is given twice"),
         ("data.inputs=[a", "is not understood"),
         ("data.fs=-3", "data.fs is -3; give a positive number"),
@@ -275,7 +278,7 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
     ):
         assert message in refused(capsys, file, word)
     assert "no file is named" in refused(capsys, "data.fs=3")
-    for value in ("5", "0.5", "true", "[1]", "{a: 1}"):
+    for value in ("5", "0.5", "true", "[1]"):
         assert "give the path of a file, a pattern" in refused(capsys, f"data.path={value}")
     loud = written(file.parent / "loud.csv", {"y": 1e200 * signals["force"]})
     assert "'y' goes up to 3." in refused(capsys, loud)  # was a traceback of the figure
@@ -291,7 +294,7 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
             ["data.inputs=[force,level]", "data.time=time"],
             "no column is left for the outputs; it has",
         ),
-        (["--out", "x.csv"], "--out is 'x.csv'; give a name that ends with .png"),
+        (["out=x.csv"], "out is 'x.csv'; give a name that ends with .png"),
         (["nothing*.csv"], "no file matches 'nothing*.csv'"),
         (["gone.csv"], "there is no file 'gone.csv'"),
     ],
@@ -335,5 +338,5 @@ def test_help_says_how_to_use_it(tmp_path: Path):
         [sys.executable, str(ROOT / "scripts" / "preview.py"), "--help"],
         capture_output=True, text=True, check=True, cwd=tmp_path,
     )  # fmt: skip
-    for word in ("data.inputs", "data.outputs", "data.fs", "data.time", "--out", "PATH"):
+    for word in ("data.inputs", "data.outputs", "data.fs", "data.time", "out=PATH"):
         assert word in done.stdout
