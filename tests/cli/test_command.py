@@ -22,6 +22,41 @@ print("loaded", *sorted({name.split(".")[0] for name in sys.modules}))
 """
 
 
+HELP = {
+    "preview": "PATH data.path= data.inputs= data.outputs= data.fs= data.time= out=",
+    "linear": "data.path= nx=auto bla.refine= frf.method= +bench= linear.json",
+    "compare": "FOLDER out= +bench= data=file",
+    "evaluate": "checkpoint= out= overwrite=true +bench= data=file effect",
+    "simulate": "checkpoint= data.path= data.inputs= data.outputs= data.time= data.fs= start= "
+    "estimate= x0= skip= out= format= overwrite=",
+}
+"""Words that the help of a command has."""
+
+
+@pytest.mark.parametrize("word", HELP)
+def test_help_says_how_to_use_it_and_leaves_nothing_behind(
+    word: str, tmp_path: Path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lfrtorch", word, "--help"])
+    with pytest.raises(SystemExit) as stop:
+        command.main()
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out
+    assert [one for one in HELP[word].split() if one not in printed] == []
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("script", "word"), [("bla.py", "linear"), ("preview.py", "preview")])
+def test_a_script_runs_anywhere(script: str, word: str, tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, str(CONF.parent / "scripts" / script), "--help"],
+        capture_output=True, text=True, check=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert [one for one in HELP[word].split() if one not in done.stdout] == []
+
+
 def test_help_comes_without_what_computes():
     done = subprocess.run(
         [sys.executable, "-c", ALL_HELP], capture_output=True, text=True, check=True

@@ -211,14 +211,3 @@ def test_scores_are_replaced_where_that_is_said(run_folder: Path, monkeypatch, c
     run(monkeypatch, f"checkpoint={run_folder}", DATA, f"out={out}", "overwrite=true")
     assert json.loads(out.read_text())["bench"] == "small"
     assert f"Scores in {out}" in capsys.readouterr().out
-
-
-def test_help_says_how_to_use_it_and_leaves_nothing_behind(tmp_path: Path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        run(monkeypatch, "--help")
-    assert stop.value.code == 0
-    printed = capsys.readouterr().out
-    for word in ("checkpoint=", "out=", "overwrite=true", "+bench=", "data=file", "without effect"):
-        assert word in printed
-    assert list(tmp_path.iterdir()) == []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
@@ -236,26 +235,6 @@ def test_settings_that_cannot_be_are_one_message(
     assert stop.value.code == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "linear.json").exists()
-
-
-HELP = ("data.path=", "nx=auto", "bla.refine=", "frf.method=", "+bench=", "linear.json")
-
-
-def test_help_says_how_to_use_it(tmp_path: Path, monkeypatch, capsys):
-    with pytest.raises(SystemExit) as stop:
-        run(monkeypatch, tmp_path, "--help")
-    assert stop.value.code == 0
-    printed = capsys.readouterr().out
-    assert all(word in printed for word in HELP)
-
-
-@pytest.mark.slow
-def test_it_is_a_script_that_runs_anywhere(tmp_path: Path):
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "bla.py"), "--help"],
-        capture_output=True, text=True, check=True, cwd=tmp_path,
-    )  # fmt: skip
-    assert all(word in done.stdout for word in HELP)
 
 
 @pytest.mark.numeric

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -330,13 +328,3 @@ def test_train_says_the_notes_of_a_file(file: Path, signals, capsys):
     assert "note: output 'level' has its largest value 0.3" in capsys.readouterr().out
     config.loaded(configuration(*words, f"data.path={clean}"))
     assert "note: output" not in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_help_says_how_to_use_it(tmp_path: Path):
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "preview.py"), "--help"],
-        capture_output=True, text=True, check=True, cwd=tmp_path,
-    )  # fmt: skip
-    for word in ("data.inputs", "data.outputs", "data.fs", "data.time", "out=PATH"):
-        assert word in done.stdout

@@ -411,19 +411,6 @@ def test_what_was_there_stays_where_the_model_diverges(folder: Path, monkeypatch
     assert (folder / "x.csv").read_text() == "old"
 
 
-def test_help_says_all(tmp_path: Path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["simulate.py", "--help"])
-    with pytest.raises(SystemExit) as stop:
-        simulate.launch()
-    assert stop.value.code == 0
-    printed = capsys.readouterr().out
-    words = "checkpoint data.path data.inputs data.outputs data.time data.fs start estimate x0 skip"
-    for word in (*words.split(), "out", "format", "overwrite"):
-        assert f"{word}=" in printed
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_columns_of_other_names_are_asked_for_in_words_of_the_command_line(
     folder: Path, monkeypatch, capsys
 ):
