@@ -25,7 +25,7 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.threads import spread_by_hand
-from lfrtorch.engine.parameter_layout import layout
+from lfrtorch.engine.sensitivity import layout
 from lfrtorch.least_squares.gauge import reduction
 from lfrtorch.least_squares.jacobian import CACHED_BYTES
 from lfrtorch.least_squares.levenberg_marquardt import LMState

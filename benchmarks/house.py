@@ -2,8 +2,8 @@
 
     python benchmarks/house.py [CHECKOUT [AFTER]]
 
-prints a Markdown table of this checkout, of another one, or of two side by side. Each is measured in
-processes of its own that import the package from there.
+prints a Markdown table of this checkout, of another one, or of two side by side. Each is measured
+in processes of its own that import the package from there.
 
 - Lines: physical lines of Python files. A docstring's lines count as docstring, a line that holds
   nothing but a comment as comment.
@@ -12,8 +12,8 @@ processes of its own that import the package from there.
   ``lfrtorch.identify``.
 - Hops: calls from one file to another, in the package or ``train.py``, up to the first compiled
   simulation of the fit: the first compiled function of ``engine`` that is called from Python while
-  functions of ``fitting`` and ``least_squares`` run. *On the stack*: neighbours of the call stack at
-  that moment whose files differ; functions of other packages between them are left out. *Of the
+  functions of ``fitting`` and ``least_squares`` run. *On the stack*: neighbours of the call stack
+  at that moment whose files differ; functions of other packages between them are left out. *Of the
   record*: direct calls that pass a record or give one back, by itself or in a data set, a list, a
   tuple or a dictionary; each (file of the caller, file of the function, function) counts once. The
   object of a method is not passed.
@@ -25,9 +25,9 @@ processes of its own that import the package from there.
   ``conf/config.yaml`` composed with ``data=file``, without Hydra's own.
 - Exclusions: raised errors whose message names two settings or more, as ``name=``, ``name is`` or
   ``{self.name}``.
-- Edits for an activation: files of the package with the word softplus. Edits for a setting: files of
-  the package, conf/ and docs/guide with the name of a field of ``Settings`` or ``SizesSearch``; names
-  without an underscore are left out, as most are words of English, too.
+- Edits for an activation: files of the package with the word softplus. Edits for a setting: files
+  of the package, conf/ and docs/guide with the name of a field of ``Settings`` or ``SizesSearch``;
+  names without an underscore are left out, as most are words of English, too.
 - ``Any``, ``cast``, ``assert``: uses in the package, imports left out.
 """
 
@@ -46,9 +46,13 @@ import tempfile
 import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
 from typing import Any
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
 
 Row = dict[str, str]
 
@@ -58,8 +62,10 @@ HOLDERS = {"Record", "NormalisedRecord", "RecordGroup", "Dataset"}
 SHORT = ["trainer.max_iter=2", "figures=false", "threads=1"]
 JOBS = {
     "main job": ["train.py", "+bench=boucwen", *SHORT],
-    "CSV": ["lfrtorch fit", "data=file", "data.path=x.csv", "data.inputs=[u]", "data.outputs=[y]"]
-    + ["data.fs=1", "nx=1", "nz=1", "nw=1", "nn=3", *SHORT],
+    "CSV": [
+        *["lfrtorch fit", "data=file", "data.path=x.csv", "data.inputs=[u]", "data.outputs=[y]"],
+        *["data.fs=1", "nx=1", "nz=1", "nw=1", "nn=3", *SHORT],
+    ],
 }
 """Words of the two jobs whose hops are counted."""
 
@@ -175,9 +181,9 @@ def lines(path: Path) -> Counter[str]:
             continue
         for statement in getattr(node, "body", ()):
             # A string that stands alone: of a module, a class, a function or a constant.
-            if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
-                if isinstance(statement.value.value, str):
-                    docstring |= {*range(statement.lineno, (statement.end_lineno or 0) + 1)}
+            value = statement.value if isinstance(statement, ast.Expr) else None
+            if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                docstring |= {*range(statement.lineno, (statement.end_lineno or 0) + 1)}
     found: Counter[str] = Counter()
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
@@ -311,7 +317,7 @@ def compiled_files(function: FunctionType) -> set[str]:
         if current.__code__ not in found:
             found.add(current.__code__)
             named = (current.__globals__.get(name) for name in current.__code__.co_names)
-            waiting += [value.py_func for value in named if hasattr(value, "py_func")]
+            waiting += [value.py_func for value in named if isinstance(value, Dispatcher)]
     return {code.co_filename for code in found}
 
 
@@ -324,19 +330,20 @@ def iteration(checkout: Path, done: Callable[[Row], None]) -> None:
     watch_kernels(lambda function: files.update(compiled_files(function)) if watching[0] else None)
 
     def watched(self: Any, *args: Any) -> Any:
-        steps["all"] += 1
+        steps["all"] += self is trainer  # the linear model has searches, too
         watching[0] = steps["all"] == 2  # the first one compiles
         if watching[0]:
             sys.setprofile(lambda frame, event, _: files.add(frame.f_code.co_filename))
         found = step(self, *args)
         sys.setprofile(None)
+        steps["all"] += watching[0]
         watching[0] = False
         return found
 
     u, y = saturation()
-    record = lfrtorch.Record(u, y)
+    record = lfrtorch.Record(np.array(u), np.array(y))
     dataset = lfrtorch.Dataset("house", [record[:400]], [], [record[400:]])
-    lfrtorch.LevenbergMarquardt.step = watched
+    lfrtorch.LevenbergMarquardt.step = watched  # pyright: ignore[reportAttributeAccessIssue]
     trainer = lfrtorch.LevenbergMarquardt(max_iter=3)
     lfrtorch.identify(dataset, lfrtorch.Settings(nx=1, nz=1, nn=3, trainer=trainer))
     passed = sorted(Path(name) for name in files if name.startswith(package))
@@ -390,7 +397,7 @@ def hops(job: str) -> Callable[[Path, Callable[[Row], None]], None]:
             ):
                 return
             sys.setprofile(None)
-            depth = sum(a != b for a, b in zip(stack, stack[1:], strict=False))
+            depth = sum(a != b for a, b in pairwise(stack))
             done({f"hops of the {job}: on the stack, of the record": f"{depth}, {len(passed)}"})
             if os.environ.get("HOUSE_TRACE"):
                 print(*reversed(stack), *sorted(passed), sep="\n", file=sys.stderr)

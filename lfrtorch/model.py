@@ -20,14 +20,13 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, reals
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
-from lfrtorch.engine.beyond_linear import Beyond, base_of
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
 from lfrtorch.engine.initial_state import estimated_start
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network, Polynomial, known
+from lfrtorch.engine.nonlinearity import Beyond, Network, Polynomial, base_of, known
 from lfrtorch.engine.operating_point import double, equilibrium, linear_part, linearised_at
 from lfrtorch.engine.simulation import Trajectory
 from lfrtorch.extended_kalman_filter import (

@@ -17,9 +17,8 @@ from torch import Tensor
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.simulation import is_compiled, kernel_arguments
+from lfrtorch.engine.simulation import folded, is_compiled, kernel_arguments
 from lfrtorch.engine.simulation_kernel import simulate_record
 from lfrtorch.records import Channel, Scaler
 

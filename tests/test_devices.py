@@ -48,7 +48,7 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     """Devices without kernels: the CPU with kernels turned off, and a GPU if there is one."""
     if request.param == "cuda":
         return "cuda"
-    monkeypatch.setattr("lfrtorch.engine.linear_recurrence.COMPILED_ON", set())
+    monkeypatch.setattr("lfrtorch._support.threads.COMPILED_ON", set())
     return "cpu"
 
 
@@ -56,7 +56,7 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 def test_search_without_kernels_is_the_one_with_them(activation: str, device: str, monkeypatch):
     model = some_model(activation)
     with monkeypatch.context() as patch:
-        patch.setattr("lfrtorch.engine.linear_recurrence.COMPILED_ON", {"cpu"})
+        patch.setattr("lfrtorch._support.threads.COMPILED_ON", {"cpu"})
         expected = searched(some_problem(some_model(activation)))
     model.lfr.to(device)
     problem = some_problem(model)
@@ -90,7 +90,7 @@ def test_several_starts_without_kernels(device: str):
 @pytest.mark.parametrize("kernels", [True, False])
 def test_single_precision(kernels: bool, monkeypatch):
     if not kernels:
-        monkeypatch.setattr("lfrtorch.engine.linear_recurrence.COMPILED_ON", set())
+        monkeypatch.setattr("lfrtorch._support.threads.COMPILED_ON", set())
     double, single = some_problem(some_model()), some_problem(some_model(dtype=torch.float32))
     expected, state = searched(double), searched(single)
     assert state.theta.dtype == state.residual.dtype == torch.float32

@@ -12,7 +12,9 @@ from functools import cache
 from typing import TypeVar
 
 import torch
+from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
+from torch import Tensor
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -139,3 +141,17 @@ def _pool() -> ThreadPoolExecutor:
 
 if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads
     os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+COMPILED_ON = {"cpu"}
+"""Devices that have compiled kernels; all else runs in torch, parallel in time."""
+
+
+def has_kernels(tensor: Tensor) -> bool:
+    """Whether compiled kernels serve the tensor's device."""
+    return tensor.device.type in COMPILED_ON
+
+
+def to_numpy(tensor: Tensor) -> NDArray:
+    """A CPU tensor as a contiguous array for compiled code."""
+    return tensor.detach().contiguous().numpy()

@@ -33,10 +33,10 @@ from lfrtorch._support.tables import engineering, number, table
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import levels_of, vector
 from lfrtorch.engine.activations import ACTIVATIONS
-from lfrtorch.engine.beyond_linear import Beyond, folded
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network, is_network
+from lfrtorch.engine.nonlinearity import Beyond, Network, is_network
 from lfrtorch.engine.operating_point import double
+from lfrtorch.engine.simulation import folded
 from lfrtorch.engine.static_enclosure import Enclosure, Interval, enclosure, everywhere
 from lfrtorch.model import Model
 from lfrtorch.records import Channel

@@ -23,10 +23,10 @@ from jaxtyping import Complex128, Float
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
-from lfrtorch.engine.beyond_linear import Beyond
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import static_slope
+from lfrtorch.engine.nonlinearity import Beyond
 from lfrtorch.engine.operating_point import double
 from lfrtorch.linear.resolvent import frequency_response
 from lfrtorch.model import Model

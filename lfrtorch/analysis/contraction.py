@@ -17,11 +17,11 @@ from lfrtorch._support.types import Array
 from lfrtorch.analysis.bounds import amplitudes, reach
 from lfrtorch.analysis.linearisation import levels_of
 from lfrtorch.engine.activations import FAR
-from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import linearise, spectral_radius
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.operating_point import double
+from lfrtorch.engine.simulation import folded
 from lfrtorch.engine.static_enclosure import Enclosure, enclosure, everywhere
 from lfrtorch.least_squares.certificate import SLOWEST, Certificate, Differences, certificate, gain
 from lfrtorch.model import Model

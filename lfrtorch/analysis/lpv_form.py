@@ -22,11 +22,11 @@ from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import vector
-from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import static_slope
 from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network, known
 from lfrtorch.engine.operating_point import double, equilibrium
+from lfrtorch.engine.simulation import folded
 from lfrtorch.model import Model
 
 _NODES = 32

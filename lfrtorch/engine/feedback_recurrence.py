@@ -15,17 +15,11 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lfrtorch._support.threads import spread
+from lfrtorch._support.threads import has_kernels, spread, to_numpy
 from lfrtorch.engine.blocked_kernel import add_feedback
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.jacobian_kernel import copy_to
-from lfrtorch.engine.linear_recurrence import (
-    flush,
-    has_kernels,
-    linear_recurrence,
-    scan,
-    to_numpy,
-)
+from lfrtorch.engine.linear_recurrence import flush, linear_recurrence, scan
 from lfrtorch.engine.linearised import PASS, linearise_at, static_slope
 
 Weights = Mapping[str, Tensor]

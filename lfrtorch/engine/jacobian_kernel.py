@@ -24,7 +24,7 @@ def jacobian_rows(
     Job r * chunks + c is chunk c of the columns of record r. The weights have a leading axis: one
     model for all records, or one a record. The derivatives of the static map are ``by_weight``, or
     come from slope, h, Ww and z of a network; the others are empty. Entries are those of
-    ``parameter_layout.DirectTerms``.
+    ``sensitivity.DirectTerms``.
 
     Shape:
         S: (R, nx, C), J: (R, B, nw, nz), v: (R, B, nx + nu + nw), by_weight: (R, B, nw, columns),

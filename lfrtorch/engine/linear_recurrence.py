@@ -11,21 +11,12 @@ import math
 import torch
 from jaxtyping import Float
 from numba import njit
-from numpy.typing import NDArray
 from torch import Tensor
 
-from lfrtorch._support.threads import spread
+from lfrtorch._support.threads import has_kernels, spread, to_numpy
 
 NOTHING = 1e-30
 """Entries below this are set to 0; states have unit size."""
-
-COMPILED_ON = {"cpu"}
-"""Devices that have compiled kernels; all else runs in torch, parallel in time."""
-
-
-def has_kernels(tensor: Tensor) -> bool:
-    """Whether compiled kernels serve the tensor's device."""
-    return tensor.device.type in COMPILED_ON
 
 
 def linear_recurrence(
@@ -39,11 +30,6 @@ def linear_recurrence(
     s[:, 0] = s0
     spread(_recur, R, to_numpy(F), to_numpy(g), s.detach().numpy())
     return s
-
-
-def to_numpy(tensor: Tensor) -> NDArray:
-    """A CPU tensor as a contiguous array for compiled code."""
-    return tensor.detach().contiguous().numpy()
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import linearise_static
+from lfrtorch.engine.nonlinearity import linearise_static, of_static
 
 PASS = 1 << 14
 """Most samples, of all records together, that are linearised in one pass."""
@@ -50,12 +50,6 @@ def linearise_at(weights: Mapping[str, Tensor], J: Float[Tensor, "R T nw nz"]) -
     nx = A.shape[-1]
     both = (J.flatten(-2) @ products + constant).unflatten(-1, (-1, nx))
     return Linearised(both[..., :nx, :], both[..., nx:, :])
-
-
-def of_static(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights of the static nonlinearity among those of the cell, by their own names."""
-    prefix = "static."
-    return {name.removeprefix(prefix): p for name, p in weights.items() if name.startswith(prefix)}
 
 
 def spectral_radius(matrices: Float[Tensor, "*axes n n"]) -> Float[Tensor, "*axes"]:

@@ -260,6 +260,50 @@ class Stacked(Module):
         return vmap(one)(dict(zip(self.names, self.weights, strict=True)), z)
 
 
+class Beyond(Module):
+    """What a map f is beyond a linear one, in other coordinates: w = W (f(Z z) - L Z z).
+
+    The buffers ``slope``, ``into`` and ``out`` are L, Z and W.
+    """
+
+    slope: Tensor
+    into: Tensor
+    out: Tensor
+
+    def __init__(
+        self,
+        base: Module,
+        slope: Float[Tensor, "nw nz"],
+        into: Float[Tensor, "nz nz"],
+        out: Float[Tensor, "nw nw"],
+    ) -> None:
+        super().__init__()
+        self.base = base
+        self.register_buffer("slope", slope)
+        self.register_buffer("into", into)
+        self.register_buffer("out", out)
+
+    def weight_shapes(self, nz: int, nw: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of L, Z, W and the weights of f for nz and nw signals."""
+        of_base = getattr(self.base, "weight_shapes", None)
+        own = {} if of_base is None else of_base(nz, nw)
+        shapes: dict[str, tuple[int, ...]] = {"slope": (nw, nz), "into": (nz, nz), "out": (nw, nw)}
+        return shapes | {f"base.{name}": shape for name, shape in own.items()}
+
+    def forward(self, z: Float[Tensor, "*axes nz"]) -> Float[Tensor, "*axes nw"]:
+        """w of z."""
+        z = z @ self.into.mT
+        return (self.base(z) - z @ self.slope.mT) @ self.out.mT
+
+    def __repr__(self) -> str:
+        return f"{self.base!r} less a linear map"
+
+
+def base_of(static: Module | None) -> Module | None:
+    """A map, or f of a ``Beyond``."""
+    return base_of(static.base) if isinstance(static, Beyond) else static
+
+
 def known(static: Module | None) -> Network | Polynomial | None:
     """The map, if its equations are known: a subclass may have another forward pass."""
     return static if isinstance(static, Network | Polynomial) and type(static) in KNOWN else None
@@ -272,6 +316,12 @@ KNOWN = (Network, Polynomial)
 def is_network(static: Module | None) -> TypeGuard[Network]:
     """Whether a map is a ``Network`` itself: some features are for neurons alone."""
     return type(static) is Network
+
+
+def of_static(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The weights of the static nonlinearity among those of the cell, by their own names."""
+    prefix = "static."
+    return {name.removeprefix(prefix): p for name, p in weights.items() if name.startswith(prefix)}
 
 
 def linearise_static(

@@ -9,14 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._support.threads import spread
-from lfrtorch.engine.beyond_linear import base_of, folded
+from lfrtorch._support.threads import has_kernels, spread, to_numpy
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import monodromy
-from lfrtorch.engine.linear_recurrence import has_kernels, to_numpy
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.newton import newton_states
-from lfrtorch.engine.nonlinearity import Kernel, known
+from lfrtorch.engine.nonlinearity import Beyond, Kernel, base_of, known
 from lfrtorch.engine.simulation_kernel import simulate_record
 
 PERIODIC_TOLERANCE = 1e-10
@@ -176,6 +174,31 @@ def is_compiled(cell: LFRCell, u: Tensor) -> bool:
     """Whether machine code simulates the cell on the device of ``u``."""
     static = base_of(cell.static)
     return (static is None or known(static) is not None) and has_kernels(u)
+
+
+@torch.no_grad()
+def folded(cell: LFRCell) -> LFRCell:
+    """The cell with f itself in the place of its ``Beyond``; any other cell as it is.
+
+    L, Z and W go into the linear block. x, u and y stay; z and w are those of f.
+    """
+    beyond = cell.static
+    if not isinstance(beyond, Beyond):
+        return cell
+    sizes = cell.nu, cell.ny, cell.nx, cell.nz, cell.nw
+    found = LFRCell(*sizes, beyond.base, device=cell.A.device, dtype=cell.A.dtype)
+    L, Z, W = beyond.slope, beyond.into, beyond.out
+    Cz, Dzu, Bw, Dyw = Z @ cell.Cz, Z @ cell.Dzu, cell.Bw @ W, cell.Dyw @ W
+    found.state_covariance.copy_(cell.state_covariance)
+    found.A.copy_(cell.A - Bw @ L @ Cz)
+    found.Bu.copy_(cell.Bu - Bw @ L @ Dzu)
+    found.Bw.copy_(Bw)
+    found.Cz.copy_(Cz)
+    found.Dzu.copy_(Dzu)
+    found.Cy.copy_(cell.Cy - Dyw @ L @ Cz)
+    found.Dyu.copy_(cell.Dyu - Dyw @ L @ Dzu)
+    found.Dyw.copy_(Dyw)
+    return folded(found)
 
 
 def _loop(

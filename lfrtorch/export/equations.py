@@ -17,9 +17,9 @@ from torch.nn import Module
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.engine.beyond_linear import folded
 from lfrtorch.engine.nonlinearity import Network, Polynomial, known
 from lfrtorch.engine.operating_point import double, equilibrium
+from lfrtorch.engine.simulation import folded
 from lfrtorch.extended_kalman_filter import NoiseCovariance, data_root
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import NO_OBSERVER, Model

@@ -19,7 +19,7 @@ from lfrtorch.fitting.prediction import Noise, check_noise
 from lfrtorch.fitting.trainer import Trainer
 from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.parameters import Ridge
+from lfrtorch.least_squares.simulation_errors import Ridge
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.model import Model
 

@@ -49,7 +49,7 @@ from lfrtorch.fitting.side_by_side import Together, any_of
 from lfrtorch.fitting.trainer import Fit, Monitor, Stop, StoppedError, Trainer
 from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.parameters import Ridge
+from lfrtorch.least_squares.simulation_errors import Ridge
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.paired_blocks import (

@@ -21,8 +21,7 @@ from torch.nn.utils import vector_to_parameters
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.linearised import of_static
-from lfrtorch.engine.nonlinearity import Network, is_network, linearise_static
+from lfrtorch.engine.nonlinearity import Network, is_network, linearise_static, of_static
 from lfrtorch.engine.static_enclosure import enclosure, everywhere
 from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.certificate import (

@@ -20,8 +20,7 @@ from lfrtorch.least_squares.guarantee import Guarantee, Name, guarantee_of
 from lfrtorch.least_squares.jacobian import Jacobian, TermRows
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
 from lfrtorch.least_squares.linear_systems import System
-from lfrtorch.least_squares.parameters import Ridge
-from lfrtorch.least_squares.simulation_errors import SimulationErrors, SystemErrors
+from lfrtorch.least_squares.simulation_errors import Ridge, SimulationErrors, SystemErrors
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
@@ -96,6 +95,7 @@ class Problem(LeastSquares):
             self.fixed = torch.zeros_like(self._theta_0, dtype=torch.bool)
             self.fixed[: len(fixed)] = fixed
         self._reduced: Reduction | None = None
+        self._fits_memory = False
 
     @classmethod
     def of(
@@ -237,8 +237,10 @@ class Problem(LeastSquares):
         states = len(theta) - own
         eliminate = eliminate and states > own and self.ranks.world == 1
         eliminate = eliminate and all(term.eliminates for term in self._terms)
-        spectral = sum(group.y.numel() for group in self.errors.groups if group.spectral)
-        check_fit_memory(self.lfr.cell, 0 if eliminate else states, spectral)
+        if not self._fits_memory:  # the same at every θ
+            spectral = sum(group.y.numel() for group in self.errors.groups if group.spectral)
+            check_fit_memory(self.lfr.cell, 0 if eliminate else states, spectral)
+            self._fits_memory = True
         rows = [part for t in self._terms for part in t.linearise(theta, eliminate=eliminate)]
         if eliminate:
             reduced = everything(theta[:own])

@@ -15,18 +15,91 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lfrtorch._support.checks import number
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.initial_state import estimated_start, start_from_beginning
 from lfrtorch.engine.innovation import split_predictor, split_weights
-from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.sensitivity import Linearisation
-from lfrtorch.engine.simulation import Trajectory, is_compiled
+from lfrtorch.engine.simulation import Trajectory, is_compiled, simulate, steady_state
 from lfrtorch.least_squares.jacobian import MappedRows, Memory, OutputRows
-from lfrtorch.least_squares.parameters import Parameters
 from lfrtorch.least_squares.record_groups import group_records
 from lfrtorch.records import NormalisedRecord
+
+Ridge = float | Mapping[str, float]
+
+LARGEST_RIDGE = 1e100
+"""Largest ridge: its square does not overflow."""
+
+
+class Parameters:
+    """θ: the parameters of a cell that require a gradient, then initial states of records.
+
+    Args:
+        cell: the model.
+        states: number of records whose initial state is a parameter.
+    """
+
+    def __init__(self, cell: LFRCell, states: int) -> None:
+        free = [(name, p) for name, p in cell.named_parameters() if p.requires_grad]
+        self.names = [name for name, _ in free]
+        self._sizes = [p.numel() for _, p in free]
+        self.states, self._nx = states, cell.nx
+        self.own = sum(self._sizes)
+        """Entries before the initial states."""
+
+    def of(self, cell: LFRCell, initial_states: Float[Tensor, "states nx"]) -> Float[Tensor, " P"]:
+        """θ of the weights of a cell and initial states."""
+        own = [cell.get_parameter(name).detach().flatten() for name in self.names]
+        return torch.cat([*own, initial_states.flatten()])
+
+    def initial_states(self, theta: Float[Tensor, " P"]) -> Float[Tensor, "states nx"]:
+        """The initial states in θ."""
+        return theta[self.own :].view(self.states, self._nx)
+
+    def write(self, cell: LFRCell, theta: Float[Tensor, " P"]) -> None:
+        """Put θ into a cell, whose weights are views of it from then on."""
+        theta = theta.detach().to(cell.A)
+        for name, part in zip(self.names, theta[: self.own].split(self._sizes), strict=True):
+            parameter = cell.get_parameter(name)
+            parameter.data = part.view(parameter.shape)
+
+    def ridge(self, ridge: Ridge) -> Float[Tensor, " P"]:
+        """The weight of every entry of θ.
+
+        Args:
+            ridge: one number, or one for each group of parameters by the beginning of their names,
+                ``{"static": 1e-3, "A": 1e-2, "x0": 0}``; other groups get 0.
+
+        Raises:
+            ValueError: a negative ridge, one above ``LARGEST_RIDGE``, or an unknown group.
+        """
+        groups = ridge if isinstance(ridge, Mapping) else {"": ridge}
+        names, sizes = list(self.names), list(self._sizes)
+        if self.states:
+            names.append("x0")
+            sizes.append(self.states * self._nx)
+        weights = [0.0] * len(names)
+        for group, value in groups.items():
+            name = f"ridge of '{group}'" if group else "ridge"
+            number(name, value)
+            if value > LARGEST_RIDGE:
+                raise InputError(f"{name} is {value}; give {LARGEST_RIDGE} at most.")
+            own = [i for i, name in enumerate(names) if _belongs(name, group)]
+            if not own:
+                raise InputError(
+                    f"ridge has a group '{group}', and no parameter's name begins so; "
+                    f"the parameters are {', '.join(dict.fromkeys(names))}."
+                )
+            for i in own:
+                weights[i] = float(value)
+        return torch.tensor(weights, dtype=torch.float64).repeat_interleave(torch.tensor(sizes))
+
+
+def _belongs(name: str, group: str) -> bool:
+    return not group or name == group or name.startswith(f"{group}.")
 
 
 class SimulationErrors:
@@ -52,6 +125,7 @@ class SimulationErrors:
         y_scale: Array | float = 1.0,
         solve_initial_states: bool = False,
     ) -> None:
+        cell.check()
         self._cell, self.ranks, self._y_scale = deepcopy(cell), ranks, y_scale
         self._solved = solve_initial_states
         self.groups = group_records(records, cell.A, ranks)
@@ -105,19 +179,19 @@ class SimulationErrors:
         """Trajectories of each group at θ; those of the latest θ are cached."""
         if self._latest is None or not torch.equal(self._latest[0], theta):
             self._latest = None  # free its memory first
-            lfr = LFR(self.cell_at(theta))
-            found = [
-                lfr.trajectory(
-                    group.u,
-                    self.initial_state(i, theta),
-                    "periodic" if group.start == "periodic" else "zero",  # from the initial state
-                    guess=self._guesses[i],
-                )
-                for i, group in enumerate(self.groups)
-            ]
+            found = [self._trajectory(i, theta) for i in range(len(self.groups))]
             self.remember(theta, found)
             return found
         return self._latest[1]
+
+    def _trajectory(self, i: int, theta: Float[Tensor, " P"]) -> Trajectory:
+        """The trajectory of a group at θ."""
+        group, x0 = self.groups[i], self.initial_state(i, theta)
+        cell = self.cell_at(theta)  # whose sizes and dtype θ cannot change: no check
+        if group.start == "periodic":
+            return steady_state(cell, group.u, self._guesses[i])
+        x0 = group.u.new_zeros(len(group.u), cell.nx) if x0 is None else x0
+        return simulate(cell, group.u, x0, guess=self._guesses[i])
 
     def initial_state(self, i: int, theta: Float[Tensor, " P"]) -> Float[Tensor, "R nx"] | None:
         """Initial states of group i at θ, unless they are zero or periodic."""

@@ -11,9 +11,8 @@ import torch
 from reference import measure, normal, polynomial_cell, random_cell, random_model
 
 from lfrtorch import analysis
-from lfrtorch.engine.beyond_linear import Beyond
 from lfrtorch.engine.lfr import LFR
-from lfrtorch.engine.nonlinearity import Network
+from lfrtorch.engine.nonlinearity import Beyond, Network
 from lfrtorch.model import Model
 
 pytestmark = pytest.mark.numeric

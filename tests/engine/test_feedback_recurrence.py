@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lfrtorch.engine import feedback_recurrence, linear_recurrence
+from lfrtorch._support import threads
+from lfrtorch.engine import feedback_recurrence
 from lfrtorch.engine.feedback_recurrence import states, transition
 from lfrtorch.engine.linearised import linearise_at
 
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.numeric
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
     """On the CPU, and as on any other device."""
     if request.param == "torch":
-        monkeypatch.setattr(linear_recurrence, "COMPILED_ON", set())
+        monkeypatch.setattr(threads, "COMPILED_ON", set())
 
 
 def weights(nx: int, nz: int, nw: int, models: int | None, dtype: torch.dtype):

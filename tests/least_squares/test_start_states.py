@@ -10,8 +10,8 @@ from torch.testing import assert_close
 from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import SVDSystem
-from lfrtorch.least_squares.parameters import Ridge
 from lfrtorch.least_squares.problem import Problem
+from lfrtorch.least_squares.simulation_errors import Ridge
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
