@@ -65,12 +65,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs of the same data, the best on validation first.
-
-    Args:
-        name: of the data.
-        runs: at least one.
-    """
+    """Runs of the same data, one at least, the best on validation first."""
 
     name: str
     runs: Sequence[Compared]
@@ -125,8 +120,7 @@ class Comparison:
     def simulations(self, record: Record) -> dict[str, Array]:
         """Simulations of a record by the best runs, one of each setting, and by a linear model.
 
-        Args:
-            record: of the same channels as the models; others are left out.
+        Models of other channels are left out.
         """
         best = {label: runs[0] for label, runs in self.settings.items()}
         best = best or {self._name(run): run for run in self.runs}
@@ -149,13 +143,9 @@ class Comparison:
         return linear | found if found else {}
 
     def figures(self, record: Record | None = None) -> dict[str, Figure]:
-        """Errors against parameters, boxes of each setting, and simulations, by name.
-
-        Args:
-            record: that the best models simulate. Default: none.
-        """
+        """Errors against parameters, boxes of each setting, simulations of a record, by name."""
         drawn = {"parameters": self._by_parameters()}
-        if self.settings:
+        if self.settings and self.front:  # boxes need finite errors
             drawn["seeds"] = self._boxes()
         simulated = {} if record is None else self.simulations(record := with_window(record))
         if record is not None and simulated:
@@ -221,26 +211,7 @@ class Comparison:
 
 
 def compare(folders: Sequence[str | Path]) -> list[Comparison]:
-    """The whole runs in folders, and in all folders below them, by their data.
-
-    Args:
-        folders: of runs, or with runs in them.
-
-    Raises:
-        InputError: there is none.
-
-    Example:
-        >>> from lfrtorch.reporting.comparison import compare
-        >>> dataset = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[record[200:]])
-        >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=1)
-        >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(nx=1, nz=1, nn=4, trainer=trainer))
-        >>> for seed in (0, 1):
-        ...     words = f"lfrtorch fit nn=4 seed={seed}"
-        ...     lfrtorch.reporting.write(run, f"seed {seed}", command=words, draw=False)
-        >>> (found,) = compare(["seed 0", "seed 1"])
-        >>> found.varied, len(found.runs), list(found.settings)
-        (['seed'], 2, ['all runs'])
-    """
+    """Read the whole runs in folders, and in all folders below them, by their data."""
     files = dict.fromkeys(
         path.resolve() for folder in folders for path in sorted(Path(folder).rglob("metrics.json"))
     )
@@ -260,19 +231,20 @@ def write(
 ) -> None:
     """Write ``comparison.html``, ``comparison.md`` and ``comparison.csv`` with all runs.
 
-    Args:
-        comparisons: see :func:`compare`.
-        folder: of the files; those of an earlier comparison are replaced.
-        records: that the page shows, simulated by the best models, by the names of the data.
-            Default: none.
+    The page shows simulations of ``records``, which are named as the data.
 
     Example:
         >>> from lfrtorch.reporting import comparison
         >>> dataset = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[record[200:]])
         >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=1)
         >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(nx=1, nz=1, nn=4, trainer=trainer))
-        >>> lfrtorch.reporting.write(run, "study/one", draw=False)
-        >>> comparison.write(comparison.compare(["study"]), "study", {"mine": record[200:]})
+        >>> for seed in (0, 1):
+        ...     words = f"lfrtorch fit nn=4 seed={seed}"
+        ...     lfrtorch.reporting.write(run, f"study/seed {seed}", command=words, draw=False)
+        >>> (found,) = comparison.compare(["study"])
+        >>> found.varied, len(found.runs), list(found.settings)
+        (['seed'], 2, ['all runs'])
+        >>> comparison.write([found], "study", {"mine": record[200:]})
     """
     images, parts, records = {}, [], records or {}
     for number, one in enumerate(comparisons):

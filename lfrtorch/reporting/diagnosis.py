@@ -202,27 +202,15 @@ def evidence(
     result: FitResult,
     responses: Sequence[Response],
     *,
-    bla: LinearModel | None = None,
-    noise_rms: float | None = None,
-    continued: bool = False,
+    bla: LinearModel | None = None,  # whose free responses tell a wrong start
+    noise_rms: float | None = None,  # of the training outputs in their unit, if it is known
+    continued: bool = False,  # from a model
     ridge: bool = False,
-    search: SizeSearch | None = None,
-    trainer: Trainer | None = None,
+    search: SizeSearch | None = None,  # for the sizes, if validation chose them
+    trainer: Trainer | None = None,  # Levenberg-Marquardt if not given
     verdict: Verdict | None = None,
 ) -> Evidence:
-    """The numbers that advice rests on.
-
-    Args:
-        result: the fit.
-        responses: of the training records, and of validation and tests if there are any.
-        bla: the linear model of the training records, whose free responses tell a wrong start.
-        noise_rms: of the training outputs in their unit, if it is known.
-        continued: whether the fit went on from a model.
-        ridge: whether it had one.
-        search: for the sizes, if validation chose them.
-        trainer: of the fit. Default: Levenberg-Marquardt.
-        verdict: on the fit, which advice agrees with.
-    """
+    """Measure what advice rests on; the responses are of all records."""
     train, validation, tests = (
         [response for response in responses if response.use == use]
         for use in ("train", "validation", "test")
@@ -318,12 +306,7 @@ def chance_of_ratio(here: Sequence[Array], there: Sequence[Array]) -> float:
 
     An F test whose degrees of freedom are those that the powers of ten blocks of time show, of here
     or there, whichever vary more: slow errors, or a few large ones, are few degrees of freedom.
-
-    Args:
-        here, there: errors of each record (T, ny).
-
-    Returns:
-        0 to 1; 1 if one side has fewer samples than blocks, or no error.
+    1 if one side has fewer samples than blocks, or no error.
 
     References:
         Satterthwaite, "An approximate distribution of estimates of variance components",

@@ -28,36 +28,22 @@ HORIZONS = 1, 10, 100
 
 @dataclass(frozen=True)
 class Score:
-    """Simulation errors on one record, or a group of them, after the skip window.
+    """Simulation errors on one record, or a group of them, after the skip window."""
 
-    Args:
-        use: ``"train"``, ``"validation"``, ``"selection"`` or ``"test"``.
-        source: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
-        channels: of the outputs.
-        samples, skip, scored: length of the record, how many samples at its beginning do not count,
-            and how many do.
-        rmse, lti_rmse: of the NL-LFR and of the linear model; None without one of them.
-        std: standard deviation of the measured output over the scored samples.
-        nrmse: rmse over std.
-        rmse_by_output, lti_rmse_by_output, std_by_output: the same of each output.
-        start_error: what the uncertainty of an estimated start state adds to ``rmse``.
-        records: how many the score is of.
-    """
-
-    use: str
-    source: str
-    channels: tuple[Channel, ...]
+    use: str  # "train", "validation", "selection" or "test"
+    source: str  # "official", "simulated", "stand-in" or "file"
+    channels: tuple[Channel, ...]  # of the outputs
     samples: int
-    skip: int
-    scored: int
-    rmse: float | None
-    lti_rmse: float | None
-    std: float
-    nrmse: float | None
+    skip: int  # samples at the beginning that do not count
+    scored: int  # how many do
+    rmse: float | None  # of the NL-LFR; None without one
+    lti_rmse: float | None  # of the linear model
+    std: float  # standard deviation of the measured output over the scored samples
+    nrmse: float | None  # rmse / std
     rmse_by_output: tuple[float, ...]
     lti_rmse_by_output: tuple[float, ...]
     std_by_output: tuple[float, ...]
-    start_error: float | None
+    start_error: float | None  # what an estimated start's uncertainty adds to rmse
     records: int = 1
 
     def entry(self) -> dict[str, Any]:
@@ -80,11 +66,7 @@ class Score:
 class Response:
     """What models make of a record, in physical units.
 
-    Args:
-        record: the measurement.
-        use: ``"train"``, ``"validation"``, ``"selection"`` or ``"test"``.
-        simulated: outputs (T, ny) by the names ``"linear"`` and ``"NL-LFR"``, of one model or both.
-        start_error: see :class:`Score`.
+    ``simulated`` has outputs (T, ny) by the names ``"linear"`` and ``"NL-LFR"``, of one or both.
     """
 
     record: Record

@@ -56,18 +56,11 @@ def coherent_part(
 
     At each line, it is the multiple coherence times the error's power. The coherence is corrected
     for its bias with n signals and K segments, as the adjusted R² is. With several outputs the
-    largest part counts. For records too short for that see :func:`filtered_part`.
+    largest part counts. None if the records are too short.
 
     Args:
-        signals: one array a record.
-        errors: those of the simulations, one array a record.
+        signals, errors: (T, n) and (T, ny) of each record.
         of: number of signals that the filters' memory is short enough for. Default: n.
-
-    Shape:
-        signals: (T, n), errors: (T, ny) each.
-
-    Returns:
-        0 to 1, or None if the records are too short.
     """
     n = signals[0].shape[1]
     T, shortest = sum(map(len, errors)), min(map(len, errors))
@@ -102,14 +95,7 @@ def filtered_part(signals: Sequence[Array], errors: Sequence[Array], lags: int) 
 
     What they explain by chance is taken off: the mean of what they explain of the errors shifted in
     time, which is far more for slow errors than for white ones. With several outputs the largest
-    part counts.
-
-    Args:
-        signals, errors: see :func:`coherent_part`.
-        lags: samples of the memory.
-
-    Returns:
-        0 to 1, or None if the memory is too short.
+    part counts. None if the memory is too short.
     """
     if lags < _LAGS:
         return None

@@ -74,15 +74,10 @@ def render(
     command: str = "",
     config: str = "",
 ) -> str:
-    """The page of a run.
+    """Make the page of a run.
 
-    Args:
-        run: what was found.
-        images: figures as PNG by name; ``static_map``, ``convergence``, ``frequency_response``,
-            ``poles_and_zeros`` and ``residuals`` have their places, and those of ``views`` theirs.
-        views: of each record that is shown, by its name, captions by the names of its figures. The
-            first two of the first record follow the verdict.
-        command, config: that made the run.
+    The images are PNG by the names of figures, and ``views`` has captions by the same names, of
+    each record that is shown. The first two of the first record follow the verdict.
     """
     tried = run.metrics["sizes_search"]
     groups = [(name, w) for name, w in run.fit.model.lfr.cell.named_parameters() if w.numel()]
@@ -113,13 +108,7 @@ def render(
 
 
 def page(template: str, images: Mapping[str, bytes], **values: Any) -> str:
-    """A page from a template of ours.
-
-    Args:
-        template: name of its file.
-        images: PNG by name, which the page has inside.
-        values: of the template's other variables.
-    """
+    """Fill a template of ours, with images (PNG by name) inside."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("lfrtorch.reporting"),
         autoescape=True,

@@ -115,13 +115,7 @@ class TensorBoard:
     def hyperparameters(
         self, settings: Mapping[str, Any], found: Mapping[str, float | None], step: int
     ) -> None:
-        """Add the run to the page HParams, where many runs are compared.
-
-        Args:
-            settings: numbers, truth values and texts among them are shown.
-            found: with them; numbers that are known.
-            step: of the iterations.
-        """
+        """Add the run to the page HParams, where many runs are compared."""
         shown = {k: v for k, v in settings.items() if isinstance(v, bool | int | float | str)}
         values = {f"found/{k}": v for k, v in found.items() if v is not None}
         for summary in hparams(shown, values):

@@ -18,14 +18,7 @@ _LONGEST = 10  # seconds that git may take
 
 
 def origin(dataset: Dataset) -> dict[str, Any]:
-    """What ``metrics.json`` says of the origin of a run.
-
-    Args:
-        dataset: its records.
-
-    Returns:
-        ``machine``, ``git`` (None if the working directory is in no repository) and ``checksums``
-        of the records, by their names.
+    """What ``metrics.json`` says of the origin of a run: machine, git, checksums of the records.
 
     Example:
         >>> from lfrtorch.reporting.origin import origin

@@ -41,15 +41,7 @@ def metrics(
 ) -> dict[str, Any]:
     """What ``metrics.json`` holds of a fit, but for its origin; None if a number is not finite.
 
-    Args:
-        result: the fit.
-        evaluation: of its model.
-        seeds: of the random starts.
-        search: for the sizes, if they were not given.
-        verdict: on the fit.
-        refit: the fit to all estimation records, if there was one. Its model is scored on the
-            tests; validation errors are those before it.
-        residuals: of the record with the largest error.
+    A model that was fitted again is scored on the tests; validation errors are those before it.
     """
     model, dataset = (refit or result).model, evaluation.dataset
     entries = scored(evaluation)
@@ -87,12 +79,7 @@ def metrics(
 
 
 def scored(evaluation: Evaluation, command: str = "") -> dict[str, Any]:
-    """What ``metrics`` has without a fit: scores of a model, and of a linear one if there is one.
-
-    Args:
-        evaluation: of the models.
-        command: that made it.
-    """
+    """Scores of a model, and of a linear one if there is one: ``metrics`` without a fit."""
     dataset, bla = evaluation.dataset, evaluation.linear
     model = evaluation.refitted or evaluation.model
     assert model is not None
@@ -211,13 +198,7 @@ def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
 def lines(
     name: str, entry: Mapping[str, Any], published: Sequence[Published]
 ) -> list[tuple[str, Mapping[str, float | None]]]:
-    """The errors of a score by name: all outputs together, and those that published figures name.
-
-    Args:
-        name: of the score.
-        entry: of ``metrics.json``.
-        published: what stands beside it.
-    """
+    """Errors of a score by name: all outputs together, and those that published figures name."""
     found: list[tuple[str, Mapping[str, float | None]]] = [(name, {of: entry[of] for of in ERRORS})]
     named = {key.rpartition(" ")[2] for p in published for key in p.scores if " " in key}
     for i, output in enumerate(entry.get("outputs", [])):
@@ -291,11 +272,7 @@ def starts_table(result: Mapping[str, Any]) -> str:
 
 
 def finalists(result: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], str]:
-    """The entries of the starts that no others ended, and a line on those that others did.
-
-    Args:
-        result: what ``metrics`` returns.
-    """
+    """The entries of the starts that no others ended, and a line on those that others did."""
     ended = [start for start in result["ranking"] if start["reason"] != Reason.OTHERS_BETTER]
     count = len(result["ranking"]) - len(ended)
     others = f"{count} {'others' if count > 1 else 'other'} ended earlier: see metrics.json."

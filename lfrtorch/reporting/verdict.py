@@ -140,15 +140,14 @@ class _Errors(NamedTuple):
 def judge(
     result: FitResult, responses: Sequence[Response], *, linear_nx: int, error: str = "error"
 ) -> Verdict:
-    """The verdict on a fit, from all records beside their simulations.
+    """Judge a fit by the errors on all records.
 
     Every record that was not fitted is looked at: one on which the NL-LFR is clearly worse is
     enough. It is better if it is so on the tests together, or without tests on validation.
     Records of fewer than ten scored samples say nothing.
 
     Args:
-        result: the fit.
-        responses: see :class:`lfrtorch.reporting.evaluation.Evaluation`.
+        result, responses: the fit, and its model on all records.
         linear_nx: order of the linear model, which the sentence names.
         error: what it is called, for example ``"prediction error"``.
     """
@@ -224,13 +223,8 @@ def reconsidered(
     """The verdict on predictions one sample ahead, in view of others and of simulations.
 
     Sensor noise may be all that both models leave one sample ahead. If they do alike there, the
-    NL-LFR is better where it is so in one of the views and worse in none.
-
-    Args:
-        verdict: of ``judge``, on predictions one sample ahead.
-        result: the fit.
-        views: the same records farther ahead and simulated, by what their errors are called.
-        linear_nx: states of the linear model.
+    NL-LFR is better where it is so in one of the views and worse in none. ``views`` has the records
+    farther ahead and simulated, by what their errors are called.
     """
     if verdict.kind != Kind.LINEAR or verdict.use == NEITHER:
         return verdict
@@ -250,9 +244,6 @@ def judge_linear(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Whether a linear model explains what was not fitted: its worst output on the tests.
 
     Without tests that are scored it is judged on validation, and else on training.
-
-    Args:
-        scores: of all records, see ``lfrtorch.reporting.linear_report.numbers``.
     """
     errors = {use: _relative_errors(scores, use) for use in ("test", "validation", "train")}
     judged = next((use for use, found in errors.items() if found), None)
@@ -333,13 +324,11 @@ def _errors(responses: Sequence[Response]) -> list[_Errors]:
     return found
 
 
-def _compared(errors: Sequence[_Errors], among: int = 1) -> _Compared:
-    """Both models on some records, each relative to the linear model's error there.
-
-    Args:
-        errors: of the records.
-        among: records that are compared one by one.
-    """
+def _compared(
+    errors: Sequence[_Errors],
+    among: int = 1,  # records that are compared one by one
+) -> _Compared:
+    """Both models on some records, each relative to the linear model's error there."""
     counts = np.concatenate([e.counts for e in errors])
     samples = np.array([e.counts.sum() for e in errors])
     # A record on which the linear model is exact, as one in which nothing happens, has no scale.
