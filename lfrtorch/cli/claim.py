@@ -37,15 +37,7 @@ class Claim(Callback):
 
 
 def claim(folder: Path, cfg: DictConfig) -> None:
-    """Have a folder to oneself until the program ends.
-
-    Args:
-        folder: ``hydra.run.dir``, made if it is missing.
-        cfg: says whether a run may be replaced or goes on.
-
-    Raises:
-        ValueError: it cannot be written to, another run works there, or has ended there.
-    """
+    """Have a folder to oneself until the program ends, or refuse it; make it if it is missing."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -53,10 +53,7 @@ def _record_of_run(folder: Path) -> Record | None:
 def run(folders: list[Path], out: str | Path | None = None, record: Record | None = None) -> None:
     """Print the tables, and write the files.
 
-    Args:
-        folders: of the runs, or with runs in them.
-        out: of the files. Default: the folder that all lie in.
-        record: that the best models simulate on the page. Default: that of the best run's data.
+    By default these go where all folders lie, and the record is one of the best run's data.
     """
     for folder in folders:
         if not folder.is_dir():

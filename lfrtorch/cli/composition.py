@@ -36,9 +36,7 @@ _WITHOUT_DATA = ("export",)  # commands that read no data
 def take_words(command: str, whole: Callable[[Sequence[str]], list[str]] = list) -> None:
     """Check the command line, and leave it to Hydra with quotes around what it cannot read without.
 
-    Args:
-        command: see :func:`check_words`.
-        whole: adds what the words stand for, as the settings of the run in ``resume=DIR``.
+    ``whole`` adds what the words stand for, as the settings of the run in ``resume=DIR``.
     """
     given = sys.argv[1:]
     sys.argv[1:] = [quoted(word) for word in whole(given)]
@@ -50,12 +48,7 @@ def started(
     work: Callable[[DictConfig], object],
     whole: Callable[[Sequence[str]], list[str]] = list,
 ) -> None:
-    """Start a command of one run; errors of users end it with a line.
-
-    Args:
-        command, whole: see :func:`take_words`.
-        work: what it does with its settings.
-    """
+    """Start a command of one run; errors of users end it with a line."""
 
     def job(cfg: DictConfig) -> None:
         with user_errors(cfg=cfg):
@@ -80,14 +73,7 @@ def name_paths(option: str) -> None:
 def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> None:
     """Refuse words that Hydra would not take, or would add where nothing reads them.
 
-    Args:
-        command: the configuration's name.
-        given: the command line.
-        used: the command line with the words of an earlier run, which were taken then. Default:
-            the command line alone.
-
-    Raises:
-        InputError: with what was meant, as far as that can be told.
+    The words that are used may have those of an earlier run before them, which were taken then.
     """
     if {word for word in given if word.startswith("-")} - SWEEPS:
         return  # an option of Hydra, as --help

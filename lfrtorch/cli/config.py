@@ -25,11 +25,7 @@ from lfrtorch.survey.notes import notes_on
 
 
 def configured(cfg: DictConfig) -> Settings:
-    """The settings of an identification.
-
-    Raises:
-        ValueError: settings that cannot be, or no data chosen.
-    """
+    """The settings of an identification."""
     require_data(cfg)
     if cfg.nx is None and cfg.init_from is None:
         raise InputError(

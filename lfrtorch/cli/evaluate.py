@@ -75,13 +75,7 @@ def evaluate(cfg: DictConfig) -> None:
 
 
 def from_files(cfg: DictConfig, model: lfrtorch.Model, command: str) -> None:
-    """Complete the data: the model's channels; all records are tests if the run saw none of them.
-
-    Args:
-        cfg: changed in place.
-        model: that is scored.
-        command: whose words come before.
-    """
+    """Complete the data: the model's channels; all records are tests if the run saw none."""
     for side, channels in (("inputs", model.inputs), ("outputs", model.outputs)):
         if cfg.data[side] is None:
             cfg.data[side] = [channel.name for channel in channels]

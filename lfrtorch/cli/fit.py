@@ -76,12 +76,7 @@ def run(
 ) -> float:
     """One run, its files written into ``folder`` by the first process; returns the validation RMSE.
 
-    Args:
-        cfg, folder, command: the settings, where the files go, and what the user typed.
-        ranks: the processes that share the fit.
-
-    Raises:
-        ProcessLostError, TerminatedError: the fit ended early, and what it had found is written.
+    A fit that ended early has its files written before the error of that.
     """
     ranks = Ranks() if ranks is None else ranks
     asked, cfg = cfg, chosen_before(cfg, folder)

@@ -28,10 +28,6 @@ def instantiate(node: Any, *args: Any, **options: Any) -> Any:
     """What a node of the settings describes.
 
     What its target raises comes with a note that says which node it was, ``full_key: data``.
-
-    Args:
-        node: with a ``_target_``.
-        args, options: of the target, beside those of the node.
     """
     if _TRUSTED is not None:
         options["_execution_whitelist_"] = _TRUSTED

@@ -32,11 +32,7 @@ OVERRIDES = Path(".hydra", "overrides.yaml")
 
 
 def arguments(given: Sequence[str]) -> list[str]:
-    """The command line with the settings of the run in ``resume=DIR``, if there is one, before it.
-
-    Raises:
-        ValueError: no run there.
-    """
+    """The command line, after the settings of the run in ``resume=DIR`` if there is one."""
     values = dict(argument.split("=", 1) for argument in given if "=" in argument)
     folder = values.get("resume", "null")
     if folder != "null":
@@ -59,15 +55,7 @@ def arguments(given: Sequence[str]) -> list[str]:
 
 
 def words_of(folder: str | Path, given: Sequence[str] = ()) -> list[str]:
-    """The words that made the run in a folder.
-
-    Args:
-        folder: of the run.
-        given: words that may name code, as the user knows them.
-
-    Raises:
-        ValueError: no list of words, or one that names code.
-    """
+    """The words that made the run in a folder; those that name code only if given as well."""
     overrides = expanded(Path(folder) / OVERRIDES)
     listed = read_settings(overrides)
     if not (isinstance(listed, list) and all(isinstance(word, str) for word in listed)):
@@ -82,11 +70,7 @@ def words_of(folder: str | Path, given: Sequence[str] = ()) -> list[str]:
 
 
 def read_settings(path: Path) -> Any:
-    """What a YAML file of a run's folder holds.
-
-    Raises:
-        ValueError: a damaged one, or one that stands for more than is in it.
-    """
+    """What a YAML file of a run's folder holds, if it is whole and has no aliases."""
     try:
         text = path.read_text(encoding="utf-8")
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):

@@ -98,11 +98,7 @@ ConfigStore.instance().store(
 
 
 def study_words(given: Sequence[str]) -> list[str]:
-    """The command line of several runs, with what names their folders.
-
-    Raises:
-        ValueError: ``hydra.sweep.dir`` holds a study of other settings, or the launcher is missing.
-    """
+    """The command line of several runs, with what names their folders."""
     if any(word.startswith("resume=") for word in given):
         raise InputError(
             "resume is of one run; several go on by the same command with hydra.sweep.dir=DIR."
@@ -142,18 +138,10 @@ def _compared(words: Sequence[str]) -> list[str]:
 
 
 def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, hydra: Any) -> float:
-    """One of several runs, unless it is done; its outcome is a line on the terminal.
+    """One of several runs, unless it is done; returns its validation RMSE, nan if it failed.
 
-    A run that fails, or is killed, is noted in its folder and stops no other.
-
-    Args:
-        work: the run; returns its validation RMSE.
-        cfg: of the run; one that was killed goes on, on as many threads as its place has.
-        folder: of its files.
-        hydra: the configuration of Hydra.
-
-    Returns:
-        The validation RMSE, nan if the run failed.
+    Its outcome is a line on the terminal. A run that fails, or is killed, is noted in its folder
+    and stops no other. One that was killed goes on, on as many threads as its place has.
     """
     with alone(folder) as lock:
         known = None if cfg.overwrite else done(folder, list(hydra.overrides.task))
@@ -300,11 +288,7 @@ class Report(Callback):
 
 
 def went_on(launched: Callable[[], Any]) -> None:
-    """Start the runs; those that are left again if a process that works on them is killed.
-
-    Raises:
-        SystemExit: runs failed, or processes were killed several times.
-    """
+    """Start the runs; those that are left again if a process that works on them is killed."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here, and not as a traceback
     for _ in range(ATTEMPTS):
         try:

@@ -65,8 +65,8 @@ def advise(evidence: Evidence) -> list[Advice]:
     """
     return [
         found
-        for rule in RULES
-        if not ((evidence.noise_limited or evidence.unexplained) and rule in ON_THE_MODEL)
+        for rule, on_the_model in _RULES
+        if not (on_the_model and (evidence.noise_limited or evidence.unexplained))
         and (found := rule(evidence)) is not None
     ]
 
@@ -358,40 +358,26 @@ def noise_unknown(e: Evidence) -> Advice | None:
     )
 
 
-RULES = (
-    diverges,
-    neither_usable,
-    validation_is_unlike,
-    gain_is_lost,
-    nothing_held_out,
-    starts_in_a_transient,
-    at_the_noise,
-    overfits,
-    linear_part_incomplete,
-    hardly_better,
-    outputs_left_out,
-    nonlinear_part_incomplete,
-    choose_sizes,
-    best_start_alone,
-    one_start,
-    still_falling,
-    tests_are_louder,
-    largest_sizes,
-    noise_unknown,
-)
-"""All of them, the most useful first."""
-
-ON_THE_MODEL = (
-    still_falling,
-    overfits,
-    linear_part_incomplete,
-    hardly_better,
-    outputs_left_out,
-    nonlinear_part_incomplete,
-    best_start_alone,
-    one_start,
-    choose_sizes,
-    largest_sizes,
+_RULES = (  # the most useful first, and whether a rule is on the sizes or the search
+    (diverges, False),
+    (neither_usable, False),
+    (validation_is_unlike, False),
+    (gain_is_lost, False),
+    (nothing_held_out, False),
+    (starts_in_a_transient, False),
+    (at_the_noise, False),
+    (overfits, True),
+    (linear_part_incomplete, True),
+    (hardly_better, True),
+    (outputs_left_out, True),
+    (nonlinear_part_incomplete, True),
+    (choose_sizes, True),
+    (best_start_alone, True),
+    (one_start, True),
+    (still_falling, True),
+    (tests_are_louder, False),
+    (largest_sizes, True),
+    (noise_unknown, False),
 )
 
 
