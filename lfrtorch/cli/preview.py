@@ -55,7 +55,7 @@ def place(path: Path) -> str:
 
 
 def figure_path(asked: str | None, name: str, files: int) -> Path:
-    """Where the figure of a file goes: for one as asked, beside it by the file's name for several."""
+    """Where the figure of a file goes: as asked for one, with the file's name for several."""
     if asked is None:
         return Path(f"{name}_preview.png")
     out = Path(asked)

@@ -8,7 +8,7 @@ import math
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic, sleep, time
 from typing import Any
@@ -19,6 +19,8 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import FileWriter, SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
+from lfrtorch._support.errors import InputError
+from lfrtorch.analysis.model_plots import static_figure
 from lfrtorch.engine.simulation import spectral_radius
 from lfrtorch.fitting.multistart import ROUNDS
 from lfrtorch.fitting.trainer import Progress
@@ -90,9 +92,8 @@ class TensorBoard:
         if self.record is not None and self.y_linear is not None and step % self.every == 0:
             simulated = {"linear": self.y_linear, "NL-LFR": model.simulate(self.record)}
             self.figure("signals/response", plots.response(self.record, simulated), step)
-            signals = model.signals(self.record)
-            drawn = plots.static_map(signals.z[0].numpy(), signals.w[0].numpy())
-            self.figure("signals/static_map", drawn, step)
+            with suppress(InputError):  # a linear model, or one that diverges
+                self.figure("signals/static_map", static_figure(model, self.record), step)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """Add a figure."""

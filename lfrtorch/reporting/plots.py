@@ -225,48 +225,6 @@ def distribution(
     return figure
 
 
-def static_map(z: Array, w: Array) -> Figure:
-    """The static nonlinearity over the region that the data visited.
-
-    One input: w against z with the data's density below. Two: w in colour over the (z1, z2) plane.
-    More: w against each z in turn.
-
-    Shape:
-        z: (samples, nz), w: (samples, nw), normalised units, along a simulation.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> trajectory = model.signals(record)
-        >>> figure = plots.static_map(trajectory.z[0].numpy(), trajectory.w[0].numpy())
-        >>> figure.axes[0].get_ylabel()
-        'w1'
-    """
-    step = max(1, len(z) // _MOST_POINTS)
-    z, w = z[::step], w[::step]
-    nz, nw = z.shape[1], w.shape[1]
-    columns = nz if nz > 2 else 1
-    figure = Figure(figsize=(5.5 * columns, 4.0 * nw), layout="constrained")
-    grid = figure.subplots(nw, columns, squeeze=False)
-    for j in range(nw):
-        for i, ax in enumerate(grid[j]):
-            if nz == 2:
-                points = ax.scatter(z[:, 0], z[:, 1], c=w[:, j], s=3, cmap="coolwarm", lw=0)
-                figure.colorbar(points, ax=ax, label=f"w{j + 1}")
-                ax.set(xlabel="z1", ylabel="z2")
-                continue
-            order = np.argsort(z[:, i])
-            style = "-" if nz == 1 else "."
-            ax.plot(z[order, i], w[order, j], style, ms=1, color=NL_LFR)
-            density = ax.twinx()
-            density.hist(z[:, i], bins=80, color="0.8", density=True)
-            density.set(yticks=[], ylim=(0, 4 * density.get_ylim()[1]))
-            ax.set_zorder(density.get_zorder() + 1)
-            ax.patch.set_visible(False)
-            ax.set(xlabel=f"z{i + 1} (grey: density of the data)", ylabel=f"w{j + 1}")
-    figure.suptitle("static nonlinearity over the visited region (normalised)")
-    return figure
-
-
 def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Figure:
     """Errors on training and validation records against iteration, the kept iterate marked.
 

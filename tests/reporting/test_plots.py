@@ -162,15 +162,6 @@ def test_long_signals_keep_their_extremes():
     assert abs(line[np.argmax(line[:, 1]), 0] - 77_777) <= 10
 
 
-@pytest.mark.parametrize(("nz", "panels"), [(1, 1), (2, 1), (3, 3)])
-def test_static_map_has_a_panel_for_each_output(nz: int, panels: int):
-    rng = np.random.default_rng(0)
-    z, w = rng.normal(size=(500, nz)), rng.normal(size=(500, 2))
-    figure = plots.static_map(z, w)
-    labels = [ax.get_ylabel() for ax in figure.axes]
-    assert sum(label in ("w1", "w2") for label in labels) == 2 * panels
-
-
 def test_convergence_marks_the_kept_iterate():
     history = [Progress(i, 3, 1.0 / (i + 1), 2.0 / (i + 1), 0.0, True, {}, 0.0) for i in range(4)]
     ax = plots.convergence(history, 2, "m").axes[0]
