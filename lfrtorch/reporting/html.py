@@ -28,7 +28,6 @@ from lfrtorch._support.tables import (
     times,
 )
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.linearisation import poles_at_rest
 from lfrtorch.analysis.residual_analysis import LEGEND as RESIDUALS_LEGEND
 from lfrtorch.fitting.size_search import LEGEND, size_table
@@ -38,14 +37,15 @@ from lfrtorch.records import common_unit
 from lfrtorch.reporting.evaluation import Evaluation, Score
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import (
-    REFITTED,
-    finalists,
     linear_name,
     neurons,
     of_samples,
+    origins,
     own_linear,
     published_unit,
+    stability,
     start_matters,
+    starts,
 )
 from lfrtorch.reporting.verdict import LINEAR_MODEL, of_linear
 
@@ -102,7 +102,7 @@ def render(
         parameters=[
             [name, " × ".join(map(str, w.shape)), w.numel()] for name, w in groups if w.numel()
         ],
-        stability=_stability(run.metrics["stable_to"]),
+        stability=stability(run.metrics["stable_to"]),
         facts=_facts(run),
     )
 
@@ -305,47 +305,16 @@ def _linear(bla: LinearModel, result: FitResult) -> dict[str, Any]:
 
 
 def _fit(run: Run) -> dict[str, Any]:
-    metrics = run.metrics
-    fit, ranking = metrics["fit"], metrics["ranking"]
-    ended, others = finalists(metrics)
-    errors = ("train", "validation", "selection")
-    unit = common_unit(run.model.outputs)
-    factor, unit = engineering([start[name] for start in ended for name in errors], unit)
-    starts = [
-        [s["seed"], s["reason"], s["iterations"], *(times(factor, s[name]) for name in errors)]
-        for s in ended
-    ]
-    label = f" ({unit})" if unit else ""
-    head = ["seed", "why it ended", "iterations"]
-    head += [f"{name}{label}" for name in ("training", *errors[1:])]
+    fit, count = run.metrics["fit"], len(run.metrics["ranking"])
+    unit, head, rows, others = starts(run.metrics, common_unit(run.model.outputs))
     judge = "validation" if run.dataset.validation else "training"
-    summary = (
-        f"{fit['reason'].capitalize()}; kept iteration {metrics['chosen_iteration']} of "
-        f"{fit['iterations']}, the best on {judge}."
-    )
-    if len(ranking) > 1:
-        summary += f" The best of {len(ranking)} starts."
-    if metrics["averaged"] > 1:
-        summary += f" The model is the mean of the best {metrics['averaged']}, side by side."
-    if metrics["distilled"]:
-        summary += f" The model stands for the mean of the best {metrics['distilled']}."
-    if metrics["refit"] is not None:
-        summary += f" {REFITTED}"
-    return {"summary": summary, "head": head, "starts": starts, "others": others}
-
-
-def _stability(stable_to: float) -> str:
-    tried = ", ".join(f"{factor:g}" for factor in LOUDER)
-    if stable_to >= max(LOUDER):
-        return (
-            f"Stable on the training inputs {stable_to:g} times as loud, the most that was tried "
-            f"({tried}). That says nothing of the accuracy there."
-        )
-    stable = f"{stable_to:g} times as loud" if stable_to > 1 else "as they are"
-    return (
-        f"Stable on the training inputs {stable}, and no longer on the next louder ones tried "
-        f"({tried} times): validate at the amplitudes you will use."
-    )
+    said = [
+        f"{fit['reason'].capitalize()}; kept iteration {run.metrics['chosen_iteration']} of "
+        f"{fit['iterations']}, the best on {judge}.",
+        *[f"The best of {count} starts."] * (count > 1),
+        *origins(run.metrics),
+    ]
+    return {"summary": " ".join(said), "unit": unit, "head": head, "starts": rows, "others": others}
 
 
 def _facts(run: Run) -> list[list[str]]:

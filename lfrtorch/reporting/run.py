@@ -16,6 +16,7 @@ from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.model import Model
+from lfrtorch.records import common_unit
 from lfrtorch.reporting import scores
 from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.evaluation import Evaluation, Response
@@ -85,18 +86,10 @@ class Run:
             f"{quantity(1e3 * fit.seconds_per_iteration, 'ms')} an iteration\n"
         )
         if len(fit.starts) > 1:
-            parts.append(scores.starts_table(self.metrics) + "\n")
-        if fit.averaged > 1:
-            parts.append(f"The model is the mean of the best {fit.averaged} starts.\n")
-        if fit.distilled:
-            parts.append(f"The model stands for the mean of the best {fit.distilled} starts.\n")
-        if self.refit is not None:
-            parts.append(f"{scores.REFITTED}\n")
+            unit = common_unit(self.model.outputs)
+            parts.append(scores.starts_table(self.metrics, unit) + "\n")
+        parts += [f"{said}\n" for said in scores.origins(self.metrics)]
         parts.append(scores.table(self.metrics, self.dataset.published))
         if self.metrics["stable_to"] < max(LOUDER):
-            parts.append(
-                f"note: stable on the training inputs {self.metrics['stable_to']:g} times as loud, "
-                "and no longer on the next louder ones tried; validate at the amplitudes you will "
-                "use."
-            )
+            parts.append(f"note: {scores.stability(self.metrics['stable_to'])}")
         return "\n".join(parts)

@@ -11,7 +11,7 @@ from typing import Any
 
 from lfrtorch._support import tables
 from lfrtorch._support.reasons import Reason
-from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
+from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import LISTED, Published
 from lfrtorch.fitting.size_search import SizeSearch
@@ -24,9 +24,6 @@ ERRORS = "rmse", "lti_rmse"
 """Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
 
 _SEEN = 0.2  # part of an RMSE that an error must have to be told: it makes 2 % of it
-
-REFITTED = "Refitted to all estimation records: validation errors are those before it."
-"""What is said of a model that was."""
 
 
 def metrics(
@@ -256,27 +253,55 @@ def neurons(sizes: Mapping[str, int]) -> str:
     return f"{sizes['nn']} neurons" if sizes["nn"] else "a map of one's own"
 
 
-def starts_table(result: Mapping[str, Any]) -> str:
-    """The starts of a fit that went to the end, the best first, and how many others there were."""
-    ended, others = finalists(result)
+def starts_table(result: Mapping[str, Any], unit: str = "") -> str:
+    """The starts of a fit that went to the end, and how many others there were."""
+    unit, head, rows, others = starts(result, unit)
+    title = f"Starts, RMSE of the best iterate of each{f' ({unit})' if unit else ''}"
+    return "\n\n".join(part for part in (title, tables.table(head, rows), others) if part)
+
+
+def starts(
+    result: Mapping[str, Any], unit: str
+) -> tuple[str, list[str], list[list[tables.Cell]], str]:
+    """Unit, head and rows of the starts that no others ended, the best first, and of the others."""
+    ended = [start for start in result["ranking"] if start["reason"] != Reason.OTHERS_BETTER]
     names = ("train", "validation", "selection")
-    factor, unit = tables.engineering([s[name] for s in ended for name in names], unit_of(result))
+    factor, unit = tables.engineering([s[name] for s in ended for name in names], unit)
     head = ["seed", "iterations", "training", "validation", "selection", ""]
     rows = [
         [s["seed"], s["iterations"], *(tables.times(factor, s[n]) for n in names), s["reason"]]
         for s in ended
     ]
-    title = f"Starts, RMSE of the best iterate of each{f' ({unit})' if unit else ''}"
-    parts = [title, tables.table(head, rows), others]
-    return "\n\n".join(part for part in parts if part)
-
-
-def finalists(result: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], str]:
-    """The entries of the starts that no others ended, and a line on those that others did."""
-    ended = [start for start in result["ranking"] if start["reason"] != Reason.OTHERS_BETTER]
     count = len(result["ranking"]) - len(ended)
     others = f"{count} {'others' if count > 1 else 'other'} ended earlier: see metrics.json."
-    return ended, others if count else ""
+    return unit, head, rows, others if count else ""
+
+
+def origins(result: Mapping[str, Any]) -> list[str]:
+    """What became of the best starts, if the model is not simply one of them."""
+    said = []
+    if result["averaged"] > 1:
+        said.append(f"The model is the mean of the best {result['averaged']} starts.")
+    if result["distilled"]:
+        said.append(f"The model stands for the mean of the best {result['distilled']} starts.")
+    if result["refit"] is not None:
+        said.append("Refitted to all estimation records: validation errors are those before it.")
+    return said
+
+
+def stability(stable_to: float) -> str:
+    """How much louder the training inputs may be."""
+    tried = ", ".join(f"{factor:g}" for factor in LOUDER)
+    if stable_to >= max(LOUDER):
+        return (
+            f"Stable on the training inputs {stable_to:g} times as loud, the most that was tried "
+            f"({tried}). That says nothing of the accuracy there."
+        )
+    stable = f"{stable_to:g} times as loud" if stable_to > 1 else "as they are"
+    return (
+        f"Stable on the training inputs {stable}, and no longer on the next louder ones tried "
+        f"({tried} times): validate at the amplitudes you will use."
+    )
 
 
 def finite(entry: Any) -> Any:
