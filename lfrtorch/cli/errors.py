@@ -6,7 +6,6 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NoReturn
 
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig
@@ -35,25 +34,24 @@ def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None
         with handled(as_error):
             yield
         return
-    except TerminatedError as end:
-        _end(end, rank)
+    except TerminatedError as end:  # as a program ends that a signal ended
+        if rank == "0":
+            print(end, file=sys.stderr)
+        sys.exit(128 + end.number)
     except (LfrtorchError, OSError, InstantiationException) as failed:
         show(f"{_where(failed)}{failed}")
     except (MemoryError, RuntimeError, ImportError, TypeError) as failed:
-        if not (_of_memory(failed) or _of_the_settings(failed)):
+        if _of_memory(failed):
+            lack = "there is not enough memory; give smaller sizes or shorter records."
+            show(f"{_where(failed)}{lack}")
+        elif _of_the_settings(failed):
+            show(f"{_where(failed)}{failed}")
+        else:
             raise
-        show(f"{_where(failed)}{_said(failed)}")
     except KeyboardInterrupt:
         print("interrupted outside the fit: nothing to keep", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
     sys.exit(1)
-
-
-def _end(end: TerminatedError, rank: str) -> NoReturn:
-    """Exit as a program does that a signal ended."""
-    if rank == "0":
-        print(end, file=sys.stderr)
-    sys.exit(128 + end.number)
 
 
 def _where(error: BaseException) -> str:
@@ -74,10 +72,3 @@ def _of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (
         isinstance(error, RuntimeError) and "memory" in str(error) and "alloc" in str(error)
     )
-
-
-def _said(error: BaseException) -> str:
-    """The message of an error; those of memory have none, or one of the allocator."""
-    if _of_memory(error):
-        return "there is not enough memory; give smaller sizes or shorter records."
-    return str(error)
