@@ -21,14 +21,10 @@ def translated(text: str, cfg: DictConfig) -> str:
         >>> cfg = OmegaConf.create({"data": {"start": "zero"}, "trainer": {"max_iter": 5}})
         >>> translated("estimate their starts (start='estimated'), or give max_iter=20.", cfg)
         'estimate their starts (data.start=estimated), or give trainer.max_iter=20.'
-        >>> translated("Still falling: trainer=Adam(max_iter=20).", cfg)
-        'Still falling: trainer.max_iter=20.'
         >>> translated("use estimate_bla(max_iter=400).", cfg)
         'use bla.max_iter=400.'
     """
     text = text.replace("init_from=run.model", "init_from=RUN")
-    text = re.sub(r"Settings\((\w+=[^()]*)\)", lambda found: found[1].replace(",", ""), text)
-    text = re.sub(r"(?<!\w)\w+=\w+\((\w+=\w+)\)", r"\1", text)
     text = re.sub(r"estimate_bla\((\w+=\w+)\)", r"bla.\1", text)
     words = {name: f"{group}.{name}" for group in GROUPS for name in cfg.get(group) or {}}
     words |= {str(name): str(name) for name in cfg}

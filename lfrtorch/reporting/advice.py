@@ -169,8 +169,7 @@ def still_falling(e: Evidence) -> Advice | None:
         return None
     limit = 4 * max(e.iterations, 1)
     return Advice(
-        f"Still falling: trainer={type(e.trainer).__name__}(max_iter={limit}); "
-        "init_from=run.model goes on from here.",
+        f"Still falling: max_iter={limit}; init_from=run.model goes on from here.",
         f"at the pace of the last iterations the validation error falls by {percent(e.falling)} "
         f"in a tenth of the {e.iterations}",
         {"trainer": replace(e.trainer, max_iter=limit)},
@@ -340,7 +339,7 @@ def choose_sizes(e: Evidence) -> Advice | None:
     static = "degree" if e.sizes.get("degree") else "nn"
     change: dict[str, Any] = dict.fromkeys(["nx", "nz", "nw", static], "auto")
     return Advice(
-        f"Let validation choose the sizes: Settings({_written(change)}).",
+        f"Let validation choose the sizes: {_written(change)}.",
         "the sizes were given",
         change,
     )

@@ -59,11 +59,11 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
         (advice.nothing_held_out, {"validation": None, "linear_validation": None}, "hold out"),
         (advice.validation_is_unlike, {"linear_validation": 0.4}, "cross-validate"),
         (advice.validation_is_unlike, {"linear_validation": 0.1}, "cross-validate"),
-        (advice.still_falling, {"falling": 0.05}, "trainer=LevenbergMarquardt(max_iter=400)"),
+        (advice.still_falling, {"falling": 0.05}, "max_iter=400"),
         (
             advice.still_falling,
             {"falling": 0.05, "trainer": lfrtorch.Adam()},
-            "trainer=Adam(max_iter=400)",
+            "max_iter=400",
         ),
         (advice.overfits, {"validation": 0.05}, "nn=5, or more data"),
         (advice.overfits, OVERTRAINED, "nn=5, or more data"),
