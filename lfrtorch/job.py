@@ -33,7 +33,7 @@ from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan, scan_orders
-from lfrtorch.linear.requirements import check_excitation, excited_directions
+from lfrtorch.linear.requirements import excited_directions
 from lfrtorch.model import Model, check_channels
 from lfrtorch.records import Record
 from lfrtorch.reporting.advice import advise
@@ -396,7 +396,9 @@ def _larger(
     found: dict[int, LinearModel] = {}
     for nx in orders:
         try:
-            check_excitation(train, nx)
+            excited, wanted = excited_directions(train, nx)
+            if excited < wanted:
+                break
             found[nx] = estimate_bla(train, nx, **settings.linear)
         except ValueError:
             break

@@ -280,8 +280,13 @@ def _stable(
     tried = candidates(problem, nx, given)
     estimate, found = best_minimum(problem, tried, max_iter)
     notes += _doubts(problem, estimate, found)
-    if isinstance(problem, ResponseFit) and problem.data.weight is not None:
-        notes += _residual_notes(found.rmse, weight)
+    weighted = isinstance(problem, ResponseFit) and problem.data.weight is not None
+    if weighted and isinstance(weight, str | None) and found.rmse > 2.0:  # good fits reached 1.3
+        cause = "nonlinear distortion or " if weight == "noise" else ""
+        notes.append(
+            f"the error is {number(found.rmse)} times its {weight or 'total'} deviation: "
+            f"{cause}too low an order."
+        )
     if max_iter and found.iterations >= max_iter:
         notes.append(
             f"the search was stopped after {max_iter} iterations: "
@@ -401,14 +406,6 @@ def _doubts(problem: Problem, estimate: SubspaceEstimate, found: Refined) -> lis
             "one, or an order above what they carry; look at the data, or lower nx."
         )
     return notes
-
-
-def _residual_notes(rmse: float, weight: Weight | Array | None) -> list[str]:
-    """Say what a normalised residual means that the variances do not explain."""
-    if rmse <= 2.0 or not isinstance(weight, str | None):  # good fits to 50 lines reached 1.3
-        return []
-    cause = "nonlinear distortion or too low an order" if weight == "noise" else "too low an order"
-    return [f"the error is {number(rmse)} times its {weight or 'total'} deviation: {cause}."]
 
 
 def physical(found: Refined, scaler: Scaler, about: FRF | Record) -> LinearModel:

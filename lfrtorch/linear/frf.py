@@ -235,10 +235,10 @@ def estimate_frf(
     integer("order", order, 0)
     if band is not None:
         checks.band(band)
-    if band is not None and not 0 <= band[0] <= band[1]:
-        raise InputError(
-            f"the band is {band[0]} to {band[1]} Hz; give a lower and an upper frequency."
-        )
+        if not 0 <= band[0] <= band[1]:
+            raise InputError(
+                f"the band is {band[0]} to {band[1]} Hz; give a lower and an upper frequency."
+            )
     if method == "auto":
         periodic = all(record.period or record.start == "periodic" for record in data)
         method = "robust" if periodic else "local_polynomial"
@@ -250,10 +250,8 @@ def estimate_frf(
         f"noise: record '{record.name}' is used from its first sample on; a transient there counts "
         "as noise; skip=N leaves it out."
         for record, P in zip(data, spectra.P, strict=True)
-        if record.start != "periodic" and record.samples == P * spectra.N
+        if record.start != "periodic" and record.samples == P * spectra.N and spectra.freedom
     ]
-    if not spectra.freedom:
-        at_once = []
     spectra, data, notes = united(spectra, data, shifted=True)
     frf = (_robust if method == "robust" else _fast)(spectra, data, chosen)
     return replace(frf, notes=(*frf.notes, *notes, *at_once[:1]))

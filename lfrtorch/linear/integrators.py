@@ -31,12 +31,6 @@ from lfrtorch.metrics import rms
 from lfrtorch.model import simulate_record
 from lfrtorch.records import Channel, NormalisedRecord, Record, Scaler
 
-LONGEST = 0.1
-"""Largest time constant of the n filters together, in lengths of the shortest record."""
-
-POLES = 50
-"""Values of λ that are tried."""
-
 SAME_LINE = 1e-9
 """Distance from z = 1 below which a line is the one at 0, where the response is infinite."""
 
@@ -74,7 +68,7 @@ def differenced(
 
 
 def _filtered(signal: Array, times: int, pole: float) -> Array:
-    """Filtered some times about its mean."""
+    """Filter a signal some times about its mean."""
     mean = signal.mean(axis=0)
     signal = signal - mean
     for _ in range(times):
@@ -83,14 +77,15 @@ def _filtered(signal: Array, times: int, pole: float) -> Array:
 
 
 def whitening_pole(errors: Sequence[Array], integrators: int, pole: float = 0.0) -> float:
-    """λ of n filters that leave least of the errors of G₁.
+    """Return λ of n filters that leave least of errors of G₁ which have passed those of ``pole``.
 
     The errors count as white noise of the output, n times differenced, and white noise of G₁: a
     moving average (1 - λ z⁻¹)ⁿ of white noise, which is smaller than what any other λ leaves.
     """
     n, T = integrators, min(map(len, errors))
     plain = [scipy.signal.lfilter(np.poly([pole] * n), [1.0], e, axis=0)[n:] for e in errors]
-    poles = 1.0 - np.geomspace(1.0, min(1.0, n / (LONGEST * T)), POLES)
+    # The time constant of all filters is a tenth of the shortest record at most.
+    poles = 1.0 - np.geomspace(1.0, min(1.0, n / (0.1 * T)), 50)
     left = np.array([np.sum([_squares(e, n, pole) for e in plain], axis=0) for pole in poles])
     return float(poles[np.argmin(np.log(np.maximum(left, 1e-300)).sum(axis=1))])
 

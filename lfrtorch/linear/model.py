@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from lfrtorch._support import checkpoint
 from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError, brief
+from lfrtorch._support.optional import imported
 from lfrtorch._support.tables import number
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.engine.cell import LFRCell
@@ -368,19 +369,13 @@ class LinearModel:
         that are the same then, the second one has one more.
 
         Raises:
-            ImportError: the package ``control`` is not installed.
+            ValueError: the package ``control`` is not installed.
 
         Example:
             >>> bla.to_control().dt
             0.01
         """
-        try:
-            import control
-        except ImportError as error:
-            raise ImportError(
-                "to_control needs the package control: pip install 'lfrtorch[control]'."
-            ) from error
-        return control.ss(
+        return imported("control", "control").ss(
             self.A, self.B, self.C, self.D, 1.0 / self.fs,
             inputs=control_labels(self.inputs), outputs=control_labels(self.outputs),
         )  # fmt: skip

@@ -176,8 +176,12 @@ def scan_orders(
         try:
             if records:
                 check_length(records, nx)
-            if tried and (narrow := _narrow(records, nx)):
-                notes.append(narrow)
+            excited, wanted = excited_directions(records, nx) if tried and records else (0, 0)
+            if excited < wanted:
+                notes.append(
+                    f"orders from {nx} on are left out: the input excites {excited} of the "
+                    f"{wanted} directions that order {nx} has (one a frequency and phase)."
+                )
                 break
             model, length = fit(nx)
         except ValueError:
@@ -256,19 +260,6 @@ def _worthwhile(models: Sequence[LinearModel]) -> list[int]:
             kept.append(model.nx)
             best = _fitted(model)
     return kept
-
-
-def _narrow(records: list[Record], nx: int) -> str:
-    """Return a note if the input excites too few directions for an order."""
-    if not records:
-        return ""
-    excited, wanted = excited_directions(records, nx)
-    if excited == wanted:
-        return ""
-    return (
-        f"orders from {nx} on are left out: the input excites {excited} of the {wanted} "
-        f"directions that order {nx} has (one a frequency and phase)."
-    )
 
 
 def _first(tried: Sequence[_Tried]) -> int:

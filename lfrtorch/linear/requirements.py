@@ -17,12 +17,9 @@ from lfrtorch.records import Record
 REPEATS = 0.1
 """Largest deviation of periods of an input, and of the means of an output, over the signal's."""
 
-TRANSIENT = 1 / 3
-"""Largest part of the scored samples in which an output that is fitted in steady state settles."""
-
 
 def check_signals(records: list[Record]) -> None:
-    """Refuse a channel that is constant in all records with a ValueError."""
+    """Refuse a channel that is constant in all records."""
     for signals, channels in (
         ([r.u for r in records], records[0].inputs),
         ([r.y for r in records], records[0].outputs),
@@ -38,7 +35,7 @@ def check_signals(records: list[Record]) -> None:
 
 
 def check_length(records: list[Record], nx: int) -> None:
-    """Refuse records that are too short for a subspace of the order with a ValueError."""
+    """Refuse records that are too short for a subspace of the order."""
     nu, ny = len(records[0].inputs), len(records[0].outputs)
     lengths = [r.samples for r in records]
     if not suffice(lengths, nx, nu, ny):
@@ -78,7 +75,7 @@ def _steady_part(record: Record) -> Record | None:
         return None
     settling = find_transient(record.y[record.skip :], N)
     P = (scored - settling) // N
-    if (1 if record.skip >= N else 2) > P or settling > TRANSIENT * scored:
+    if (1 if record.skip >= N else 2) > P or settling > scored / 3:
         return None
     part = record.signals_in(slice(record.samples - P * N, None))
     y, repeated = part["y"], part["u"] if record.reference is None else part["reference"]
@@ -91,8 +88,7 @@ def _steady_part(record: Record) -> Record | None:
 
 
 def check_spectral_data(data: SpectralData, nx: int, direct: int = 0) -> None:
-    """Refuse fewer equations than unknowns with a ValueError; the last ``direct`` inputs act on
-    the output alone."""
+    """Refuse fewer equations than unknowns; ``direct`` inputs act on the output alone."""
     nu, ny = data.U.shape[1] - direct, data.Y.shape[1]
     unknowns, equations = nx * (nu + ny) + (nu + direct) * ny, data.equations
     if equations < unknowns:
@@ -115,16 +111,6 @@ def excited_directions(records: Sequence[Record], nx: int) -> tuple[int, int]:
     rows = rows / np.maximum(rms(rows, axis=0), 1e-300)
     size = np.linalg.eigvalsh(rows.T @ rows)
     return int((size > 1e-10 * size[-1]).sum()), nu * wanted
-
-
-def check_excitation(records: Sequence[Record], nx: int) -> None:
-    """Refuse an input that moves in fewer directions than a model of the order has."""
-    excited, wanted = excited_directions(records, nx)
-    if excited < wanted:
-        raise InputError(
-            f"the input excites {excited} of the {wanted} directions that order nx={nx} has (one a "
-            "frequency and phase): excite more lines, or lower nx."
-        )
 
 
 def excitation_notes(records: list[Record], nx: int) -> list[str]:

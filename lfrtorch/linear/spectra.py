@@ -119,23 +119,30 @@ def _spectra(data: Sequence[Record], windows: list[slice], N: int) -> Spectra:
         signals = np.concatenate([record.y[window], record.u[window]], axis=1)
         Z = np.fft.rfft(signals.reshape(-1, N, size), axis=1) * (np.sqrt(2) / N)
         mean = Z.mean(axis=0)
-        D = (Z - mean).swapaxes(0, 1)
-        count = len(Z) - 1
         E = np.fft.rfft(excited[window].reshape(-1, N, size - ny), axis=1) * (np.sqrt(2) / N)
         references.append(E.mean(axis=0))
         # Line 0 is left out: a drift of the offset is no change of the input.
-        change = np.sum(np.abs(E - references[-1])[:, 1:] ** 2, axis=(0, 1)) / max(count, 1)
-        if count:
-            C += outer(D)
-        freedom += count
+        changes.append(
+            np.sum(np.abs(E - references[-1])[:, 1:] ** 2, axis=(0, 1)) / max(len(Z) - 1, 1)
+        )
+        if len(Z) > 1:
+            C += outer((Z - mean).swapaxes(0, 1))
+        freedom += len(Z) - 1
         means.append(mean)
         P.append(len(Z))
-        changes.append(change)
     both = np.stack(means, axis=1)
     Y, U = both[:, :, :ny], both[:, :, ny:]
     R = np.stack(references, axis=1)
     rms = np.sqrt(np.sum(np.abs(R[1:]) ** 2, axis=(0, 1)) / len(data))
-    _check_repetition(data, np.sqrt(changes) / rms, N)
+    change = np.sqrt(changes) / rms
+    if change.max() > 0.1:
+        r, channel = (int(i) for i in np.unravel_index(np.argmax(change), change.shape))
+        raise InputError(
+            f"record '{data[r].name}': the periods of {N} samples of input "
+            f"'{data[r].inputs[channel].name}' deviate from their mean by "
+            f"{100 * change[r, channel]:.0f} %; give period=N, skip=N or "
+            "method='local_polynomial',\nor the reference of an input with noise."
+        )
     C /= max(freedom, 1)
     reference = None if known[0] is None else R
     return Spectra(U, Y, C, freedom, np.array(P), N, data[0].fs / N, reference)
@@ -151,18 +158,6 @@ def given_references(data: Sequence[Record]) -> list[Array | None]:
             "one, or none."
         )
     return [record.reference for record in data]
-
-
-def _check_repetition(data: Sequence[Record], change: Array, N: int) -> None:
-    """Refuse inputs whose periods change; ``change`` (R, nu) is relative to the rms."""
-    if change.max() > 0.1:
-        r, channel = (int(i) for i in np.unravel_index(np.argmax(change), change.shape))
-        raise InputError(
-            f"record '{data[r].name}': the periods of {N} samples of input "
-            f"'{data[r].inputs[channel].name}' deviate from their mean by "
-            f"{100 * change[r, channel]:.0f} %; give period=N, skip=N or "
-            "method='local_polynomial',\nor the reference of an input with noise."
-        )
 
 
 def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | None) -> Integers:
