@@ -389,28 +389,3 @@ def test_covariance_of_window_errors_is_that_of_all_lines_together():
     # The blocks of one line are the covariances of the response.
     own = np.einsum("kurl,kvrl,kop->koupv", errors.weights, errors.weights.conj(), errors.noise)
     np.testing.assert_allclose(own.reshape(F, 4, 4), frf.cov_total, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("known", [True, False])
-def test_covariance_is_that_of_many_fits(known: bool):
-    """200 fits of a first-order system to lines of unequal noise: pole and gains."""
-    system = np.array([[0.7]]), np.array([[1.0]]), np.array([[1.0]]), np.array([[0.2]])
-    F, runs = 100, 200
-    z = np.exp(1j * np.linspace(0.05, 3.0, F))
-    G = frequency_response(*system, z)
-    U = np.ones((F, 1, 1), dtype=complex)
-    variance = 1e-4 * np.linspace(0.2, 3.0, F)[:, None, None]
-    rng = np.random.default_rng(5)
-    poles, predicted = [], []
-    for _ in range(runs):
-        noise = rng.normal(size=(F, 1, 1)) + 1j * rng.normal(size=(F, 1, 1))
-        Y = G + np.sqrt(variance / 2) * noise
-        fit = ResponseFit(SpectralData(z, U, Y, 1.0 / variance if known else None), known=known)
-        found = refined(fit, system, 20)
-        poles.append(found.A[0, 0])
-        assert found.covariance is not None
-        predicted.append(found.covariance[0, 0])
-    # The variance of 200 draws has a relative deviation of √(2 / 199) = 0.1: four of them.
-    assert np.mean(predicted) == pytest.approx(np.var(poles, ddof=1), rel=0.4)
-    assert np.mean(poles) == pytest.approx(0.7, abs=4 * np.std(poles) / np.sqrt(runs))

@@ -245,24 +245,6 @@ def test_covariance_of_prediction_errors_is_that_of_white_ones(T: int):
     )
 
 
-@pytest.mark.parametrize("kind", ["white", "coloured", "prediction"])
-@pytest.mark.slow
-def test_covariance_is_that_of_many_fits(kind: str):
-    """The pole of a first-order system, over 60 records: simulation errors of any spectrum."""
-    prediction = kind == "prediction"
-    system = np.array([[0.8]]), np.array([[1.0]]), np.array([[1.0]]), np.array([[0.0]])
-    K = np.array([[0.0 if kind == "white" else 0.7]])
-    poles, predicted = [], []
-    for seed in range(60):
-        record, _ = innovations(system, K, 300, seed=100 + seed)
-        found = refined(fit_of([record], prediction=prediction), system, 15)
-        poles.append(found.A[0, 0])
-        assert found.covariance is not None
-        predicted.append(found.covariance[0, 0])
-    # The gauge of one state scales B and C and leaves A alone; √(2 / 59) = 0.18, four of them.
-    assert np.mean(predicted) == pytest.approx(np.var(poles, ddof=1), rel=0.73)
-
-
 def test_covariance_of_a_predictor_is_that_of_its_system():
     """By the linear map of A' = A - K C and B' = B - K D, written out for small changes."""
     system = random_system(2, 1, 1)
