@@ -55,7 +55,6 @@ from lfrtorch.linear.subspace import SubspaceEstimate
 from lfrtorch.metrics import rms
 from lfrtorch.model import state_moment
 from lfrtorch.records import Record, Scaler, as_records, without_coordinates
-from lfrtorch.survey.integration import integrators as count_integrators
 
 Criterion = Literal["simulation", "prediction", "frequency"]
 
@@ -163,8 +162,6 @@ def estimate_bla(
     model = estimate(data, nx, settings)
     fit = _fit(model)
     notes = fit.notes
-    if not integrators and not isinstance(data, FRF):
-        notes += _integrator_notes(data)
     if fit.rmse > 0.7 and refine != "frequency":  # half of the power
         notes += (
             f"the model explains little: {100 * fit.rmse:.0f} % of the output's rms remain. Are "
@@ -174,17 +171,6 @@ def estimate_bla(
         moment = state_moment(model.to_model(), data)
         model = replace(model, state_covariance=moment.numpy())
     return replace(model, fit=replace(fit, seconds=time.perf_counter() - clock, notes=notes))
-
-
-def _integrator_notes(records: list[Record]) -> tuple[str, ...]:
-    """Say what to do about outputs that integrate, by the longest record."""
-    longest = max(records, key=lambda record: record.samples)
-    u, y = longest.u[longest.skip :], longest.y[longest.skip :]
-    counts = [count_integrators(u, y[:, i]) for i in range(y.shape[1])]
-    if not any(counts):
-        return ()
-    names = ", ".join(f"'{c.name}'" for c, n in zip(longest.outputs, counts, strict=True) if n)
-    return (f"output {names} integrates: use integrators={max(counts)} for exact poles at z = 1.",)
 
 
 def default_criterion(records: Sequence[Record]) -> Criterion:

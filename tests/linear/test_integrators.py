@@ -254,19 +254,3 @@ def test_a_steady_state_is_refused():
     data = record(start="periodic")
     with pytest.raises(ValueError, match="no steady state of its own"):
         estimate_bla(data, 2, integrators=1)
-
-
-def test_a_note_asks_for_integrators():
-    u = np.random.default_rng(0).standard_normal(1000)
-    data = Record(u, lfilter([0, 1], np.poly([1.0, 0.5]), u), start="estimated")
-    (said,) = [note for note in notes_of(data) if note.startswith("output")]
-    assert said == "output 'y' integrates: use integrators=1 for exact poles at z = 1."
-    assert notes_of(data, integrators=1) == ()
-    leaky = replace(data, y=lfilter([0, 1, 0.2], np.convolve(LAG, [1, -0.3]), data.u, axis=0))
-    assert notes_of(leaky) == ()
-
-
-def notes_of(data: Record, **options: Any) -> tuple[str, ...]:
-    fit = estimate_bla(data, 2, max_iter=0, **options).fit
-    assert fit is not None
-    return fit.notes
