@@ -97,13 +97,9 @@ def best_minimum(
         if len(costs) >= AGREED and max(costs[-AGREED:]) <= SAME * min(costs):
             break  # the last ones are all in the best minimum: the others would be, too
     searches.sort(key=lambda each: each[1].state.cost)
-    costs = [0.0, *(search.state.cost for _, search in searches)]
-    distinct = [
-        each
-        for each, last in zip(searches, costs, strict=False)
-        if each[1].state.cost > SAME * last
-    ]
-    finalists = (distinct or searches)[: LEADERS if many else FINALISTS]
+    apart = distinct([search.state.cost for _, search in searches], SAME)
+    finalists = [searches[i] for i in apart] or searches
+    finalists = finalists[: LEADERS if many else FINALISTS]
     for _, search in finalists:
         search.advance(max_iter, SETTLED if many else 0.0)
     if many:
@@ -111,6 +107,12 @@ def best_minimum(
         finalists[0][1].advance(max_iter)
     estimate, search = min(finalists, key=lambda each: problem.improbability(each[1]))
     return estimate, problem.refined(search)
+
+
+def distinct(costs: Sequence[float], ratio: float) -> list[int]:
+    """Return the places of the rising costs that are above ``ratio`` times the one before."""
+    pairs = zip(costs, [0.0, *costs], strict=False)
+    return [i for i, (cost, before) in enumerate(pairs) if cost > ratio * before]
 
 
 def search_from(problem: Problem, matrices: Matrices) -> Search:

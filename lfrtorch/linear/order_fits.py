@@ -22,7 +22,7 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array
 from lfrtorch.linear.bla import Settings, default_criterion, physical, pose
 from lfrtorch.linear.frf import FRF
-from lfrtorch.linear.minima import ALIKE, no_start, search_from, transformation
+from lfrtorch.linear.minima import ALIKE, distinct, no_start, search_from, transformation
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Matrices, Refined, Search
 from lfrtorch.linear.requirements import check_spectral_data
@@ -65,6 +65,12 @@ def description_length(rmse: float, parameters: int, equations: float) -> float:
     return rmse * equations ** (parameters / (2.0 * equations))
 
 
+def fitted(model: LinearModel) -> float:
+    """Return the error of the fit."""
+    assert model.fit is not None
+    return model.fit.rmse
+
+
 class OrderFits:
     """Fits of several orders to the same data.
 
@@ -77,7 +83,6 @@ class OrderFits:
         problem: ResponseFit,
         scaler: Scaler,
         about: FRF | Record,
-        criterion: str,
         train: Sequence[tuple[Record, Sequence[Window]]],
         *,
         offset: bool,
@@ -85,8 +90,7 @@ class OrderFits:
         max_iter: int,
     ) -> None:
         self.problem, self._scaler, self._about = problem, scaler, about
-        self._criterion, self._train, self._offset = criterion, train, offset
-        self._max_iter = max_iter
+        self._train, self._offset, self._max_iter = train, offset, max_iter
         inputs = problem.data.U.shape[1] - problem.starts
         self._driven = ResponseFit(
             replace(problem.data, U=problem.data.U[:, :inputs]), known=problem.known
@@ -125,8 +129,9 @@ class OrderFits:
             windows = [[(record.skip, record.samples)] for record in records]
             return cls.of_windows(records, windows, **common, feedthrough=through)
         whole = [(record, [(0, record.samples)]) for record in records]
-        train = whole if settings.refine == "simulation" else ()
-        return cls(problem, scaler, about, settings.refine, train, **common)
+        return cls(
+            problem, scaler, about, whole if settings.refine == "simulation" else (), **common
+        )
 
     @classmethod
     def of_windows(
@@ -156,10 +161,8 @@ class OrderFits:
         )
         problem = ResponseFit(spectra, known=False, feedthrough=feedthrough, starts=len(kept))
         whole = list(zip(records, windows, strict=True))
-        return cls(
-            problem, scaler, records[0], "simulation", whole,
-            offset=offset, most=most, max_iter=max_iter,
-        )  # fmt: skip
+        common: dict[str, Any] = {"offset": offset, "most": most, "max_iter": max_iter}
+        return cls(problem, scaler, records[0], whole, **common)
 
     @spread_by_hand()
     def fit(self, nx: int) -> tuple[LinearModel, float]:
@@ -209,8 +212,8 @@ class OrderFits:
         start of a search has it less than its minimum.
         """
         models = [self._model(each, clock, y_offset) for each in found]
-        best = int(np.argmin([error for _, _, error in models]))
-        return found[best], *models[best][:2]
+        best = int(np.argmin([fitted(model) for model, _ in models]))
+        return found[best], *models[best]
 
     def _starts(self, nx: int) -> list[Matrices]:
         """Return starts of finite cost, the best first; of those that are alike one."""
@@ -224,15 +227,10 @@ class OrderFits:
         pairs += [(e.A, e.C) for e in estimates if e is not None and len(e.A) == nx]
         found = [self.problem.with_input_matrices(A, C) for A, C in pairs]
         ranked = sorted((each for each in found if np.isfinite(each[0])), key=lambda each: each[0])
-        costs = [0.0, *(cost for cost, _ in ranked)]
-        apart = [
-            matrices
-            for (cost, matrices), last in zip(ranked, costs, strict=False)
-            if cost > ALIKE * last
-        ]
         if not ranked:
             raise no_start(nx)
-        return (apart or [matrices for _, matrices in ranked])[:STARTS]
+        apart = distinct([cost for cost, _ in ranked], ALIKE) or range(len(ranked))
+        return [ranked[i][1] for i in apart][:STARTS]
 
     def _extended(self, below: Matrices, more: int) -> list[tuple[Array, Array]]:
         """Return A and C of a model with ``more`` states that describe its errors."""
@@ -256,8 +254,8 @@ class OrderFits:
 
     def _model(
         self, found: Refined, clock: float, y_offset: Array
-    ) -> tuple[LinearModel, list[Array], float]:
-        """Return the model in physical units, its errors in each record, and their size.
+    ) -> tuple[LinearModel, list[Array]]:
+        """Return the model in physical units, and its errors in each record.
 
         The states that records begin from depend on the offset of the output, so that a guess of it
         comes first, and is corrected by the mean of the errors.
@@ -271,15 +269,15 @@ class OrderFits:
         errors = [record.y - model.simulate(record) for record, _ in self._train]
         if errors:
             pairs = zip(errors, self._train, strict=True)
-            fitted = np.concatenate([e[a:b] for e, (_, windows) in pairs for a, b in windows])
+            inside = np.concatenate([e[a:b] for e, (_, windows) in pairs for a, b in windows])
             if self._offset:
-                mean = fitted.mean(axis=0)
+                mean = inside.mean(axis=0)
                 model = replace(model, y_offset=model.y_offset + mean)
-                fitted, errors = fitted - mean, [each - mean for each in errors]
-            rmse = float(rms(fitted / self._scaler.y_scale))
-        spent = time.perf_counter() - clock
-        fit = LinearFit(self._criterion, rmse, found.iterations, found.reason, spent)
-        return replace(model, fit=fit), errors, rmse
+                inside, errors = inside - mean, [each - mean for each in errors]
+            rmse = float(rms(inside / self._scaler.y_scale))
+        criterion, spent = "simulation" if self._train else "frequency", time.perf_counter() - clock
+        fit = LinearFit(criterion, rmse, found.iterations, found.reason, spent)
+        return replace(model, fit=fit), errors
 
     def _without_starts(self, found: Refined) -> Refined:
         """Return the system without the inputs that make its initial states."""

@@ -28,7 +28,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.linear.bla import estimate_bla
 from lfrtorch.linear.frf import FRF
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.linear.order_fits import OrderFits, Window, description_length
+from lfrtorch.linear.order_fits import OrderFits, Window, description_length, fitted
 from lfrtorch.linear.requirements import check_length, check_signals, excited_directions
 from lfrtorch.metrics import rms
 from lfrtorch.paired_blocks import (
@@ -109,7 +109,7 @@ class OrderScan:
             value = s[model.nx - 1] if model.nx <= len(s) else None
             radius = tables.radius(float(np.abs(model.poles).max()))
             chosen = "chosen" if model.nx == self.chosen else ""
-            rows.append([model.nx, _fitted(model), score, value, radius, chosen])
+            rows.append([model.nx, fitted(model), score, value, radius, chosen])
         head = ["nx", "fitted", how, "singular value", "largest pole", ""]
         return tables.table(head, rows, digits=4)
 
@@ -165,7 +165,7 @@ def scan_orders(
         tried.append(new)
         scores = _scores(tried)
         watch(
-            f"order {new.model.nx}: fitted {number(_fitted(new.model))}, {how} "
+            f"order {new.model.nx}: fitted {number(fitted(new.model))}, {how} "
             f"{number(scores[-1])}, {quantity(time.perf_counter() - clock, 's')}"
         )
         return no_progress(scores, PATIENCE)
@@ -236,11 +236,6 @@ def _rising(orders: Sequence[int], least: int) -> list[int]:
     return [nx for nx in rising if nx >= least] or rising
 
 
-def _fitted(model: LinearModel) -> float:
-    assert model.fit is not None
-    return model.fit.rmse
-
-
 def _scores(tried: Sequence[_Tried]) -> list[float]:
     """Return the rms of all errors of each model, or its description length without any."""
     return [_rms(each.errors) if each.errors else each.length for each in tried]
@@ -256,9 +251,9 @@ def _worthwhile(models: Sequence[LinearModel]) -> list[int]:
     """Return the first order, and each that fits better than those below by ``MARGIN``."""
     kept, best = [], inf
     for model in models:
-        if not kept or _fitted(model) < best / (1.0 + MARGIN):
+        if not kept or fitted(model) < best / (1.0 + MARGIN):
             kept.append(model.nx)
-            best = _fitted(model)
+            best = fitted(model)
     return kept
 
 
@@ -391,4 +386,4 @@ def _alone(
         starts = sum(r.start != "zero" for r in data)
     gains = 0 if model.K is None else ny
     p = nx * (nu + ny + gains + starts) + nu * ny
-    return model, description_length(_fitted(model), p, M)
+    return model, description_length(fitted(model), p, M)
