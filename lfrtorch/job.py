@@ -27,6 +27,7 @@ from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.stage import Stage
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import FitResult, Stop
 from lfrtorch.linear.bla import estimate_bla
@@ -105,27 +106,22 @@ def identify(
     if observer is None:
         observer = LineObserver() if ranks.rank == 0 else Observer()
     with closing(observer):
-        return _identified(dataset, settings, observer, snapshots, ranks, stop)
+        return _identified(Stage(dataset, settings, observer, ranks, stop), snapshots)
 
 
-def _identified(
-    dataset: Dataset,
-    settings: Settings,
-    observer: Observer,
-    snapshots: Snapshots | None,
-    ranks: Ranks,
-    stop: Stop | None,
-) -> Run:
-    """``identify`` with somebody who looks on."""
+def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
+    """Run all stages."""
+    dataset, settings, observer = given.dataset, given.settings, given.observer
     if settings.init_from is not None:
         check_channels(settings.init_from, dataset.train[0])
-    whole, dataset = dataset, dataset.with_windows()
+    dataset = dataset.with_windows()
+    stage = replace(given, dataset=dataset)
     approximated = linear_records(dataset.train, settings, observer)
     linear, order_scan = linear_model(
-        approximated, settings, dataset.validation, observer=observer, ranks=ranks
+        approximated, settings, dataset.validation, observer=observer, ranks=given.ranks
     )
     settings, asked = replace(settings, nx=linear.nx), settings
-    sizes = choose_sizes(dataset, asked, linear, observer=observer, ranks=ranks, stop=stop)
+    sizes = choose_sizes(stage, linear)
     if sizes is not None:
         chosen, starts = sizes.chosen, max(SEARCHED_STARTS, asked.starts)
         settings = replace(settings, seed=chosen.seed, starts=starts, **chosen.sizes)
@@ -140,9 +136,7 @@ def _identified(
     if settings.init_from is not None and settings.starts > 1:
         observer.say("note: starts is 1: the fit starts from the model of init_from alone")
     if settings.first_part < 1.0:
-        settings, models = begun_on_part(
-            dataset, settings, models, observer, ranks=ranks, stop=stop
-        )
+        settings, models = begun_on_part(replace(stage, settings=settings), models)
     average = _most_averaged(models, settings.average, observer)
     samples = sum(record.samples for record in dataset.train)
     if samples >= SLOW_SAMPLES and not is_compiled(cell := models[0].lfr.cell, cell.A.cpu()):
@@ -161,23 +155,18 @@ def _identified(
         dataset.train,
         dataset.validation,
         dataset.selection,
-        trainer=settings.trainer,
-        ridge=settings.ridge,
-        noise=settings.noise,
-        horizon=settings.horizon,
         average=average,
         monitors=monitors,
         watch=watch,
-        ranks=ranks,
         snapshots=snapshots,
-        stop=stop,
+        **stage.options,
     )
     observer.end(result)
     if settings.distil:
-        result = distilled(dataset, settings, result, observer, ranks=ranks, stop=stop)
+        result = distilled(replace(stage, settings=settings), result)
     again = None
     if settings.refit:
-        result, again = refitted(whole, settings, result, observer, ranks=ranks, stop=stop)
+        result, again = refitted(replace(given, settings=settings), result)
     return scored_run(
         dataset, settings, linear, result, order_scan=order_scan, size_search=sizes, again=again
     )
@@ -331,21 +320,14 @@ def linear_records(
     return steady
 
 
-def choose_sizes(
-    dataset: Dataset,
-    settings: Settings,
-    linear: LinearModel,
-    *,
-    observer: Observer,
-    ranks: Ranks,
-    stop: Stop | None,
-) -> SizeSearch | None:
+def choose_sizes(stage: Stage, linear: LinearModel) -> SizeSearch | None:
     """The search for the sizes that are ``"auto"``; None if none but nx is.
 
     If nx is one of them, the order of the linear model is the least: an NL-LFR may make use of
     states that a linear model does not. Models are fitted to the part of the training records that
     the first iterations have.
     """
+    dataset, settings, observer = stage.dataset, stage.settings, stage.observer
     if not settings.searched:
         return None
     grid = settings.sizes_search
@@ -359,6 +341,7 @@ def choose_sizes(
         begin = linears[tried.get("nx", linear.nx)]
         return starting_model(dataset.train, replace(settings, **tried), begin, seed)
 
+    iterations = math.ceil(grid.iterations * trainer.limit)
     tried = {
         name: getattr(grid if name in settings.searched else settings, name)
         for name in settings.size_names
@@ -374,14 +357,9 @@ def choose_sizes(
         seeds=settings.first_seeds(grid.starts),
         finalists=grid.finalists,
         folds=grid.folds,
-        trainer=replace(trainer, max_iter=math.ceil(grid.iterations * trainer.limit)),
-        ridge=settings.ridge,
-        noise=settings.noise,
-        horizon=settings.horizon,
         monitor=observer.searching(),
         watch=lambda ended: observer.say(str(ended)),
-        ranks=ranks,
-        stop=stop,
+        **{**stage.options, "trainer": replace(trainer, max_iter=iterations)},
     )
     observer.say(search.table())
     for note in search.notes:

@@ -30,6 +30,7 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.first_fit import part_of
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
+from lfrtorch.fitting.stage import Stage
 from lfrtorch.fitting.trainer import StoppedError
 from lfrtorch.job import choose_sizes, linear_records
 from lfrtorch.linear.bla import estimate_bla
@@ -125,7 +126,7 @@ def test_sizes_are_searched_as_far_as_short_records_carry():
     for (train, validation), orders in ((parts[:2], {1, 3}), (toned, {1})):
         data = Dataset("mine", [train], [validation], [])
         linear = estimate_bla(data.train, nx=1)
-        found = choose_sizes(data, asked, linear, observer=Observer(), ranks=Ranks(), stop=None)
+        found = choose_sizes(Stage(data, asked, Observer(), Ranks(), None), linear)
         assert found is not None
         assert {c.sizes["nx"] for c in found.candidates} == orders
 

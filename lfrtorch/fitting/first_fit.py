@@ -9,40 +9,29 @@ from typing import Any
 
 from lfrtorch._support.reasons import CUT_SHORT
 from lfrtorch._support.tables import quantity
-from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.trainer import Stop, StoppedError
+from lfrtorch.fitting.stage import Stage
+from lfrtorch.fitting.trainer import StoppedError
 from lfrtorch.model import Model
 from lfrtorch.records import Record, common_unit
 
 
-def begun_on_part(
-    dataset: Dataset,
-    settings: Settings,
-    models: list[Model],
-    observer: Observer,
-    *,
-    ranks: Ranks,
-    stop: Stop | None,
-) -> tuple[Settings, list[Model]]:
+def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Model]]:
     """The best start after the first iterations, on a part of the training records.
 
     Args:
-        dataset, ranks, stop: see :func:`lfrtorch.identify`.
-        settings: name the part.
+        stage: its settings name the part.
         models: of all starts.
-        observer: who is told.
 
     Returns:
         The settings, with the seed of the start that is kept, and its model.
     """
+    dataset, settings, observer = stage.dataset, stage.settings, stage.observer
     train = dataset.train
     part = part_of(train, settings.first_part)
     samples, all_samples = (sum(r.samples for r in records) for records in (part, train))
-    if max(len(models), len(part)) < ranks.world or samples == all_samples:
+    if max(len(models), len(part)) < stage.ranks.world or samples == all_samples:
         observer.say(
             f"note: first_part is {settings.first_part}, and there are {len(train)} training "
             "record(s): all are fitted from the first iteration"
@@ -55,13 +44,8 @@ def begun_on_part(
         part,
         dataset.validation,
         dataset.selection,
-        trainer=replace(trainer, max_iter=settings.first_iterations),
-        ridge=settings.ridge,
-        noise=settings.noise,
-        horizon=settings.horizon,
         monitors=None if monitor is None else [[monitor]] * len(models),
-        ranks=ranks,
-        stop=stop,
+        **{**stage.options, "trainer": replace(trainer, max_iter=settings.first_iterations)},
     )
     if result.reason in CUT_SHORT:
         raise StoppedError("stopped during the first iterations, on a part of the records")

@@ -11,28 +11,18 @@ import torch
 from lfrtorch._support.reasons import CUT_SHORT, Reason
 from lfrtorch._support.tables import number, quantity
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
-from lfrtorch.dataset import Dataset
-from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.distillation import distil
 from lfrtorch.fitting.multistart import AS_GOOD
-from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.refit import refit
-from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.trainer import FitResult, Stop, StoppedError
+from lfrtorch.fitting.stage import Stage
+from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.records import common_unit
 
 
-def distilled(
-    dataset: Dataset,
-    settings: Settings,
-    result: FitResult,
-    observer: Observer,
-    *,
-    ranks: Ranks,
-    stop: Stop | None,
-) -> FitResult:
+def distilled(stage: Stage, result: FitResult) -> FitResult:
     """The fit with one model in the place of a mean, if it does as well on validation."""
+    dataset, settings, observer = stage.dataset, stage.settings, stage.observer
     if result.reason in CUT_SHORT:
         return result
     if not result.members:
@@ -48,8 +38,8 @@ def distilled(
             trainer=settings.trainer,
             seed=settings.seed,
             monitor=observer.searching(),
-            ranks=ranks,
-            stop=stop,
+            ranks=stage.ranks,
+            stop=stage.stop,
         ),
     )
     if one.reason in CUT_SHORT:
@@ -57,7 +47,7 @@ def distilled(
     judged = dataset.validation or dataset.train
     problems = [Problem.judge(m, judged) for m in (one.model, result.model)]
     costs = [problem.cost(problem.residual(problem.theta)) for problem in problems]
-    found, mean = ranks.first(torch.tensor(costs, dtype=torch.float64)).sqrt().tolist()
+    found, mean = stage.ranks.first(torch.tensor(costs, dtype=torch.float64)).sqrt().tolist()
     taken = found <= AS_GOOD * mean or not dataset.validation
     on = "validation" if dataset.validation else "training"
     observer.say(
@@ -69,24 +59,16 @@ def distilled(
     return replace(result, model=one.model, averaged=1, members=(), distilled=result.averaged)
 
 
-def refitted(
-    dataset: Dataset,
-    settings: Settings,
-    result: FitResult,
-    observer: Observer,
-    *,
-    ranks: Ranks,
-    stop: Stop | None,
-) -> tuple[FitResult, FitResult | None]:
+def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | None]:
     """The fit and that to all estimation records; None if the model that was chosen stays.
 
     A fit that was interrupted here has that for its reason.
 
     Args:
-        dataset: the records without windows for scores: what need not be skipped is fitted.
-        settings, result, ranks, stop: of the fit.
-        observer: who is told.
+        stage: has the records without windows for scores: what need not be skipped is fitted.
+        result: of the fit.
     """
+    dataset, settings, observer = stage.dataset, stage.settings, stage.observer
     held_out = [*dataset.validation, *dataset.selection]
     if result.reason in CUT_SHORT:
         return result, None
@@ -103,14 +85,9 @@ def refitted(
             result,
             dataset.train,
             held_out,
-            trainer=settings.trainer,
-            ridge=settings.ridge,
-            noise=settings.noise,
-            horizon=settings.horizon,
             iterations=iterations,
             monitor=observer.searching(),
-            ranks=ranks,
-            stop=stop,
+            **stage.options,
         ),
     )
     if again.reason in CUT_SHORT:
@@ -119,7 +96,7 @@ def refitted(
     margins = torch.tensor(
         [largest_stable_amplitude(m, records) for m in (again.model, result.model)]
     )
-    if bool(torch.lt(*ranks.first(margins))):
+    if bool(torch.lt(*stage.ranks.first(margins))):
         observer.say(
             "note: refit: the model would become unstable on louder inputs; that before it stays"
         )

@@ -1,0 +1,55 @@
+"""What the stages of a job share: sizes, a first part, the fit, one model for a mean, a refit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypedDict
+
+from lfrtorch.dataset import Dataset
+from lfrtorch.distributed import Ranks
+from lfrtorch.fitting.observer import Observer
+from lfrtorch.fitting.prediction import Noise
+from lfrtorch.fitting.settings import Settings
+from lfrtorch.fitting.trainer import Stop, Trainer
+from lfrtorch.least_squares.simulation_errors import Ridge
+
+
+class FitOptions(TypedDict):
+    """Keywords of every fit of a job, see :func:`lfrtorch.fit`."""
+
+    trainer: Trainer
+    ridge: Ridge
+    noise: Noise
+    horizon: int | None
+    ranks: Ranks
+    stop: Stop | None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a stage is given, and hands on.
+
+    Args:
+        dataset: records by use.
+        settings: as far as they are chosen.
+        observer: who is told.
+        ranks, stop: see :func:`lfrtorch.fit`.
+    """
+
+    dataset: Dataset
+    settings: Settings
+    observer: Observer
+    ranks: Ranks
+    stop: Stop | None
+
+    @property
+    def options(self) -> FitOptions:
+        """Keywords of its fit."""
+        return {
+            "trainer": self.settings.trainer,
+            "ridge": self.settings.ridge,
+            "noise": self.settings.noise,
+            "horizon": self.settings.horizon,
+            "ranks": self.ranks,
+            "stop": self.stop,
+        }
