@@ -15,6 +15,7 @@ SCRIPTS = [
     "feedback",
     "first_try",
     "horizon",
+    "house",
     "large_linear",
     "linear",
     "load",
