@@ -31,7 +31,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 
 __all__ = ["load", "multisine", "simulate", "sweep"]
 
@@ -108,10 +108,6 @@ def load(
     Shape:
         u (N) and y (m) of training and validation: (samples, 1); of the multisine test:
         (8192, 1); of the sweep test: (153000, 1).
-
-    Raises:
-        ValueError: an argument out of range, or a test file that cannot be used.
-        FileNotFoundError: ``root`` holds no test file, or one of a pair is missing.
 
     Example:
         >>> data = lfrtorch.datasets.boucwen.load(samples=1024)
@@ -368,8 +364,7 @@ def _sweep_test(folder: Path) -> Record:
 
 
 def _record(u: Array, y: Array, **kwargs: Any) -> Record:
-    channels: dict[str, Any] = {"inputs": (Channel("u", "N"),), "outputs": (Channel("y", "m"),)}
-    return Record(u, y, fs=_FS, **channels, **kwargs)
+    return official.record(u, y, {"u": "N"}, {"y": "m"}, fs=_FS, **kwargs)
 
 
 def _official_folder(root: str | Path | None, download: bool) -> Path:
@@ -405,5 +400,6 @@ def _read_official(folder: Path, test: str) -> tuple[Array, Array] | None:
             "both to have the test simulated."
         )
     advice = "download the file again, or remove it and its partner to have the test simulated."
-    (u,), (y,) = (official.read_mat(path, [path.stem], _TESTS[test], advice) for path in paths)
+    shape = (_TESTS[test],)
+    u, y = (official.read_arrays(p, {p.stem: shape}, advice=advice)[p.stem] for p in paths)
     return u, y

@@ -22,9 +22,10 @@ from typing import Any
 
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch._support.types import Array
+from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 
 __all__ = ["load"]
 
@@ -34,16 +35,15 @@ _SAMPLES = 1024  # of each record
 _MOST = 10.0  # V, of the sensor
 _WINDOW = 50  # samples that the package leaves unscored
 
-_PUBLISHED = (
-    Published("pNARX", {"test": 0.416}, official.BOARD),
-    Published("SUBNET", {"test": 0.37}, official.BOARD),
-    Published("TSEM", {"test": 0.33}, official.BOARD),
-    Published("CT-SUBNET", {"test": 0.306}, official.BOARD),
-    Published("B-splines", {"test": 0.30}, f"{official.LEGACY}; tensor"),
-    Published("LTC", {"test": 0.298}, "closed-form liquid network, mean of 2, 0.271 to 0.381 V"),
-    Published(
-        "grey box", {"test": 0.221}, f"{official.BOARD}; normalised, neural state space (2025)"
-    ),
+_PUBLISHED = official.published(
+    ("test",),
+    ("pNARX", (0.416,), official.BOARD),
+    ("SUBNET", (0.37,), official.BOARD),
+    ("TSEM", (0.33,), official.BOARD),
+    ("CT-SUBNET", (0.306,), official.BOARD),
+    ("B-splines", (0.30,), f"{official.LEGACY}; tensor"),
+    ("LTC", (0.298,), "closed-form liquid network, mean of 2, 0.271 to 0.381 V"),
+    ("grey box", (0.221,), f"{official.BOARD}; normalised, neural state space (2025)"),
 )
 
 
@@ -66,24 +66,15 @@ def load(
             of the two overflows and the only inputs below 1.2 V (the last quarter's) are wanted.
         first: the first of them, counted from 0; what is before and what is after trains.
         skip: samples at the beginning of the test that are not scored.
-        download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
-        root: folder that holds ``Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat``; by default
-            the cache folder of the package nonlinear_benchmarks.
+        download: whether a missing file is downloaded.
+        root: folder that holds ``Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat``.
 
     Shape:
         u, y (V) of training: (1024, 1), or (256, 1) and (512, 1) with ``validation=0.25``; of
         validation: (512, 1), 256 of them scored; of the test ``"test"``: (1024, 1), 974 scored.
 
-    Raises:
-        ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file below ``root``.
-        OSError: the download fails.
-
     Example:
         >>> data = lfrtorch.datasets.cascaded_tanks.load(download=True)  # doctest: +SKIP
-        >>> lfrtorch.datasets.cascaded_tanks.load(root="elsewhere")
-        Traceback (most recent call last):
-        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("skip", skip, 1)
     number("validation", validation)
@@ -96,17 +87,14 @@ def load(
             f"are {_SAMPLES}: give {latest} at most, or a smaller validation."
         )
     path = official.find(root, _FILE, "Cascaded_Tanks", download=download)
-    signals = official.read_mat(path, ["uEst", "yEst", "uVal", "yVal"], _SAMPLES)
+    shapes = {name: (_SAMPLES,) for name in ("uEst", "yEst", "uVal", "yVal")}
+    estimation_u, estimation_y, test_u, test_y = official.read_arrays(path, shapes).values()
+    settings: dict[str, Any] = {"fs": _FS, "start": "estimated", "limits": (None, _MOST)}
 
-    def record(name: str, which: int, **settings: Any) -> Record:
-        u, y = signals[2 * which : 2 * which + 2]
-        channels: dict[str, Any] = {"inputs": (Channel("u", "V"),), "outputs": (Channel("y", "V"),)}
-        return Record(
-            u, y, fs=_FS, start="estimated", name=name, source="official", limits=(None, _MOST),
-            **channels, **settings,
-        )  # fmt: skip
+    def record(name: str, u: Array, y: Array, skip: int = 0) -> Record:
+        return official.record(u, y, {"u": "V"}, {"y": "V"}, name=name, skip=skip, **settings)
 
-    whole, end = record("train", 0), first + held_out
+    whole, end = record("train", estimation_u, estimation_y), first + held_out
 
     def part(name: str, first: int, last: int, warm_up: int = 0) -> Record:
         return official.part(whole, first, last, warm_up=warm_up, name=name, start="estimated")
@@ -121,7 +109,7 @@ def load(
         name="cascaded_tanks",
         train=train,
         validation=chosen,
-        tests=[record("test", 1, skip=skip)],
-        leaderboard=[record("test", 1, skip=_WINDOW)],
+        tests=[record("test", test_u, test_y, skip)],
+        leaderboard=[record("test", test_u, test_y, _WINDOW)],
         published=_PUBLISHED,
     )

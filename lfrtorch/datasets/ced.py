@@ -11,8 +11,7 @@ pulley hangs on a spring, which makes for a lightly damped mode.
 
 The archive's address and name have changed: older versions of nonlinear_benchmarks ask for
 CoupledElectricDrivesDataSetAndReferenceModels.zip, newer ones for FULLTEXT01.zip. Both hold
-DATAUNIF.MAT. The archive's PRBS measurements, DATAPRBS.MAT, are no part of the benchmark. The
-package's README gives the unit of this benchmark, ticks/s, to EMPS, and that of EMPS to this one.
+DATAUNIF.MAT. The archive's PRBS measurements, DATAPRBS.MAT, are no part of the benchmark.
 
 References:
     T. Wigren, M. Schoukens (2017), "Coupled electric drives data set and reference models",
@@ -24,9 +23,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 
 __all__ = ["load"]
 
@@ -40,15 +39,12 @@ _SITE = "_site"  # at the end of the name of a test as the site cuts it
 _LEVELS = {"low": ("u11", "z11"), "high": ("u12", "z12")}
 
 
-def _published(label: str, low: float, high: float, reference: str = official.BOARD) -> Published:
-    return Published(label, {f"low{_SITE}": low, f"high{_SITE}": high}, reference)
-
-
-_PUBLISHED = (
-    _published("pNARX", 0.230, 0.137),
-    _published("CT-SUBNET", 0.115, 0.074),
-    _published("GP-NARX", 0.087, 0.070),
-    _published("dynoNet", 0.062, 0.047, f"{official.BOARD} (2024), untuned"),
+_PUBLISHED = official.published(
+    [level + _SITE for level in _LEVELS],
+    ("pNARX", (0.230, 0.137), official.BOARD),
+    ("CT-SUBNET", (0.115, 0.074), official.BOARD),
+    ("GP-NARX", (0.087, 0.070), official.BOARD),
+    ("dynoNet", (0.062, 0.047), f"{official.BOARD} (2024), untuned"),
 )
 
 
@@ -70,24 +66,15 @@ def load(
     Args:
         validation: fraction of the estimation samples of each measurement, the last of them, that
             validate.
-        download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
-        root: folder that holds ``CED/DATAUNIF.MAT``, or ``CED/FULLTEXT01.zip`` with the file in it;
-            by default the cache folder of nonlinear_benchmarks.
+        download: whether a missing file is downloaded.
+        root: folder that holds ``CED/DATAUNIF.MAT``, or ``CED/FULLTEXT01.zip`` with the file in it.
 
     Shape:
         u (V), z (ticks/s) of training: (320, 1); of validation: (400, 1), 80 of them scored; of the
         tests ``"low"`` and ``"high"``: (500, 1), and of the site's: (100, 1), 90 scored.
 
-    Raises:
-        ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file below ``root``, or nothing to download it with.
-        OSError: the download fails.
-
     Example:
         >>> data = lfrtorch.datasets.ced.load(download=True)  # doctest: +SKIP
-        >>> lfrtorch.datasets.ced.load(root="elsewhere")
-        Traceback (most recent call last):
-        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     trained = _ESTIMATION - official.held_out(_ESTIMATION, validation)
     path = official.find(root, _FILE, "CED", others=_ARCHIVES, download=download)
@@ -95,14 +82,7 @@ def load(
     arrays = official.read_arrays(path, shapes, Path(_FILE).name, _ADVICE)
 
     whole = {
-        level: Record(
-            arrays[u],
-            arrays[z],
-            fs=_FS,
-            source="official",
-            inputs=(Channel("u", "V"),),
-            outputs=(Channel("z", "ticks/s"),),
-        )
+        level: official.record(arrays[u], arrays[z], {"u": "V"}, {"z": "ticks/s"}, fs=_FS)
         for level, (u, z) in _LEVELS.items()
     }
 

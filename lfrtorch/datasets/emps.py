@@ -16,8 +16,8 @@ What to know of the file and of the package nonlinear_benchmarks:
   scores do not depend on that.
 - The test file has the pulses as pulses_N, which neither those scripts nor the package use as an
   input, and this module does not.
-- The package's README gives the unit of this benchmark, mm, to the coupled drives, and ticks/s to
-  this one. Its data are qm as it stands, in metres.
+- The package's README interchanges the units of this benchmark and of the coupled drives. Its data
+  are qm as it stands, in metres.
 
 References:
     A. Janot, M. Gautier, M. Brunot (2019), "Data set and reference models of EMPS", Workshop on
@@ -31,9 +31,9 @@ from pathlib import Path
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 
 __all__ = ["load"]
 
@@ -44,16 +44,14 @@ _SAMPLES = 24_841  # of each file
 _WINDOW = 20  # samples, unscored, of the test
 
 
-def _published(label: str, millimetres: float, reference: str) -> Published:
-    return Published(label, {"test": 1e-3 * millimetres}, reference, unit="mm")
-
-
-_PUBLISHED = (
-    _published("pNARX", 5.18, official.BOARD),
-    _published("CT-SUBNET", 4.61, official.BOARD),
-    _published("LTC", 4.10, "closed-form liquid network; with noise"),
-    _published("CT network", 3.68, f"{official.LEGACY}; input-output stable"),
-    _published("dynoNet", 2.64, f"{official.LEGACY}; 5.01 mm since"),
+_PUBLISHED = official.published(
+    ("test",),
+    ("pNARX", (5.18,), official.BOARD),
+    ("CT-SUBNET", (4.61,), official.BOARD),
+    ("LTC", (4.10,), "closed-form liquid network; with noise"),
+    ("CT network", (3.68,), f"{official.LEGACY}; input-output stable"),
+    ("dynoNet", (2.64,), f"{official.LEGACY}; 5.01 mm since"),
+    unit="mm",
 )
 
 
@@ -77,28 +75,19 @@ def load(
             that is fitted to the first samples alone.
         warm_up: first samples of the validation record, which its start state is fitted to and
             which train, too; by default as many as the test has.
-        download: whether missing files are downloaded, by the package nonlinear_benchmarks.
+        download: whether missing files are downloaded.
         root: folder that holds ``EMPS/DATA_EMPS.mat`` and ``EMPS/DATA_EMPS_PULSES.mat``, or
-            ``EMPS/EMPS.zip`` with both in it; by default the cache folder of nonlinear_benchmarks.
+            ``EMPS/EMPS.zip`` with both in it.
 
     Shape:
         u (V), y (m) of training: (24841, 1), or (19873, 1) with ``validation=0.2``; of validation:
         (4988, 1), 4968 of them scored; of the test: (24841, 1), 24821 scored.
 
-    Raises:
-        ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no estimation file below ``root``, or nothing to download it with.
-        OSError: the download fails.
-
     Example:
         >>> data = lfrtorch.datasets.emps.load(download=True)  # doctest: +SKIP
-        >>> lfrtorch.datasets.emps.load(root="elsewhere")
-        Traceback (most recent call last):
-        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("warm_up", warm_up, 1)
-    held_out = official.held_out(_SAMPLES, validation) if validation else 0
-    trained = _SAMPLES - held_out
+    trained = _SAMPLES - (official.held_out(_SAMPLES, validation) if validation else 0)
     if warm_up > trained:
         raise InputError(
             f"warm_up is {warm_up}, and there are {trained} samples before the validation record; "
@@ -111,6 +100,10 @@ def load(
     )
 
     part = partial(official.part, start="estimated")
+
+    def whole_but(unscored: int, name: str) -> Record:
+        return part(estimation, unscored, _SAMPLES, warm_up=warm_up, name=name)
+
     tests = [
         part(_measured(path, _TEST), _WINDOW, _SAMPLES, warm_up=_WINDOW, name=name)
         for name, path in found.items()
@@ -118,15 +111,9 @@ def load(
     return Dataset(
         name="emps",
         train=[part(estimation, 0, trained, warm_up=0, name="train")],
-        validation=[
-            part(estimation, trained, _SAMPLES, warm_up=warm_up, name="validation")
-            for _ in range(held_out > 0)
-        ],
+        validation=[] if trained == _SAMPLES else [whole_but(trained, "validation")],
         tests=tests,
-        selection=[
-            part(estimation, warm_up, _SAMPLES, warm_up=warm_up, name="from the first samples")
-            for _ in range(held_out == 0)
-        ],
+        selection=[] if trained < _SAMPLES else [whole_but(warm_up, "from the first samples")],
         published=_PUBLISHED,
         notes=notes,
         leaderboard=tests,
@@ -136,13 +123,6 @@ def load(
 def _measured(path: Path, file: str) -> Record:
     """One file, or the archive with it, as a record."""
     advice = f"remove '{file}' and '{_ARCHIVE}', and download them again."
-    shapes = {signal: (_SAMPLES, 1) for signal in ("vir", "qm")}
-    arrays = official.read_arrays(path, shapes, Path(file).name, advice)
-    return Record(
-        arrays["vir"],
-        arrays["qm"],
-        fs=_FS,
-        source="official",
-        inputs=(Channel("vir", "V"),),
-        outputs=(Channel("qm", "m"),),
-    )
+    shapes = {"vir": (_SAMPLES, 1), "qm": (_SAMPLES, 1)}
+    u, y = official.read_arrays(path, shapes, Path(file).name, advice).values()
+    return official.record(u, y, {"vir": "V"}, {"qm": "m"}, fs=_FS)

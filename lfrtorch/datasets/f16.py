@@ -41,7 +41,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.metrics import rms
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 
 __all__ = ["load"]
 
@@ -54,19 +54,18 @@ _MULTISINES = tuple(f"multisine_{level}" for level in _ESTIMATION)
 _SKIP = 50  # samples, unscored, of records from rest
 
 
-def _published(label: str, errors: Sequence[float], reference: str) -> Published:
-    names = [f"{kind}_{level} acc1" for kind in _KINDS for level in _TESTS]
-    return Published(label, dict(zip(names, errors, strict=True)), reference)
-
-
 _PUBLISHED = (
-    _published("ARX", (0.291, 0.502, 0.653, 0.178, 0.306, 0.422), official.BOARD),
-    _published("LSTM", (0.122, 0.268, 0.379, 0.0874, 0.187, 0.300), official.BOARD),
-    _published("GRU", (0.111, 0.264, 0.383, 0.0876, 0.191, 0.315), official.BOARD),
-    _published(
-        "modal TCN",
-        (0.0999, 0.1766, 0.2710, 0.0503, 0.1111, 0.1670),
-        "modal FFT backbone with a temporal convolutional network, mean of 8 folds, not submitted",
+    *official.published(
+        [f"{kind}_{level} acc1" for kind in _KINDS for level in _TESTS],
+        ("ARX", (0.291, 0.502, 0.653, 0.178, 0.306, 0.422), official.BOARD),
+        ("LSTM", (0.122, 0.268, 0.379, 0.0874, 0.187, 0.300), official.BOARD),
+        ("GRU", (0.111, 0.264, 0.383, 0.0876, 0.191, 0.315), official.BOARD),
+        (
+            "modal TCN",
+            (0.0999, 0.1766, 0.2710, 0.0503, 0.1111, 0.1670),
+            "modal FFT backbone with a temporal convolutional network, mean of 8 folds, not "
+            "submitted",
+        ),
     ),
     Published(
         "deep LRU",
@@ -103,23 +102,14 @@ def load(
         validation_level: that whose multisine validates, in the place of ``validation``.
         download: whether files that are missing are downloaded (148 MB) by nonlinear_benchmarks.
         root: folder that holds ``F16/F16GVT_Files/BenchmarkData/F16Data_FullMSine_Level1.mat`` and
-            so on; by default the cache folder of the package nonlinear_benchmarks.
+            so on.
 
     Shape:
         u (N), y (m/s²) of a multisine that trains: (8192, 1), (8192, 3); of others: (73728, 1),
         (73728, 3); of swept sines: (T, 1), (T, 3), T about 108000.
 
-    Raises:
-        ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file of the estimation data below ``root``, or nothing to
-            download it with.
-        OSError: the download fails.
-
     Example:
         >>> data = lfrtorch.datasets.f16.load(download=True)  # doctest: +SKIP
-        >>> lfrtorch.datasets.f16.load(root="elsewhere")
-        Traceback (most recent call last):
-        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     if levels is not None:
         train = _multisines("levels", levels)
@@ -158,25 +148,19 @@ def _whole(path: Path, name: str, called: str) -> Record:
     """A file, from rest."""
     period = _PERIOD if name.startswith("multisine") else None
     samples = None if period is None else _PERIODS * _PERIOD
-    force = official.read_arrays(path, {"Force": (1, samples)}, path.name)["Force"]
+    force = official.read_arrays(path, {"Force": (1, samples)})["Force"]
     shape = 3, force.shape[1]
-    acceleration = official.read_arrays(path, {"Acceleration": shape}, path.name)["Acceleration"]
+    acceleration = official.read_arrays(path, {"Acceleration": shape})["Acceleration"]
     if force.shape[1] <= _SKIP:
         raise InputError(
             f"'{path}': 'Force' has {force.shape[1]} samples; expected more than {_SKIP}; download "
             "the file again."
         )
-    return Record(
-        force.T,
-        acceleration.T,
-        fs=_FS,
-        skip=_SKIP,
-        name=called,
-        source="official",
-        inputs=(Channel("force", "N"),),
-        outputs=tuple(Channel(f"acc{i}", "m/s²") for i in (1, 2, 3)),
+    outputs = {f"acc{i}": "m/s²" for i in (1, 2, 3)}
+    return official.record(
+        force.T, acceleration.T, {"force": "N"}, outputs, fs=_FS, skip=_SKIP, name=called,
         period=period,
-    )
+    )  # fmt: skip
 
 
 def _measured(path: Path, name: str, called: str) -> Record:

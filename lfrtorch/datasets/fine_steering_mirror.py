@@ -28,9 +28,9 @@ import numpy as np
 from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 
 __all__ = ["LEVELS", "load"]
 
@@ -43,18 +43,15 @@ _CHANNELS = 3  # inputs, and outputs
 _WINDOW = 100  # samples, unscored, of each period
 
 
-def _published(label: str, micrometres: Sequence[float], reference: str) -> Published:
-    scores = {f"level_{a}": 1e-6 * e for a, e in zip(LEVELS, micrometres, strict=True)}
-    return Published(label, scores, reference, unit="µm")
-
-
-_PUBLISHED = (
-    _published("LTI", (0.114, 0.216, 0.228), f"{official.BOARD}; nx 28, a model for each level"),
-    _published(
+_PUBLISHED = official.published(
+    [f"level_{level}" for level in LEVELS],
+    ("LTI", (0.114, 0.216, 0.228), f"{official.BOARD}; nx 28, a model for each level"),
+    (
         "freq-statespace",
         (0.0866, 0.131, 0.169),
         f"{official.BOARD}; NL-LFR with nx 28, nz 16, nw 8, 128 neurons, a model for all levels",
     ),
+    unit="µm",
 )
 
 
@@ -83,24 +80,15 @@ def load(
             the other, and their difference shows the noise.
         download: whether a missing file is downloaded, by a package nonlinear_benchmarks that has
             this benchmark (version 1.0.1 has not).
-        root: folder that holds ``FineSteeringMirror/combined_data.npz``; by default the cache
-            folder of the package nonlinear_benchmarks.
+        root: folder that holds ``FineSteeringMirror/combined_data.npz``.
 
     Shape:
         u (V), y (m): (8192, 3), of which 8092 are scored; of training without ``mean`` (16384, 3).
 
-    Raises:
-        ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file below ``root``, or nothing to download it with.
-        OSError: the download fails.
-
     Example:
         >>> data = lfrtorch.datasets.fine_steering_mirror.load(download=True)  # doctest: +SKIP
-        >>> lfrtorch.datasets.fine_steering_mirror.load(root="elsewhere")
-        Traceback (most recent call last):
-        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
-    chosen = _checked(levels)
+    chosen = official.chosen_levels(levels, LEVELS)
     integer("validation", validation, 0)
     true_or_false("mean", mean)
     path = official.find(root, _FILE, "FineSteeringMirror", download=download)
@@ -165,17 +153,11 @@ def load(
 
 def _record(name: str, u: Array, y: Array, *, period: int, skip: int = 0) -> Record:
     """Whole periods in steady state."""
-    return Record(
-        u,
-        y,
-        fs=_FS,
-        start="periodic",
-        skip=skip,
-        name=name,
-        source="official",
-        inputs=tuple(Channel(f"u{i + 1}", "V") for i in range(_CHANNELS)),
-        outputs=tuple(Channel(f"y{i + 1}", "m") for i in range(_CHANNELS)),
-        period=period,
+    inputs, outputs = (
+        {f"{letter}{i + 1}": unit for i in range(_CHANNELS)} for letter, unit in ("uV", "ym")
+    )
+    return official.record(
+        u, y, inputs, outputs, fs=_FS, start="periodic", skip=skip, name=name, period=period
     )
 
 
@@ -191,17 +173,3 @@ def _each(name: str, u: Array, y: Array, realisations: Iterable[int]) -> list[Re
         for r in realisations
         for p in range(u.shape[3])
     ]
-
-
-def _checked(levels: Sequence[int]) -> list[int]:
-    """The levels as plain integers, in the order given."""
-    try:
-        chosen = [LEVELS[LEVELS.index(level)] for level in levels]
-    except (TypeError, ValueError):
-        chosen = []
-    if not chosen or len(set(chosen)) < len(chosen):
-        raise InputError(
-            f"levels is {levels}; give one or more of {', '.join(map(str, LEVELS))} (mV rms), "
-            "each once, for example [100, 300]."
-        )
-    return chosen

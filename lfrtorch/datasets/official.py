@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from lfrtorch._support.checks import number, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.records import Record, Start
+from lfrtorch.dataset import Published
+from lfrtorch.records import Channel, Record, Start
 
 Shape = tuple[int | None, ...]
 """Of an array in a file; None for an axis of any length."""
@@ -103,16 +104,7 @@ def find_tests(
     others: Sequence[str] = (),
     download: bool = False,
 ) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """The paths of the test files that are there, and a note on those that are not.
-
-    Args:
-        root, loader, others, download: see :func:`find`.
-        files: below ``root``, by the name of the test.
-
-    Raises:
-        ValueError: ``download`` is neither true nor false.
-        FileNotFoundError, OSError: with ``download``, if a missing file cannot be had.
-    """
+    """Return the paths of the test files that are there, by test, and a note on the others."""
     below, found = folder(root), {}
     for test, file in files.items():
         if download or _present(below, (file, *others)):
@@ -125,13 +117,7 @@ def find_tests(
 
 
 def archive_note(archive: Path, md5: str, file: str) -> str:
-    """Whether a benchmark's archive is the one that is known, by its checksum.
-
-    Args:
-        archive: as it was downloaded.
-        md5: of the known one, in hexadecimal digits.
-        file: name of the file that was unpacked from it.
-    """
+    """Say if the archive that ``file`` was unpacked from has the known checksum."""
     if not _there(archive):
         return f"no {archive.name} beside {file}: its checksum is unknown"
     with archive.open("rb") as content:
@@ -143,30 +129,15 @@ def archive_note(archive: Path, md5: str, file: str) -> str:
     )
 
 
-def read_mat(path: Path, names: Sequence[str], samples: int, advice: str = _AGAIN) -> list[Array]:
-    """Signals (samples,) that a .mat file holds as rows or columns, in the order of their names.
-
-    Args:
-        path: the file.
-        names: of the signals.
-        samples: of each.
-        advice: what to do about a file that cannot be used.
-
-    Raises:
-        ValueError: a file that cannot be read, or another shape or type, or NaN.
-    """
-    either = (1, samples), (samples, 1)
-    return [_variable(path, path, name, either, advice).ravel() for name in names]
-
-
 def read_arrays(
-    path: Path, shapes: Mapping[str, Shape], member: str, advice: str = _AGAIN
+    path: Path, shapes: Mapping[str, Shape], member: str = "", advice: str = _AGAIN
 ) -> dict[str, Array]:
-    """Arrays of a .mat file by name.
+    """Read arrays of a .mat file by name.
 
     Args:
         path: the file, or a zip archive that holds it.
-        shapes: of the arrays, by name; None for an axis of any length.
+        shapes: of the arrays, by name; None for an axis of any length, and (samples,) for a signal
+            that is a row or a column of the file.
         member: name of the file in the archive, in whatever folder.
         advice: what to do about a file that cannot be used.
 
@@ -174,19 +145,17 @@ def read_arrays(
         ValueError: a file that cannot be read, or another shape or type, or NaN.
     """
     content = _unpacked(path, member, advice) if path.suffix == ".zip" else path
-    return {
-        name: _variable(path, content, name, (shape,), advice) for name, shape in shapes.items()
-    }
+    found: dict[str, Array] = {}
+    for name, shape in shapes.items():
+        signal = len(shape) == 1
+        allowed = ((1, *shape), (*shape, 1)) if signal else (shape,)
+        array = _variable(path, content, name, allowed, advice)
+        found[name] = array.ravel() if signal else array
+    return found
 
 
 def read_struct(path: Path, name: str, fields: Sequence[str], advice: str = _AGAIN) -> list[Array]:
-    """Matrices of one shape, (samples, records), in a struct of a .mat file, in the order named.
-
-    Args:
-        path: the file.
-        name: of the struct.
-        fields: of the struct, that hold the matrices.
-        advice: what to do about a file that cannot be used.
+    """Read matrices of one shape, (samples, records), from a struct of a .mat file, in this order.
 
     Raises:
         ValueError: a file that cannot be read, or fields that are missing, empty, no matrices, of
@@ -212,56 +181,26 @@ def read_struct(path: Path, name: str, fields: Sequence[str], advice: str = _AGA
     ]
 
 
-def read_npz(path: Path, advice: str = _AGAIN) -> dict[str, Array]:
-    """All arrays of a .npz file by name.
-
-    Args:
-        path: the file.
-        advice: what to do about a file that cannot be used.
-
-    Raises:
-        ValueError: a file that cannot be read, another type, or NaN.
-    """
+def read_npz(path: Path) -> dict[str, Array]:
+    """Read all arrays of a .npz file by name; refuse NaN and what is no number."""
     try:
         with path.open("rb") as content, np.load(content) as file:
             found = {name: file[name] for name in file.files}
     except Exception as error:  # a damaged archive makes for several kinds
-        raise InputError(f"'{path}' is no readable .npz file ({error!r}); {advice}") from error
+        raise InputError(f"'{path}' is no readable .npz file ({error!r}); {_AGAIN}") from error
     return {
-        name: _numbers(path, name, array, (array.shape,), advice) for name, array in found.items()
+        name: _numbers(path, name, array, (array.shape,), _AGAIN) for name, array in found.items()
     }
 
 
-def without_tests(missing: Sequence[str], why: str, *, partly: bool = False) -> tuple[str, ...]:
-    """The note on test records that are not at hand; none if none are missing.
-
-    Args:
-        missing: their names.
-        why: the reason.
-        partly: whether other test records are there.
-
-    Example:
-        >>> from lfrtorch.datasets import official
-        >>> official.without_tests(["test"], "no file")
-        ('no test records: no file',)
-        >>> official.without_tests(["a", "b"], "no files", partly=True)
-        ('no test records a, b: no files',)
-    """
+def without_tests(missing: Sequence[str], why: str, *, partly: bool) -> tuple[str, ...]:
+    """Return the note on missing tests; ``partly`` if others are there."""
     names = f" {', '.join(missing)}" if partly else ""
     return (f"no test records{names}: {why}",) if missing else ()
 
 
 def held_out(samples: int, validation: float, least: int = 1) -> int:
-    """How many of the estimation samples, the last of them, validate.
-
-    Args:
-        samples: of the estimation part.
-        validation: the fraction.
-        least: samples that training needs.
-
-    Raises:
-        ValueError: a fraction that leaves too little to train or nothing to validate on.
-    """
+    """Return how many of the estimation samples validate; ``least`` must be left for training."""
     number("validation", validation, positive=True)
     count = round(samples * min(validation, 1))
     if not 0 < count <= samples - least:
@@ -276,12 +215,52 @@ def held_out(samples: int, validation: float, least: int = 1) -> int:
 def part(
     whole: Record, first: int, last: int, *, warm_up: int, name: str, start: Start = "zero"
 ) -> Record:
-    """Samples ``first`` to ``last`` as a record that begins ``warm_up`` unscored samples earlier.
+    """Cut samples ``first`` to ``last`` out, with ``warm_up`` unscored samples before them.
 
-    From zero state its transient falls into the warm-up, and an estimated start state is fitted to
+    From zero state the transient falls into the warm-up, and an estimated start state is fitted to
     the warm-up: no state has to be estimated from outputs that are scored.
     """
     return replace(whole[first - warm_up : last], name=name, skip=warm_up, start=start)
+
+
+def record(
+    u: Array, y: Array, inputs: Mapping[str, str], outputs: Mapping[str, str], **settings: Any
+) -> Record:
+    """Make a record of channels with these names and units; it is official unless said."""
+    given = {"source": "official", **settings}
+    for use, channels in (("inputs", inputs), ("outputs", outputs)):
+        given[use] = tuple(Channel(name, unit) for name, unit in channels.items())
+    return Record(u, y, **given)
+
+
+def published(
+    tests: Sequence[str], *rows: tuple[str, Sequence[float | None], str], unit: str = ""
+) -> tuple[Published, ...]:
+    """Make published results of rows: a label, the RMSE (``unit``) of each test, and the source.
+
+    None stands for an RMSE that is not known; the last tests may be left out.
+    """
+    scale = {"mV": 1e-3, "mm": 1e-3, "µm": 1e-6}.get(unit, 1.0)
+    found: list[Published] = []
+    for label, errors, source in rows:
+        known = zip(tests, errors, strict=False)
+        scores = {test: scale * error for test, error in known if error is not None}
+        found.append(Published(label, scores, source, unit=unit))
+    return tuple(found)
+
+
+def chosen_levels(levels: Sequence[int], known: Sequence[int]) -> list[int]:
+    """Return amplitudes (mV rms) as plain integers; refuse unknown ones, repetitions and none."""
+    try:
+        chosen = [known[known.index(level)] for level in levels]
+    except (TypeError, ValueError):
+        chosen = []
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise InputError(
+            f"levels is {levels}; give one or more of {', '.join(map(str, known))} (mV rms), each "
+            f"once, for example [{known[0]}, {known[-1]}]."
+        )
+    return chosen
 
 
 def _there(path: Path) -> bool:

@@ -26,10 +26,10 @@ import numpy as np
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
 from lfrtorch.datasets.parwh_simulator import FS, PERIOD, Signals, StandIn, multisine, simulate
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 
 __all__ = ["LEVELS", "load", "multisine", "simulate"]
 
@@ -60,31 +60,26 @@ _NOT_FOUND = (
 _PAPER = "Schoukens and Tóth (2020), table 2, official data"
 
 
-def _published(label: str, millivolts: Sequence[float], reference: str = _PAPER) -> Published:
-    """Of the levels, and of the arrow if it was simulated."""
-    names = [*(f"level_{level}" for level in LEVELS), "arrow"]
-    scores = {name: 1e-3 * value for name, value in zip(names, millivolts, strict=False)}
-    return Published(label, scores, reference, unit="mV")
-
-
-_PUBLISHED = (
-    _published(
+_PUBLISHED = official.published(
+    [*(f"level_{level}" for level in LEVELS), "arrow"],
+    (
         "linear (paper)",
         (0.83, 9.46, 19.9, 30.7, 37.7, 45.5),
         f"{_PAPER}; a model for each level, that of 1000 mV for the arrow",
     ),
-    _published("GRU", (1.75, 3.82, 5.61, 7.23, 10.5), official.BOARD),
-    _published("NL-LFR (paper)", (0.30, 0.51, 0.72, 1.03, 1.37, 1.42)),
-    _published(
+    ("GRU", (1.75, 3.82, 5.61, 7.23, 10.5), official.BOARD),
+    ("NL-LFR (paper)", (0.30, 0.51, 0.72, 1.03, 1.37, 1.42), _PAPER),
+    (
         "parallel WH",
         (0.30, 0.50, 0.38, 0.57, 1.10, 2.66),
         "Schoukens et al. (2015), official data",
     ),
-    _published(
+    (
         "NL-LFR, inferred",
         (0.200, 0.397, 0.412, 0.469, 0.827),
         f"{official.BOARD}; NL-LFR by inference and learning (2025), a model for each level",
     ),
+    unit="mV",
 )
 
 
@@ -112,8 +107,7 @@ def load(
         source: ``"official"``, downloaded by the package nonlinear_benchmarks if it is missing;
             ``"stand-in"``; or ``"auto"``, the official file if it is at hand, else the stand-in.
         root: folder that holds ``ParWH/ParWHFiles/ParWHData.mat`` (or ``ParWH/ParWHData.mat``, or
-            ``ParWH/ParWHFiles.zip`` with the file in it); by default the cache folder of
-            nonlinear_benchmarks. Where it is given, ``"auto"`` requires the file.
+            ``ParWH/ParWHFiles.zip`` with the file in it). If given, ``"auto"`` requires the file.
         seed: of the official data, chooses what trains: record r of a level, counted from 0, is
             realisation ``(seed + r) % 19``. Of the stand-in, seeds all records: record r of a level
             (mV) and use, train 0, validation 1, level test 2 and arrow 3, draws first its phases,
@@ -129,11 +123,6 @@ def load(
     Shape:
         u, y (V) of training and validation: (16384 periods, 1); of the tests: (16384, 1).
 
-    Raises:
-        ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file below ``root``, or nothing to download it with.
-        OSError: the download fails.
-
     Example:
         >>> data = lfrtorch.datasets.parwh.load(source="stand-in", levels=[100], periods=2)
         >>> data.train[0].u.shape, len(data.tests)
@@ -145,7 +134,7 @@ def load(
     integer("realisations", realisations, 1)
     integer("periods", periods, 1)
     number("noise_rms", noise_rms)
-    chosen = _checked(levels)
+    chosen = official.chosen_levels(levels, LEVELS)
     path = _found(source, root)
     if path is None:
         data = StandIn(seed=seed, periods=periods, noise_rms=noise_rms)
@@ -156,18 +145,10 @@ def load(
         notes = (official.archive_note(archive, _MD5, Path(_FILE).name),)
 
     def record(name: str, u: Array, y: Array, *, skip: int = 0) -> Record:
-        return Record(
-            u,
-            y,
-            fs=FS,
-            start="periodic",
-            skip=skip,
-            name=name,
-            source=data.source,
-            inputs=(Channel("u", "V"),),
-            outputs=(Channel("y", "V"),),
-            period=PERIOD,
-        )
+        return official.record(
+            u, y, {"u": "V"}, {"y": "V"}, fs=FS, start="periodic", skip=skip, name=name,
+            source=data.source, period=PERIOD,
+        )  # fmt: skip
 
     levels_alone = [record(f"level_{level}", *data.test(level)) for level in LEVELS]
     return Dataset(
@@ -178,10 +159,7 @@ def load(
             for r, name in enumerate(_names(level, realisations))
         ],
         validation=[record(f"validation_{level}", *data.validation(level)) for level in chosen],
-        tests=[
-            *levels_alone,
-            record("arrow", *data.arrow(), skip=_ARROW_SKIP),
-        ],
+        tests=[*levels_alone, record("arrow", *data.arrow(), skip=_ARROW_SKIP)],
         noise_rms=noise_rms if path is None else None,
         seed=seed,
         published=_PUBLISHED,
@@ -264,18 +242,3 @@ def _found(source: str, root: str | Path | None) -> Path | None:
         if source == "official" or root is not None:
             raise
         return None
-
-
-def _checked(levels: Sequence[int]) -> list[int]:
-    """The levels as plain integers, in the order given."""
-    try:
-        given = list(levels)
-        chosen = [LEVELS[LEVELS.index(level)] for level in given]
-    except (TypeError, ValueError):
-        chosen = []
-    if not chosen or len(set(chosen)) < len(chosen):
-        raise InputError(
-            f"levels is {levels}; give one or more of {', '.join(map(str, LEVELS))} (mV rms), "
-            "each once, for example [100, 1000]."
-        )
-    return chosen

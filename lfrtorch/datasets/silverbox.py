@@ -16,46 +16,38 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from lfrtorch._support.checks import integer
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 
 __all__ = ["load"]
 
 _FILE = "Silverbox/SilverboxFiles/SNLS80mV.mat"
 _FS = 1e7 / 2**14  # Hz
 _SAMPLES = 131_072
-_ARROW = (100, 40_575)
-_ARROW_INSIDE = (100, 32_100)  # of the multisines' amplitudes
 _ESTIMATION = (40_650, 105_712)  # of the multisines, three quarters
-_MULTISINE = (105_712, 127_400)
 _SKIP = 50  # samples, unscored, of the tests
+_TESTS = {  # first sample, and the one after the last
+    "multisine": (105_712, 127_400),
+    "arrow": (100, 40_575),
+    "arrow_no_extrapolation": (100, 32_100),  # of the multisines' amplitudes
+}
 
-
-def _published(
-    label: str, millivolts: Sequence[float | None], reference: str = official.BOARD
-) -> Published:
-    """Of the three tests."""
-    names = "multisine", "arrow", "arrow_no_extrapolation"
-    known = zip(names, millivolts, strict=True)
-    scores = {name: 1e-3 * error for name, error in known if error is not None}
-    return Published(label, scores, reference, unit="mV")
-
-
-_PUBLISHED = (
-    _published("PNLSS", (None, 0.26, None), official.LEGACY),
-    _published("SUBNET", (0.36, 1.4, 0.32)),
-    _published("GP-NARX", (0.345, 0.721, 0.286)),
-    _published(
+_PUBLISHED = official.published(
+    tuple(_TESTS),
+    ("PNLSS", (None, 0.26, None), official.LEGACY),
+    ("SUBNET", (0.36, 1.4, 0.32), official.BOARD),
+    ("GP-NARX", (0.345, 0.721, 0.286), official.BOARD),
+    (
         "NL-LFR, inferred",
         (0.289, 0.334, 0.257),
         f"{official.BOARD}; NL-LFR by inference and learning (2025)",
     ),
+    unit="mV",
 )
 
 
@@ -77,64 +69,36 @@ def load(
     Args:
         validation: fraction of the estimation samples, the last of them, that validate.
         warm_up: samples that are simulated and not scored.
-        download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
-        root: folder that holds ``Silverbox/SilverboxFiles/SNLS80mV.mat``; by default the cache
-            folder of the package nonlinear_benchmarks.
+        download: whether a missing file is downloaded.
+        root: folder that holds ``Silverbox/SilverboxFiles/SNLS80mV.mat``.
 
     Shape:
         u, y (V) of training: (52050, 1), its first 500 not scored; of validation: (13512, 1),
         13012 scored; of the tests ``"multisine"``: (22188, 1), 21638 scored, ``"arrow"``:
         (40475, 1), 40425 scored, ``"arrow_no_extrapolation"``: (32000, 1), 31950 scored.
 
-    Raises:
-        ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file below ``root``.
-        OSError: the download fails.
-
     Example:
         >>> data = lfrtorch.datasets.silverbox.load(download=True)  # doctest: +SKIP
-        >>> lfrtorch.datasets.silverbox.load(root="elsewhere")
-        Traceback (most recent call last):
-        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("warm_up", warm_up, 0)
     begin, end = _ESTIMATION
     trained = end - official.held_out(end - begin, validation, least=warm_up + 1)
     path = official.find(root, _FILE, "Silverbox", download=download)
-    u, y = official.read_mat(path, ["V1", "V2"], _SAMPLES)
-    whole = Record(
-        u,
-        y,
-        fs=_FS,
-        source="official",
-        inputs=(Channel("V1", "V"),),
-        outputs=(Channel("V2", "V"),),
-    )
+    u, y = official.read_arrays(path, {"V1": (_SAMPLES,), "V2": (_SAMPLES,)}).values()
+    whole = official.record(u, y, {"V1": "V"}, {"V2": "V"}, fs=_FS)
 
-    def part(name: str, first: int, last: int, *, unscored: int) -> Record:
+    def part(name: str, first: int, last: int, unscored: int) -> Record:
         return official.part(whole, first, last, warm_up=unscored, name=name)
+
+    def test(name: str, warm_up: int) -> Record:
+        first, last = _TESTS[name]
+        return part(name, first + _SKIP, last, warm_up + _SKIP)
 
     return Dataset(
         name="silverbox",
-        train=[part("train", begin + warm_up, trained, unscored=warm_up)],
-        validation=[part("validation", trained, end, unscored=warm_up)],
-        tests=[
-            part("multisine", _MULTISINE[0] + _SKIP, _MULTISINE[1], unscored=warm_up + _SKIP),
-            part("arrow", _ARROW[0] + _SKIP, _ARROW[1], unscored=_SKIP),
-            part(
-                "arrow_no_extrapolation",
-                _ARROW_INSIDE[0] + _SKIP,
-                _ARROW_INSIDE[1],
-                unscored=_SKIP,
-            ),
-        ],
+        train=[part("train", begin + warm_up, trained, warm_up)],
+        validation=[part("validation", trained, end, warm_up)],
+        tests=[test(name, warm_up if name == "multisine" else 0) for name in _TESTS],
         published=_PUBLISHED,
-        leaderboard=[
-            replace(whole[first:last], start="estimated", skip=_SKIP, name=name)
-            for name, (first, last) in (
-                ("multisine", _MULTISINE),
-                ("arrow", _ARROW),
-                ("arrow_no_extrapolation", _ARROW_INSIDE),
-            )
-        ],
+        leaderboard=[replace(test(name, 0), start="estimated") for name in _TESTS],
     )

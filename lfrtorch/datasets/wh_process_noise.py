@@ -44,7 +44,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
-from lfrtorch.records import Channel, Record
+from lfrtorch.records import Record
 
 __all__ = ["load"]
 
@@ -70,23 +70,14 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
         validation: how many realisations, the last of them, validate.
         download: whether files that are missing are downloaded (423 MB) by nonlinear_benchmarks.
         root: folder that holds ``WienHammer/WienerHammersteinFiles/WH_EstimationExample.mat`` and
-            ``WH_TestDataset.mat`` beside it; by default the cache folder of the package
-            nonlinear_benchmarks.
+            ``WH_TestDataset.mat`` beside it.
 
     Shape:
         u, y (V) of training and validation: (T, 1), as long as the file has them; of the tests
         ``"multisine"`` and ``"sweep"``: (16384, 1). The first 100 samples are not scored.
 
-    Raises:
-        ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no estimation file below ``root``, or nothing to download it with.
-        OSError: the download fails.
-
     Example:
         >>> data = lfrtorch.datasets.wh_process_noise.load(download=True)  # doctest: +SKIP
-        >>> lfrtorch.datasets.wh_process_noise.load(root="elsewhere")
-        Traceback (most recent call last):
-        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     integer("validation", validation, 1)
 
@@ -101,16 +92,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
         return u, y
 
     def record(name: str, u: Array, y: Array) -> Record:
-        return Record(
-            u,
-            y,
-            fs=_FS,
-            skip=_SKIP,
-            name=name,
-            source="official",
-            inputs=(Channel("u", "V"),),
-            outputs=(Channel("y", "V"),),
-        )
+        return official.record(u, y, {"u": "V"}, {"y": "V"}, fs=_FS, skip=_SKIP, name=name)
 
     path = official.find(root, f"{_FILES}/{_ESTIMATION}", _LOADER, download=download)
     u, y = columns(path)

@@ -17,9 +17,8 @@ from pathlib import Path
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
-from lfrtorch.dataset import Dataset, Published
+from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
-from lfrtorch.records import Channel, Record
 
 __all__ = ["load"]
 
@@ -35,23 +34,16 @@ _SITE = (5200, 105_200), (105_200, 184_000)
 _SITE_WINDOW = 50  # samples, unscored, of its test
 
 
-def _published(
-    label: str, millivolts: float, reference: str, tests: tuple[str, ...] = ("site",)
-) -> Published:
-    scores = dict.fromkeys(tests, 1e-3 * millivolts)
-    return Published(label, scores, reference, unit="mV")
-
-
-_BOTH = ("test", "site")
-_OWN = f"Beintema, Schoukens and Tóth (2023), and {official.BOARD}"
-_COMPARED = "as compared in Beintema, Schoukens and Tóth (2023)"
-_PUBLISHED = (
-    _published("BLA", 44, "the best of several, which reach up to 56 mV", ("test",)),
-    _published("LSTM", 1.54, official.BOARD),
-    _published("PNLSS", 0.42, official.LEGACY, _BOTH),
-    _published("NL-LFR", 0.30, f"Schoukens and Tóth (2020), and {official.BOARD}", _BOTH),
-    _published("QBLA", 0.279, f"{_COMPARED}, and {official.BOARD}", _BOTH),
-    _published("SUBNET", 0.241, _OWN, _BOTH),
+_COMPARISON = "Beintema, Schoukens and Tóth (2023)"
+_PUBLISHED = official.published(
+    ("test", "site"),
+    ("BLA", (44,), "the best of several, which reach up to 56 mV"),
+    ("LSTM", (None, 1.54), official.BOARD),
+    ("PNLSS", (0.42, 0.42), official.LEGACY),
+    ("NL-LFR", (0.30, 0.30), f"Schoukens and Tóth (2020), and {official.BOARD}"),
+    ("QBLA", (0.279, 0.279), f"as compared in {_COMPARISON}, and {official.BOARD}"),
+    ("SUBNET", (0.241, 0.241), f"{_COMPARISON}, and {official.BOARD}"),
+    unit="mV",
 )
 
 
@@ -79,24 +71,15 @@ def load(
         skip: samples at the beginning of the training record that are not fitted. Default: 5000 of
             the official split, the end of an earlier response (55 samples), then rest, as the input
             starts at sample 4999; 1000 of the site's, which begins amid the measurement.
-        download: whether a missing file is downloaded, by the package nonlinear_benchmarks.
-        root: folder that holds ``WienerHammerBenchMark/WienerHammerBenchMark.mat``; by default the
-            cache folder of the package nonlinear_benchmarks.
+        download: whether a missing file is downloaded.
+        root: folder that holds ``WienerHammerBenchMark/WienerHammerBenchMark.mat``.
 
     Shape:
         u, y (V) of training: (80000, 1); of validation: (21000, 1), 20000 of them scored; of the
         tests: (88000, 1), 87000 scored, and (78800, 1), 78750 scored.
 
-    Raises:
-        ValueError: an argument out of range, or a file that cannot be used.
-        FileNotFoundError: no such file below ``root``.
-        OSError: the download fails.
-
     Example:
         >>> data = lfrtorch.datasets.wiener_hammerstein.load(download=True)  # doctest: +SKIP
-        >>> lfrtorch.datasets.wiener_hammerstein.load(root="elsewhere")
-        Traceback (most recent call last):
-        FileNotFoundError: there is no '...' in 'elsewhere'. Give the folder that holds ...
     """
     if split not in ("official", "site"):
         raise InputError(f"split is {split!r}; give 'official' or 'site'.")
@@ -107,15 +90,9 @@ def load(
     first, last = _SITE[0] if site else (0, _ESTIMATION)
     held_out = official.held_out(last - first, validation, least=_WARM_UP + skip + 1)
     path = official.find(root, _FILE, "WienerHammerBenchMark", download=download)
-    u, y = official.read_mat(path, ["uBenchMark", "yBenchMark"], _SAMPLES)
-    whole = Record(
-        u,
-        y,
-        fs=_FS,
-        source="official",
-        inputs=(Channel("u", "V"),),
-        outputs=(Channel("y", "V"),),
-    )
+    shapes = {"uBenchMark": (_SAMPLES,), "yBenchMark": (_SAMPLES,)}
+    u, y = official.read_arrays(path, shapes).values()
+    whole = official.record(u, y, {"u": "V"}, {"y": "V"}, fs=_FS)
     trained = last - held_out
     of_site = replace(whole[slice(*_SITE[1])], start="estimated", skip=_SITE_WINDOW, name="site")
     of_paper = official.part(whole, _ESTIMATION + _WARM_UP, _SAMPLES, warm_up=_WARM_UP, name="test")

@@ -353,11 +353,7 @@ def test_refused_half_a_pair(brief, tmp_path):
     ("stem", "signal", "match"),
     [
         ("uval_multisine", np.zeros((1, 8191)), r"shape \(1, 8191\).*expected \(1, 8192\)"),
-        ("yval_multisine", np.zeros((2, 4096)), r"shape \(2, 4096\)"),
         ("yval_sinesweep", np.zeros((1, 8192)), r"expected \(1, 153000\)"),
-        ("uval_multisine", np.full((1, 8192), np.nan), "without NaN"),
-        ("yval_multisine", np.full((1, 8192), 1j), "type complex128"),
-        ("yval_multisine", "text", "expected"),
     ],
 )
 def test_refused_signals(brief, tmp_path, stem, signal, match):
@@ -365,53 +361,7 @@ def test_refused_signals(brief, tmp_path, stem, signal, match):
     with pytest.raises(ValueError, match=match) as refusal:
         boucwen.load(root=tmp_path, samples=150, selection_rms=[])
     assert f"{stem}.mat'" in str(refusal.value)
-
-
-@pytest.mark.parametrize("damage", ["empty", "text", "cut", "renamed"])
-def test_refused_damaged_files(brief, tmp_path, damage):
-    path = official_files(tmp_path) / "uval_sinesweep.mat"
-    content = path.read_bytes()
-    if damage == "renamed":
-        savemat(path, {"u": np.zeros((1, SWEEP))})
-    else:
-        path.write_bytes({"empty": b"", "text": b"u = 1, 2\n" * 99, "cut": content[:9999]}[damage])
-    with pytest.raises(ValueError, match=r"uval_sinesweep\.mat' holds no readable"):
-        boucwen.load(root=tmp_path, samples=150, selection_rms=[])
-
-
-# --- arguments ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        ({"samples": 149}, "period of 149 samples .* at least 150"),
-        ({"samples": 0}, "period of 0 samples"),
-        ({"samples": 1024.0}, "whole number"),
-        ({"rms": 0.0}, "rms is 0.0; give a positive"),
-        ({"rms": -50.0}, "rms is -50.0; give"),
-        ({"rms": np.nan}, "rms is nan"),
-        ({"rms": 1e9}, "integration fails under a force of up to .* smaller"),
-        ({"noise_rms": -1e-6}, "noise_rms is -1e-06; give"),
-        ({"noise_rms": np.inf}, "noise_rms is inf; give a number of at least 0"),
-        ({"seed": -1}, "seed is -1"),
-        (
-            {"seed": 3, "validation_seed_offset": -4},
-            "validation_seed_offset is -4; give a whole number of at least -3",
-        ),
-        ({"validation_seed_offset": 0}, "none may be the training or simulated test realisation"),
-        (
-            {"validation_seed_offset": 1999},
-            "none may be the training or simulated test realisation",
-        ),
-        ({"rms": []}, "rms is empty; give"),
-        ({"rms": [50, -1]}, "rms is -1; give a positive"),
-        ({"selection_rms": [50, 0]}, "selection_rms is 0; give"),
-    ],
-)
-def test_refused_arguments(arguments, match):
-    with pytest.raises(ValueError, match=match):
-        boucwen.load(**arguments)
+    assert str(refusal.value).endswith("to have the test simulated.")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from scipy.io import savemat
 
 import lfrtorch
-from lfrtorch.datasets import cascaded_tanks, official
+from lfrtorch.datasets import cascaded_tanks
 
 FILE = "Cascaded_Tanks/CascadedTanksFiles/dataBenchmark.mat"
 
@@ -69,38 +69,6 @@ def test_validation_amid_the_record(numbered):
     assert {record.start for record in (*data.train, *data.validation)} == {"estimated"}
     (validation,) = data.validation
     assert (scored(validation), validation.skip) == ((257, 512), 256)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        ({"validation": -0.1}, "validation is -0.1"),
-        ({"validation": 1.0}, "leaves 0 of the 1024"),
-        ({"skip": 0}, "skip is 0"),
-        ({"first": 0}, "first is 0"),
-        ({"validation": 0.25, "first": 769}, "first is 769.*give 768 at most"),
-    ],
-)
-def test_refused_arguments(arguments, match):
-    with pytest.raises(ValueError, match=match):
-        cascaded_tanks.load(**arguments)
-
-
-def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"(?s)no 'Cascaded_Tanks/Cascaded.*root=DIR"):
-        cascaded_tanks.load(root=tmp_path)
-
-
-def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered, monkeypatch):
-    root = tmp_path / "fresh"
-
-    def download(below, file, loader):
-        assert (below, file, loader) == (root, FILE, "Cascaded_Tanks")
-        (root / FILE).parent.mkdir(parents=True)
-        (root / FILE).write_bytes((numbered / FILE).read_bytes())
-
-    monkeypatch.setattr(official, "_download", download)
-    assert scored(cascaded_tanks.load(root=root, download=True).train[0]) == (1, 1024)
 
 
 def test_a_file_of_another_length_is_refused(numbered):

@@ -1,9 +1,7 @@
 """Coupled electric drives: the split, the file, and a run on simulated drives."""
 
 import json
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 from zipfile import ZipFile
 
 import numpy as np
@@ -88,33 +86,6 @@ def test_the_archive_does_as_well(tmp_path, archive):
         packed.write(tmp_path / FILE, "drives/DATAUNIF.MAT")
     (tmp_path / FILE).unlink()
     assert scored(ced.load(root=tmp_path).tests[1]) == (1411, 1500)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        ({"validation": 0}, "validation is 0"),
-        ({"validation": 1.0}, "leaves 0 of the 400"),
-        ({"download": "no"}, "download is 'no'; give True or False"),
-    ],
-)
-def test_refused_arguments(arguments, match):
-    with pytest.raises(ValueError, match=match):
-        ced.load(**arguments)
-
-
-def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"(?s)no 'CED/DATAUNIF.MAT'.*root=DIR"):
-        ced.load(root=tmp_path)
-
-
-def test_a_missing_file_is_downloaded(tmp_path, monkeypatch):
-    def CED(*, data_file_locations: bool, dir_placement: Path):
-        assert data_file_locations
-        write(dir_placement, **numbers())
-
-    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", SimpleNamespace(CED=CED))
-    assert scored(ced.load(root=tmp_path, download=True).tests[0]) == (411, 500)
 
 
 def test_a_wrong_file_is_refused_with_advice(tmp_path):

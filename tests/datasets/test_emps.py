@@ -2,10 +2,8 @@
 
 import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from zipfile import ZipFile
 
 import numpy as np
@@ -93,29 +91,6 @@ def test_all_samples_train(numbered):
     assert not emps.load(root=numbered, validation=0.2).selection
 
 
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        ({"validation": 1.0}, "leaves 0 of the 24841"),
-        ({"warm_up": 0}, "warm_up is 0"),
-        (
-            {"validation": 0.2, "warm_up": 19_874},
-            "warm_up is 19874, and there are 19873 samples before",
-        ),
-        ({"download": "no"}, "download is 'no'; give True or False"),
-    ],
-)
-def test_refused_arguments(arguments, match):
-    with pytest.raises(ValueError, match=match):
-        emps.load(**arguments)
-
-
-def test_a_missing_estimation_file_is_one_message(numbered):
-    (numbered / ESTIMATION).unlink()
-    with pytest.raises(FileNotFoundError, match=rf"(?s)no '{ESTIMATION}'.*root=DIR"):
-        emps.load(root=numbered)
-
-
 def test_a_missing_test_file_is_a_note(numbered):
     (numbered / TEST).unlink()
     data = emps.load(root=numbered)
@@ -125,15 +100,6 @@ def test_a_missing_test_file_is_a_note(numbered):
     (numbered / TEST).write_bytes(b"text " * 99)
     with pytest.raises(ValueError, match=r"remove .* and download them again"):
         emps.load(root=numbered)
-
-
-def test_missing_files_are_downloaded(tmp_path, monkeypatch):
-    def EMPS(*, data_file_locations: bool, dir_placement: Path):
-        assert data_file_locations
-        write(dir_placement, numbers(), numbers(-1))
-
-    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", SimpleNamespace(EMPS=EMPS))
-    assert scored(emps.load(root=tmp_path, download=True).tests[0]) == (-21, -SAMPLES)
 
 
 def test_a_wrong_file_is_refused_with_advice(numbered):

@@ -2,10 +2,8 @@
 
 import json
 import shutil
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -122,40 +120,6 @@ def test_published(numbered):
     assert all(np.array_equal(r.weight, [1, 0, 0]) for r in data.leaderboard)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        ({"levels": [2]}, "levels is .2.; give of 1, 3, 5, 7"),
-        ({"levels": 3}, "levels is 3; give of 1, 3, 5, 7"),
-        ({"levels": "13"}, "levels is 13; give of 1, 3, 5, 7"),
-        ({"levels": []}, "give one or more to train"),
-        ({"levels": [1, 1]}, "each once in all"),
-        ({"validation_level": 4}, "validation_level is .4.; give of"),
-        ({"validation_level": [5]}, "validation_level is ..5..; give of"),
-        ({"train": []}, "give one or more to train"),
-        ({"train": ["multisine_2"]}, "train is .'multisine_2'.; give a list of multisine_1"),
-        ({"train": "sweep_1"}, "train is sweep_1; give a list of"),
-        ({"train": ["sweep_5"], "validation": ["sweep_5"]}, "each once in all"),
-        ({"validation": [5]}, "validation is .5.; give a list of"),
-    ],
-)
-def test_refused_arguments(arguments, match):
-    with pytest.raises(ValueError, match=match):
-        f16.load(**arguments)
-
-
-@pytest.mark.parametrize("missing", [name(1), name(5), name(5, "SineSw")])
-def test_a_missing_estimation_file_is_one_message(numbered, tmp_path, missing):
-    for each in (numbered / FOLDER).iterdir():
-        (tmp_path / FOLDER).mkdir(parents=True, exist_ok=True)
-        if each.name != missing:
-            (tmp_path / FOLDER / each.name).symlink_to(each)
-    with pytest.raises(FileNotFoundError, match=r"holds 'F16' with root=DIR") as told:
-        f16.load(root=tmp_path)
-    assert f"no '{FOLDER}/{missing}'" in str(told.value)
-    assert "nonlinear_benchmarks.F16()" in str(told.value)
-
-
 @pytest.mark.parametrize("there", [(), (name(4),)])
 def test_missing_test_files_are_a_note(numbered, tmp_path, there):
     for each in (numbered / FOLDER).iterdir():
@@ -179,20 +143,6 @@ def test_a_damaged_test_file_is_an_error(numbered, tmp_path):
     shutil.rmtree(tmp_path / FOLDER)
 
 
-def test_missing_files_are_downloaded_once(numbered, tmp_path, monkeypatch):
-    asked = []
-
-    def F16(**arguments):
-        asked.append(arguments)
-        shutil.copytree(numbered / FOLDER, tmp_path / FOLDER)
-
-    monkeypatch.setitem(sys.modules, "nonlinear_benchmarks", SimpleNamespace(F16=F16))
-    data = f16.load(root=tmp_path, download=True)
-    assert asked == [{"data_file_locations": True, "dir_placement": tmp_path}]
-    assert int(data.tests[0].u[0, 0]) == 2_000_000
-    shutil.rmtree(tmp_path / FOLDER)
-
-
 @pytest.mark.parametrize(
     ("force", "acceleration", "match"),
     [
@@ -208,13 +158,6 @@ def test_another_layout(tmp_path, force, acceleration, match):
         f16.load(root=tmp_path)
     assert str(told.value).startswith(f"'{path}'")
     assert str(told.value).endswith("download the file again.")
-
-
-def test_a_damaged_file(tmp_path):
-    (tmp_path / FOLDER).mkdir(parents=True)
-    (tmp_path / FOLDER / name(1)).write_bytes(b"text " * 99)
-    with pytest.raises(ValueError, match="no readable 'Force'"):
-        f16.load(root=tmp_path)
 
 
 # --- a system of the kind -------------------------------------------------------------------

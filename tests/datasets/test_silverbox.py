@@ -5,7 +5,7 @@ import pytest
 from scipy.io import savemat
 from scipy.signal import lfilter
 
-from lfrtorch.datasets import official, silverbox
+from lfrtorch.datasets import silverbox
 
 FILE = "Silverbox/SilverboxFiles/SNLS80mV.mat"
 SAMPLES = 131_072
@@ -64,38 +64,6 @@ def test_the_rules_of_the_cuts(numbered):
     assert scored(data.validation[0]) == (73_182, 105_712)
     assert scored(data.tests[0]) == (105_763, 127_400)
     assert [r.skip for r in (*data.train, *data.validation, *data.tests)] == [0, 0, 50, 50, 50]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        ({"validation": 0}, "validation is 0"),
-        ({"validation": 1.0}, "leaves 0 of the 65062"),
-        ({"validation": 0.999}, "leaves 65 of the 65062 .* needs 501"),
-        ({"warm_up": -1}, "warm_up is -1"),
-        ({"warm_up": 60_000}, "needs 60001"),
-    ],
-)
-def test_refused_arguments(arguments, match):
-    with pytest.raises(ValueError, match=match):
-        silverbox.load(**arguments)
-
-
-def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered, monkeypatch):
-    root = tmp_path / "fresh"
-
-    def download(below, file, loader):
-        assert (below, file, loader) == (root, FILE, "Silverbox")
-        (root / FILE).parent.mkdir(parents=True)
-        (root / FILE).write_bytes((numbered / FILE).read_bytes())
-
-    monkeypatch.setattr(official, "_download", download)
-    assert silverbox.load(root=root, download=True).train[0].samples > 1
-
-
-def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"(?s)no 'Silverbox/Silver.*root=DIR"):
-        silverbox.load(root=tmp_path)
 
 
 @pytest.mark.data

@@ -1,10 +1,7 @@
 """Wiener-Hammerstein with process noise: the split, the files, and what the noise does."""
 
 import json
-import shutil
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,27 +56,11 @@ def test_split(numbered, validation):
     assert (data.name, data.noise_rms) == ("wh_process_noise", None)
 
 
-@pytest.mark.parametrize("validation", [0, -1, 1.5, "2", None, True])
-def test_refused_arguments(validation):
-    with pytest.raises(ValueError, match=f"validation is {validation!r}; give a whole number"):
-        wh_process_noise.load(validation=validation)
-
-
 @pytest.mark.parametrize("validation", [10, 11])
 def test_one_record_trains_at_least(numbered, validation):
     with pytest.raises(ValueError, match=r"has 10 record\(s\), .* give 1 to 9") as told:
         wh_process_noise.load(root=numbered, validation=validation)
     assert f"validation is {validation}" in str(told.value)
-
-
-def test_a_missing_estimation_file_is_one_message(numbered):
-    (numbered / FOLDER / ESTIMATION).unlink()
-    with pytest.raises(FileNotFoundError, match=r"holds 'WienHammer' with root=DIR") as told:
-        wh_process_noise.load(root=numbered)
-    assert f"no '{FOLDER}/{ESTIMATION}'" in str(told.value)
-    assert "nonlinear_benchmarks.not_splitted_benchmarks.WienerHammerstein_Process_Noise()" in str(
-        told.value
-    )
 
 
 def test_a_missing_test_file_is_a_note(numbered):
@@ -88,22 +69,6 @@ def test_a_missing_test_file_is_a_note(numbered):
     assert data.tests == []
     assert data.train
     assert data.notes[0].startswith("no test records: WH_TestDataset.mat")
-
-
-def test_missing_files_are_downloaded(numbered, tmp_path, monkeypatch):
-    asked = []
-
-    def WienerHammerstein_Process_Noise(**arguments):
-        asked.append(arguments)
-        shutil.copytree(numbered / FOLDER, tmp_path / "new" / FOLDER)
-
-    parent = "nonlinear_benchmarks"
-    submodule = SimpleNamespace(WienerHammerstein_Process_Noise=WienerHammerstein_Process_Noise)
-    monkeypatch.setitem(sys.modules, parent, SimpleNamespace(not_splitted_benchmarks=submodule))
-    monkeypatch.setitem(sys.modules, f"{parent}.not_splitted_benchmarks", submodule)
-    data = wh_process_noise.load(root=tmp_path / "new", download=True)
-    assert asked == [{"data_file_locations": True, "dir_placement": tmp_path / "new"}]
-    assert int(data.tests[1].u[0, 0]) == 52_000
 
 
 @pytest.mark.parametrize(

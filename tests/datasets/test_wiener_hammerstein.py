@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from lfrtorch.datasets import official, wiener_hammerstein
+from lfrtorch.datasets import wiener_hammerstein
 
 FILE = "WienerHammerBenchMark/WienerHammerBenchMark.mat"
 SAMPLES = 188_000
@@ -61,39 +61,6 @@ def test_the_rule_of_the_validation_part(numbered):
     assert scored(data.train[0]) == (1, 50_000)
     assert scored(data.validation[0]) == (50_001, 100_000)
     assert scored(data.tests[0]) == (101_001, 188_000)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        ({"validation": 0}, "validation is 0"),
-        ({"validation": 1.0}, "leaves 0 of the 100000"),
-        ({"validation": 0.95}, "leaves 5000 of the 100000 .* needs 6001"),
-        ({"split": "package"}, "split is 'package'; give 'official' or 'site'"),
-        ({"skip": -1}, "skip is -1"),
-        ({"skip": 80_000}, "validation is 0.2, which leaves 80000"),
-    ],
-)
-def test_refused_arguments(arguments, match):
-    with pytest.raises(ValueError, match=match):
-        wiener_hammerstein.load(**arguments)
-
-
-def test_a_missing_file_is_downloaded_where_that_is_asked_for(tmp_path, numbered, monkeypatch):
-    root = tmp_path / "fresh"
-
-    def download(below, file, loader):
-        assert (below, file, loader) == (root, FILE, "WienerHammerBenchMark")
-        (root / FILE).parent.mkdir(parents=True)
-        (root / FILE).write_bytes((numbered / FILE).read_bytes())
-
-    monkeypatch.setattr(official, "_download", download)
-    assert wiener_hammerstein.load(root=root, download=True).train[0].samples > 1
-
-
-def test_a_missing_file_is_one_message(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"(?s)no 'WienerHammerBenchMark/Wiener.*root=DIR"):
-        wiener_hammerstein.load(root=tmp_path)
 
 
 def test_a_file_of_another_length_is_refused(numbered):
