@@ -101,14 +101,7 @@ class Dataset:
             object.__setattr__(self, use, records)
 
     def with_windows(self) -> Dataset:
-        """The same with windows for the scores of estimated starts that leave them open.
-
-        Example:
-            >>> test = lfrtorch.Record(u[100:], y[100:], fs=100.0, start="estimated", name="test")
-            >>> data = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[test])
-            >>> data.with_windows().tests[0].skip
-            50
-        """
+        """Set windows for the scores of estimated starts that leave them open."""
         held_out = ("validation", "selection", "tests")
         return replace(self, **{use: [*map(with_window, getattr(self, use))] for use in held_out})
 

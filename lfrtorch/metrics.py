@@ -39,13 +39,7 @@ def rmse(record: Record, y_hat: Array) -> float:
 
 
 def rmse_by_output(record: Record, y_hat: Array) -> Array:
-    """The same of each output, (ny,); NaN for one without a scored sample.
-
-    Example:
-        >>> from lfrtorch.metrics import rmse_by_output
-        >>> rmse_by_output(record, record.y + 0.5)
-        array([0.5])
-    """
+    """Return the RMSE of each output, (ny,); NaN for one without a scored sample."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         squares = np.square(record.errors(y_hat)).sum(axis=0)
         return np.sqrt(squares / record.scored.sum(axis=0))
@@ -68,16 +62,9 @@ def nrmse(record: Record, y_hat: Array) -> float:
 
 
 class BlockScores:
-    """Scores of each output over blocks of samples; only sums are kept in memory.
+    """Scores of each output (ny,) over blocks of samples, without the first ``skip``.
 
-    A sample without a measurement (NaN) does not count.
-
-    Args:
-        ny: outputs.
-        skip: samples at the beginning that do not count.
-
-    Shape:
-        samples, rmse, nrmse: (ny,).
+    Only sums are kept in memory. A sample without a measurement (NaN) does not count.
     """
 
     def __init__(self, ny: int, skip: int = 0) -> None:

@@ -44,13 +44,9 @@ BLOCKS = 10
 
 
 def as_good(squares: Sequence[Array] | Array, counts: Integers) -> Booleans:
-    """Which models are within one standard error of the best, or ``MARGIN``; at most ``CEILING``.
+    """Return which models are within one standard error of the best, or ``MARGIN``.
 
-    Args:
-        squares, counts: see ``standard_errors_above``.
-
-    Shape:
-        squares: (C, B), counts: (B,) -> (C,).
+    None is that is worse by more than ``CEILING``. Arguments as in ``standard_errors_above``.
     """
     means = np.asarray(squares).sum(axis=1)
     near = standard_errors_above(squares, counts) <= 1.0
@@ -65,15 +61,11 @@ def no_progress(errors: Sequence[float], last: int) -> bool:
 
 
 def standard_errors_above(squares: Sequence[Array] | Array, counts: Integers) -> Array:
-    """How far the mean squares of several models are above the least of them.
+    """Return how far the mean squares of models are above the least, in its standard errors.
 
     Args:
-        squares: sums of squared errors of each model in each block of time; infinite if one
-            diverges.
-        counts: samples of each block.
-
-    Shape:
-        squares: (C, B), counts: (B,) -> (C,), in standard errors of the difference.
+        squares: sums of squared errors in each block of time (C, B); infinite if one diverges.
+        counts: samples of each block (B,).
     """
     sums = np.asarray(squares)
     best = int(np.argmin(sums.sum(axis=1)))
@@ -98,10 +90,9 @@ def blocked_mean(sums: Array, counts: Integers) -> tuple[Array, Array]:
 
 
 def squares_in_blocks(errors: Sequence[Array]) -> Array:
-    """Sums of squared errors over each block of time; infinite if one of them is not finite.
+    """Return sums of squared errors over each block of time; infinite if one is not finite.
 
-    Args:
-        errors: of each record, (T, ny) each; the outputs' mean counts.
+    The errors of each record are (T, ny); the outputs' mean counts.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         blocks = in_blocks([np.mean(error**2, axis=1) for error in errors])
@@ -110,7 +101,7 @@ def squares_in_blocks(errors: Sequence[Array]) -> Array:
 
 
 def in_blocks(signals: Sequence[Array]) -> list[Array]:
-    """Signals (T,) cut into blocks of about equal length, ``BLOCKS`` of them or a few more."""
+    """Cut signals (T,) into blocks of about equal length, ``BLOCKS`` of them or a few more."""
     samples = sum(map(len, signals))
     if samples < BLOCKS:
         raise InputError(

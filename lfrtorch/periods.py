@@ -34,7 +34,7 @@ _TAIL = 4  # of two periods' difference, its last 1 / 4 is taken for noise
 
 
 def find_period(u: Array) -> int | None:
-    """The shortest period, in samples, that explains the signals; ``None`` if they do not repeat.
+    """Return the shortest period, in samples, that explains the signals; None if none repeats.
 
     For every shift p up to half the record,
 
@@ -42,13 +42,8 @@ def find_period(u: Array) -> int | None:
 
     is 0 for a period, 1 for unrelated signals and the noise-to-signal ratio for a period in noise.
     A period is a p whose D is at a minimum and small, and stays small for 2 p, 3 p, ... A transient
-    in its first periods, which a measured input may have, makes it no longer.
-
-    Args:
-        u: signals that are to repeat together; constant ones are left out.
-
-    Shape:
-        u: (T, nu) or (T,).
+    in its first periods, which a measured input may have, makes it no longer. Constant signals do
+    not count. Shape of u: (T, nu) or (T,).
     """
     u = u.reshape(len(u), -1)
     u = near_one(u, axis=0)
@@ -112,20 +107,11 @@ def _differences(u: Array) -> Array:
 
 
 def find_transient(y: Array, period: int) -> int:
-    """Samples of the whole first periods in which the outputs have not settled.
+    """Return the samples of the first whole periods in which the outputs have not settled.
 
     These are the periods, from the first on, that differ from the next one by more than the last
-    two from each other. Of two periods the end of their difference is taken for noise.
-
-    Args:
-        y: outputs, from the start of the first period on.
-        period: of the inputs, in samples.
-
-    Shape:
-        y: (T, ny) or (T,).
-
-    Returns:
-        A whole number of periods; the last whole one is never in it.
+    two from each other. Of two periods the end of their difference is taken for noise. The last
+    whole period never counts. Shape of y: (T, ny) or (T,).
     """
     y = y.reshape(len(y), -1)
     count = len(y) // period

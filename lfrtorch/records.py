@@ -64,11 +64,7 @@ class Channel(NamedTuple):
 
 
 def described_channels(entries: Any) -> tuple[Channel, ...]:
-    """Channels as a checkpoint describes them.
-
-    Raises:
-        TypeError: no list of names and units.
-    """
+    """Describe channels for a JSON file."""
     found = tuple(Channel(**entry) for entry in entries)
     if not all(isinstance(text, str) for channel in found for text in channel):
         raise TypeError("a name or a unit of a channel is no text")
@@ -76,13 +72,7 @@ def described_channels(entries: Any) -> tuple[Channel, ...]:
 
 
 def common_unit(channels: Sequence[Channel]) -> str:
-    """The unit of a number on all of the channels; none if they have several.
-
-    Example:
-        >>> from lfrtorch.records import Channel, common_unit
-        >>> common_unit([Channel("x", "m"), Channel("y", "m")])
-        'm'
-    """
+    """Return the unit of all channels, empty if they differ."""
     units = {channel.unit for channel in channels}
     return units.pop() if len(units) == 1 else ""
 
@@ -428,25 +418,13 @@ class Record:
         )
 
     def signals_in(self, window: slice | NDArray[np.integer]) -> dict[str, Any]:
-        """The signals in ``window``, or at some samples, by name, for ``dataclasses.replace``.
-
-        Example:
-            >>> sorted(record.signals_in(slice(20)))
-            ['reference', 'u', 'valid', 'y']
-        """
+        """Return the signals in ``window`` by name, for ``dataclasses.replace``."""
         several = {name: getattr(self, name) for name in ("u", "y", "reference", "valid")}
         return {name: one if one is None else one[window] for name, one in several.items()}
 
 
 def interpolated(y: Array, valid: Booleans) -> Array:
-    """Outputs (T, ny), those that are not valid (T, ny) on a line between their neighbours.
-
-    Example:
-        >>> from lfrtorch.records import interpolated
-        >>> y = np.array([[1.0], [np.nan], [3.0]])
-        >>> interpolated(y, np.isfinite(y)).ravel()
-        array([1., 2., 3.])
-    """
+    """Replace the samples of outputs that are not valid by straight lines."""
     k, filled = np.arange(len(y)), y.copy()
     for i, there in enumerate(valid.T):
         if there.any():
@@ -455,13 +433,7 @@ def interpolated(y: Array, valid: Booleans) -> Array:
 
 
 def signals(record: Record) -> str:
-    """Inputs and outputs of a record, the first ones if they are many.
-
-    Example:
-        >>> from lfrtorch.records import signals
-        >>> signals(record)
-        'u -> y'
-    """
+    """Write the channels of a record: u -> y."""
 
     def listed(channels: Sequence[Channel]) -> str:
         names = [str(channel) for channel in channels[:_LISTED]]
@@ -471,17 +443,9 @@ def signals(record: Record) -> str:
 
 
 def with_past_outputs(record: Record) -> Record:
-    """The record of a one-step predictor: its inputs are u, then y, and its output is y.
+    """Make the record of a one-step predictor: its inputs are u, then y, and its output is y.
 
     A record in steady state has an estimated start: its noise does not repeat.
-
-    Raises:
-        ValueError: outputs that are not valid.
-
-    Example:
-        >>> from lfrtorch.records import with_past_outputs
-        >>> with_past_outputs(record)
-        Record('record': u, y -> y, 400 samples at 100 Hz, start estimated)
     """
     record.require_all_valid(PAST_OUTPUTS)
     return replace(
@@ -496,12 +460,7 @@ def with_past_outputs(record: Record) -> Record:
 
 
 def as_records(records: Record | Sequence[Record]) -> list[Record]:
-    """One record or several as a list, checked to share channels and sampling frequency.
-
-    Raises:
-        ValueError: no record, something else than records, or records of different channel counts
-            or sampling frequencies.
-    """
+    """List one record or several, checked to share channels and sampling frequency."""
     if not isinstance(records, Record | Iterable):
         raise _no_record(records)
     found = [records] if isinstance(records, Record) else list(records)
@@ -674,16 +633,9 @@ def _channels(given: Any, what: str) -> tuple[Channel, ...]:
 
 
 def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: int = 0) -> Array:
-    """A signal (T, channels) of finite real numbers from (T, channels) or (T,), not writeable.
+    """Return a signal (T, channels), not writeable, of finite real numbers; (T,) is one channel.
 
-    Args:
-        x: the samples.
-        channels: their names.
-        what: what an error message calls the signal.
-        first: number of the first sample in an error message.
-
-    Raises:
-        ValueError: another type or shape, no sample, NaN or infinite samples.
+    Messages call it ``what`` and its first sample number ``first``.
     """
     array = np.array(reals(what, x), order="C")  # a copy: it is frozen below
     if array.ndim == 1:

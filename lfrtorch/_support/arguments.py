@@ -30,23 +30,7 @@ NAMES: dict[Any, str] = {
 def typed(*own: str) -> Callable[[Function], Function]:
     """Let a function or class refuse arguments of other types than its hints name.
 
-    Numbers and arrays alone are left to the function, which knows more about them.
-
-    Args:
-        own: arguments that the function looks at itself.
-
-    Raises:
-        InputError: by the function, with the argument's name, its value and what to give.
-
-    Example:
-        >>> from typing import Literal
-        >>> from lfrtorch._support.arguments import typed
-        >>> @typed()
-        ... def drawn(kind: Literal["line", "bar"], grid: bool = True): ...
-        >>> drawn("bars")
-        Traceback (most recent call last):
-        ...
-        lfrtorch._support.errors.InputError: kind is 'bars'; give 'line' or 'bar'.
+    Numbers and arrays alone are left to the function, and so are the arguments ``own``.
     """
 
     def decorate(function: Function) -> Function:
@@ -82,14 +66,7 @@ def typed(*own: str) -> Callable[[Function], Function]:
 
 
 def is_of(value: Any, hint: Any) -> bool:
-    """Whether a value is of the type of a hint; True if the hint is not looked at.
-
-    Example:
-        >>> from collections.abc import Sequence
-        >>> from lfrtorch._support.arguments import is_of
-        >>> is_of([1, 2], int | Sequence[int]), is_of([1, "x"], int | Sequence[int])
-        (True, False)
-    """
+    """Return whether a value is of the type of a hint; True if the hint is not looked at."""
     first, *others = members(hint)
     if others:
         return any(is_of(value, one) for one in (first, *others))
@@ -121,13 +98,7 @@ def is_of(value: Any, hint: Any) -> bool:
 
 
 def members(hint: Any) -> tuple[Any, ...]:
-    """The hints that a union is of, and those of its aliases; of another hint itself alone.
-
-    Example:
-        >>> from lfrtorch._support.arguments import members
-        >>> [one.__name__ for one in members(int | None)]
-        ['int', 'NoneType']
-    """
+    """Return the members of a union and of its aliases; of another hint itself alone."""
     hint = getattr(hint, "__value__", hint)  # of numpy's ArrayLike from numpy 2.5 on
     if get_origin(hint) not in UNIONS:
         return (hint,)
@@ -135,21 +106,13 @@ def members(hint: Any) -> tuple[Any, ...]:
 
 
 def wanted(hint: Any) -> str:
-    """What a hint asks for.
-
-    Example:
-        >>> from collections.abc import Sequence
-        >>> from typing import Literal
-        >>> from lfrtorch._support.arguments import wanted
-        >>> wanted(int | Sequence[int] | Literal["auto"])
-        "a whole number, several of them or 'auto'"
-    """
+    """Say what a hint asks for."""
     *others, last = _choices(hint)
     return f"{', '.join(others)} or {last}" if others else last
 
 
 def _choices(hint: Any) -> list[str]:
-    """What a hint asks for, one text for each kind."""
+    """Say what a hint asks for, one text for each kind."""
     kinds, arrays = members(hint), members(ArrayLike)
     if len(kinds) > 1:
         if not set(arrays) <= set(kinds):
@@ -166,7 +129,7 @@ def _choices(hint: Any) -> list[str]:
 
 
 def _several(hint: Any, others: tuple[Any, ...]) -> list[str]:
-    """That several of another kind can be given, too, if they can."""
+    """Say that several of another kind can be given, too, if they can."""
     alike = get_origin(hint) is Sequence and set(_choices(get_args(hint)[0])) <= {
         text for one in others if one is not hint for text in _choices(one)
     }

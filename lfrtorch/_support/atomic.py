@@ -17,19 +17,16 @@ TEMPORARY = ".lfrtorch-"
 
 
 def refuse_existing(path: str | Path, option: str) -> None:
-    """Refuse a path that exists with a ValueError that names the option to replace it."""
+    """Refuse a path that exists; the message names the option to replace it."""
     if Path(path).exists():
         raise InputError(f"'{path}' exists; give another name, or {option} to replace it.")
 
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to, of the same extension; it takes the place of ``path``.
+    """Give a path beside ``path`` to write to; when the block ends, it takes the place of ``path``.
 
     If the block raises, nothing is left, and what was at ``path`` stays as it was.
-
-    Raises:
-        OSError: names the folder.
     """
     path = real(path)  # a link's target is replaced, not the link
     with writing_to(path.parent):
@@ -46,7 +43,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def writing_to(folder: Path) -> Iterator[None]:
-    """Errors of the system inside say which folder cannot be written to."""
+    """Name the folder in errors of the system."""
     try:
         yield
     except OSError as error:
@@ -59,7 +56,7 @@ def writing_to(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """A folder beside ``path`` to write files to; it becomes ``path``, which is new or empty."""
+    """Give a folder beside ``path`` to write files to; it becomes ``path``, new or empty."""
     with writing_to(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=path.parent))
@@ -73,7 +70,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def put(fresh: Path, path: Path) -> None:
-    """Let what is whole take its place, on the disk before its name is: power may fail."""
+    """Let a file or folder that is whole take its place; first on the disk, as power may fail."""
     full = 0o777 if fresh.is_dir() else 0o666
     flush(fresh)
     os.chmod(fresh, full & ~umask())  # what tempfile makes is its owner's alone
@@ -92,7 +89,7 @@ def flush(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what a killed program left unfinished in a folder where no other writes now."""
+    """Remove what a killed program left unfinished in a folder that no other writes to."""
     for path in list(folder.glob(f"{TEMPORARY}*")):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -101,7 +98,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def umask() -> int:
-    """The permissions that new files do not get."""
+    """Return the permissions that new files do not get."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

@@ -36,10 +36,6 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
     """Write a checkpoint folder whole or not at all; an existing checkpoint is replaced.
 
     An existing one stays readable at every moment. Other files in its folder stay where they are.
-
-    Raises:
-        ValueError: ``folder`` exists and is not a checkpoint.
-        OSError: it cannot be written, as on a full disk.
     """
     folder = real(folder)  # a link's target is replaced, not the link
     replaced = (folder / DESCRIPTION).is_file()
@@ -66,7 +62,7 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], **metadata: str) -> None:
-    """Write a safetensors file with a digest; a full disk is an OSError, as of any other file."""
+    """Write a safetensors file with a digest; a full disk is an OSError."""
     held = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     try:
         save_file(held, path, metadata={**metadata, DIGEST: _digest(held, metadata)})
@@ -75,11 +71,7 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], **metadata: str) -> No
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors of a safetensors file and what else stands in it; files of before have no digest.
-
-    Raises:
-        OSError: it is damaged, no file, or of more bytes than there is memory for.
-    """
+    """Read a safetensors file and its metadata; older files have no digest."""
     if path.exists() and not path.is_file():
         raise OSError("it is no file")
     try:
@@ -107,15 +99,9 @@ def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
 def read(
     folder: str | Path, inside: Sequence[str] = ("model", "linear")
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Description and weights of a checkpoint folder, or of a run's folder that holds one.
+    """Read the description and weights of a checkpoint, or of one ``inside`` the folder of a run.
 
-    Args:
-        folder: the checkpoint, or the run.
-        inside: where in a run's folder, the first that is there.
-
-    Raises:
-        ValueError: no checkpoint there, a damaged one, one of another program or newer version, or
-            files that may carry code, which are never opened.
+    Refuse damaged ones, newer versions, and files that may carry code, which are never opened.
     """
     folder = _located(expanded(folder), inside)
     try:

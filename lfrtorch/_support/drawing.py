@@ -24,16 +24,7 @@ LOG_DECADES = 1.5
 
 
 def unit_axis(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> None:
-    """Limits of an axis, its label, and ticks in the unit with an SI prefix.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from lfrtorch._support import drawing
-        >>> ax = Figure().subplots()
-        >>> drawing.unit_axis(ax.yaxis, (0.0, 2e-6), "displacement", "m")
-        >>> ax.get_ylabel()
-        'displacement (µm)'
-    """
+    """Set limits and label of an axis, and ticks in the unit with an SI prefix."""
     low, high = limits
     largest = max(abs(low), abs(high))
     factor, shown = engineering([largest], unit)
@@ -44,24 +35,14 @@ def unit_axis(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> 
 
 
 def plain_ticks(axis: Axis) -> None:
-    """Numbers instead of powers of ten at a logarithmic axis; below a decade also between them.
-
-    Example:
-        >>> from matplotlib.figure import Figure
-        >>> from lfrtorch._support import drawing
-        >>> ax = Figure().subplots()
-        >>> lines = ax.semilogy([0.02, 0.05])
-        >>> drawing.plain_ticks(ax.yaxis)
-        >>> ax.yaxis.get_minor_formatter()(0.03)
-        '0.03'
-    """
+    """Write numbers, not powers of ten; below a decade also at minor ticks."""
     low, high = axis.get_view_interval()
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter("{x:.3g}" if high < 10 * low else NullFormatter())
 
 
 def legend_above(ax: Axes, *, ncols: int = 3, markerscale: float = 1.0) -> None:
-    """A legend above the panel, where it hides nothing, with lines thick enough to be seen."""
+    """Draw a legend above the panel, with lines thick enough to be seen."""
     legend = ax.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=ncols, markerscale=markerscale,
         frameon=False, borderaxespad=0.2, columnspacing=1.2, handlelength=1.8, fontsize="small",
@@ -71,12 +52,12 @@ def legend_above(ax: Axes, *, ncols: int = 3, markerscale: float = 1.0) -> None:
 
 
 def is_wide(first: float, last: float) -> bool:
-    """Whether the frequency axis of a band is logarithmic."""
+    """Return whether the frequency axis of a band is logarithmic."""
     return first > 0 and last > first * 10**LOG_DECADES
 
 
 def frequency_axis(grid: NDArray[np.object_], first: float, last: float) -> None:
-    """The frequency axis of all panels, in Hz, with its label below the last row."""
+    """Set the frequency axis of all panels, in Hz, with its label below the last row."""
     for ax in grid.ravel():
         if is_wide(first, last):
             ax.set_xscale("log")
@@ -92,17 +73,17 @@ def frequency_axis(grid: NDArray[np.object_], first: float, last: float) -> None
 
 
 def decibel(amplitude: ArrayLike) -> Array:
-    """Amplitude in dB; an amplitude of 0 leaves a gap."""
+    """Return an amplitude in dB; an amplitude of 0 leaves a gap."""
     amplitude = np.abs(np.asarray(amplitude))
     return 20.0 * np.log10(np.where(amplitude > 0, amplitude, np.nan))
 
 
 def unit_label(what: str, output: str, source: str) -> str:
-    """The label of a gain in dB, of the units of output and input."""
+    """Return the label of a gain in dB, of the units of output and input."""
     per = "/".join(factor_of(unit or "1") for unit in (output, source))
     return f"{what} (dB{reference(per if output or source else '')})"
 
 
 def reference(unit: str) -> str:
-    """What 0 dB is, for a label."""
+    """Say in a label what 0 dB is."""
     return f", re 1 {unit}" if unit else ""

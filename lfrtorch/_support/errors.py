@@ -28,13 +28,7 @@ class InputError(LfrtorchError, ValueError):
 
 
 def brief(error: BaseException | str, longest: int = LONGEST) -> str:
-    """The message of another library on one line, cut off if it is longer.
-
-    Example:
-        >>> from lfrtorch._support.errors import brief
-        >>> brief("no such\\n    key")
-        'no such key'
-    """
+    """Return the message of another library on one line, cut off if it is longer."""
     said = str(error) or (type(error).__name__ if isinstance(error, BaseException) else "")
     text = " ".join(said[: 4 * longest].split())
     return text if len(text) <= longest else f"{text[:longest]}..."

@@ -16,22 +16,7 @@ _UNITS = ("kB", "MB", "GB", "TB", "PB", "EB")
 
 
 def check_memory(needed: float, what: str, remedy: str, device: torch.device | None = None) -> None:
-    """Refuse what takes more bytes than a device has with a ValueError, before it is asked for.
-
-    Args:
-        needed: bytes.
-        what: takes them, for the message.
-        remedy: what to do.
-        device: which one. Default: the CPU.
-
-    Example:
-        >>> from lfrtorch._support.memory import check_memory
-        >>> try:
-        ...     check_memory(8e18, "'x.h5', 1e18 samples,", "save a part of it")
-        ... except lfrtorch.InputError as error:
-        ...     print(str(error).split(",")[1])
-         1e18 samples
-    """
+    """Refuse what takes more bytes than a device (default: the CPU) has, and say the remedy."""
     there = memory_of(device)
     if needed > there:
         raise InputError(
@@ -40,10 +25,7 @@ def check_memory(needed: float, what: str, remedy: str, device: torch.device | N
 
 
 def memory_of(device: torch.device | None = None) -> float:
-    """Bytes of memory of a device, or what a container or a process may take.
-
-    Infinite if that is not known.
-    """
+    """Return the bytes that a device has, or a container or process may take; inf if unknown."""
     if device is not None and device.type == "cuda":
         import torch
 
@@ -57,7 +39,7 @@ def memory_of(device: torch.device | None = None) -> float:
 
 
 def _own_limit() -> float:
-    """What ``ulimit -v`` leaves this process, as batch systems set it."""
+    """Return what ``ulimit -v`` leaves this process, as batch systems set it."""
     try:
         import resource
     except ImportError:  # not on Windows
@@ -67,23 +49,14 @@ def _own_limit() -> float:
 
 
 def limit_of(listed: Path, mounted: Path) -> float:
-    """Bytes that the control groups of a process leave it, as those of containers and batch jobs.
+    """Return the least memory limit of the control groups of a process, inf if there is none.
 
     Args:
         listed: file of the groups, a line each.
         mounted: folder of what the groups may take; groups above limit those in them.
 
-    Returns:
-        The smallest limit, infinite if there is none.
-
     References:
         Linux kernel documentation, "Control Group v2", and its v1 with "memory.limit_in_bytes".
-
-    Example:
-        >>> from pathlib import Path
-        >>> from lfrtorch._support.memory import limit_of
-        >>> limit_of(Path("none"), Path("none"))
-        inf
     """
     try:
         groups = [line.split(":", 2)[1:] for line in listed.read_text().splitlines()]
@@ -105,7 +78,7 @@ def limit_of(listed: Path, mounted: Path) -> float:
 
 
 def _number(file: Path) -> float:
-    """What the file says, infinite if that is "max" or nothing."""
+    """Return the number in a file, inf if there is none or "max"."""
     try:
         return float(int(file.read_text()))
     except (OSError, ValueError):
@@ -113,12 +86,6 @@ def _number(file: Path) -> float:
 
 
 def in_bytes(count: float) -> str:
-    """Bytes with a unit.
-
-    Example:
-        >>> from lfrtorch._support.memory import in_bytes
-        >>> in_bytes(8.1e12)
-        '8.1 TB'
-    """
+    """Write bytes with a unit, 8.1 TB for example."""
     power = min(max(int(math.log10(max(count, 1.0)) // 3), 1), len(_UNITS))
     return f"{count / 1000**power:.3g} {_UNITS[power - 1]}"

@@ -8,11 +8,11 @@ from typing import Any
 from lfrtorch._support.errors import InputError
 
 
-def imported(package: str, extra: str) -> Any:
-    """A package, or a ValueError that names the extra which installs it."""
+def imported(package: str, extra: str, otherwise: str = "") -> Any:
+    """Import a package, or name the extra that installs it, and what to do otherwise."""
     try:
         return import_module(package)
     except ImportError:
         raise InputError(
-            f"the package {package} is not installed: pip install 'lfrtorch[{extra}]'."
+            f"the package {package} is not installed: pip install 'lfrtorch[{extra}]'{otherwise}."
         ) from None

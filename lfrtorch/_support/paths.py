@@ -9,16 +9,7 @@ from lfrtorch._support.errors import InputError, brief
 
 
 def expanded(path: str | Path) -> Path:
-    """The path, with a home folder for its ``~``; nothing needs to be there.
-
-    Raises:
-        ValueError: one that no file can have: a name that is too long, or of an unknown user.
-
-    Example:
-        >>> from lfrtorch._support.paths import expanded
-        >>> expanded("x.csv").name
-        'x.csv'
-    """
+    """Expand ``~`` in a path; refuse one that no file can have, too long or of an unknown user."""
     try:
         found = Path(path).expanduser()
         found.is_file()  # an error, unless there may be such a file
@@ -31,11 +22,5 @@ def expanded(path: str | Path) -> Path:
 
 
 def real(path: str | Path) -> Path:
-    """The path without links, as far as it is there; one of a loop of links stays as it is.
-
-    Example:
-        >>> from lfrtorch._support.paths import real
-        >>> real("/no/../x.csv").name
-        'x.csv'
-    """
+    """Return the path without links, as far as it is there; loops of links stay."""
     return Path(os.path.realpath(path))

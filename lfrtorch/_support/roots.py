@@ -12,17 +12,10 @@ from lfrtorch._support.types import Complex
 
 
 def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | None]]:
-    """Poles or zeros z = exp(s / fs) as frequency |s| / 2π in Hz, damping ratio and radius of z.
+    """Describe poles or zeros z = exp(s / fs): frequency |s| / 2π in Hz, damping ratio, radius.
 
-    A conjugate pair counts once. The frequency is at most fs / 2, that of a negative root, which
+    A conjugate pair counts once. The frequency is at most fs / 2, as of a negative root, which
     alternates from sample to sample; of a root at 0 it is not known.
-
-    Example:
-        >>> from lfrtorch._support.roots import frequency_and_damping
-        >>> s = 2 * np.pi * 5.0 * np.array([-0.1 + 0.995j, -0.1 - 0.995j])  # 5 Hz, 10 % damping
-        >>> (pole,) = frequency_and_damping(np.exp(s / 100.0), fs=100.0)
-        >>> round(pole["frequency"], 1), round(pole["damping"], 2)
-        (5.0, 0.1)
     """
     listed = []
     for z in sorted(values[values.imag >= 0], key=lambda z: (abs(np.angle(z)), abs(z))):
@@ -43,13 +36,6 @@ def frequency_and_damping(values: Complex, fs: float) -> list[dict[str, float | 
 
 
 def remark(root: Mapping[str, Any], *, pole: bool) -> str:
-    """Whether a root stands for two, and whether it is an unstable pole.
-
-    Example:
-        >>> from lfrtorch._support.roots import frequency_and_damping, remark
-        >>> roots = frequency_and_damping(np.array([1.1 + 0.1j, 1.1 - 0.1j]), fs=1.0)
-        >>> [remark(root, pole=True) for root in roots]
-        ['pair, unstable']
-    """
+    """Say that a root stands for two, and that a pole is unstable."""
     unstable = pole and root["radius"] > 1.0
     return ", ".join(["pair"] * bool(root["imag"]) + ["unstable"] * unstable)

@@ -43,13 +43,7 @@ Cell = str | int | float | None
 
 
 def in_lines(text: str) -> str:
-    """A sentence whose first line is not too long to be read; a table stays as it is.
-
-    Example:
-        >>> from lfrtorch._support.tables import in_lines
-        >>> in_lines("the input is constant")
-        'the input is constant'
-    """
+    """Break a long sentence into lines; a table stays as it is."""
     if "\n" in text:
         return text
     return textwrap.fill(
@@ -58,7 +52,7 @@ def in_lines(text: str) -> str:
 
 
 def number(value: float | None, digits: int = DIGITS) -> str:
-    """A number with its significant digits, trailing zeros included: 1235, 12.3, 0.100, 9.40e-5."""
+    """Write a number with its significant digits: 1235, 12.3, 0.100, 9.40e-5."""
     if value is None or not math.isfinite(value):
         return UNKNOWN
     if value == 0:
@@ -70,19 +64,10 @@ def number(value: float | None, digits: int = DIGITS) -> str:
 
 
 def engineering(values: Iterable[float | None], unit: str, shown: str = "") -> tuple[float, str]:
-    """What numbers of a unit are multiplied by to be read well, and the unit with its SI prefix.
+    """Return the factor and unit with SI prefix that numbers of a unit are read best in.
 
-    One for all, so that they compare: their median is between 0.1 and 1000 there.
-
-    Args:
-        values: numbers of a column, or the largest one of an axis; unknown ones do not count.
-        unit: theirs; one that takes no prefix is returned as it is.
-        shown: the unit with the prefix that it shall have, whatever the numbers.
-
-    Example:
-        >>> from lfrtorch._support.tables import engineering
-        >>> engineering([2e-7], "m")[1], engineering([2e-7], "m", "µm")[1]
-        ('nm', 'µm')
+    One for all, so that they compare: their median is between 0.1 and 1000 there. ``shown`` asks
+    for a unit with a prefix, whatever the numbers. A unit that takes no prefix stays as it is.
     """
     for power, prefix in PREFIXES.items():
         if shown and shown == prefix + unit:
@@ -99,50 +84,44 @@ def engineering(values: Iterable[float | None], unit: str, shown: str = "") -> t
 
 
 def factor_of(unit: str) -> str:
-    """A unit as a factor of another, in brackets if it is a product or a quotient.
-
-    Example:
-        >>> from lfrtorch._support.tables import factor_of
-        >>> f"{factor_of('rad/s')}²/Hz", factor_of("m")
-        ('(rad/s)²/Hz', 'm')
-    """
+    """Put a unit that is a product or a quotient in brackets: (rad/s)."""
     return f"({unit})" if any(sign in unit for sign in "/ ·*^²") else unit
 
 
 def times(factor: float, value: float | None) -> float | None:
-    """The product, if the value is known."""
+    """Return the product, if the value is known."""
     return None if value is None else factor * value
 
 
 def quantities(values: Sequence[float | None], unit: str, digits: int = DIGITS) -> list[str]:
-    """Numbers with their unit, all with the same SI prefix; without a unit the numbers alone."""
+    """Write numbers with their unit, all with the same SI prefix."""
     factor, unit = engineering(values, unit)
     return [f"{number(times(factor, v), digits)} {unit}".rstrip() for v in values]
 
 
 def quantity(value: float | None, unit: str) -> str:
-    """A number with its unit, with the SI prefix that it is read best in."""
+    """Write a number with its unit, with the SI prefix that it is read best in."""
     return quantities([value], unit)[0]
 
 
 def percent(ratio: float | None) -> str:
-    """100 times a ratio, with the sign %."""
+    """Write 100 times a ratio, with the sign %."""
     shown = number(in_percent(ratio))
     return shown if shown == UNKNOWN else f"{shown} %"
 
 
 def in_percent(ratio: float | None) -> float | None:
-    """100 times a ratio, if it is known."""
+    """Return 100 times a ratio, if it is known."""
     return times(100, ratio)
 
 
 def cell(value: Cell, digits: int = DIGITS) -> str:
-    """A value of a table; texts and whole numbers stay as they are."""
+    """Write a value of a table; texts and whole numbers stay as they are."""
     return str(value) if isinstance(value, str | int) else number(value, digits)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], digits: int = DIGITS) -> str:
-    """Lines of text: a head, a rule, and the rows; columns of words to the left, others right."""
+    """Write a head, a rule and rows; columns of words to the left, others to the right."""
     words = [all(isinstance(row[i], str) for row in rows) for i in range(len(head))]
     return tabulate(
         [[cell(value, digits) for value in row] for row in rows],
@@ -154,13 +133,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], digits: int = DIG
 
 
 def radius(value: float | None) -> str:
-    """Distance of a pole or zero from the origin, so that one outside the unit circle shows.
-
-    Example:
-        >>> from lfrtorch._support.tables import radius
-        >>> [radius(value) for value in (0.98765, 0.999998, 1.0, 1.00002)]
-        ['0.9877', '1 - 2.0e-6', '1', '1 + 2.0e-5']
-    """
+    """Write the distance of a root from the origin; near the unit circle as 1 ± a number."""
     beyond = (math.nan if value is None else value) - 1.0
     if abs(beyond) < ROUNDING:
         return "1"

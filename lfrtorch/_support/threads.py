@@ -23,7 +23,7 @@ _workers: ContextVar[int | None] = ContextVar("workers", default=None)
 
 
 def workers() -> int:
-    """Threads that work is spread over."""
+    """Return the number of threads that work is spread over."""
     return _workers.get() or torch.get_num_threads()
 
 
@@ -53,7 +53,7 @@ _changing, _limited, _inside = threading.Lock(), ExitStack(), set[object]()
 
 @contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    """BLAS, which all threads of the program share, on one thread until the last one has left."""
+    """Keep BLAS, which all threads share, on one thread until the last one has left."""
     own = object()
     with _changing:
         if not _inside:
@@ -97,13 +97,7 @@ def each_alone(
     items: Sequence[Item],
     stop: Callable[[], None] = lambda: None,
 ) -> list[Result]:
-    """The results of ``work`` on each item, one thread an item, ``workers()`` at a time.
-
-    Args:
-        work: finds its own work spread over one thread.
-        items: what it is called with.
-        stop: called if one fails, or at Ctrl-C: it should make the others end soon.
-    """
+    """Return ``work`` of each item, a thread each; if one fails, or at Ctrl-C, call ``stop``."""
 
     def alone(item: Item) -> Result:
         token = _workers.set(1)

@@ -12,9 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +20,7 @@ from numpy.typing import NDArray
 
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.memory import check_memory
+from lfrtorch._support.optional import imported
 from lfrtorch._support.types import Array
 from lfrtorch.files.matlab_elements import check_elements
 from lfrtorch.files.table import BLOCK, Clock, Table
@@ -64,8 +63,7 @@ Stored = Callable[[Path], AbstractContextManager[Any]]
 class Packing(NamedTuple):
     """Numbers that are stored as (number - offset) / scale, a missing one as ``fill``.
 
-    References:
-        NetCDF Climate and Forecast Metadata Conventions 1.11, 2.5.1 and 8.1.
+    See the NetCDF Climate and Forecast Metadata Conventions 1.11, 2.5.1 and 8.1.
     """
 
     scale: float
@@ -134,11 +132,6 @@ class ArrayTable(Table):
     Time runs along the axis of an array that is as long as a vector of the file is, and of two such
     axes, or none, along the longer one. An array u of k channels has the columns u1 .. uk, one of a
     channel the column u. A lone number with the name of a sampling frequency or time is a rate.
-
-    Args:
-        path: the file.
-        found: signals by name, or why something is none.
-        stored: opens the file.
     """
 
     def __init__(self, path: Path, found: Mapping[str, Signal | str], stored: Stored) -> None:
@@ -215,14 +208,7 @@ class ArrayTable(Table):
 
 
 def sampling_rate(name: str, signal: Signal) -> float | None:
-    """The sampling frequency in Hz, if it is a lone number with the name of that or of its inverse.
-
-    Example:
-        >>> from lfrtorch.files.arrays import Signal, sampling_rate
-        >>> Ts = np.array(0.0025)
-        >>> sampling_rate("rig.Ts", Signal(Ts.shape, Ts.dtype, values=Ts))
-        400.0
-    """
+    """Return the sampling frequency of a lone number with the name of it or of its inverse."""
     own = re.split(r"[./]", name)[-1]
     frequency, interval = _FREQUENCY.fullmatch(own), _INTERVAL.fullmatch(own)
     value = signal.values
@@ -459,19 +445,9 @@ def _linked(group: Any, key: str) -> Any:
     return item
 
 
-def optional(package: str) -> ModuleType:
-    """A package of the extra ``files``.
-
-    Raises:
-        ValueError: it is not installed.
-    """
-    try:
-        return import_module(package)
-    except ImportError as error:
-        raise InputError(
-            f"files of this format need {package}, which is not installed: "
-            "pip install 'lfrtorch[files]', or store them as .csv or .npz."
-        ) from error
+def optional(package: str) -> Any:
+    """Import a package of the extra ``files``."""
+    return imported(package, "files", ", or store the file as .csv or .npz")
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:

@@ -38,12 +38,9 @@ _INSTEAD = {
 
 
 def open_table(path: str | Path) -> Table:
-    """The table of a file; what it holds is read as far as its columns ask for.
+    """Open the table of a file; what it holds is read as far as its columns ask for.
 
-    Args:
-        path: a text file (.csv, .tsv, .txt, .dat, .lvm, these also as .gz), a MATLAB file of any
-            version, .npz, .npy, HDF5 (.h5, .hdf5), Parquet or Excel (.xlsx, .xlsm), whose sheet may
-            stand behind its name: ``rig.xlsx#Run 2``.
+    The sheet of a workbook may stand behind its name: ``rig.xlsx#Run 2``.
 
     Raises:
         FileNotFoundError: no such file.

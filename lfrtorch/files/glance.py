@@ -50,16 +50,10 @@ def look_at(
     time: str | int | None = None,
     fs: float | None = None,
 ) -> Glance:
-    """The first samples of a file. Without inputs and outputs all signals are looked at.
+    """Read the first samples of a file; without inputs and outputs, of all signals.
 
-    Args:
-        table: the file.
-        inputs, outputs: columns. Default: the others, if one side is given.
-        time: column of times. Default: one that looks like it.
-        fs: sampling frequency in Hz. Default: that which the file says.
-
-    Raises:
-        ValueError: a column that is not there or has two uses, or none of numbers.
+    If one side is given, the other columns are the other side. Without ``time`` a column that looks
+    like time is taken, without ``fs`` the sampling frequency that the file says.
     """
     (u, y, stamps), remarks = _roles(table, inputs, outputs, time)
     wanted = [*u, *y]

@@ -27,11 +27,11 @@ from lfrtorch.files.measurement import (
     Wanted,
     read_measurement,
 )
-from lfrtorch.files.split import SHORTEST, TooShortError, cut
+from lfrtorch.files.split import TooShortError, cut
 from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.periods import find_period, find_transient
 from lfrtorch.records import Record
-from lfrtorch.score_window import warm_up
+from lfrtorch.score_window import SHORTEST, warm_up
 from lfrtorch.survey.integration import integrators
 
 __all__ = ["load_records"]

@@ -73,12 +73,7 @@ class Measurement:
 
 
 def read_measurement(path: Path, wanted: Wanted) -> Measurement:
-    """Inputs and outputs of a file, and its sampling frequency.
-
-    Raises:
-        ValueError: columns that are not there, infinite values, gaps that are not to be split at,
-            time stamps that are no even grid, or no sampling frequency or two of them.
-    """
+    """Read inputs, outputs and sampling frequency of a file; refuse gaps, unless to be split."""
     table = open_table(path)
     u = table.find(wanted.inputs, "inputs")
     y = table.find(wanted.outputs, "outputs")
@@ -270,11 +265,7 @@ def _beside_fs(table: Table, t: Array, column: int) -> tuple[Sampling | None, li
 
 
 def _lost(table: Table, column: int, error: UnevenError) -> str:
-    """A note on a column that runs at the given frequency, but not evenly.
-
-    Raises:
-        ValueError: samples that stand twice beyond doubt.
-    """
+    """Note that a column runs at the given frequency, but not evenly; refuse samples twice."""
     said = f"the column {_uneven(table, column, error)}"
     if isinstance(error, TwiceError):
         raise InputError(f"'{table.path}': {said}; {error.remedy}.{_renamed(table, column)}")
@@ -303,16 +294,10 @@ class Rate(NamedTuple):
 
 
 def find_rate(table: Table, used: Sequence[int]) -> Rate | None:
-    """What a file says of its sampling frequency; nothing if it says none.
+    """Return what a file says of its sampling frequency, None if nothing.
 
-    That is a column which is named as time is and runs evenly, or else a lone number like ``Fs``.
-
-    Args:
-        table: the file.
-        used: columns that are something else.
-
-    Raises:
-        ValueError: two of them that contradict one another.
+    It is a column that is named as time is and runs evenly, or else a lone number like ``Fs``.
+    Columns ``used`` are something else. Two that contradict one another are refused.
     """
     times, _ = _beside(table, used, named=True)
     said = [(_called(table, c), g.fs, g.uncertainty) for c, g in times]
@@ -352,13 +337,7 @@ def _first(table: Table, columns: Sequence[int], samples: int) -> dict[int, Arra
 def _beside(
     table: Table, columns: Sequence[int], *, named: bool
 ) -> tuple[list[tuple[int, Sampling]], list[tuple[int, UnevenError]]]:
-    """Columns that are none of those and an even grid of time, and why others are none.
-
-    Args:
-        table: the file, of which the first block is read.
-        columns: what is measured.
-        named: look only at columns that are named as time is.
-    """
+    """Find even grids of time among the columns that are not measured, and why others are none."""
     known = set(columns)
     left = [
         column

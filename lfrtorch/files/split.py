@@ -6,9 +6,7 @@ from dataclasses import replace
 
 from lfrtorch._support.errors import InputError
 from lfrtorch.records import Record
-
-SHORTEST = 10
-"""Scored samples of a part."""
+from lfrtorch.score_window import SHORTEST
 
 
 class TooShortError(InputError):
@@ -16,19 +14,11 @@ class TooShortError(InputError):
 
 
 def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
-    """The parts by use; one whose fraction is 0 is left out.
+    """Cut a record into parts by use; one whose fraction is 0 is left out.
 
     Every part begins where the record begins and is simulated from there: only its own samples are
     scored, so that the transient of the start reaches neither validation nor test. A record in
     steady state is cut into whole periods, at least one each, which are in steady state themselves.
-
-    Args:
-        record: the whole measurement.
-        validation: fraction of the samples, those after the training part.
-        test: fraction of the samples, those at the end.
-
-    Raises:
-        TooShortError: a part of fewer scored samples than ``SHORTEST``, or of no period.
     """
     names = ["train", *["validation"] * bool(validation), *["test"] * bool(test)]
     steady = record.start == "periodic"

@@ -38,15 +38,10 @@ class FileStream:
         path: the file, of any format that ``open_table`` reads.
         u, y: the model's input and output channels.
         fs: its sampling frequency in Hz.
-        inputs, outputs: their columns, names or numbers from 0. Default: the columns with the names
-            of the channels, and no outputs unless all of them are there.
+        inputs, outputs: their columns. Default: the columns with the names of the channels, and no
+            outputs unless all of them are there.
         time: column of time stamps, which must run evenly at ``fs``.
         find_time: without ``time``, look for what the file says of its sampling.
-
-    Raises:
-        ValueError: a file that cannot be read, or columns that are not there, too many, too few or
-            in another unit.
-        FileNotFoundError: no such file.
     """
 
     def __init__(
@@ -79,11 +74,7 @@ class FileStream:
         """Name and unit of the time stamps; without them, of the sample numbers."""
 
     def blocks(self, samples: int = BLOCK) -> Iterator[Block]:
-        """At most ``samples`` samples at a time; an output that is missing in one is NaN.
-
-        Raises:
-            ValueError: a sample without an input or a time, or times that do not run at ``fs``.
-        """
+        """Yield at most ``samples`` samples at a time; an output that is missing in one is NaN."""
         first, seen, seconds = 0, np.empty(0), 0.0
         columns = [*self.times, *self.u, *self.y]
         ends = [len(self.times), len(self.times) + len(self.u)]

@@ -108,11 +108,9 @@ class Table(ABC):
         """
 
     def without_footer(self, rows: Iterable[_Row], said: Callable[[_Row], str]) -> Iterator[_Row]:
-        """Rows without those of words at the end, as means; a note says that they are left out.
+        """Yield rows without those of words at the end; a note says that they are left out.
 
-        Args:
-            rows: those of the samples, one by one.
-            said: what a row says that is no sample; empty of one that is.
+        ``said`` returns what a row says that is no sample, nothing of one that is.
         """
         held, words, count = [], "", 0
         for row in rows:
@@ -152,16 +150,10 @@ class Table(ABC):
         )
 
     def find(self, wanted: str | int | Sequence[str | int] | None, option: str) -> tuple[int, ...]:
-        """Numbers of the columns that are wanted by name, by header or by number from 0.
+        """Return the numbers of columns given by name, header or number.
 
         The name u of an array of several channels stands for all of them, u[0] for the first.
-
-        Args:
-            wanted: one or several.
-            option: what messages call it, ``inputs`` for example.
-
-        Raises:
-            ValueError: no such column, more than one of the name, or something else than names.
+        Messages call the argument by the name ``option``.
         """
         listed = [wanted] if isinstance(wanted, str | int) else wanted
         if (
@@ -257,7 +249,7 @@ def _parts(header: str) -> tuple[str, str]:
 
 
 def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel, ...]:
-    """Names and units from headers as "force (N)", "force [N]" or "force/N".
+    """Split headers as "force (N)", "force [N]" or "force/N" into names and units.
 
     What is in the brackets stays in the name if names would be equal without, and if it
     follows the name at once and is no unit, as in "y(t)".

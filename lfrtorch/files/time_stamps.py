@@ -69,13 +69,7 @@ class Sampling(NamedTuple):
 
 
 class UnevenError(InputError):
-    """A column that is no even grid of time.
-
-    Args:
-        message: what it does, without the column's name.
-        sample: one at which that shows.
-        remedy: what to do.
-    """
+    """A column that is no even grid of time: what it does, at which sample, and a remedy."""
 
     fs = 0.0
     """The usual sampling frequency in Hz, if there is one."""
@@ -104,18 +98,7 @@ def is_time(channel: Channel) -> bool:
 
 
 def time_unit(t: Array, channel: Channel) -> TimeUnit:
-    """The unit of time stamps, which their header or their size tells; else seconds.
-
-    Raises:
-        UnevenError: a unit that is none of time, or numbers that may be of several.
-
-    Example:
-        >>> from lfrtorch.files.time_stamps import time_unit
-        >>> time_unit(np.arange(3.0), lfrtorch.Channel("time", "minutes")).seconds
-        60.0
-        >>> time_unit(1.7e12 + np.arange(3), lfrtorch.Channel("timestamp"))
-        TimeUnit(seconds=0.001, assumed='milliseconds since 1970')
-    """
+    """Return the unit of time stamps, which header or size tells; refuse what may be several."""
     written = _named(channel)[1]
     if written:
         seconds = _seconds(written)
@@ -177,17 +160,7 @@ def _seconds(unit: str) -> float | None:
 
 
 def sampling(t: Array) -> Sampling:
-    """The even grid that the time stamps are on, up to the rounding of their digits.
-
-    Args:
-        t: time stamps in seconds.
-
-    Shape:
-        t: (T,).
-
-    Raises:
-        UnevenError: stamps that do not rise, or are not evenly spaced between gaps.
-    """
+    """Return the even grid of time stamps (s), up to rounding; refuse uneven ones."""
     if len(t) < 2:
         raise UnevenError("has one sample", 0)
     digit = _last_digit(t)

@@ -16,13 +16,10 @@ Write = Callable[[Mapping[str, NDArray]], None]
 
 
 def table_writer(path: Path) -> AbstractContextManager[Write]:
-    """A function that appends samples to a new file: arrays (n,) by the name of their column.
+    """Open a file for a function that appends arrays (n,) by the names of their columns.
 
     The same columns each time. CSV has every digit and an empty cell for NaN; a block is a row
     group of a Parquet file; arrays of .npz are kept in memory until the end.
-
-    Args:
-        path: the file, its format by its extension, one of ``FORMATS``.
     """
     return FORMATS[path.suffix.lower()](path)
 

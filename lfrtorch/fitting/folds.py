@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
-from lfrtorch.files.split import SHORTEST
 from lfrtorch.records import Record, as_records
+from lfrtorch.score_window import SHORTEST
 
 
 class Fold(NamedTuple):

@@ -16,19 +16,15 @@ import scipy
 from lfrtorch._support.types import Array, Complex
 from lfrtorch.metrics import rms
 
-SEGMENTS = (4, 8)
-"""Numbers of segments of a record, for lags up to T / 8 or T / 16. The one that explains more of
-the output is taken: short segments miss long memories and delays, few segments average little."""
+# Numbers of segments of a record, for lags up to T / 8 or T / 16. The one that explains more of the
+# output is taken: short segments miss long memories and delays, few segments average little.
+_SEGMENTS = (4, 8)
+_SHORTEST, _LONGEST = 32, 16384  # samples of a segment
+_FLOOR = 1e-2  # added to the input's power, relative: without power the response is 0
 
-SHORTEST, LONGEST = 32, 16384
-"""Samples of a segment."""
-
-FLOOR = 1e-2
-"""Added to the input's power, relative to its largest value: without power the response is 0."""
-
-ONSET, CLEAR, UNCLEAR = 0.1, 4.0, 0.5
-"""The response begins when it exceeds ONSET of its peak and CLEAR times its rms at negative lags.
-If that limit is more than UNCLEAR of the peak, the delay is unknown."""
+# The response begins when it exceeds ONSET of its peak and CLEAR times its rms at negative lags.
+# If that limit is more than UNCLEAR of the peak, the delay is unknown.
+_ONSET, _CLEAR, _UNCLEAR = 0.1, 4.0, 0.5
 
 
 class TwoSidedResponse(NamedTuple):
@@ -59,8 +55,8 @@ def two_sided_response(u: Array, y: Array) -> TwoSidedResponse | None:
     """The causality test of an input (T,) and an output (T,); ``None`` if short or constant."""
     if np.ptp(u) == 0 or np.ptp(y) == 0:
         return None
-    lengths = {min(len(u) // n // 2 * 2, LONGEST) for n in SEGMENTS}
-    found = [_by_segments(u, y, length) for length in sorted(lengths) if length >= SHORTEST]
+    lengths = {min(len(u) // n // 2 * 2, _LONGEST) for n in _SEGMENTS}
+    found = [_by_segments(u, y, length) for length in sorted(lengths) if length >= _SHORTEST]
     return max(found, key=lambda one: one.coherence - one.chance, default=None)
 
 
@@ -70,8 +66,8 @@ def _by_segments(u: Array, y: Array, length: int) -> TwoSidedResponse:
     _, Syu = scipy.signal.csd(u, y, nperseg=length)
     g = _response(Suu, Syu)
     size, half = np.abs(g), length // 2
-    begun = max(ONSET, CLEAR * float(rms(g[half:]) / size.max()))
-    excited = np.flatnonzero(Syy > FLOOR * Syy.max())
+    begun = max(_ONSET, _CLEAR * float(rms(g[half:]) / size.max()))
+    excited = np.flatnonzero(Syy > _FLOOR * Syy.max())
     gain = np.abs(Syu[excited]) / Syy[excited]
     third = max(len(gain) // 3, 1)
     tiny = np.finfo(float).tiny
@@ -81,14 +77,14 @@ def _by_segments(u: Array, y: Array, length: int) -> TwoSidedResponse:
         causality=_causality(g),
         reverse=_causality(_response(Syy, Syu.conj())),
         rise=float(np.median(gain[-third:]) / max(np.median(gain[:third]), tiny)),
-        delay=int(np.argmax(size[:half] >= begun * size.max())) if begun < UNCLEAR else 0,
+        delay=int(np.argmax(size[:half] >= begun * size.max())) if begun < _UNCLEAR else 0,
         peak=int(np.argmax(size[:half])),
     )
 
 
 def _response(power: Array, cross: Complex) -> Array:
     """The two-sided impulse response (length,), negative lags in its second half."""
-    return np.fft.irfft(cross / (power + FLOOR * power.max()))
+    return np.fft.irfft(cross / (power + _FLOOR * power.max()))
 
 
 def _causality(g: Array) -> float:

@@ -15,49 +15,40 @@ import numpy as np
 
 from lfrtorch._support.types import Array, Complex
 
-SHORTEST = 100
-"""Least samples of a record that can tell."""
+_SHORTEST = 100  # samples of a record that can tell
 
-LOWEST = {1: 12, 2: 4}
-"""The first excited line is at most this one. Two integrators need a lower one: above its resonance
-a mass on a spring looks like a free one."""
+# The first excited line is at most this one. Two integrators need a lower one: above its resonance
+# a mass on a spring looks like a free one.
+_LOWEST = {1: 12, 2: 4}
+_EXCITED, _STRONG = 1e-3, 1e-2  # power of the first excited line, and of those in the fit, relative
 
-EXCITED, STRONG = 1e-3, 1e-2
-"""Power of the first excited line, and of those in the fit, relative to the largest."""
+# In the lower band V has the coherence COHERENT with the inputs and phases of at most REAL degrees;
+# in the upper band, where friction distorts, the coherence UPPER. Its size relative to the inputs'
+# differs between the bands by at most the factor EVEN.
+_COHERENT, _REAL, _UPPER, _EVEN = 0.95, 25.0, 0.4, 0.6
 
-COHERENT, REAL, UPPER, EVEN = 0.95, 25.0, 0.4, 0.6
-"""In the lower band V has this coherence with the inputs, and phases of at most REAL degrees; in
-the upper band, where friction distorts, the coherence UPPER. Its size relative to the inputs'
-differs between the bands by at most the factor EVEN."""
-
-LINES, FITTED, FORGETS, GAIN, LAG = 12, 0.75, 3.0, 0.5, 0.3
-"""The fit has LINES lines for each input and more, and tells if it explains FITTED of them. Then it
-is an integrator if the record is shorter than FORGETS time constants, b alone explains 1 ± GAIN of
-the lowest lines, and c is at most LAG of it there."""
+# The fit has LINES lines for each input and more, and tells if it explains FITTED of them. Then it
+# is an integrator if the record is shorter than FORGETS time constants, b alone explains 1 ± GAIN
+# of the lowest lines, and c is at most LAG of it there.
+_LINES, _FITTED, _FORGETS, _GAIN, _LAG = 12, 0.75, 3.0, 0.5, 0.3
 
 
 def integrators(u: Array, y: Array) -> int:
-    """How many integrators, 0, 1 or 2, lie between the inputs and an output of a record.
+    """Return how many integrators, 0, 1 or 2, lie between the inputs and an output.
 
     A system that forgets more slowly than in a third of the record counts as one that integrates.
 
     Shape:
         u: (T, nu), y: (T,).
-
-    Example:
-        >>> from lfrtorch.survey.integration import integrators
-        >>> u = np.random.default_rng(0).standard_normal((1000, 1))
-        >>> integrators(u, np.cumsum(u)), integrators(u, u[:, 0])
-        (1, 0)
     """
     T, u = len(y), u[:, np.ptp(u, axis=0) > 0]
-    if T < SHORTEST or np.ptp(y) == 0 or not u.size:
+    if T < _SHORTEST or np.ptp(y) == 0 or not u.size:
         return 0
     U = _spectrum(u / u.std(axis=0), T)
     power = (np.abs(U) ** 2).sum(axis=1)
     power[0] = 0.0
-    first = int(np.argmax(power > EXCITED * power.max()))
-    for n, lowest in LOWEST.items():
+    first = int(np.argmax(power > _EXCITED * power.max()))
+    for n, lowest in _LOWEST.items():
         if first > lowest:
             break
         V, before = (_differenced(y, times) for times in (n, n - 1))
@@ -85,8 +76,8 @@ def _first_order(
 ) -> tuple[bool, bool]:
     """Whether the fit of first order tells, and whether it says integrator."""
     nu = U.shape[1]
-    k = np.arange(first, min(3 * first + LINES * nu, len(V)))
-    k = k[power[k] > STRONG * power[k].max()]
+    k = np.arange(first, min(3 * first + _LINES * nu, len(V)))
+    k = k[power[k] > _STRONG * power[k].max()]
     jw = 2j * np.pi * k[:, None] / (2 * (len(V) - 1))
     around = np.abs(k[:, None] - k) <= 2
     weight = 1.0 / np.sqrt(np.maximum(around @ np.abs(V[k]) ** 2, 1e-300))
@@ -96,15 +87,15 @@ def _first_order(
     size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
     theta = np.linalg.lstsq(rows / size, target, rcond=None)[0] / size
     left = np.sum((target - rows @ theta) ** 2)
-    if len(k) < 2 * (1 + 2 * nu) or left > (1 - FITTED) * np.sum(target**2):
+    if len(k) < 2 * (1 + 2 * nu) or left > (1 - _FITTED) * np.sum(target**2):
         return False, False
     low = k <= k[0] + 3
     gain, lag = U[k[low]] @ theta[1 : 1 + nu], (jw * U[k])[low] @ theta[1 + nu :]
     share = np.sum(np.abs(gain) ** 2) / np.sum(np.abs(V[k[low]]) ** 2)
     return True, bool(
-        abs(theta[0]) * 2 * (len(V) - 1) < FORGETS
-        and abs(share - 1) < GAIN
-        and np.sum(np.abs(lag) ** 2) < LAG**2 * np.sum(np.abs(gain) ** 2)
+        abs(theta[0]) * 2 * (len(V) - 1) < _FORGETS
+        and abs(share - 1) < _GAIN
+        and np.sum(np.abs(lag) ** 2) < _LAG**2 * np.sum(np.abs(gain) ** 2)
     )
 
 
@@ -115,15 +106,15 @@ def _even(U: Complex, V: Complex, first: int) -> bool:
         return False
     sizes = []
     for band, coherent in (
-        (slice(first, middle), COHERENT),
-        (slice(middle, 3 * middle), UPPER),
+        (slice(first, middle), _COHERENT),
+        (slice(middle, 3 * middle), _UPPER),
     ):
         H = np.linalg.lstsq(U[band], V[band], rcond=None)[0]
         total = np.sum(np.abs(V[band]) ** 2)
         if np.sum(np.abs(V[band] - U[band] @ H) ** 2) > (1 - coherent) * total:
             return False
-        turned = np.abs(H.imag) > np.tan(np.deg2rad(REAL)) * np.abs(H.real)
+        turned = np.abs(H.imag) > np.tan(np.deg2rad(_REAL)) * np.abs(H.real)
         if total == 0 or (not sizes and turned.any()):
             return False
         sizes.append(total / np.sum(np.abs(U[band]) ** 2))
-    return bool(EVEN < np.sqrt(sizes[1] / sizes[0]) < 1 / EVEN)
+    return bool(_EVEN < np.sqrt(sizes[1] / sizes[0]) < 1 / _EVEN)

@@ -90,27 +90,10 @@ def survey_measurement(
     outputs: Sequence[Channel] = (),
     period: int | None = None,
 ) -> Survey:
-    """Numbers of each signal.
+    """Return the numbers of each signal (T,) or (T, channels), NaN for missing samples.
 
-    Args:
-        u: inputs as measured, NaN for a missing sample; no channel if it is not known which signals
-            are inputs.
-        y: outputs, likewise.
-        fs: sampling frequency in Hz.
-        inputs, outputs: names and units. Default: u1, u2 ... and y1, y2 ...
-        period: samples of a period of the inputs. Default: it is searched for.
-
-    Shape:
-        u: (T, nu), y: (T, ny); (T,) is one channel.
-
-    Raises:
-        ValueError: different lengths, or other numbers of names than of channels.
-
-    Example:
-        >>> from lfrtorch.survey.measurement import survey_measurement
-        >>> found = survey_measurement(u, y, fs=100.0)
-        >>> found.outputs[0].samples, found.outputs[0].missing, found.whole
-        (400, 0, slice(0, 400, None))
+    ``u`` has no channel if it is not known which signals are inputs. Without ``fs`` frequencies are
+    in cycles per sample; without ``period`` that of the inputs is searched for.
     """
     u, y = _columns("u", u), _columns("y", y)
     if len(u) != len(y):

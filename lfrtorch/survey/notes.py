@@ -17,61 +17,40 @@ from lfrtorch.survey.mechanics import reacting, rubs
 from lfrtorch.survey.outliers import input_outliers, output_outliers
 from lfrtorch.survey.signal import SignalSurvey, longest_run
 
-SHORT = 300
-"""A record of fewer samples is short: a small NL-LFR model has 50 to 100 parameters."""
+_SHORT = 300  # samples: a small NL-LFR model has 50 to 100 parameters
+_ENOUGH = 100  # samples of a record for notes on what it excites
+_MOST = 2**21  # samples of a record that are looked at, the first ones after ``skip``
 
-ENOUGH = 100
-"""Least samples of a record for notes on what it excites."""
+# Inputs stand still if all of them stay within REST of their rms for the share STILL of the record,
+# which is looked at in STRETCHES parts.
+_STILL, _STRETCHES, _REST = 0.2, 200, 0.05
+_STUCK = 0.1  # share of the record in which an output does not change at all, while an input does
 
-MOST = 2**21
-"""``notes_on`` looks at this many samples of a record at most, the first ones after ``skip``."""
+# A record is oversampled if all power lies below fs / OVERSAMPLED; decimation leaves it below
+# fs / WANTED.
+_OVERSAMPLED, _WANTED = 30, 10
+_COARSE, _FEW = 0.05, 200  # step of a coarse output over its rms; least samples of its record
 
-STILL, STRETCHES, REST = 0.2, 200, 0.05
-"""Inputs stand still if all of them stay within REST of their rms for the share STILL of the
-record, which is looked at in STRETCHES parts."""
+# An input of fewer frequencies is narrow; a frequency counts if it has the share LINE of the power
+# of the strongest. LOBE lines of a windowed spectrum are of one sine.
+_FEW_FREQUENCIES, _LINE, _LOBE = 5, 1e-4, 6
+_NARROW = 0.1  # an input is narrow, too, if its band is narrower than this times its centre
+_SAME = 0.999  # correlation of two inputs that carry the same signal
 
-STUCK = 0.1
-"""Share of the record in which an output does not change at all, while an input does."""
+# An output drifts if a straight line explains DRIFT of its variance, with slopes in all thirds of
+# the record within the factor ALIKE, and at most OTHERS of that of any input or its magnitude.
+_DRIFT, _ALIKE, _OTHERS = 0.2, 3.0, 0.05
 
-OVERSAMPLED, WANTED = 30, 10
-"""A record is oversampled if all power lies below fs / OVERSAMPLED; decimation leaves it below
-fs / WANTED."""
+# The output comes first if the causality is below BEFORE and the reverse one above AFTER. A reverse
+# gain that rises with frequency speaks against it, as an integrator with feedthrough has it; then
+# the causality must be below CERTAIN.
+_BEFORE, _AFTER, _CERTAIN = -0.15, 0.5, -0.4
+_SHOWN = 6  # outliers that a note names; it counts the others
 
-COARSE, FEW = 0.05, 200
-"""An output is coarse if its steps exceed COARSE of its rms, in a record of more than FEW
-samples."""
-
-FEW_FREQUENCIES, LINE = 5, 1e-4
-"""An input of fewer frequencies is narrow; a frequency counts if it has the share LINE of the power
-of the strongest."""
-
-LOBE = 6
-"""Neighbouring lines that one sine has in the windowed spectrum of a record."""
-
-NARROW = 0.1
-"""An input is narrow, too, if its band is narrower than this times its centre."""
-
-SAME = 0.999
-"""Correlation of two inputs that carry the same signal."""
-
-DRIFT, ALIKE, OTHERS = 0.2, 3.0, 0.05
-"""An output drifts if a straight line explains DRIFT of its variance, with slopes in all thirds of
-the record within the factor ALIKE, and at most OTHERS of that of any input or its magnitude."""
-
-BEFORE, AFTER, CERTAIN = -0.15, 0.5, -0.4
-"""The output comes first if the causality is below BEFORE and the reverse one above AFTER. A
-reverse gain that rises with frequency speaks against it, as an integrator with feedthrough has it;
-then the causality must be below CERTAIN."""
-
-SHOWN = 6
-"""Outliers that a note names; it counts the others."""
-
-COHERENT, UNRELATED = 0.1, 0.05
-"""Coherence beyond chance above which the causality test means something, and below which the
-output does not follow the inputs."""
-
-DELAY, SHARP = 8, 0.5
-"""Least samples of a delay that is worth a shift, and its least share of the lag of the peak."""
+# Coherence beyond chance above which the causality test means something, and below which the output
+# does not follow the inputs.
+_COHERENT, _UNRELATED = 0.1, 0.05
+_DELAY, _SHARP = 8, 0.5  # samples of a delay that is worth a shift; its share of the peak's lag
 
 
 class Note(NamedTuple):
@@ -84,26 +63,17 @@ class Note(NamedTuple):
 def examine(
     found: Survey, u: Array, y: Array, *, skipped: int = 0, given: Mapping[str, Any] | None = None
 ) -> list[Note]:
-    """Notes on a measurement; none on one that was made well.
+    """Return notes on a measurement u (T, nu), y (T, ny); none on one that was made well.
 
     Args:
-        found: its survey.
-        u, y: its signals (T, nu) and (T, ny), NaN for a missing sample. Without inputs all signals
-            count as outputs, and there are no notes on how these follow from inputs.
+        found: its survey. Without inputs all signals count as outputs.
         skipped: samples of the record before these, which count in the numbers of samples.
         given: arguments of :func:`lfrtorch.estimate_bla` that are set: what they do already is not
             advised.
-
-    Example:
-        >>> from lfrtorch.survey.measurement import survey_measurement
-        >>> from lfrtorch.survey.notes import examine
-        >>> u, y = np.zeros((400, 1)), np.random.default_rng(0).standard_normal((400, 1))
-        >>> examine(survey_measurement(u, y), u, y)[0].kind
-        'constant u1'
     """
     notes = [*_levels(found, u, y, skipped), *_outliers(found, u, y, skipped)]
     u, y = u[found.whole], y[found.whole]
-    if len(y) >= ENOUGH:
+    if len(y) >= _ENOUGH:
         notes += _excitation(found, u, skipped)
         notes += _relations(found, u, y, given or {})
     return notes
@@ -112,28 +82,15 @@ def examine(
 def notes_on(
     records: Record | Sequence[Record], *, given: Mapping[str, Any] | None = None
 ) -> list[str]:
-    """What will hurt a model of the records, and what to do about it, a sentence each.
+    """Say what will hurt a model of the records, and what to do about it, a sentence each.
 
-    If there are several records, a sentence names the one it is about.
-
-    Args:
-        records: those that are fitted; what they skip is not looked at.
-        given: see :func:`examine`.
-
-    Raises:
-        ValueError: no records, or records of different channels.
-
-    Example:
-        >>> from lfrtorch.survey.notes import notes_on
-        >>> short = lfrtorch.Record(np.random.default_rng(0).standard_normal(50), np.arange(50.0))
-        >>> for note in notes_on(short):
-        ...     print(note)
-        50 samples are few to fit: ...
+    If there are several records, a sentence names the one it is about. What they skip is not looked
+    at; ``given`` is that of :func:`examine`.
     """
     data = as_records(records)
     by_kind: dict[str, list[tuple[str, str]]] = {}
     for r in data:
-        scored = slice(r.skip, r.skip + MOST)
+        scored = slice(r.skip, r.skip + _MOST)
         known = {**(given or {})}
         if r.reference is not None:  # no advice on feedback
             known |= {"feedthrough": False, "refine": "prediction"}
@@ -177,7 +134,7 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
                 text = f"output {told}: it does not respond; check the sensor and the column."
             yield Note(f"constant {name}", text)
     still = _still(found.inputs, u)
-    if still[1] >= STILL * max(T, ENOUGH):
+    if still[1] >= _STILL * max(T, _ENOUGH):
         yield Note(
             "still",
             f"{_listed(found.inputs)} {'is' if len(found.inputs) == 1 else 'are'} constant in "
@@ -197,7 +154,7 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
             )
         first, length = longest_run(np.diff(signal) == 0)
         length += 1
-        stuck = length >= STUCK * T and one.values > 2 and not one.clipped
+        stuck = length >= _STUCK * T and one.values > 2 and not one.clipped
         if stuck and not (roles and _rests(found.inputs, u[first : first + length])):
             yield Note(
                 f"stuck {name}",
@@ -205,14 +162,14 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
                 f"({100 * length / T:.0f} % of the record)"
                 f"{' while the input moves' if roles else ''}: check the sensor.",
             )
-        if T > FEW and one.values > 2 and one.step > COARSE * one.rms:
+        if T > _FEW and one.values > 2 and one.step > _COARSE * one.rms:
             yield Note(
                 f"coarse {name}",
                 f"{kind}'{name}' has {one.values} values, in steps of {one.step:.3g} "
                 f"({100 * one.step / one.rms:.0f} % of its rms): an rms error of about "
                 f"{one.step / np.sqrt(12):.2g} is the least; use more of the converter's range.",
             )
-    if T < SHORT:
+    if T < _SHORT:
         yield Note(
             "short",
             f"{T} samples{_after(skipped)} are few to fit: a small nonlinear model has 50 to 100 "
@@ -228,8 +185,8 @@ def _outliers(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]
         if not len(k):
             continue
         kind = ("input " if i < u.shape[1] else "output ") if found.inputs else ""
-        shown = ", ".join(str(skipped + sample) for sample in k[:SHOWN])
-        more = f" and {len(k) - SHOWN} more" if len(k) > SHOWN else ""
+        shown = ", ".join(str(skipped + sample) for sample in k[:_SHOWN])
+        more = f" and {len(k) - _SHOWN} more" if len(k) > _SHOWN else ""
         remedy = "interpolate, or leave the outputs that follow out"
         yield Note(
             f"outliers {one.channel.name}",
@@ -253,23 +210,23 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
                 "between them; use a signal of many levels, as a multisine.",
             )
         count = _frequencies(signal)
-        if count < FEW_FREQUENCIES:
+        if count < _FEW_FREQUENCIES:
             yield Note(
                 f"narrow {name}",
                 f"input '{name}' excites {count} frequenc{'y' if count == 1 else 'ies'} or so, "
                 f"{low:.4g} to {high:.4g} {unit}: enough for order {count}; "
                 "excite the band where the model is used.",
             )
-        elif high - low < NARROW * (high + low) / 2:
+        elif high - low < _NARROW * (high + low) / 2:
             yield Note(
                 f"narrow {name}",
                 f"input '{name}' excites {low:.4g} to {high:.4g} {unit} only: elsewhere a model is "
                 "a guess; excite the band where it is used.",
             )
     bands = [one.band for one in found.signals]
-    if bands and all(b is not None and b[1] < fs / OVERSAMPLED for b in bands):
+    if bands and all(b is not None and b[1] < fs / _OVERSAMPLED for b in bands):
         highest = max(b[1] for b in bands if b is not None)
-        factor = int(fs / (WANTED * highest)) if highest > 0 else 1
+        factor = int(fs / (_WANTED * highest)) if highest > 0 else 1
         yield Note(
             "oversampled",
             f"all power lies below {highest:.3g} {unit}, fs / {fs / highest:.0f}: the record is "
@@ -288,7 +245,7 @@ def _excitation(found: Survey, u: Array, skipped: int) -> Iterator[Note]:
             if bands[i] is None or bands[j] is None:
                 continue
             correlation = float(np.corrcoef(u[:, i], u[:, j])[0, 1])
-            if abs(correlation) > SAME:
+            if abs(correlation) > _SAME:
                 names = found.inputs[j].channel.name, found.inputs[i].channel.name
                 yield Note(
                     f"same {names}",
@@ -348,7 +305,7 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
         if (
             not integrates
             and pairs
-            and sum(p.coherence - p.chance for p in pairs.values()) < UNRELATED
+            and sum(p.coherence - p.chance for p in pairs.values()) < _UNRELATED
         ):
             yield Note(
                 f"unrelated {name}",
@@ -357,9 +314,9 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
             )
         for j, pair in pairs.items():
             if (
-                pair.coherence - pair.chance > COHERENT
-                and pair.causality > AFTER
-                and pair.delay >= max(DELAY, SHARP * pair.peak)
+                pair.coherence - pair.chance > _COHERENT
+                and pair.causality > _AFTER
+                and pair.delay >= max(_DELAY, _SHARP * pair.peak)
             ):
                 lasting = "" if found.fs is None else f" ({pair.delay / found.fs:.3g} s)"
                 yield Note(
@@ -375,21 +332,21 @@ def _relations(found: Survey, u: Array, y: Array, given: Mapping[str, Any]) -> I
 def _first(pair: TwoSidedResponse) -> bool:
     """Whether the output comes before the input."""
     return (
-        pair.coherence - pair.chance > COHERENT
-        and pair.causality < BEFORE
-        and pair.reverse > AFTER
-        and (pair.rise < 1 or pair.causality < CERTAIN)
+        pair.coherence - pair.chance > _COHERENT
+        and pair.causality < _BEFORE
+        and pair.reverse > _AFTER
+        and (pair.rise < 1 or pair.causality < _CERTAIN)
     )
 
 
 def _drift(output: SignalSurvey, y: Array, u: Array) -> Iterator[Note]:
     """Whether an output (T,) drifts, and the inputs (T, nu) and their magnitudes do not."""
     share, slope = _trend(y)
-    thirds = [_trend(part)[1] for part in np.array_split(y, 3)] if len(y) >= SHORT else [0.0]
-    steady = all(slope * third > 0 and 1 / ALIKE < third / slope < ALIKE for third in thirds)
+    thirds = [_trend(part)[1] for part in np.array_split(y, 3)] if len(y) >= _SHORT else [0.0]
+    steady = all(slope * third > 0 and 1 / _ALIKE < third / slope < _ALIKE for third in thirds)
     centred = u - u.mean(axis=0)
     others = [_trend(v)[0] for v in (*centred.T, *np.abs(centred).T)]
-    if share > DRIFT and steady and max(others, default=1.0) < OTHERS:
+    if share > _DRIFT and steady and max(others, default=1.0) < _OTHERS:
         yield Note(
             f"drift {output.channel.name}",
             f"output '{output.channel.name}' drifts by {slope * len(y):.3g} in the record, "
@@ -410,8 +367,8 @@ def _still(inputs: Sequence[SignalSurvey], u: Array) -> tuple[int, int]:
     """First sample and length of the longest part of inputs (T, nu) in which none moves."""
     if not any(one.rms > 0 for one in inputs):
         return 0, 0
-    rest = REST * np.array([one.rms for one in inputs])
-    edges = np.linspace(0, len(u), min(STRETCHES, len(u)) + 1).astype(int)
+    rest = _REST * np.array([one.rms for one in inputs])
+    edges = np.linspace(0, len(u), min(_STRETCHES, len(u)) + 1).astype(int)
     low, high = (extreme.reduceat(u, edges[:-1]) for extreme in (np.fmin, np.fmax))
     longest, last = (0, 0), 0
     for first in range(len(low)):
@@ -427,15 +384,15 @@ def _still(inputs: Sequence[SignalSurvey], u: Array) -> tuple[int, int]:
 def _rests(inputs: Sequence[SignalSurvey], part: Array) -> bool:
     """Whether no input moves in a part (T, nu) of the record."""
     spread = np.fmax.reduce(part) - np.fmin.reduce(part)
-    return not np.any(spread > REST * np.array([one.rms for one in inputs]))
+    return not np.any(spread > _REST * np.array([one.rms for one in inputs]))
 
 
 def _frequencies(signal: Array) -> int:
     """How many frequencies a signal (T,) excites, about."""
     _, power = scipy.signal.periodogram(signal, window="hann")
-    excited = power > LINE * power.max()
+    excited = power > _LINE * power.max()
     groups = np.sum(np.diff(excited.astype(np.int8), prepend=0) == 1)
-    return int(max(groups, np.ceil(np.sum(excited) / LOBE)))
+    return int(max(groups, np.ceil(np.sum(excited) / _LOBE)))
 
 
 def _after(skipped: int) -> str:

@@ -23,57 +23,40 @@ from scipy.ndimage import maximum_filter1d
 
 from lfrtorch._support.types import Array, Integers
 
-SHORTEST, LEVELS = 100, 16
-"""Least samples of a record that can tell; a signal of at most that many values has levels."""
+_SHORTEST, _LEVELS = 100, 16  # samples of a record that can tell; values of a signal of levels
+_MOST, _FEW = 0.02, 3  # share, or number in a short record, of outliers: more are by design
 
-MOST, FEW = 0.02, 3
-"""Outliers are at most this share of the samples, or FEW of a short record: more are by design."""
+# Quantiles of the heights that fix the tail, the lighter one of those from BODY to TAIL, and how
+# likely the largest height of a record exceeds what it promises.
+_TAIL, _BODY, _CHANCE = 0.97, (0.5, 0.8), 0.01
+_GAP = 3.0  # heights that are this many times the next lower one are no part of the tail
 
-TAIL, BODY, CHANCE = 0.97, (0.5, 0.8), 0.01
-"""Quantiles of the heights that fix the tail, the lighter one of those from BODY to TAIL, and how
-likely the largest height of a record exceeds what it promises."""
+# Outliers are farther from all other samples than BEYOND of these samples' range, or higher than
+# ABOVE times their largest jump, and than STEPS steps of the converter.
+_BEYOND, _ABOVE, _STEPS = 0.2, 1.5, 5.0
 
-GAP = 3.0
-"""Heights that are this many times the next lower one are no part of the tail."""
+# An input is active if it jumped in the last BEFORE samples by ACTIVE times what is usual. What
+# sticks out of an output then is its response, unless the inputs are active for more than RARELY of
+# the record and ALIKE of what would by chance sticks out while they are not.
+_BEFORE, _ACTIVE, _RARELY, _ALIKE = 20, 2.0, 0.1, 0.5
 
-BEYOND, ABOVE, STEPS = 0.2, 1.5, 5.0
-"""Outliers are farther from all other samples than BEYOND of these samples' range, or higher than
-ABOVE times their largest jump, and than STEPS steps of the converter."""
-
-BEFORE, ACTIVE, RARELY, ALIKE = 20, 2.0, 0.1, 0.5
-"""An input is active if it jumped in the last BEFORE samples by ACTIVE times what is usual. What
-sticks out of an output then is its response, unless the inputs are active for more than RARELY of
-the record and ALIKE of what would by chance sticks out while they are not."""
-
-DESIGN, RESPONDS = 0.5, 10.0
-"""Lone samples with more than DESIGN of the power are an experiment with impulses, if the power of
-each output is RESPONDS times as large in the next BEFORE samples."""
+# Lone samples with more than DESIGN of the power are an experiment with impulses, if the power of
+# each output is RESPONDS times as large in the next BEFORE samples.
+_DESIGN, _RESPONDS = 0.5, 10.0
 
 
 def input_outliers(u: Array, y: Array | None = None) -> Integers:
-    """Samples of an input (T,), or of any signal, that stick out of it.
-
-    Args:
-        u: the signal, NaN for a missing sample.
-        y: outputs (T, ny), which respond to impulses.
-
-    Example:
-        >>> from lfrtorch.survey.outliers import input_outliers
-        >>> u = np.random.default_rng(0).standard_normal(1000)
-        >>> u[[300, 700]] = 9.0, -8.0
-        >>> input_outliers(u).tolist()
-        [300, 700]
-    """
+    """Return samples that stick out of any signal (T,); outputs (T, ny) respond to impulses."""
     u = _filled(u)
     k = _sticking_out(u)
     power = (u - np.median(u)) ** 2
-    if not k.size or power[k].sum() <= DESIGN * power.sum():
+    if not k.size or power[k].sum() <= _DESIGN * power.sum():
         return k
     after = np.zeros(len(u), bool)
-    after[np.minimum(k[:, None] + np.arange(BEFORE), len(u) - 1)] = True
+    after[np.minimum(k[:, None] + np.arange(_BEFORE), len(u) - 1)] = True
     for output in () if y is None else y.T:
         power = (_filled(output) - np.nanmedian(output)) ** 2
-        if power[after].mean() <= RESPONDS * power[~after].mean():
+        if power[after].mean() <= _RESPONDS * power[~after].mean():
             return k
     return k[:0]
 
@@ -84,25 +67,25 @@ def output_outliers(y: Array, u: Array) -> Integers:
     active = np.zeros(len(y), bool)
     for channel in u.T if k.size else ():
         jump = np.abs(np.diff(_filled(channel), append=channel[-1:]))  # to the next sample, too
-        largest = maximum_filter1d(np.nan_to_num(jump), BEFORE + 2, origin=BEFORE // 2)
-        active |= largest > ACTIVE * np.median(largest)
+        largest = maximum_filter1d(np.nan_to_num(jump), _BEFORE + 2, origin=_BEFORE // 2)
+        active |= largest > _ACTIVE * np.median(largest)
     rest, share = k[~active[k]], float(active.mean())
-    return k if share > RARELY and len(rest) >= ALIKE * (1 - share) * len(k) else rest
+    return k if share > _RARELY and len(rest) >= _ALIKE * (1 - share) * len(k) else rest
 
 
 def _sticking_out(x: Array) -> Integers:
     T = len(x)
-    values = np.unique(x) if T >= SHORTEST else x[:0]
-    if len(values) <= LEVELS:
+    values = np.unique(x) if T >= _SHORTEST else x[:0]
+    if len(values) <= _LEVELS:
         return np.zeros(0, np.int64)
     height = _heights(x)
-    found = height > max(_limit(height), STEPS * float(np.diff(values).min()))
-    if not 0 < np.count_nonzero(found) <= max(FEW, MOST * T):
+    found = height > max(_limit(height), _STEPS * float(np.diff(values).min()))
+    if not 0 < np.count_nonzero(found) <= max(_FEW, _MOST * T):
         return np.zeros(0, np.int64)
     low, high = float(x[~found].min()), float(x[~found].max())
     jumps = np.abs(np.diff(x))[~found[1:] & ~found[:-1]]
     outside = np.maximum(x - high, low - x)
-    found &= (outside > BEYOND * (high - low)) | (height > ABOVE * jumps.max(initial=0.0))
+    found &= (outside > _BEYOND * (high - low)) | (height > _ABOVE * jumps.max(initial=0.0))
     between = np.zeros(T, bool)  # a good sample between two bad ones sticks out on their other side
     between[1:-1] = found[:-2] & found[2:] & (outside[1:-1] <= 0)
     return np.flatnonzero(found & ~between)
@@ -124,17 +107,17 @@ def _heights(x: Array) -> Array:
 def _limit(height: Array) -> float:
     """The height that only outliers exceed."""
     some = np.sort(height[height > 0])[::-1]
-    if len(some) < SHORTEST // 3:
+    if len(some) < _SHORTEST // 3:
         return 0.0
-    tail = float(np.quantile(some, TAIL))
-    depth = np.log(1 / (1 - TAIL))
+    tail = float(np.quantile(some, _TAIL))
+    depth = np.log(1 / (1 - _TAIL))
     c = max(
         np.log(depth / np.log(1 / (1 - q))) / np.log(max(tail / np.quantile(some, q), 1.05))
-        for q in BODY
+        for q in _BODY
     )
-    promised = tail * float(np.log(len(some) / CHANCE) / depth) ** (1 / c)
-    top = some[: max(FEW, int(MOST * len(height))) + 1]
-    gaps = np.flatnonzero(top[:-1] > GAP * top[1:])
+    promised = tail * float(np.log(len(some) / _CHANCE) / depth) ** (1 / c)
+    top = some[: max(_FEW, int(_MOST * len(height))) + 1]
+    gaps = np.flatnonzero(top[:-1] > _GAP * top[1:])
     return min(promised, float(top[gaps[-1] + 1])) if gaps.size else promised
 
 

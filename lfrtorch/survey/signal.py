@@ -11,33 +11,19 @@ from lfrtorch._support.types import Array, Booleans, Integers
 from lfrtorch.periods import find_transient
 from lfrtorch.records import Channel
 
-IN_BAND = 0.99
-"""Share of the power about the mean that lies in the band; the rest is half below, half above."""
-
 LEAST = 16
 """Least samples of a spectrum."""
 
-QUIET = 0.2
-"""The level of white noise is this quantile of the spectrum."""
+_IN_BAND = 0.99  # share of the power about the mean in the band; half of the rest is below it
+_QUIET = 0.2  # quantile of the spectrum that is the level of white noise
+_LOUD = 0.5  # largest rms of noise over the signal's that a spectrum can tell from the signal
+_SEGMENTS, _LONGEST = 8, 4096  # least segments of an averaged spectrum, and most samples of one
 
-LOUD = 0.5
-"""Largest rms of the noise, relative to the signal's, that a spectrum can tell from the signal."""
-
-SEGMENTS, LONGEST = 8, 4096
-"""The averaged spectrum has at least SEGMENTS segments of at most LONGEST samples."""
-
-CLIPPED_SAMPLES, CLIPPED_RUN, CLIPPED_RATIO, NEIGHBOURS = 5, 3, 5, 5
-"""A signal is clipped if it is at an extreme for CLIPPED_SAMPLES, CLIPPED_RUN of them in a row, and
-CLIPPED_RATIO times as often as at any of the next NEIGHBOURS values. (A sine in coarse steps has a
-ratio of 2.4.)"""
-
-LEVELS = 16
-"""A signal with at most this many values consists of levels, like a binary one; it is not
-clipped."""
-
-
-SILENT = 1e-10
-"""Power of a combination of inputs, relative to the largest, that counts as none."""
+# A signal is clipped if it is at an extreme for SAMPLES, RUN of them in a row, and RATIO times as
+# often as at any of the next NEIGHBOURS values. (A sine in coarse steps has a ratio of 2.4.)
+_CLIPPED_SAMPLES, _CLIPPED_RUN, _CLIPPED_RATIO, _NEIGHBOURS = 5, 3, 5, 5
+_LEVELS = 16  # a signal of so few values consists of levels, like a binary one; it is not clipped
+_SILENT = 1e-10  # power of a combination of inputs, relative to the largest, that counts as none
 
 
 class Extreme(NamedTuple):
@@ -61,7 +47,7 @@ class SignalSurvey(NamedTuple):
         minimum, maximum: its extremes.
         values: how many different ones there are.
         step: smallest difference of two of them.
-        band: frequencies in Hz between which ``IN_BAND`` of the power about the mean lies.
+        band: frequencies in Hz between which 99 % of the power about the mean lies.
         period: samples of a period, ``None`` if it does not repeat.
         noise: its estimated rms, ``None`` if it cannot be told from the signal.
         method: of the noise. ``"periods"``: the scatter of whole periods in steady state;
@@ -100,18 +86,10 @@ def survey_signal(
     period: int | None = None,
     inputs: Array | None = None,
 ) -> SignalSurvey:
-    """The numbers of a signal.
+    """Return the numbers of a signal (T,), NaN where a sample is missing.
 
-    Args:
-        signal: as measured, NaN where a sample is missing.
-        whole: a part of it without gaps, for the spectrum.
-        channel: its name and unit.
-        fs: sampling frequency in Hz.
-        period: samples of a period, if it repeats.
-        inputs: what it follows in that part, if it is an output.
-
-    Shape:
-        signal: (T,), whole: (N,), inputs: (N, nu); N is at most T.
+    ``whole`` is its longest part without gaps, for the spectrum, and ``inputs`` (N, nu) what that
+    part (N,) follows, if it is an output.
     """
     missing = ~np.isfinite(signal)
     known = signal[~missing] if missing.any() else signal
@@ -148,12 +126,12 @@ def longest_run(holds: Booleans) -> tuple[int, int]:
 
 
 def band(signal: Array, fs: float = 1.0) -> tuple[float, float] | None:
-    """Frequencies in Hz between which ``IN_BAND`` of the power about the mean lies; else None."""
+    """Frequencies in Hz between which 99 % of the power about the mean lies; else None."""
     if len(signal) < LEAST or np.ptp(signal) == 0:
         return None
     f, power = scipy.signal.periodogram(signal, fs, window="hann")
     share = np.cumsum(power[1:])
-    outside = (1 - IN_BAND) / 2
+    outside = (1 - _IN_BAND) / 2
     low, high = np.searchsorted(share, share[-1] * np.array([outside, 1 - outside]))
     return float(f[1 + low]), float(f[1 + high])
 
@@ -164,9 +142,9 @@ def _extreme(signal: Array, values: Array, counts: Integers) -> Extreme:
         return Extreme(np.nan, 0, 0, False)
     samples, run = int(counts[0]), longest_run(signal == values[0])[1]
     clipped = (
-        len(values) > LEVELS
-        and samples >= max(CLIPPED_SAMPLES, CLIPPED_RATIO * counts[1 : 1 + NEIGHBOURS].max())
-        and run >= CLIPPED_RUN
+        len(values) > _LEVELS
+        and samples >= max(_CLIPPED_SAMPLES, _CLIPPED_RATIO * counts[1 : 1 + _NEIGHBOURS].max())
+        and run >= _CLIPPED_RUN
     )
     return Extreme(float(values[0]), samples, run, bool(clipped))
 
@@ -180,12 +158,12 @@ def _noise(
         if count > 1:
             periods = signal[len(signal) - count * period :].reshape(count, period)
             return float(np.sqrt(np.mean(np.var(periods, axis=0, ddof=1)))), "periods"
-    length = min(len(signal) // SEGMENTS, LONGEST)
+    length = min(len(signal) // _SEGMENTS, _LONGEST)
     if length < LEAST or np.ptp(signal) == 0:
         return None, ""
     density = _unexplained(signal, inputs, length)
-    noise = float(np.sqrt(np.quantile(density[1:-1], QUIET) / 2))
-    return (noise, "spectrum") if noise < LOUD * signal.std() else (None, "")
+    noise = float(np.sqrt(np.quantile(density[1:-1], _QUIET) / 2))
+    return (noise, "spectrum") if noise < _LOUD * signal.std() else (None, "")
 
 
 def _unexplained(signal: Array, inputs: Array | None, length: int) -> Array:
@@ -199,6 +177,6 @@ def _unexplained(signal: Array, inputs: Array | None, length: int) -> Array:
     _, Suu = scipy.signal.csd(u[:, None], u[None], nperseg=length)
     _, Suy = scipy.signal.csd(u, signal, nperseg=length)
     Suu, Suy = np.moveaxis(Suu, -1, 0), Suy.T[:, :, None]
-    followed = (Suy.conj() * (np.linalg.pinv(Suu, rcond=SILENT, hermitian=True) @ Suy)).real
+    followed = (Suy.conj() * (np.linalg.pinv(Suu, rcond=_SILENT, hermitian=True) @ Suy)).real
     left = np.maximum(density - followed.sum(axis=(1, 2)), 0.0)
     return left * segments / (segments - len(moving))  # some of the noise follows by chance

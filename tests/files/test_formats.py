@@ -859,7 +859,9 @@ def test_damaged_files(tmp_path, name):
 def test_optional_packages(tmp_path, monkeypatch, name, package):
     (tmp_path / name).write_bytes(b"something")
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ValueError, match=rf"need {package}.*pip install 'lfrtorch\[files\]'"):
+    with pytest.raises(
+        ValueError, match=rf"{package} is not installed: pip install 'lfrtorch\[files\]'"
+    ):
         open_table(tmp_path / name)
 
 
