@@ -9,9 +9,8 @@ nonlinear_benchmarks, and of scores that were published with them).
 The pulse counter is blind to the sign of the speed: z is its absolute value, an even function. The
 pulley hangs on a spring, which makes for a lightly damped mode.
 
-The archive's address and name have changed: older versions of nonlinear_benchmarks ask for
-CoupledElectricDrivesDataSetAndReferenceModels.zip, newer ones for FULLTEXT01.zip. Both hold
-DATAUNIF.MAT. The archive's PRBS measurements, DATAPRBS.MAT, are no part of the benchmark.
+The archive is FULLTEXT01.zip, or CoupledElectricDrivesDataSetAndReferenceModels.zip in older
+versions of nonlinear_benchmarks; its PRBS measurements, DATAPRBS.MAT, are no part of the benchmark.
 
 References:
     T. Wigren, M. Schoukens (2017), "Coupled electric drives data set and reference models",
@@ -57,11 +56,9 @@ def load(
     nonlinearbenchmark.org gives: the start state is fitted to the 10 outputs that are not scored.
     Validation and the tests ``"low"`` and ``"high"`` are simulated from the beginning of their
     measurement: all that comes before their scored samples is warm-up. Whether a measurement begins
-    at rest is not known, and ``start="zero"`` would be rest at the inputs' mean, which is another
-    state. So all records have an estimated start: training fits it with the parameters, and in
-    validation and these tests it is fitted to the warm-up, training outputs among it.
-    It matters little by then: hundreds of samples of known inputs decide the state, better than the
-    10 outputs of the window, which do not show the sign of the speed.
+    at rest is not known. So all records have an estimated start: training fits it with the
+    parameters, and in validation and these tests it is fitted to the warm-up: hundreds of samples
+    of known inputs decide the state better than 10 outputs, which hide the sign of the speed.
 
     Args:
         validation: fraction of the estimation samples of each measurement, the last of them, that

@@ -9,15 +9,9 @@ A force moves a mass against viscous and dry friction: from the force to the pos
 integrates, the friction is the nonlinearity, and both measurements are under the feedback of a
 position controller (its reference qg and the times t are in the files, too, and not read).
 
-What to know of the file and of the package nonlinear_benchmarks:
-
-- vir is a voltage. The package calls it a force in N, at the load; the scripts of those who
-  measured make that force of it, gtau vir, with the drive gain gtau (N/V) in the files. A model's
-  scores do not depend on that.
-- The test file has the pulses as pulses_N, which neither those scripts nor the package use as an
-  input, and this module does not.
-- The package's README interchanges the units of this benchmark and of the coupled drives. Its data
-  are qm as it stands, in metres.
+The input vir is a voltage; the scripts of those who measured make a force of it by the drive gain
+gtau (N/V) in the files, which a model's scores do not depend on. The pulses of the test file
+(pulses_N) are no input in those scripts, nor here. The data are qm as it stands, in metres.
 
 References:
     A. Janot, M. Gautier, M. Brunot (2019), "Data set and reference models of EMPS", Workshop on

@@ -8,20 +8,17 @@ modes are lightly damped. Sampled at 400 Hz, at seven levels (of the multisines 
 periods of 8192 samples, the first of them a transient, and a swept sine from rest. Levels 1, 3, 5
 and 7 are for estimation; 2, 4 and 6, whose files end in ``_Validation``, are the tests.
 
-What to know of the files and of the package nonlinear_benchmarks, which downloads them:
-
 - The force carries measurement noise, and the structure acts back on the shaker and so on the
-  force: it is not the generator's signal (``Voltage``, not used here). Noise at the input biases a
-  least squares fit; the mean over periods lessens it.
-- The published scores are of the first acceleration alone, which the package returns unless it is
-  told ``output_index``. A score here pools the three outputs; ``rmse_by_output`` has each.
-- The package's window of 50 samples, 0.125 s, is no warm-up for modes that ring for seconds. The
-  tests are therefore simulated from rest at their first sample, where the input begins, and the
-  transient of a multisine's first period is scored.
-- The swept sines (``SineSw``) of levels 1, 3 and 5 end in zeros, up to 1500 of all channels: they
-  fill the file and are no measurement. Training and validation leave them out; the tests are scored
-  as they are.
-- The special odd multisines (``SpecialOddMSine``), whose arrays have three axes, are not used.
+  force: it is not the generator's signal. Noise at the input biases a least squares fit; the mean
+  over periods lessens it.
+- The published scores are of the first acceleration alone. A score here pools the three outputs;
+  ``rmse_by_output`` has each.
+- The window of 50 samples, 0.125 s, is no warm-up for modes that ring for seconds. The tests are
+  therefore simulated from rest at their first sample, where the input begins, and the transient of
+  a multisine's first period is scored.
+- The swept sines (``SineSw``) of levels 1, 3 and 5 end in zeros that fill the file, up to 1500 of
+  all channels. Training and validation leave them out; the tests are scored as they are.
+- The special odd multisines (``SpecialOddMSine``) are not used.
 
 References:
     J.P. Noël, M. Schoukens (2017), "F-16 aircraft benchmark based on ground vibration test data",

@@ -8,24 +8,15 @@ used here), u and y. ``WH_EstimationExample.mat`` (10 records) is for estimation
 ``WH_TestDataset.mat`` has the two tests, a random-phase multisine and a swept sine up to 15 kHz,
 16384 samples and 0.71 V rms each, measured *without* process noise.
 
-That is what the benchmark is about: noise before a nonlinearity is not noise at the output. The
-simulation error on records that have it has a large floor, and the fit that makes it least tends to
-the mean output given the input, E f(x + e) in place of f(x). That is a smoother saturation than the
-one of the tests, a bias which does not fade with more data. So errors on training and validation
-are no measure of those on the tests, neither in size nor, near the floor, in order.
+Noise before a nonlinearity is not noise at the output. The simulation error on records that have it
+has a large floor, and the fit that makes it least tends to the mean output given the input,
+E f(x + e) in place of f(x): a smoother saturation than the tests', a bias which does not fade with
+more data. So errors on training and validation are no measure of those on the tests, neither in
+size nor, near the floor, in order.
 
-What to know of the files and of the package nonlinear_benchmarks, which downloads them (all of it
-from the package and from public code that reads the files, none of it checked on them):
-
-- Its function is in the submodule ``not_splitted_benchmarks``: there is no official split. It
-  returns the records of all files without names, and has no window. (Gedon et al. fit one of the
-  two records of ``WH_MultisineFadeOut`` and validate on the other; identibench fits those of all
-  files, validates on those of ``WH_CombinedZeroMultisineSinesweep``, and leaves the first 100
-  samples of the tests unscored, as is done here.)
-- The readme in the archive is reported to speak of a shift by possibly one sample between
-  channels; none is corrected here.
-- Whether records begin at rest is not known. All are simulated from zero state, whose effect lies
-  in the 100 samples that are not scored.
+There is no official split, window or statement of whether records begin at rest (and none of this
+is checked on the files). All are simulated from zero state, whose effect lies in the first 100
+samples; these are not scored, as in identibench.
 
 References:
     M. Schoukens, J.P. Noël (2016), "Wiener-Hammerstein benchmark with process noise", Workshop on
