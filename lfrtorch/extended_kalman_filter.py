@@ -19,8 +19,7 @@ from lfrtorch.engine.linearised import linearise
 from lfrtorch.records import Channel, Record, Scaler
 from lfrtorch.state_observer import StateObserver
 
-ROUNDING = 1e-9
-"""Eigenvalues of a covariance that are negative by this part of the largest one are rounding."""
+_ROUNDING = 1e-9  # part of the largest eigenvalue by which a negative one may be rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +210,7 @@ def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
         raise InputError(
             f"{name} has the shape {value.shape}; give ({size}, {size}), {size} variances, or one."
         )
-    rounding = ROUNDING * np.abs(value).max()
+    rounding = _ROUNDING * np.abs(value).max()
     if not (np.isfinite(value).all() and (np.abs(value - value.T) <= rounding).all()):
         raise InputError(f"{name} is not symmetric, or not finite; give a covariance.")
     return (value + value.T) / 2.0
@@ -220,6 +219,6 @@ def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
 def _root(P: Float[Array, "n n"], size: float) -> Float[Array, "n n"] | None:
     """U with U Uᵀ = P; None if P has a negative eigenvalue, relative to a size."""
     values, vectors = np.linalg.eigh(P)
-    if values[0] < -ROUNDING * size:
+    if values[0] < -_ROUNDING * size:
         return None
     return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0)))

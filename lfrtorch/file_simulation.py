@@ -23,14 +23,9 @@ from lfrtorch.score_window import PART, WINDOW, score_window, warm_up
 BEGINNING = 100
 """Samples in which the transient of a wrong start state would be seen."""
 
-TRANSIENT = 3.0
-"""Error there over that of the rest above which it is."""
-
-LOOKED_AT = 1_000_000
-"""Most samples of a file whose input is looked at for a period."""
-
-FAR = 6.0
-"""Standard deviations of the training input that Gaussian noise and most signals stay within."""
+_TRANSIENT = 3.0  # error there over that of the rest above which there is a transient
+_LOOKED_AT = 1_000_000  # most samples of a file whose input is looked at for a period
+_FAR = 6.0  # standard deviations of the training input that most signals stay within
 
 
 class Start(NamedTuple):
@@ -80,8 +75,8 @@ def start_at_rest(stream: FileStream, *, skip: int | None = None) -> Start:
         return Start(None, skip or 0)
     samples = sum(len(block.u) for block in stream.blocks())
     settling = 0
-    if samples <= LOOKED_AT:
-        u, y = _beginning(stream, LOOKED_AT)
+    if samples <= _LOOKED_AT:
+        u, y = _beginning(stream, _LOOKED_AT)
         period = find_period(u) if np.isfinite(y).all() else None
         settling = 0 if period is None else find_transient(y, period)
     return Start(None, warm_up(samples, settling))
@@ -173,13 +168,13 @@ def notes_on(result: Simulated, model: Model, *, estimated: bool) -> list[str]:
         f"the input {channel.name} goes {number(peak)} standard deviations of the training "
         "input away from its mean: the model extrapolates there"
         for channel, peak in zip(model.inputs, result.peaks, strict=True)
-        if peak > FAR and model.sizes["nz"]  # a linear model is the same at all amplitudes
+        if peak > _FAR and model.sizes["nz"]  # a linear model is the same at all amplitudes
     ]
     scores, settled = result.scores, result.settled
     with np.errstate(invalid="ignore"):
         before = scores.samples * scores.rmse**2 - settled.samples * settled.rmse**2
         beginning = np.sqrt(before / (scores.samples - settled.samples))
-        transient = (settled.samples >= BEGINNING) & (beginning > TRANSIENT * settled.rmse)
+        transient = (settled.samples >= BEGINNING) & (beginning > _TRANSIENT * settled.rmse)
     if not estimated and transient.any():
         ratio = (beginning / settled.rmse)[transient].max()
         notes.append(

@@ -36,8 +36,7 @@ from lfrtorch._support.types import Array, Booleans, Integers
 MARGIN = 0.01
 """A model does as well as the best if its rms error exceeds that one's by at most this part."""
 
-CEILING = 0.05
-"""And does not if it exceeds it by more than this part."""
+_CEILING = 0.05  # a model does not do as well if it exceeds that one's by more than this part
 
 BLOCKS = 10
 """Least number of blocks of time, over all records."""
@@ -46,11 +45,11 @@ BLOCKS = 10
 def as_good(squares: Sequence[Array] | Array, counts: Integers) -> Booleans:
     """Return which models are within one standard error of the best, or ``MARGIN``.
 
-    None is that is worse by more than ``CEILING``. Arguments as in ``standard_errors_above``.
+    None is that is worse by more than 5 %. Arguments as in ``standard_errors_above``.
     """
     means = np.asarray(squares).sum(axis=1)
     near = standard_errors_above(squares, counts) <= 1.0
-    near &= means <= (1.0 + CEILING) ** 2 * means.min()
+    near &= means <= (1.0 + _CEILING) ** 2 * means.min()
     return near | (means <= (1.0 + MARGIN) ** 2 * means.min())
 
 

@@ -16,12 +16,10 @@ from lfrtorch._support.errors import InputError, brief
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-LONGEST = 80
-"""Characters of a value that a message shows."""
-
-NUMBERS = {int: Integral, float: Real}
-UNIONS = (Union, UnionType)
-NAMES: dict[Any, str] = {
+_LONGEST = 80  # characters of a value that a message shows
+_NUMBERS = {int: Integral, float: Real}
+_UNIONS = (Union, UnionType)
+_NAMES: dict[Any, str] = {
     NoneType: "None", bool: "True or False", int: "a whole number", float: "a number",
     str: "a text", Mapping: "a dict", Callable: "a function", np.ndarray: "an array",
 }  # fmt: skip
@@ -45,7 +43,7 @@ def typed(*own: str) -> Callable[[Function], Function]:
             texts = {name: t for name, t in inner.__annotations__.items() if name not in left}
             names = inspect.unwrap(inner).__globals__
             found = get_type_hints(SimpleNamespace(__annotations__=texts), names)
-            return {name: hint for name, hint in found.items() if hint not in NUMBERS}
+            return {name: hint for name, hint in found.items() if hint not in _NUMBERS}
 
         @wraps(inner)
         def checked(*args: Any, **kwargs: Any) -> Any:
@@ -53,7 +51,7 @@ def typed(*own: str) -> Callable[[Function], Function]:
             for name, hint in hints().items():
                 if name in given and not is_of(given[name], hint):
                     raise InputError(
-                        f"{name} is {brief(repr(given[name]), LONGEST)}; give {wanted(hint)}."
+                        f"{name} is {brief(repr(given[name]), _LONGEST)}; give {wanted(hint)}."
                     )
             return inner(*args, **kwargs)
 
@@ -67,7 +65,7 @@ def typed(*own: str) -> Callable[[Function], Function]:
 
 def is_of(value: Any, hint: Any) -> bool:
     """Return whether a value is of the type of a hint; True if the hint is not looked at."""
-    first, *others = members(hint)
+    first, *others = _members(hint)
     if others:
         return any(is_of(value, one) for one in (first, *others))
     hint = first
@@ -76,7 +74,7 @@ def is_of(value: Any, hint: Any) -> bool:
         plain = value.item() if isinstance(value, np.generic) else value
         return any((type(plain), plain) == (type(one), one) for one in inner)
     if origin is Sequence:
-        arrays = isinstance(value, np.ndarray) and inner[0] in NUMBERS
+        arrays = isinstance(value, np.ndarray) and inner[0] in _NUMBERS
         several = isinstance(value, Sequence) and not isinstance(value, str | bytes)
         return (several or arrays) and all(is_of(one, inner[0]) for one in value)
     if origin is Iterable:
@@ -87,8 +85,8 @@ def is_of(value: Any, hint: Any) -> bool:
         return callable(value)
     if hint is bool:
         return isinstance(value, bool | np.bool_)
-    if hint in NUMBERS:
-        return isinstance(value, NUMBERS[hint]) and not isinstance(value, bool)
+    if hint in _NUMBERS:
+        return isinstance(value, _NUMBERS[hint]) and not isinstance(value, bool)
     if getattr(hint, "_is_protocol", False):
         names = (name for name in vars(hint) if not name.startswith("_"))
         return not isinstance(value, type) and all(hasattr(value, name) for name in names)
@@ -97,12 +95,12 @@ def is_of(value: Any, hint: Any) -> bool:
     )
 
 
-def members(hint: Any) -> tuple[Any, ...]:
+def _members(hint: Any) -> tuple[Any, ...]:
     """Return the members of a union and of its aliases; of another hint itself alone."""
     hint = getattr(hint, "__value__", hint)  # of numpy's ArrayLike from numpy 2.5 on
-    if get_origin(hint) not in UNIONS:
+    if get_origin(hint) not in _UNIONS:
         return (hint,)
-    return tuple(one for each in get_args(hint) for one in members(each))
+    return tuple(one for each in get_args(hint) for one in _members(each))
 
 
 def wanted(hint: Any) -> str:
@@ -113,7 +111,7 @@ def wanted(hint: Any) -> str:
 
 def _choices(hint: Any) -> list[str]:
     """Say what a hint asks for, one text for each kind."""
-    kinds, arrays = members(hint), members(ArrayLike)
+    kinds, arrays = _members(hint), _members(ArrayLike)
     if len(kinds) > 1:
         if not set(arrays) <= set(kinds):
             return [text for one in kinds for text in _several(one, kinds) or _choices(one)]
@@ -125,7 +123,7 @@ def _choices(hint: Any) -> list[str]:
         return [f"a list (each: {wanted(inner[0])})"]
     kind = origin or hint
     name = getattr(kind, "__name__", str(kind))
-    return [NAMES.get(kind) or f"{'an' if name[0] in 'AEIO' or name.isupper() else 'a'} {name}"]
+    return [_NAMES.get(kind) or f"{'an' if name[0] in 'AEIO' or name.isupper() else 'a'} {name}"]
 
 
 def _several(hint: Any, others: tuple[Any, ...]) -> list[str]:

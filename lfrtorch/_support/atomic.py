@@ -29,20 +29,20 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     If the block raises, nothing is left, and what was at ``path`` stays as it was.
     """
     path = real(path)  # a link's target is replaced, not the link
-    with writing_to(path.parent):
+    with _writing_to(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=TEMPORARY, suffix=path.suffix, dir=path.parent)
         os.close(handle)
         fresh = Path(name)
         try:
             yield fresh
-            put(fresh, path)
+            _put(fresh, path)
         finally:
             fresh.unlink(missing_ok=True)
 
 
 @contextmanager
-def writing_to(folder: Path) -> Iterator[None]:
+def _writing_to(folder: Path) -> Iterator[None]:
     """Name the folder in errors of the system."""
     try:
         yield
@@ -57,28 +57,28 @@ def writing_to(folder: Path) -> Iterator[None]:
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """Give a folder beside ``path`` to write files to; it becomes ``path``, new or empty."""
-    with writing_to(path.parent):
+    with _writing_to(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=path.parent))
         try:
             yield fresh
             for file in fresh.iterdir():
-                flush(file)
-            put(fresh, path)
+                _flush(file)
+            _put(fresh, path)
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
 
 
-def put(fresh: Path, path: Path) -> None:
+def _put(fresh: Path, path: Path) -> None:
     """Let a file or folder that is whole take its place; first on the disk, as power may fail."""
     full = 0o777 if fresh.is_dir() else 0o666
-    flush(fresh)
-    os.chmod(fresh, full & ~umask())  # what tempfile makes is its owner's alone
+    _flush(fresh)
+    os.chmod(fresh, full & ~_umask())  # what tempfile makes is its owner's alone
     os.replace(fresh, path)
-    flush(path.parent)
+    _flush(path.parent)
 
 
-def flush(path: Path) -> None:
+def _flush(path: Path) -> None:
     """Have the system write a file, or the names in a folder, to the disk."""
     with suppress(OSError) if path.is_dir() else nullcontext():  # some systems open no folder
         handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
@@ -97,7 +97,7 @@ def remove_leftovers(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def umask() -> int:
+def _umask() -> int:
     """Return the permissions that new files do not get."""
     mask = os.umask(0)
     os.umask(mask)

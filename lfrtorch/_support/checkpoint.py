@@ -20,16 +20,12 @@ from lfrtorch._support.paths import expanded, real
 
 FORMAT = "lfrtorch"
 VERSION = 1
-DESCRIPTION, WEIGHTS = "model.json", "weights.safetensors"
+DESCRIPTION, _WEIGHTS = "model.json", "weights.safetensors"
+_NEXT = "next.safetensors"  # weights while another model takes the place of a checkpoint's
+_DIGEST = "sha256"  # in the metadata of tensors: tells damaged ones, which may still be numbers
 
-NEXT = "next.safetensors"
-"""Weights while another model takes the place of the one in a checkpoint."""
-
-DIGEST = "sha256"
-"""In the metadata of a file of tensors: what tells a damaged one, which may still be numbers."""
-
-CODE = (".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".joblib", ".py", ".pyc", ".so")
-"""Extensions of files that may carry code: none of them belongs to a checkpoint."""
+# Extensions of files that may carry code: none of them belongs to a checkpoint.
+_CODE = (".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".joblib", ".py", ".pyc", ".so")
 
 
 def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Tensor]) -> Path:
@@ -47,17 +43,17 @@ def write(folder: str | Path, description: dict[str, Any], weights: dict[str, Te
     if not replaced:
         with whole_folder(folder) as fresh:
             _describe(fresh / DESCRIPTION, described)
-            write_tensors(fresh / WEIGHTS, weights)
+            write_tensors(fresh / _WEIGHTS, weights)
         return folder
     before = _described(folder)
     if before == json.loads(json.dumps(described)):  # the same model with other weights
-        _replace(folder / WEIGHTS, weights)
+        _replace(folder / _WEIGHTS, weights)
     else:  # two files cannot be replaced at once: never the weights that the description names
-        for name in (WEIGHTS,) if before.get("weights") == NEXT else (NEXT, WEIGHTS):
+        for name in (_WEIGHTS,) if before.get("weights") == _NEXT else (_NEXT, _WEIGHTS):
             _replace(folder / name, weights)
             with whole_file(folder / DESCRIPTION) as fresh:
-                _describe(fresh, described if name == WEIGHTS else {**described, "weights": NEXT})
-    (folder / NEXT).unlink(missing_ok=True)
+                _describe(fresh, described if name == _WEIGHTS else {**described, "weights": _NEXT})
+    (folder / _NEXT).unlink(missing_ok=True)
     return folder
 
 
@@ -65,7 +61,7 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], **metadata: str) -> No
     """Write a safetensors file with a digest; a full disk is an OSError."""
     held = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     try:
-        save_file(held, path, metadata={**metadata, DIGEST: _digest(held, metadata)})
+        save_file(held, path, metadata={**metadata, _DIGEST: _digest(held, metadata)})
     except SafetensorError as error:
         raise OSError(f"'{path.parent}' cannot be written to: {error}") from None
 
@@ -81,7 +77,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, InputError, UnicodeError) as error:
         raise OSError(brief(error)) from None
-    written = metadata.pop(DIGEST, None)
+    written = metadata.pop(_DIGEST, None)
     if written is not None and written != _digest(tensors, metadata):
         raise OSError("its numbers are not those that were written")
     return tensors, metadata
@@ -125,7 +121,7 @@ def read(
             f"'{folder}' has checkpoint version {version} and this program reads up to {VERSION}; "
             f"install a newer {FORMAT}."
         )
-    file = folder / (NEXT if description.get("weights") == NEXT else WEIGHTS)
+    file = folder / (_NEXT if description.get("weights") == _NEXT else _WEIGHTS)
     try:
         weights, _ = read_tensors(file)
     except OSError as error:
@@ -150,14 +146,14 @@ def _located(folder: Path, inside: Sequence[str]) -> Path:
     """The folder that holds the description; refuse all else, code above all."""
     if folder.is_file():
         raise InputError(
-            f"'{folder}' is a file, and a checkpoint is a folder with {DESCRIPTION} and {WEIGHTS}; "
-            f"give that folder, or the folder of a run.\nOther files ({', '.join(CODE[:4])}) may "
-            "carry code and are never opened."
+            f"'{folder}' is a file, and a checkpoint is a folder with {DESCRIPTION} and "
+            f"{_WEIGHTS}; give that folder, or the folder of a run.\nOther files "
+            f"({', '.join(_CODE[:4])}) may carry code and are never opened."
         )
     places = [folder, *(folder / name for name in inside)]
     found = next((place for place in places if (place / DESCRIPTION).is_file()), None)
     looked_in = folder if found is None else found
-    code = sorted(p.name for p in looked_in.glob("*") if p.suffix.lower() in CODE)
+    code = sorted(p.name for p in looked_in.glob("*") if p.suffix.lower() in _CODE)
     if not folder.exists():
         raise InputError(
             f"there is no '{folder}'; give the folder of a run or of a saved model, a checkpoint."

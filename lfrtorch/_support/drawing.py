@@ -18,9 +18,7 @@ colour-blind readers tell them apart, and they differ in lightness."""
 CHANNELS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Colours of several channels, of the same palette."""
 
-
-LOG_DECADES = 1.5
-"""Width of a band from which on the frequency axis is logarithmic."""
+_LOG_DECADES = 1.5  # width of a band from which on the frequency axis is logarithmic
 
 
 def unit_axis(axis: Axis, limits: tuple[float, float], name: str, unit: str) -> None:
@@ -53,7 +51,7 @@ def legend_above(ax: Axes, *, ncols: int = 3, markerscale: float = 1.0) -> None:
 
 def is_wide(first: float, last: float) -> bool:
     """Return whether the frequency axis of a band is logarithmic."""
-    return first > 0 and last > first * 10**LOG_DECADES
+    return first > 0 and last > first * 10**_LOG_DECADES
 
 
 def frequency_axis(grid: NDArray[np.object_], first: float, last: float) -> None:

@@ -10,8 +10,7 @@ class LfrtorchError(Exception):
 LONGEST = 160
 """Characters of another library's message that are shown."""
 
-LONGEST_INPUT_ERROR = 1000
-"""Characters of a message, which may hold a value that was given."""
+_LONGEST_INPUT_ERROR = 1000  # characters of a message, which may hold a value that was given
 
 
 class InputError(LfrtorchError, ValueError):
@@ -21,8 +20,8 @@ class InputError(LfrtorchError, ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        if len(message) > LONGEST_INPUT_ERROR:
-            half = LONGEST_INPUT_ERROR // 2 - len(" ... ")
+        if len(message) > _LONGEST_INPUT_ERROR:
+            half = _LONGEST_INPUT_ERROR // 2 - len(" ... ")
             message = " ... ".join(" ".join(p.split()) for p in (message[:half], message[-half:]))
         super().__init__(message)
 

@@ -12,29 +12,20 @@ from tabulate import tabulate
 UNKNOWN = "–"
 """What stands for a number that is not known or not finite."""
 
-DIGITS = 3
-"""Significant digits of a number."""
+_DIGITS = 3  # significant digits of a number
+_SMALLEST, _LARGEST = 1e-3, 1e5  # numbers in this range are written without an exponent
+_PLAIN = 0.1, 1000.0  # numbers in this range need no prefix
+_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}  # by the power of ten
 
-SMALLEST, LARGEST = 1e-3, 1e5
-"""Numbers in this range are written without an exponent."""
-
-PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
-"""SI prefixes by their power of ten."""
-
-PREFIXED = frozenset(
+# Units that may have a prefix; others, such as °C, kg, mm and %, stay as they are.
+_PREFIXED = frozenset(
     ("A", "C", "F", "H", "Hz", "J", "N", "N m", "N/m", "N·m", "Nm", "Ohm", "Pa", "T", "V", "W",
      "m", "m/s", "m/s2", "m/s^2", "m/s²", "rad", "rad/s", "rad/s2", "rad/s^2", "rad/s²", "s", "Ω")
 )  # fmt: skip
-"""Units that may have a prefix; others, such as °C, kg, mm and %, stay as they are."""
+_NEVER_LARGER = ("s", "rad")  # what units begin with that are never kilo or more
 
-NEVER_LARGER = ("s", "rad")
-"""What units begin with that are never kilo or more."""
-
-PLAIN = 0.1, 1000.0
-"""Numbers in this range need no prefix."""
-
-NEAR, ROUNDING = 1e-3, 1e-12
-"""Distances from the unit circle: of poles whose four digits would not tell, and of none."""
+# Near the unit circle 1 - |p| is printed instead of four digits of |p|; on it, nothing but 1.
+_NEAR, _ROUNDING = 1e-3, 1e-12
 
 WIDEST = 160
 """Characters of a line of a message."""
@@ -51,14 +42,14 @@ def in_lines(text: str) -> str:
     )
 
 
-def number(value: float | None, digits: int = DIGITS) -> str:
+def number(value: float | None, digits: int = _DIGITS) -> str:
     """Write a number with its significant digits: 1235, 12.3, 0.100, 9.40e-5."""
     if value is None or not math.isfinite(value):
         return UNKNOWN
     if value == 0:
         return "0"
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")  # of the rounded value
-    if SMALLEST <= abs(float(f"{mantissa}e{exponent}")) < LARGEST:
+    if _SMALLEST <= abs(float(f"{mantissa}e{exponent}")) < _LARGEST:
         return f"{value:.{max(0, digits - 1 - int(exponent))}f}"
     return f"{mantissa}e{int(exponent)}"
 
@@ -69,18 +60,18 @@ def engineering(values: Iterable[float | None], unit: str, shown: str = "") -> t
     One for all, so that they compare: their median is between 0.1 and 1000 there. ``shown`` asks
     for a unit with a prefix, whatever the numbers. A unit that takes no prefix stays as it is.
     """
-    for power, prefix in PREFIXES.items():
+    for power, prefix in _PREFIXES.items():
         if shown and shown == prefix + unit:
             return 10.0**-power, shown
     known = [abs(v) for v in values if v and math.isfinite(v)]
-    if not known or unit not in PREFIXED:
+    if not known or unit not in _PREFIXED:
         return 1.0, unit
     typical = median_high(known)
     power = 3 * math.floor(math.log10(typical) / 3)
-    never = power not in PREFIXES or (power > 0 and unit.startswith(NEVER_LARGER))
-    if never or PLAIN[0] <= typical < PLAIN[1]:
+    never = power not in _PREFIXES or (power > 0 and unit.startswith(_NEVER_LARGER))
+    if never or _PLAIN[0] <= typical < _PLAIN[1]:
         return 1.0, unit
-    return 10.0**-power, PREFIXES[power] + unit
+    return 10.0**-power, _PREFIXES[power] + unit
 
 
 def factor_of(unit: str) -> str:
@@ -93,7 +84,7 @@ def times(factor: float, value: float | None) -> float | None:
     return None if value is None else factor * value
 
 
-def quantities(values: Sequence[float | None], unit: str, digits: int = DIGITS) -> list[str]:
+def quantities(values: Sequence[float | None], unit: str, digits: int = _DIGITS) -> list[str]:
     """Write numbers with their unit, all with the same SI prefix."""
     factor, unit = engineering(values, unit)
     return [f"{number(times(factor, v), digits)} {unit}".rstrip() for v in values]
@@ -115,12 +106,12 @@ def in_percent(ratio: float | None) -> float | None:
     return times(100, ratio)
 
 
-def cell(value: Cell, digits: int = DIGITS) -> str:
+def cell(value: Cell, digits: int = _DIGITS) -> str:
     """Write a value of a table; texts and whole numbers stay as they are."""
     return str(value) if isinstance(value, str | int) else number(value, digits)
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], digits: int = DIGITS) -> str:
+def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], digits: int = _DIGITS) -> str:
     """Write a head, a rule and rows; columns of words to the left, others to the right."""
     words = [all(isinstance(row[i], str) for row in rows) for i in range(len(head))]
     return tabulate(
@@ -135,8 +126,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], digits: int = DIG
 def radius(value: float | None) -> str:
     """Write the distance of a root from the origin; near the unit circle as 1 ± a number."""
     beyond = (math.nan if value is None else value) - 1.0
-    if abs(beyond) < ROUNDING:
+    if abs(beyond) < _ROUNDING:
         return "1"
-    if abs(beyond) < NEAR:
+    if abs(beyond) < _NEAR:
         return f"1 {'-' if beyond < 0 else '+'} {number(abs(beyond), 2)}"
     return number(value, 4)

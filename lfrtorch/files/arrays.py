@@ -27,8 +27,7 @@ from lfrtorch.files.table import BLOCK, Clock, Table
 
 _REAL, _TIMES = "biuf", "M"
 
-_RECORD = 32
-"""Samples of a vector that tells the axis of time; a shorter one may hold gains of channels."""
+_RECORD = 32  # samples of a vector that tells the axis of time; shorter ones may be gains
 
 _FREQUENCY = re.compile(
     r"f_?s(amp|ampling|ample)?|s_?rate|sampl(e|ing)[ _-]?(rate|freq|frequency)", re.IGNORECASE
@@ -60,7 +59,7 @@ Stored = Callable[[Path], AbstractContextManager[Any]]
 """Opens a file: its arrays by name."""
 
 
-class Packing(NamedTuple):
+class _Packing(NamedTuple):
     """Numbers that are stored as (number - offset) / scale, a missing one as ``fill``.
 
     See the NetCDF Climate and Forecast Metadata Conventions 1.11, 2.5.1 and 8.1.
@@ -95,7 +94,7 @@ class Signal:
     unit: str = ""
     reverse: bool = False
     values: NDArray[Any] | None = None
-    packing: Packing | None = None
+    packing: _Packing | None = None
 
     @property
     def shown(self) -> str:
@@ -149,7 +148,7 @@ class ArrayTable(Table):
         lengths: list[int] = []
         for name, signal in found.items():
             shown = "" if isinstance(signal, str) else signal.shown
-            rate = None if isinstance(signal, str) else sampling_rate(name, signal)
+            rate = None if isinstance(signal, str) else _sampling_rate(name, signal)
             reason = signal if isinstance(signal, str) else signal.refusal()
             if rate is not None:
                 rates[name] = rate
@@ -207,7 +206,7 @@ class ArrayTable(Table):
                 yield np.stack([parts[name][:, i] for name, i in chosen], axis=1, dtype=np.float64)
 
 
-def sampling_rate(name: str, signal: Signal) -> float | None:
+def _sampling_rate(name: str, signal: Signal) -> float | None:
     """Return the sampling frequency of a lone number with the name of it or of its inverse."""
     own = re.split(r"[./]", name)[-1]
     frequency, interval = _FREQUENCY.fullmatch(own), _INTERVAL.fullmatch(own)
@@ -362,7 +361,7 @@ def _group(
     if not matlab:
         attributes = {f"{prefix}{key}": np.asarray(value) for key, value in group.attrs.items()}
         given = {name: _signal(value) for name, value in attributes.items()}
-        found |= {name: one for name, one in given.items() if sampling_rate(name, one)}
+        found |= {name: one for name, one in given.items() if _sampling_rate(name, one)}
     for key in group:
         if matlab and key.startswith("#"):
             continue
@@ -413,7 +412,7 @@ def _group(
             names[name] = item.name
 
 
-def _packing(item: Any) -> Packing | None:
+def _packing(item: Any) -> _Packing | None:
     """What the attributes of a dataset say of how its numbers are stored."""
     given = [
         np.asarray(item.attrs.get(key)) for key in ("scale_factor", "add_offset", "_FillValue")
@@ -425,7 +424,7 @@ def _packing(item: Any) -> Packing | None:
         float(one.reshape(-1)[0]) if known else default
         for one, known, default in zip(given, lone, (1.0, 0.0, np.nan), strict=True)
     )
-    return Packing(scale, offset, fill)
+    return _Packing(scale, offset, fill)
 
 
 def _linked(group: Any, key: str) -> Any:

@@ -22,9 +22,7 @@ from lfrtorch.records import Channel, interpolated
 
 Gaps = Literal["error", "split"]
 
-GLANCE = 1000
-"""Samples that show of most columns that they are no grid of time."""
-
+_GLANCE = 1000  # samples that show of most columns that they are no grid of time
 _SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
 _NEAR = 0.1  # relative: the usual step of stamps that are uneven is of that frequency
 
@@ -348,7 +346,7 @@ def _beside(
     ]
     reasons: dict[int, UnevenError] = {}
     grids: dict[int, Sampling] = {}
-    for samples in (BLOCK,) if named else (GLANCE, BLOCK):
+    for samples in (BLOCK,) if named else (_GLANCE, BLOCK):
         grids.clear()
         for column, t in _first(table, left, samples).items():
             try:

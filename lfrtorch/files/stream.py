@@ -16,11 +16,8 @@ from lfrtorch.files.table import Columns, NoColumnError
 from lfrtorch.files.time_stamps import UnevenError, sampling, time_unit
 from lfrtorch.records import Channel
 
-SAME = 1e-3
-"""Relative difference of sampling frequencies that counts as none: clocks differ."""
-
-OVERLAP = 1000
-"""Time stamps of the block before that are looked at again, so that a short one shows its rate."""
+_SAME = 1e-3  # relative difference of sampling frequencies that counts as none: clocks differ
+_OVERLAP = 1000  # time stamps of the last block that are looked at with those of a short one
 
 
 class Block(NamedTuple):
@@ -92,7 +89,7 @@ class FileStream:
             times, u, y = np.split(block, ends, axis=1)
             if self.times:
                 times = times * (seconds := seconds or self._seconds(times[:, 0]))
-                seen = np.concatenate([seen[-OVERLAP:], times[:, 0]])
+                seen = np.concatenate([seen[-_OVERLAP:], times[:, 0]])
                 self._check(seen, first + len(block) - len(seen))
             yield Block(times, u, y)
             first += len(block)
@@ -108,7 +105,7 @@ class FileStream:
             )
         if rate is None:
             return (), f"nothing says how it is sampled; the model's {self.fs:g} Hz are taken"
-        if not rate.stamps and abs(rate.fs / self.fs - 1) > SAME:
+        if not rate.stamps and abs(rate.fs / self.fs - 1) > _SAME:
             raise InputError(
                 f"'{self.table.path}': {rate.note}, and the model runs at {self.fs:g} Hz; resample "
                 "the signals."
@@ -166,7 +163,7 @@ class FileStream:
                 f"{self._at(first + error.sample)}: the time column {self.clock} {error}; "
                 f"{error.remedy}, or leave out time if the column is wrong."
             ) from error
-        if abs(grid.fs / self.fs - 1) > max(SAME, grid.uncertainty):
+        if abs(grid.fs / self.fs - 1) > max(_SAME, grid.uncertainty):
             raise InputError(
                 f"the time column {self.clock} of '{self.table.path}' says {grid.fs:g} Hz and the "
                 f"model runs at {self.fs:g} Hz; resample the signals, or correct the column or its "
