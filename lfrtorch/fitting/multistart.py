@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -188,19 +188,22 @@ def fit(
         >>> sorted(start.number for start in result.starts)
         [0, 1, 2]
     """
-    found = partial(
-        _fitted, trainer=trainer, ridge=ridge, average=average, watch=watch, ranks=ranks,
-        snapshots=snapshots, stop=stop, horizon=horizon,
-    )  # fmt: skip
     check_horizon(horizon, noise)
+    options: dict[str, Any] = {
+        "trainer": LevenbergMarquardt() if trainer is None else trainer,
+        "ridge": ridge,
+        "horizon": horizon,
+        "ranks": Ranks() if ranks is None else ranks,
+        "stop": stop,
+        "simulation": SIMULATION.get(noise, 0.0),
+    }
+    found = partial(_fitted, average=average, watch=watch, snapshots=snapshots, options=options)
     models = models if isinstance(models, Model) else _different(models)
     if noise == "output":
         models = without_gain(models)
         return found(models, train, validation, selection, monitors=monitors)
     starts, *data = predicting(noise, trainer, models, train, validation, selection)
-    result = found(
-        starts, *data, monitors=shown_innovation_form(monitors), simulation=SIMULATION[noise]
-    )
+    result = found(starts, *data, monitors=shown_innovation_form(monitors))
     members = tuple(model.innovation_form() for model in result.members)
     return replace(result, model=result.model.innovation_form(), members=members)
 
@@ -231,18 +234,13 @@ def _fitted(
     validation: Record | Sequence[Record],
     selection: Record | Sequence[Record],
     *,
-    trainer: Trainer | None,
-    ridge: Ridge,
-    horizon: int | None,
     average: int,
     monitors: Sequence[Monitor] | Sequence[Sequence[Monitor]] | None,
     watch: Callable[[Round], None],
-    ranks: Ranks | None,
     snapshots: Snapshots | None,
-    stop: Stop | None,
-    simulation: float = 0.0,
+    options: Mapping[str, Any],
 ) -> FitResult:
-    """The fit of models to records as they are; ``simulation`` is that of ``Fit``."""
+    """Fit models to records as they are; ``options`` are keywords of ``Fit``."""
     alone = isinstance(models, Model)
     starts = [models] if alone else list(models)
     given = [monitors] if alone and monitors is not None else monitors
@@ -254,19 +252,15 @@ def _fitted(
     clock = time.perf_counter()
     snapshots = Snapshots() if snapshots is None else snapshots
     halt = Event()
-    search = LevenbergMarquardt() if trainer is None else trainer
-    planned = schedule(len(starts), search.limit, average)
-    ranks, train = Ranks() if ranks is None else ranks, as_records(train)
+    ranks, stop, train = options["ranks"], options["stop"], as_records(train)
+    planned = schedule(len(starts), options["trainer"].limit, average)
     sharing = ranks.sharing_records(len(starts))
     spread = sharing.world < ranks.world
-    options: dict[str, Any] = {"trainer": search, "ridge": ridge, "ranks": sharing}
-    options["simulation"] = simulation
-    options["horizon"] = horizon
-    options["stop"] = any_of(halt, stop) if sharing.world == 1 else stop
+    own = {"ranks": sharing, "stop": any_of(halt, stop) if sharing.world == 1 else stop}
     if spread:
         same_weights(starts, ranks)
     fits = [
-        Fit(model, train, validation, **options, keep=snapshots.keeper(number))
+        Fit(model, train, validation, **{**options, **own}, keep=snapshots.keeper(number))
         for number, model in enumerate(starts)
     ]
     if all(one.diverges for one in fits):
