@@ -8,27 +8,17 @@ import scipy
 from lfrtorch._support.powers import near_one
 from lfrtorch._support.types import Array
 
-_ALIKE = 0.02
-"""Largest difference D(p) that counts as noise. Two parts of narrow-band noise reach 0.05 at
-times."""
+_ALIKE = 0.02  # largest D(p) that counts as noise; parts of narrow-band noise reach 0.05 at times
 
+# Largest D(k p) / (k D(p)): it grows as k² with a p that is a little wrong, at most as k with the
+# drift of an amplifier, and not at all with noise.
 _GROWTH = 1.5
-"""Largest D(k p) / (k D(p)): it grows as k² with a p that is a little wrong, at most as k with the
-drift of an amplifier, and not at all with noise."""
-
-_BEGINNING = 1 / 3
-"""Share of the record, at its start, in which an input may differ from what it repeats later."""
-
-_NEAR = 2.0
-"""The shortest period counts as good if its D is within this factor of the best: noise differs."""
-
+_BEGINNING = 1 / 3  # share of the record in which an input may differ from what it repeats later
+_NEAR = 2.0  # the shortest period counts as good if its D is within this factor of the best
 _EXACT = 1e-9  # difference of what repeats exactly, far above rounding
 _FASTER = 0.75  # of the record: the largest shift that is looked at
 
-_SETTLED = 2.0
-"""Largest mean square difference of a period in steady state from the next one, relative to
-noise."""
-
+_SETTLED = 2.0  # mean square difference of settled periods, relative to noise, at most
 _SMALL = 1e-5  # rms difference over that of the output which is no transient, noise or not
 _TAIL = 4  # of two periods' difference, its last 1 / 4 is taken for noise
 

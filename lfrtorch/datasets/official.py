@@ -59,21 +59,15 @@ def find(
     others: Sequence[str] = (),
     download: bool = False,
 ) -> Path:
-    """The path of a benchmark's file.
+    """Return the path of a benchmark's file, below ``root`` or the cache folder.
 
     Args:
-        root: folder of the benchmarks. Default: the cache folder of nonlinear_benchmarks.
-        file: below ``root``, with the benchmark's folder first.
+        root, file: the file is ``root / file``, with the benchmark's folder first.
         loader: function of nonlinear_benchmarks that downloads it, after its submodule and a dot
             if it is in one.
         others: files that do as well, the zip archive for example; in order of preference. An empty
             archive is a placeholder and counts as missing.
         download: whether a missing file is downloaded, by ``loader``.
-
-    Raises:
-        ValueError: ``download`` is neither true nor false.
-        FileNotFoundError: it is not there, or it cannot be downloaded without nonlinear_benchmarks.
-        OSError: the download fails.
     """
     true_or_false("download", download)
     below = folder(root)
