@@ -397,7 +397,6 @@ def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFi
         ({"relaxations": -1}, "relaxations is -1"),
         ({"first_part": 0}, "first_part is 0"),
         ({"first_part": 1.5}, "first_part is 1.5"),
-        ({"first_part": 0.5, "average": 2}, "keeps one start"),
         ({"first_iterations": 0}, "first_iterations is 0"),
         ({"linear": {"speed": 3}}, "linear has no option 'speed'"),
         ({"starts": 0}, "starts is 0"),

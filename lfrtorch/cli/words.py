@@ -11,6 +11,9 @@ from lfrtorch.reporting.console import Console
 GROUPS = ("bla", "frf", "data", "trainer")
 """Groups whose words are arguments of functions. Of a name in several, the last one is meant."""
 
+YAML = {"True": "true", "False": "false", "None": "null"}
+"""Values that YAML writes in another way than Python."""
+
 
 def translated(text: str, cfg: DictConfig) -> str:
     """A message with Python's arguments as words of the command line.
@@ -34,9 +37,9 @@ def translated(text: str, cfg: DictConfig) -> str:
         if name not in words:
             return found[0]
         value = value.strip("'\"") if value[:1] in ("'", '"') else value
-        return f"{words[name]}={value.lower() if value in ('True', 'False') else value}"
+        return f"{words[name]}={YAML.get(value, value)}"
 
-    return re.sub(r"(?<![\w.])(\w+)=('\w+'|\"\w+\"|True\b|False\b|)", translate, text)
+    return re.sub(rf"(?<![\w.])(\w+)=('\w+'|\"\w+\"|{'|'.join(YAML)}|)", translate, text)
 
 
 class Terminal(Console):

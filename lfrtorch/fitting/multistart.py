@@ -37,6 +37,7 @@ from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.over_processes import OverProcesses, same_weights
@@ -61,7 +62,6 @@ from lfrtorch.fitting.trainer import (
     StoppedError,
     Trainer,
 )
-from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.simulation_errors import Ridge
@@ -188,7 +188,8 @@ def fit(
         >>> sorted(start.number for start in result.starts)
         [0, 1, 2]
     """
-    check_horizon(horizon, noise)
+    guarantee = None if trainer is None else trainer.guarantee
+    refuse_together(noise=noise, horizon=horizon, guarantee=guarantee)
     options: dict[str, Any] = {
         "trainer": LevenbergMarquardt() if trainer is None else trainer,
         "ridge": ridge,
@@ -202,7 +203,7 @@ def fit(
     if noise == "output":
         models = without_gain(models)
         return found(models, train, validation, selection, monitors=monitors)
-    starts, *data = predicting(noise, trainer, models, train, validation, selection)
+    starts, *data = predicting(models, train, validation, selection)
     result = found(starts, *data, monitors=shown_innovation_form(monitors))
     members = tuple(model.innovation_form() for model in result.members)
     return replace(result, model=result.model.innovation_form(), members=members)
@@ -335,11 +336,8 @@ def _check(starts: Sequence[Model], watching: Sequence[Sequence[Monitor]], avera
             "model its own."
         )
     integer("average", average, 1)
-    if average > 1 and any(model.lfr.cell.structure != "free" for model in starts):
-        raise InputError(
-            f"average is {average}, and a mean does not keep the structure of its models; give "
-            "average=1, or models whose structure is 'free'."
-        )
+    for model in starts:
+        refuse_together(average=average, structure=model.lfr.cell.structure)
     if average > 1 and not all(is_network(model.lfr.cell.static) for model in starts):
         raise InputError(
             f"average is {average}, and the mean is of models with a network as their static "

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-from lfrtorch._support.errors import InputError
-from lfrtorch.fitting.trainer import Monitor, Trainer
+from lfrtorch.fitting.exclusions import refuse_together
+from lfrtorch.fitting.trainer import Monitor
 from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, with_past_outputs
@@ -19,18 +19,6 @@ SIMULATION: dict[str, float] = {"innovation": 0.0, "both": 3.0}
 """Weight of simulation errors beside those of predictions, if both were as large at the start."""
 
 
-def check_noise(noise: str, trainer: Trainer | None = None) -> None:
-    """Refuse an unknown kind of noise, or one that the trainer's guarantee is not for."""
-    if noise not in get_args(Noise):
-        raise InputError(f"noise is {noise!r}; use 'output', 'innovation' or 'both'.")
-    if noise != "output" and trainer is not None and trainer.guarantee is not None:
-        raise InputError(
-            f"trainer.guarantee is {trainer.guarantee!r} and noise is {noise!r}: what it holds for "
-            "is the predictor, and the model could run away. Give guarantee=None, or "
-            "noise='output'."
-        )
-
-
 def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
     """Models whose simulation is fitted: K would be that of the models before the fit."""
     if isinstance(models, Model):
@@ -39,25 +27,17 @@ def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
 
 
 def predicting(
-    noise: str,
-    trainer: Trainer | None,
-    models: Model | Sequence[Model],
-    *records: Record | Sequence[Record],
+    models: Model | Sequence[Model], *records: Record | Sequence[Record]
 ) -> tuple[Model | list[Model], *tuple[list[Record], ...]]:
     """The predictors of models, and the records that drive them.
 
     Raises:
-        ValueError: an unknown kind of noise, a trainer with a guarantee, a model
-            without K, or one with exact integrators.
+        ValueError: a model without K, or one with exact integrators.
     """
-    check_noise(noise, trainer)
     given = [models] if isinstance(models, Model) else list(models)
     for model in given:
-        if integrating_states(model.lfr.cell).any():
-            raise InputError(
-                "noise='innovation' is for models without exact integrators, which a predictor "
-                "has not; give integrators=0, or noise='output'."
-            )
+        count = int(integrating_states(model.lfr.cell).sum())
+        refuse_together(noise="innovation", integrators=count)
     found = [model.predictor() for model in given]
     driven = [[with_past_outputs(r) for r in as_records(part)] if part else [] for part in records]
     return (found[0] if isinstance(models, Model) else found, *driven)

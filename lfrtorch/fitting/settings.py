@@ -15,9 +15,9 @@ from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch.engine.cell import check_dtype
 from lfrtorch.engine.nonlinearity import Polynomial
-from lfrtorch.fitting.prediction import Noise, check_noise
+from lfrtorch.fitting.exclusions import USUAL, refuse_together
+from lfrtorch.fitting.prediction import Noise
 from lfrtorch.fitting.trainer import Trainer
-from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_errors import Ridge
 from lfrtorch.linear.bla import estimate_bla
@@ -174,15 +174,12 @@ class Settings:
                 object.__setattr__(self, name, size)
         for name in ("nx_max", "starts", "average"):
             integer(name, getattr(self, name), 1)
-        check_noise(self.noise, self.trainer)
-        check_horizon(self.horizon, self.noise)
+        if self.horizon is not None:
+            integer("horizon", self.horizon, 2)
+        refuse_together(**self._that_exclude())
         if self.noise != "output":
             refine = self.linear.get("refine") or "prediction"
             object.__setattr__(self, "linear", {**self.linear, "refine": refine})
-            if self.distil:
-                raise InputError(
-                    f"distil is for noise='output', and noise is {self.noise!r}; give one of them."
-                )
         integer("seed", self.seed, 0)
         if not self.feedthrough:
             object.__setattr__(self, "linear", {**self.linear, "feedthrough": False})
@@ -193,24 +190,9 @@ class Settings:
         number("first_part", self.first_part, positive=True)
         if self.first_part > 1:
             raise InputError(f"first_part is {self.first_part}; give a part: above 0, 1 at most.")
-        if self.first_part < 1 and self.average > 1:
-            raise InputError(
-                f"first_part is {self.first_part}, which keeps one start, and average is "
-                f"{self.average}; give first_part=1 or average=1."
-            )
         integer("first_iterations", self.first_iterations, 1)
         for name in ("relaxations", "modes"):
             integer(name, getattr(self, name), 0)
-        if self.structure != "free" and (self.noise != "output" or self.searched):
-            raise InputError(
-                f"structure is {self.structure!r}, which is for noise='output' and given sizes; "
-                "give numbers for the sizes that are 'auto', or structure='free'."
-            )
-        if self.structure != "free" and self.average > 1:
-            raise InputError(
-                f"structure is {self.structure!r}, which a mean of models does not keep, and "
-                f"average is {self.average}; give average=1 or structure='free'."
-            )
         check_dtype(self.dtype)
         try:
             torch.empty(0, device=self.device)
@@ -243,6 +225,20 @@ class Settings:
             raise InputError(
                 "nz or nw is auto, and a map of one's own is not searched; give numbers."
             )
+
+    def _that_exclude(self) -> dict[str, Any]:
+        """Return the settings that may exclude each other, those of parts by their own names.
+
+        A model of ``init_from`` has a static map, sizes and a structure of its own.
+        """
+        own = (
+            {"static", "structure", "nz", "nw", "nn", "degree"}
+            if self.init_from is not None
+            else set()
+        )
+        given = {name: getattr(self, name, None) for name in {*USUAL} - own}
+        parts = {"guarantee": getattr(self.trainer, "guarantee", None)}
+        return given | parts | {"integrators": self.linear.get("integrators", 0)}
 
     @property
     def size_names(self) -> tuple[str, ...]:

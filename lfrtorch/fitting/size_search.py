@@ -40,6 +40,7 @@ from lfrtorch._support.tables import number, quantity
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.distributed import ProcessLostError, Ranks
+from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.folds import folds as folds_of
 from lfrtorch.fitting.live_line import StartsLine
 from lfrtorch.fitting.multistart import iterations_of
@@ -47,7 +48,6 @@ from lfrtorch.fitting.prediction import SIMULATION, Noise, predicting
 from lfrtorch.fitting.refit import all_records
 from lfrtorch.fitting.side_by_side import Together, any_of
 from lfrtorch.fitting.trainer import Fit, Monitor, Stop, StoppedError, Trainer
-from lfrtorch.fitting.windows import check_horizon
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_errors import Ridge
 from lfrtorch.linear.model import LinearModel
@@ -338,10 +338,11 @@ def search_sizes(
     if noise != "output":
         begin, linear = start, None if linear is None else linear.predictor()
         start = lambda sizes, seed: begin(sizes, seed).predictor()  # noqa: E731
-        _, train, validation = predicting(noise, trainer, [], train, validation)
+        _, train, validation = predicting([], train, validation)
     given_records = all_records(as_records(train), as_records(validation)) if folds else []
     ranks = Ranks() if ranks is None else ranks
     trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer
+    refuse_together(noise=noise, horizon=horizon, guarantee=trainer.guarantee)
     validation = [*map(with_window, as_records(validation))]
     scale = Scaler.of(validation).y_scale
     judge, clock = Judge(validation, linear, ranks, scale), time.perf_counter()
@@ -349,7 +350,6 @@ def search_sizes(
     planned = race(len(drawn), finalists, trainer.limit)
     halt = Event()
     options: dict[str, Any] = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
-    check_horizon(horizon, noise)
     options["simulation"], options["horizon"] = SIMULATION.get(noise, 0.0), horizon
     options["stop"] = any_of(halt, stop) if ranks.world == 1 else stop
     field = [

@@ -23,6 +23,7 @@ from lfrtorch.fitting.driven_states import (
     relaxation_frequencies,
     with_driven_states,
 )
+from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.nonlinear_end import nonlinear_end
 from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.least_squares.fit_memory import check_fit_memory
@@ -138,8 +139,14 @@ def initialise(
     integer("relaxations", relaxations, 0)
     integer("modes", modes, 0)
     check_dtype(dtype)
-    if structure != "free":
-        _check_structure(structure, nz, nw, nn, static, relaxations + modes, z_feedthrough)
+    _check_structure(structure, nz, nw, nn)
+    refuse_together(
+        structure=structure,
+        relaxations=relaxations,
+        modes=modes,
+        z_feedthrough=z_feedthrough,
+        static="network" if static is None else static,
+    )
     if not feedthrough:
         _check_no_feedthrough(bla, structure, z_feedthrough)
     data = [without_coordinates(record) for record in as_records(records)]
@@ -256,32 +263,14 @@ def _in_blocks(cell: LFRCell, structure: str) -> LFRCell:
     return cell
 
 
-def _check_structure(
-    structure: str,
-    nz: int,
-    nw: int,
-    nn: int | None,
-    static: Module | None,
-    driven: int,
-    z_feedthrough: bool,
-) -> None:
+def _check_structure(structure: str, nz: int, nw: int, nn: int | None) -> None:
     """Refuse what a structure has no place for with a ValueError."""
     if structure not in STRUCTURES:
         raise InputError(f"structure is {structure!r}; use one of {', '.join(STRUCTURES)}.")
-    if driven:
-        raise InputError(
-            f"structure is '{structure}', which has no relaxations or modes; give one of the two."
-        )
-    if structure == "hammerstein" and not z_feedthrough:
-        raise InputError(
-            "structure is 'hammerstein', whose z is of the inputs alone, and z_feedthrough is "
-            "False; give one of the two."
-        )
     if structure == "parallel":
-        if nz != nw or static is not None:
+        if nz != nw:
             raise InputError(
-                f"structure is 'parallel', which has a network, and a w for each z; nz is {nz} and "
-                f"nw is {nw}."
+                f"structure is 'parallel', which has a w for each z; nz is {nz} and nw is {nw}."
             )
         if nn is not None and nn < nz:
             raise InputError(f"structure is 'parallel', and {nn} neurons are fewer than {nz} z.")

@@ -19,6 +19,7 @@ from lfrtorch._support.reasons import Reason, told
 from lfrtorch._support.threads import spread_by_hand
 from lfrtorch.distributed import ProcessLostError, Ranks
 from lfrtorch.fitting import state_file
+from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.windows import windows
 from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -271,6 +272,8 @@ class Fit:
         if ranks.world > 1:
             weights = parameters_to_vector(model.lfr.parameters())
             vector_to_parameters(ranks.first(weights), model.lfr.parameters())
+        guarantee = self.trainer.guarantee
+        refuse_together(structure=model.lfr.cell.structure, guarantee=guarantee)
         longest = max(record.samples for record in as_records(train))
         if horizon is not None:
             nx = model.lfr.cell.nx
@@ -284,7 +287,7 @@ class Fit:
                 model,
                 train,
                 ridge=ridge,
-                guarantee=self.trainer.guarantee,
+                guarantee=guarantee,
                 longest=longest,
                 ranks=ranks,
             )

@@ -45,18 +45,6 @@ BEFORE = 20
 and 100 of 61 of 84: where small changes grow, the error over more samples has many minima."""
 
 
-def check_horizon(horizon: int | None, noise: str = "output") -> None:
-    """Refuse what is no horizon, or one for predictions, with a ValueError."""
-    if horizon is None:
-        return
-    integer("horizon", horizon, 2)
-    if noise != "output":
-        raise InputError(
-            f"horizon is {horizon!r}, and noise is {noise!r}, which fits predictions one sample "
-            "ahead; give horizon=None or noise='output'."
-        )
-
-
 def windows(
     records: Sequence[Record], horizon: int, nx: int, *, fitted: bool = True
 ) -> list[Record]:
@@ -75,13 +63,15 @@ def windows(
             as many as the record skips. A window that has fewer begins as the record does.
 
     Raises:
-        ValueError: too few samples for the states, or a record with weights by spectral line.
+        ValueError: a horizon below 2, too few samples for the states, or a record with weights by
+            spectral line.
 
     Example:
         >>> from lfrtorch.fitting.windows import windows
         >>> [(w.samples, w.start) for w in windows([record[:400]], 150, nx=2)]
         [(150, 'zero'), (150, 'estimated'), (150, 'estimated')]
     """
+    integer("horizon", horizon, 2)
     found = []
     for record in records:
         if record.samples - record.skip <= horizon:

@@ -7,9 +7,7 @@ from typing import Literal, Protocol
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._support.errors import InputError
 from lfrtorch.distributed import Ranks
-from lfrtorch.engine.block_form import zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.least_squares.contracting import Contracting
 from lfrtorch.least_squares.exact_integrators import integrating_states
@@ -45,11 +43,6 @@ def guarantee_of(name: Name | None, cell: LFRCell, samples: int, ranks: Ranks) -
     Raises:
         ValueError: a model that cannot keep it.
     """
-    if name is not None and zeros_of(cell):
-        raise InputError(
-            f"a fit with trainer.guarantee={name} does not keep the structure "
-            f"'{cell.structure}'; give structure=free, or trainer.guarantee=null."
-        )
     if name == "contracting":
         return Contracting(cell)
     moves = cell.A.requires_grad and not integrating_states(cell).all()

@@ -100,17 +100,3 @@ def test_what_a_structure_has_no_place_for_is_refused(record: Record):
         begun("parallel", record, nz=2, nw=1)
     with pytest.raises(lfrtorch.InputError, match="use one of free, wiener"):
         begun("volterra", record)
-    with pytest.raises(lfrtorch.InputError, match="z_feedthrough"):
-        begun("hammerstein", record, z_feedthrough=False)
-    with pytest.raises(lfrtorch.InputError, match="no relaxations"):
-        begun("wiener", record, relaxations=1)
-    with pytest.raises(lfrtorch.InputError, match="given sizes"):
-        lfrtorch.Settings(nx=2, nz="auto", structure="wiener")
-    with pytest.raises(lfrtorch.InputError, match="average"):
-        lfrtorch.Settings(nx=2, structure="wiener", average=2)
-    trainer = lfrtorch.LevenbergMarquardt(guarantee="stable")
-    with pytest.raises(lfrtorch.InputError, match="does not keep the structure"):
-        lfrtorch.fit(begun("wiener", record), record, trainer=trainer)
-    models = [begun("wiener", record, seed=seed) for seed in range(2)]
-    with pytest.raises(lfrtorch.InputError, match="average"):
-        lfrtorch.fit(models, record, record, average=2)

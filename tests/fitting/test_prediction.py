@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -255,18 +254,6 @@ def test_a_run_predicts():
         ("has no innovation gain K", lambda m, r: lfrtorch.fit(m, r, noise="innovation")),
         ("noise is 'white'", lambda m, r: lfrtorch.fit(m, r, noise=cast(Any, "white"))),
         ("noise is 'white'", lambda m, r: Settings(nx=1, noise=cast(Any, "white"))),
-        (
-            "distil is for noise='output'",
-            lambda m, r: Settings(nx=1, noise="innovation", distil=True),
-        ),
-        *(
-            ("what it holds for is the predictor, and the model could run away", act)
-            for trainer in map(partial(lfrtorch.Adam, 20, 1e-2), ("stable", "contracting"))
-            for act in (
-                lambda m, r, t=trainer: lfrtorch.fit(m, r, noise="innovation", trainer=t),
-                lambda m, r, t=trainer: Settings(nx=1, noise="both", trainer=t),
-            )
-        ),
         ("horizon is 0", lambda m, r: m.predict(r, horizon=0)),
     ],
 )

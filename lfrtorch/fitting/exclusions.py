@@ -1,0 +1,74 @@
+"""Settings that exclude each other: one row a pair, with the reason."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from lfrtorch._support.errors import InputError
+
+USUAL: dict[str, Any] = {
+    "nz": 2, "nw": 1, "nn": 15, "degree": 3, "static": "network", "structure": "free",
+    "relaxations": 0, "modes": 0, "z_feedthrough": True, "noise": "output", "horizon": None,
+    "first_part": 1.0, "average": 1, "distil": False, "guarantee": None, "integrators": 0,
+}  # fmt: skip
+"""Defaults, which exclude nothing."""
+
+
+class Exclusion(NamedTuple):
+    """Two settings of which one at least keeps its default.
+
+    Args:
+        first, second: their names.
+        reason: why a fit cannot have both.
+        values: of the first, if the others of its values go with the second.
+    """
+
+    first: str
+    second: str
+    reason: str
+    values: tuple[Any, ...] = ()
+
+    def holds(self, given: dict[str, Any]) -> bool:
+        """Return whether both settings are given, with values that exclude each other."""
+        if not {self.first, self.second} <= {*given}:
+            return False
+        first, second = given[self.first], given[self.second]
+        apart = first in self.values if self.values else first != USUAL[self.first]
+        return bool(apart and second != USUAL[self.second])
+
+
+EXCLUSIONS = (
+    *(
+        Exclusion(size, "structure", "sizes of a structure are not searched", ("auto",))
+        for size in ("nz", "nw", "nn", "degree")
+    ),
+    Exclusion("horizon", "noise", "predictions one sample ahead are not fitted in windows"),
+    Exclusion("distil", "noise", "the mean of predictors is not distilled"),
+    Exclusion("guarantee", "noise", "it holds for the predictor, and the model could run away"),
+    Exclusion("integrators", "noise", "a predictor has no exact integrators"),
+    Exclusion("guarantee", "integrators", "no integrator contracts", ("contracting",)),
+    Exclusion("guarantee", "static", "only slopes of networks are bounded", ("contracting",)),
+    Exclusion("first_part", "average", "the first iterations keep one start"),
+    Exclusion("structure", "average", "a mean of models does not keep their structure"),
+    Exclusion("structure", "noise", "a predictor does not keep the structure"),
+    Exclusion("structure", "guarantee", "steps that keep the one do not keep the other"),
+    Exclusion("structure", "relaxations", "a structure has the states of its linear blocks"),
+    Exclusion("structure", "modes", "a structure has the states of its linear blocks"),
+    Exclusion("structure", "z_feedthrough", "its z is of the inputs alone", ("hammerstein",)),
+    Exclusion("structure", "static", "its map is a network for each z", ("parallel",)),
+)
+
+
+def refuse_together(**given: Any) -> None:
+    """Refuse settings that exclude each other with a ValueError; others need not be given."""
+    for row in EXCLUSIONS:
+        if row.holds(given):
+            pair = (row.first, row.second)
+            both = " and ".join(f"{name} is {_shown(given[name])}" for name in pair)
+            advice = " or ".join(f"{name}={USUAL[name]!r}" for name in pair)
+            raise InputError(f"{both}: {row.reason}; give {advice}.")
+
+
+def _shown(value: Any) -> str:
+    """Return how a message shows a value: a static map may be an object."""
+    return "a module" if callable(value) else repr(value)
