@@ -119,3 +119,8 @@ def cut_from(
     y = model.simulate(u)[500:] + e
     record = Record(u[500:], y, start="estimated", inputs=model.inputs, outputs=model.outputs)
     return record, e
+
+
+def scored(record: Record) -> tuple[int, int]:
+    """First and last scored input sample, of records whose samples are their numbers."""
+    return int(record.u[record.skip, 0]), int(record.u[-1, 0])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from experiments import scored
 from scipy.io import savemat
 
 import lfrtorch
@@ -21,11 +22,6 @@ def numbered(tmp_path):
     signals = {"uEst": number, "yEst": -number, "uVal": 2000 + number, "yVal": -2000 - number}
     savemat(path, signals | {"Ts": np.array([[4]], np.uint8)})
     return tmp_path
-
-
-def scored(record):
-    """First and last scored sample."""
-    return int(record.u[record.skip, 0]), int(record.u[-1, 0])
 
 
 def test_official_split(numbered):

@@ -6,6 +6,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from experiments import scored
 from scipy.io import savemat
 from scipy.signal import cont2discrete, lfilter
 
@@ -15,7 +16,6 @@ from lfrtorch.datasets import ced
 
 FILE = "CED/DATAUNIF.MAT"
 ARCHIVE = "CED/FULLTEXT01.zip"
-CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
 def write(root: Path, **signals) -> Path:
@@ -35,11 +35,6 @@ def numbers() -> dict[str, np.ndarray]:
 @pytest.fixture
 def numbered(tmp_path):
     return write(tmp_path, **numbers())
-
-
-def scored(record):
-    """First and last scored sample."""
-    return int(record.u[record.skip, 0]), int(record.u[-1, 0])
 
 
 def test_split(numbered):

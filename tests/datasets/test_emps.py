@@ -8,6 +8,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from experiments import scored
 from scipy.io import savemat
 
 import lfrtorch
@@ -17,7 +18,6 @@ from lfrtorch.datasets import emps
 
 ESTIMATION, TEST = FILES = ("EMPS/DATA_EMPS.mat", "EMPS/DATA_EMPS_PULSES.mat")
 SAMPLES = 24_841
-CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
 def write(root: Path, estimation: dict[str, np.ndarray], test: dict[str, np.ndarray]) -> Path:
@@ -37,11 +37,6 @@ def numbers(sign: int = 1) -> dict[str, np.ndarray]:
 @pytest.fixture
 def numbered(tmp_path):
     return write(tmp_path, numbers(), numbers(-1))
-
-
-def scored(record):
-    """First and last scored sample."""
-    return int(record.u[record.skip, 0]), int(record.u[-1, 0])
 
 
 def test_split(numbered):

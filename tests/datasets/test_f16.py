@@ -18,7 +18,6 @@ from lfrtorch.datasets import f16
 FOLDER = "F16/F16GVT_Files/BenchmarkData"
 PERIOD, SAMPLES = 8192, 9 * 8192
 LEVELS = range(1, 8)
-CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
 SWEPT = 1000

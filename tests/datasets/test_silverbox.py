@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from experiments import scored
 from scipy.io import savemat
 from scipy.signal import lfilter
 
@@ -19,11 +20,6 @@ def numbered(tmp_path):
     number = np.arange(1.0, SAMPLES + 1)[None, :]
     savemat(path, {"V1": number, "V2": -number, "Ovld1": 0.0, "Ovld2": 0.0})
     return tmp_path
-
-
-def scored(record):
-    """First and last scored sample."""
-    return int(record.u[record.skip, 0]), int(record.u[-1, 0])
 
 
 def test_split(numbered):

@@ -1,7 +1,6 @@
 """Wiener-Hammerstein with process noise: the split, the files, and what the noise does."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from lfrtorch.datasets import wh_process_noise
 
 FOLDER = "WienHammer/WienerHammersteinFiles"
 ESTIMATION, TEST = "WH_EstimationExample.mat", "WH_TestDataset.mat"
-CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
 def write(root, file, **fields):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from experiments import scored
 from scipy.io import savemat
 
 from lfrtorch.datasets import wiener_hammerstein
@@ -18,11 +19,6 @@ def numbered(tmp_path):
     number = np.arange(1.0, SAMPLES + 1)[:, None]
     savemat(path, {"uBenchMark": number, "yBenchMark": -number, "fs": 51200.0})
     return tmp_path
-
-
-def scored(record):
-    """First and last scored sample."""
-    return int(record.u[record.skip, 0]), int(record.u[-1, 0])
 
 
 def test_official_split(numbered):

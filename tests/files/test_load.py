@@ -20,6 +20,7 @@ from lfrtorch.records import Channel
 SAMPLES = 200
 USE: dict[str, Any] = {"inputs": ["u1", "u2"], "outputs": "y", "fs": 50.0}
 TIMED: dict[str, Any] = {"inputs": "u", "outputs": "y", "time": "t"}
+BARE: dict[str, Any] = {"inputs": "u", "outputs": "y"}
 N = 100  # samples of a period
 
 
@@ -326,51 +327,48 @@ def test_refused_time(tmp_path):
 
 def test_no_sampling_frequency(tmp_path):
     path = tmp_path / "a.csv"
-    use = {"inputs": "u", "outputs": "y"}
     count = np.arange(300.0)[:, None]
     both = np.hstack([count, count / 20, np.cos(count), np.sin(count)])
     write(path, both, "n,x,u,y")
-    refused(r"fs=HZ, or by a column of time stamps: time='x' \(20 Hz\)", path, use=use)
+    refused(r"fs=HZ, or by a column of time stamps: time='x' \(20 Hz\)", path, use=BARE)
     write(path, both[:, [0, 2, 3]], "n,u,y")
-    refused(r"is not known; give fs=HZ\.$", path, use=use)
+    refused(r"is not known; give fs=HZ\.$", path, use=BARE)
     write(path, both[:, [3, 2, 3]], "t,u,y")
-    refused(r"give fs=HZ; the column 't' does not rise", path, use=use)
+    refused(r"give fs=HZ; the column 't' does not rise", path, use=BARE)
 
 
 def test_a_column_that_is_named_as_time_is_the_time(tmp_path):
     path = tmp_path / "a.csv"
-    use: dict[str, Any] = {"inputs": "u", "outputs": "y"}
     count = np.arange(300.0)[:, None]
     signals = np.random.default_rng(0).normal(size=(300, 2))
     both = np.hstack([count, count / 7, 50 * count, signals])
     write(path, np.append(both, np.full((20, 5), np.nan), axis=0), "n,v,Time [ms],u,y")
-    data = load_records(path, **use)
+    data = load_records(path, **BARE)
     assert data.train[0].fs == 20.0
     assert data.notes[0] == "the column 'Time' is taken for the time, 20 Hz"
-    assert load_records(path, **use, fs=20).notes == ()
+    assert load_records(path, **BARE, fs=20).notes == ()
     write(path, np.delete(both, [100, 101], axis=0), "n,v,Time [ms],u,y")
-    refused(r"1 gap\(s\) of 2 sample\(s\)", path, use=use)
+    refused(r"1 gap\(s\) of 2 sample\(s\)", path, use=BARE)
     write(path, both[:, [0, 2, 3, 4]], "t,Time [ms],u,y")
-    refused("'t' says 1 Hz and the column 'Time' 20 Hz; give the right one", path, use=use)
-    assert load_records(path, **use, time="Time").train[0].fs == 20.0
+    refused("'t' says 1 Hz and the column 'Time' 20 Hz; give the right one", path, use=BARE)
+    assert load_records(path, **BARE, time="Time").train[0].fs == 20.0
 
 
 def test_the_rate_that_an_array_file_says(tmp_path):
     path = tmp_path / "a.mat"
     t, (u, y) = np.arange(300) / 50, np.random.default_rng(0).normal(size=(2, 300))
-    use: dict[str, Any] = {"inputs": "u", "outputs": "y"}
     scipy.io.savemat(path, {"u": u, "y": y, "Ts": 0.02, "t": np.arange(8.0)})
-    data = load_records(path, **use)
+    data = load_records(path, **BARE)
     assert data.train[0].fs == 50.0
     assert data.notes == ("fs is 50 Hz, as 'Ts' in the file says",)
-    assert load_records(path, **use, fs=100).notes == (
+    assert load_records(path, **BARE, fs=100).notes == (
         "fs is 100 Hz and 'Ts' in the file says 50 Hz",
     )
     scipy.io.savemat(path, {"u": u, "y": y, "Ts": 0.02, "t": t})
-    assert "'t' is taken for the time, 50 Hz" in load_records(path, **use).notes[0]
+    assert "'t' is taken for the time, 50 Hz" in load_records(path, **BARE).notes[0]
     scipy.io.savemat(path, {"u": u, "y": y, "Ts": 0.02, "t": 1000 * t})
-    refused("the column 't' says 0.05 Hz and 'Ts' 50 Hz; give the right one", path, use=use)
-    assert load_records(path, **use, fs=50).train[0].fs == 50.0
+    refused("the column 't' says 0.05 Hz and 'Ts' 50 Hz; give the right one", path, use=BARE)
+    assert load_records(path, **BARE, fs=50).train[0].fs == 50.0
 
 
 @pytest.mark.data
@@ -392,10 +390,9 @@ def test_the_aircraft_as_published(benchmark_root):
 def test_a_time_column_that_contradicts_is_noted(tmp_path):
     path = tmp_path / "a.csv"
     timed(path, np.arange(300) / 100)
-    use: dict[str, Any] = {"inputs": "u", "outputs": "y"}
-    (note,) = load_records(path, **use, fs=1000).notes
+    (note,) = load_records(path, **BARE, fs=1000).notes
     assert note.startswith("fs is 1000 Hz and the column 't' says 100 Hz")
-    assert load_records(path, **use, fs=100).notes == ()
+    assert load_records(path, **BARE, fs=100).notes == ()
 
 
 def lost_and_doubled(path):
@@ -453,7 +450,7 @@ def test_a_unit_of_time_that_is_assumed_is_said(tmp_path):
     )
     write(path, np.column_stack([np.arange(300) / 100, values]), "t [Ms],u,y")
     refused("the column 't .Ms.' has the unit 'Ms', which is none of time", path,
-            use={"inputs": "u", "outputs": "y"})  # fmt: skip
+            use=BARE)  # fmt: skip
 
 
 def test_sheets_are_records(tmp_path, signals):

@@ -103,14 +103,10 @@ def test_polynomial_comes_back(tmp_path: Path, dtype: torch.dtype):
     assert np.isfinite(model.simulate(U)).all()
 
 
-def test_the_folder_of_a_run_will_do(tmp_path: Path):
+def test_the_folder_of_a_run_and_a_string_will_do(tmp_path: Path):
     model = small()
     model.save(tmp_path / "run" / "model")
     assert np.array_equal(load(tmp_path / "run").simulate(U), model.simulate(U))
-
-
-def test_a_string_will_do(tmp_path: Path):
-    model = small()
     model.save(str(tmp_path / "saved"))
     assert np.array_equal(load(str(tmp_path / "saved")).simulate(U), model.simulate(U))
 
@@ -181,12 +177,9 @@ def test_description_of_another_program(saved: Path, text: str):
     refused(saved, "was not written by lfrtorch")
 
 
-def test_newer_version(saved: Path):
+def test_newer_version_and_none(saved: Path):
     edit(saved, version=checkpoint.VERSION + 1)
     refused(saved, f"has checkpoint version {checkpoint.VERSION + 1} and this program reads up to")
-
-
-def test_version_that_is_missing(saved: Path):
     edit(saved, version=None)
     refused(saved, "is damaged (version None)")
 
@@ -393,19 +386,15 @@ def test_each_kind_of_model_is_found_in_a_run(tmp_path: Path):
 # --- refusals of save -----------------------------------------------------------------------
 
 
-def test_foreign_folder_is_left_alone(tmp_path: Path):
+def test_foreign_folder_and_file_are_left_alone(tmp_path: Path):
     (tmp_path / "thesis.txt").write_text("three years")
     with pytest.raises(ValueError, match="exists and is not a checkpoint; choose another folder"):
         small().save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
     assert (tmp_path / "thesis.txt").read_text() == "three years"
-
-
-def test_file_is_left_alone(tmp_path: Path):
-    (tmp_path / "saved").write_text("three years")
     with pytest.raises(ValueError, match="exists and is not a checkpoint"):
-        small().save(tmp_path / "saved")
-    assert (tmp_path / "saved").read_text() == "three years"
+        small().save(tmp_path / "thesis.txt")
+    assert (tmp_path / "thesis.txt").read_text() == "three years"
 
 
 def test_empty_folder_is_taken(tmp_path: Path):
