@@ -54,6 +54,8 @@ nitpick_ignore_regex = [
     ("py:.*", r"(collections|jaxtyping|matplotlib|numpy|pathlib|scipy|threading|torch|typing)\..*"),
     ("py:class", r"\w+"),  # an alias, or a type variable
     ("py:class", r"lfrtorch\.distributed\.Shared"),
+    # what the engine's own functions hand each other
+    ("py:class", r"lfrtorch\.engine\..*\.(Activation|Kernel|Matrices|StaticJacobian)"),
 ]
 
 # To other sites: `make docs-links`.
