@@ -95,7 +95,7 @@ class Problem(LeastSquares):
             self.fixed = torch.zeros_like(self._theta_0, dtype=torch.bool)
             self.fixed[: len(fixed)] = fixed
         self._reduced: Reduction | None = None
-        self._fits_memory = False
+        self._checked: set[bool] = set()  # whether the memory of these systems was checked
 
     @classmethod
     def of(
@@ -237,10 +237,10 @@ class Problem(LeastSquares):
         states = len(theta) - own
         eliminate = eliminate and states > own and self.ranks.world == 1
         eliminate = eliminate and all(term.eliminates for term in self._terms)
-        if not self._fits_memory:  # the same at every θ
+        if eliminate not in self._checked:  # the same at every θ
             spectral = sum(group.y.numel() for group in self.errors.groups if group.spectral)
             check_fit_memory(self.lfr.cell, 0 if eliminate else states, spectral)
-            self._fits_memory = True
+            self._checked.add(eliminate)
         rows = [part for t in self._terms for part in t.linearise(theta, eliminate=eliminate)]
         if eliminate:
             reduced = everything(theta[:own])

@@ -1,11 +1,15 @@
 """Sizes that take more memory to fit than a machine has."""
 
+import numpy as np
 import pytest
 import torch
+from reference import random_cell, random_model
 
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.least_squares.fit_memory import check_fit_memory
+from lfrtorch.least_squares.problem import Problem
+from lfrtorch.records import Record
 
 
 def planned(nz: int, nn: int) -> LFRCell:
@@ -34,3 +38,21 @@ def test_rows_of_spectra_are_held():
 def test_a_polynomial_of_too_many_terms():
     with pytest.raises(ValueError, match="a polynomial with nz=60, nw=1 and degree=30 takes"):
         Polynomial(60, 1, 30)
+
+
+def test_a_system_of_all_start_states_is_checked_after_one_without(monkeypatch: pytest.MonkeyPatch):
+    """A search eliminates the start states of many records, and a covariance has them all."""
+    model, rng = random_model(random_cell(nx=2)), np.random.default_rng(0)
+    records = [
+        Record(rng.normal(size=(9, 1)), rng.normal(size=(9, 1)), fs=model.fs, start="estimated")
+        for _ in range(50)
+    ]
+    checked: list[int] = []
+    monkeypatch.setattr(
+        "lfrtorch.least_squares.problem.check_fit_memory",
+        lambda cell, states, rows: checked.append(states),
+    )
+    problem = Problem.of(model, records)
+    for eliminate in (True, True, False, False):
+        problem.linearise(problem.theta, eliminate=eliminate)
+    assert checked == [0, 100]
