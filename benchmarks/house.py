@@ -145,7 +145,7 @@ def counts(checkout: Path, done: Callable[[Row], None]) -> None:
     sources = [
         p for p in package.rglob("*") if p.is_file() and p.suffix not in (".pyc", ".nbc", ".nbi")
     ]
-    row["files to edit for an activation"] = str(files_with("softplus", sources))
+    row["files to edit for an activation"] = str(files_with("(?i:softplus)", sources))
     guide = [*(checkout / "conf").rglob("*.yaml"), *(checkout / "docs/guide").rglob("*.md")]
     edits = {name: files_with(name, [*sources, *guide]) for name in names if "_" in name}
     most = max(edits, key=lambda name: edits[name])

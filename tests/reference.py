@@ -9,6 +9,7 @@ import numpy as np
 import scipy.signal
 import torch
 from hypothesis import strategies as st
+from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call, jacfwd
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
@@ -18,6 +19,7 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.engine.simulation import Trajectory
+from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.linear.refinement import Refined
 from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
@@ -304,3 +306,23 @@ def move(model: Model, far: float):
     vector_to_parameters(
         vector + far * normal(len(vector), seed=9, dtype=vector.dtype), model.lfr.parameters()
     )
+
+
+class DenseJacobian:
+    """A Jacobian that is held as one matrix, and the residual there."""
+
+    def __init__(self, jacobian: Float[Tensor, "M P"], residual: Float[Tensor, " M"]) -> None:
+        self.jacobian, self.residual = jacobian, residual
+
+    def system(self, damping: float, truncation: float) -> tuple[SVDSystem, Tensor]:
+        """The system and the gradient."""
+        R = torch.linalg.qr(self.jacobian, mode="r").R
+        return SVDSystem(R, truncation), self.jacobian.mT @ self.residual
+
+    def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
+        """J dθ."""
+        return self.jacobian @ d_theta
+
+    def adjoint(self, residual: Float[Tensor, " M"]) -> Float[Tensor, " P"]:
+        """Jᵀ residual."""
+        return self.jacobian.mT @ residual

@@ -27,7 +27,7 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import Reason
-from lfrtorch.least_squares.linear_systems import SVDSystem, System
+from lfrtorch.least_squares.linear_systems import System
 
 FASTEST_DECREASE = 0.2
 """Smallest factor on λ after an accepted step; Nielsen has 1/3."""
@@ -103,26 +103,6 @@ class ManyLeastSquares(Protocol):
 
 
 JACOBIAN, RESIDUAL, ADMISSIBLE = "jacobian", "residual", "admissible"
-
-
-class DenseJacobian:
-    """A Jacobian that is held as one matrix, and the residual there."""
-
-    def __init__(self, jacobian: Float[Tensor, "M P"], residual: Float[Tensor, " M"]) -> None:
-        self.jacobian, self.residual = jacobian, residual
-
-    def system(self, damping: float, truncation: float) -> tuple[System, Tensor]:
-        """The system and the gradient."""
-        R = torch.linalg.qr(self.jacobian, mode="r").R
-        return SVDSystem(R, truncation), self.jacobian.mT @ self.residual
-
-    def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
-        """J dθ."""
-        return self.jacobian @ d_theta
-
-    def adjoint(self, residual: Float[Tensor, " M"]) -> Float[Tensor, " P"]:
-        """Jᵀ residual."""
-        return self.jacobian.mT @ residual
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from reference import measure, move, planted, random_cell, random_model, theta, unscaled
+from reference import (
+    DenseJacobian,
+    measure,
+    move,
+    planted,
+    random_cell,
+    random_model,
+    theta,
+    unscaled,
+)
 from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
@@ -18,7 +27,6 @@ from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import EXPLOSION, Fit, Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import (
-    DenseJacobian,
     LeastSquares,
     LevenbergMarquardt,
 )

@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from reference import normal
+from reference import DenseJacobian, normal
 from torch import Tensor
 from torch.func import jacrev
 
 from lfrtorch.least_squares.levenberg_marquardt import (
-    DenseJacobian,
     LeastSquares,
     LevenbergMarquardt,
     LMState,
