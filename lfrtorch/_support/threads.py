@@ -1,4 +1,4 @@
-"""Work on several threads without OpenMP: as many as torch was given."""
+"""Work on several threads without OpenMP, and tensors as the compiled code in them takes them."""
 
 from __future__ import annotations
 
