@@ -41,24 +41,16 @@ class Bounds(Protocol):
     def tightened(
         self, step: Float[Tensor, " P"], room: Float[Tensor, " bounds"]
     ) -> Float[Tensor, " bounds"] | None:
-        """The room to try next if the step passes the bounds by higher orders; else None.
-
-        It is -inf if a step must be shorter before that can be told.
-        """
+        """The room to try next if the step passes the bounds by higher orders; else None."""
+        # It is -inf if a step must be shorter before that can be told.
         ...
 
 
 class BoundedSystem:
-    """A system whose steps keep bounds.
+    """A system whose steps keep bounds."""
 
-    A step beyond the bounds is replaced by the best one within them: the minimum of
-    |r + J δ|² + λ|δ|² under C δ <= room, which is tightened until the step keeps the bounds to all
-    orders.
-
-    Args:
-        system: without the bounds.
-        bounds: of its steps.
-    """
+    # A step beyond them is replaced by the minimum of |r + J δ|² + λ|δ|² under C δ <= room, which
+    # is tightened until the step keeps the bounds to all orders.
 
     def __init__(self, system: System, bounds: Bounds) -> None:
         self._system, self.scale, self.rank = system, system.scale, system.rank

@@ -58,12 +58,7 @@ LARGEST = 64
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """The system above.
-
-    Args:
-        A, B, C, Bu, D, Cy, Dy, Dyu: its matrices.
-        neurons: whether the slopes are those of neurons.
-    """
+    """The system above, with the slopes of neurons or of entries of ∂w/∂z."""
 
     A: Float[Array, "nx nx"]
     B: Float[Array, "nx q"]
@@ -108,12 +103,7 @@ class Differences:
 
     @classmethod
     def of(cls, cell: LFRCell, slopes: Enclosure | None) -> list[Differences]:
-        """By entry and by neuron: the smaller one, and the other if not too large.
-
-        Args:
-            cell: with a network or no static map.
-            slopes: of the map, where it is used; ``None`` without one.
-        """
+        """By entry and by neuron: the smaller one, and the other if not too large."""
         if slopes is None or not is_network(cell.static):
             nothing = np.zeros((0, 0))
             return [cls.by_entry(cell, Interval(nothing, nothing))]
@@ -183,11 +173,7 @@ def margin(system: Differences, rate: float) -> Margin | None:
 
 
 def certificate(system: Differences, rate: float) -> Certificate | None:
-    """P and T by which all differences shrink by the rate in every sample; None if none is found.
-
-    Raises:
-        ValueError: the solver is not installed.
-    """
+    """P and T by which all differences shrink by the rate in every sample; None if not found."""
     moved = prepared(system, rate)
     if moved is None:
         return None
@@ -324,13 +310,9 @@ def _solved(
     constant: Float[Array, "n n"],
     objective: int,
     weight: float,
-    trace: Array | None = None,
+    trace: Array | None = None,  # trace · ξ = 1
 ) -> tuple[Array, Array] | None:
-    """min weight ξ_objective with constant + Σ ξ_k F_k <= 0, and trace · ξ = 1 if it is given.
-
-    Returns:
-        ξ, and the multiplier of the inequality, a matrix.
-    """
+    """ξ of min weight ξ_objective with constant + Σ ξ_k F_k <= 0, and the multiplier."""
     clarabel: Any = imported("clarabel", "certificate")
     n, count = F.shape[-1], len(F)
     j, i = np.tril_indices(n)  # the upper triangle, column by column

@@ -45,14 +45,7 @@ KEPT = 0.1
 
 
 class Contracting:
-    """A guarantee: every model has a certificate.
-
-    Args:
-        cell: the model; its free parameters are the first entries of θ.
-
-    Raises:
-        ValueError: its static map is no network, or it has no certificate.
-    """
+    """A guarantee: every model has a certificate."""
 
     def __init__(self, cell: LFRCell) -> None:
         if not is_network(cell.static):
@@ -182,13 +175,7 @@ class Contracting:
 
 
 class MarginBound:
-    """The bound of a step that leaves a number t(δ) positive.
-
-    Args:
-        slope: the derivative of -t by the first entries of a step.
-        t: at 0.
-        after: t after a step.
-    """
+    """The bound of a step that leaves a number t(δ) positive."""
 
     trusted, corrections = False, 4
 

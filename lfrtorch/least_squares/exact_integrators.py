@@ -17,15 +17,7 @@ from lfrtorch.engine.cell import LFRCell
 
 
 def integrating_states(cell: LFRCell) -> Bool[Tensor, " nx"]:
-    """Which states are exact integrators.
-
-    Example:
-        >>> from lfrtorch.least_squares.exact_integrators import integrating_states
-        >>> cell = lfrtorch.LFRCell(nu=1, ny=1, nx=2)
-        >>> _ = cell.A.data.copy_(torch.tensor([[0.5, 0.0], [2.0, 1.0]]))
-        >>> integrating_states(cell)
-        tensor([False,  True])
-    """
+    """Which states are exact integrators."""
     A = cell.A.detach()
     acts = A - torch.diag(A.diagonal()) != 0
     candidates = (A.diagonal() == 1) & ~cell.Cz.detach().any(dim=0)
@@ -36,11 +28,9 @@ def integrating_states(cell: LFRCell) -> Bool[Tensor, " nx"]:
 
 
 def fixed_parameters(cell: LFRCell) -> Bool[Tensor, " free"] | None:
-    """Which entries of the free parameters a fit must not change; None if there are none.
-
-    Columns of exact integrators, and of past outputs in a predictor
-    (``lfrtorch.engine.innovation``), and the zeros of a structure (``lfrtorch.engine.block_form``).
-    """
+    """Which entries of the free parameters a fit must not change; None if there are none."""
+    # Columns of exact integrators, those of past outputs in a predictor (``engine.innovation``),
+    # and the zeros of a structure (``engine.block_form``).
     states, zeros = integrating_states(cell), zeros_of(cell)
     if not (states.any() or cell.past_outputs or zeros):
         return None

@@ -11,13 +11,9 @@ and of P x gauge directions."""
 
 
 def check_fit_memory(cell: LFRCell, states: int = 0, rows: int = 0) -> None:
-    """Refuse a model whose fit takes more memory than its device has with a ValueError.
-
-    Args:
-        cell: the model; its weights may be on torch's ``meta`` device, where they have none.
-        states: estimated start states, all entries together.
-        rows: errors of records with ``line_weight``, whose rows are all held.
-    """
+    """Refuse a model whose fit takes more memory than its device has with a ValueError."""
+    # ``states`` counts all entries of estimated start states; ``rows`` the errors of records with
+    # ``line_weight``, whose rows are all held. Weights may be on torch's ``meta`` device.
     P = sum(p.numel() for p in cell.parameters() if p.requires_grad) + states
     squares = [n**2 for n in (cell.nx, cell.nz, cell.nw)]  # coordinates of x, z and w
     numbers = SQUARES * P**2 + TALL * P * sum(squares) + max(squares) ** 2 + rows * P

@@ -61,15 +61,10 @@ def reduction(
     before: Reduction | None = None,
     fixed: Bool[Tensor, " free"] | None = None,
 ) -> Reduction:
-    """Which columns of the Jacobian of the free parameters to compute.
-
-    Args:
-        cell: the model.
-        initial_states: those that are parameters, too; their columns come last and are kept.
-        coordinates: whether the coordinates of x are free: no initial state is given in them.
-        before: the reduction at weights close by; its columns are kept if they still do.
-        fixed: which entries of the cell's free parameters are constants: columns of zeros.
-    """
+    """Which columns of the Jacobian of the free parameters to compute."""
+    # Those of ``initial_states`` come last and are kept. ``coordinates``: no initial state is given
+    # in those of x. ``before``: the reduction at weights close by, whose columns are kept if they
+    # still do. ``fixed`` entries of the free parameters have columns of zeros.
     G = (
         _directions(cell, initial_states)[:, 0 if coordinates else cell.nx**2 :]
         .double()

@@ -32,17 +32,7 @@ class Guarantee(Protocol):
 
 
 def guarantee_of(name: Name | None, cell: LFRCell, samples: int, ranks: Ranks) -> Guarantee | None:
-    """The guarantee of a name; None if there is none, or nothing that could break it.
-
-    Args:
-        name: of the guarantee.
-        cell: the model at the start; its free parameters are the first entries of θ.
-        samples: of the longest record.
-        ranks: the processes that share the records.
-
-    Raises:
-        ValueError: a model that cannot keep it.
-    """
+    """The guarantee of a name; None if there is none, or nothing that could break it."""
     if name == "contracting":
         return Contracting(cell)
     moves = cell.A.requires_grad and not integrating_states(cell).all()

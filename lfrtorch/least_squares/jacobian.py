@@ -64,10 +64,7 @@ class TermRows(Protocol):
     def fold(
         self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
     ) -> int:
-        """Add the rows [J r], in the kept columns, to the accumulator.
-
-        The rows may be cached if they take at most ``room`` bytes; returns the bytes cached.
-        """
+        """Add the rows [J r] in the kept columns; bytes cached, which are at most ``room``."""
         ...
 
     def tangent(
@@ -91,18 +88,10 @@ class TermRows(Protocol):
 
 
 class Jacobian:
-    """J (M, P) of a residual at one θ.
+    """J (M, P) of a residual at one θ."""
 
-    Args:
-        parts: the rows of all terms.
-        reduced: the columns that are computed; of the shared parameters alone if the parts
-            eliminate start states.
-        ridge: factors of θ - θ_0, the last entries of the residual of the first process.
-        penalty: θ - θ_0.
-        ranks: the processes that hold the parts.
-        fixed: which entries of θ are constants; their columns are zeros. Default: none.
-        bounded: turns a system into one of steps within bounds. Default: there are none.
-    """
+    # ``ridge`` has factors of θ - θ_0 (``penalty``), the last entries of the residual of the first
+    # process. ``reduced`` is of the shared parameters alone if the parts eliminate start states.
 
     def __init__(
         self,
@@ -122,12 +111,7 @@ class Jacobian:
         self._own_penalty = self._penalised and ranks.rank == 0
 
     def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
-        """The least-squares system of J and its gradient Jᵀr.
-
-        Args:
-            damping: that of the next trial relative to the largest eigenvalue of JᵀJ.
-            truncation: singular values below this part of the largest are left out.
-        """
+        """The least-squares system of J and its gradient Jᵀr; see the search's ``Jacobian``."""
         kept, expand = self._reduced
         if len(self._ridge) > self._shared:
             system, gradient = self._eliminated(damping, truncation)
@@ -226,10 +210,9 @@ class Jacobian:
 
 
 class Memory:
-    """Buffers for rows, handed on from one Jacobian to the next that asks for the same size.
+    """Buffers for rows, handed on from one Jacobian to the next that asks for the same size."""
 
-    A fresh allocation took a fifth of an iteration on the parallel Wiener-Hammerstein benchmark.
-    """
+    # A fresh allocation took a fifth of an iteration on the parallel Wiener-Hammerstein benchmark.
 
     def __init__(self) -> None:
         self._free: dict[int, list[Tensor]] = {}
@@ -250,11 +233,10 @@ class Memory:
 
 
 class _Cached(NamedTuple):
-    """Weighted rows of each record, and where their first n columns stand among the kept ones.
+    """Weighted rows of each record, and where their first n columns stand among the kept ones."""
 
-    If the initial state of a record follows from the other parameters, its columns are the last
-    nx; otherwise C = n.
-    """
+    # If the initial state of a record follows from the other parameters, its columns are the last
+    # nx; otherwise C = n.
 
     rows: Float[Tensor, "R T*ny C"]
     places: Int[Tensor, "R n"]
@@ -262,16 +244,9 @@ class _Cached(NamedTuple):
 
 
 class OutputRows:
-    """The rows of one group of records.
+    """The rows of one group of records."""
 
-    Args:
-        group: the records.
-        linearisation: the model along them.
-        x0: where the initial state of each record stands in θ, if they are parameters.
-        memory: buffers for the rows.
-        eliminate: whether ``fold`` eliminates these initial states, instead of taking their columns
-            into the accumulator.
-    """
+    # ``x0``: where the initial state of each record stands in θ, if they are parameters.
 
     def __init__(
         self,
@@ -306,10 +281,7 @@ class OutputRows:
     def fold(
         self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
     ) -> int:
-        """Add the weighted rows [J r], in the kept columns, to the accumulator.
-
-        Caches the rows if they take at most ``room`` bytes; returns the bytes cached.
-        """
+        """Add the weighted rows [J r] in the kept columns; bytes cached, at most ``room``."""
         group, linearisation = self.group, self.linearisation
         own = kept[kept < linearisation.parameters]
         nx = linearisation.state.shape[1]
@@ -396,11 +368,9 @@ class OutputRows:
         among_kept: Int[Tensor, " K"],
         end: Float[Tensor, "R nx C"],
     ) -> tuple[Int[Tensor, "R n"], Float[Tensor, "R nx n"] | None]:
-        """Where the columns of each record stand among the kept ones, and dx0/dθ if it is tied.
-
-        The first K are the same for all. An initial state that is a parameter has places of its
-        own. That of a periodic record depends on the other parameters, dx0/dθ = (I - Φ)⁻¹ end.
-        """
+        """Where the columns of each record stand among the kept ones, and dx0/dθ if it is tied."""
+        # The first K are the same for all. An initial state that is a parameter has places of its
+        # own. That of a periodic record depends on the other parameters, dx0/dθ = (I - Φ)⁻¹ end.
         K = len(among_kept)
         places = among_kept.to(end.device).expand(len(end), K)
         if self.linearisation.periodic:
@@ -473,13 +443,7 @@ class OutputRows:
 
 
 class MappedRows:
-    """w J_φ T: weighted rows for parameters φ that follow from θ.
-
-    Args:
-        rows: J_φ; they eliminate no initial states.
-        change: dφ/dθ.
-        weight: w.
-    """
+    """w J_φ dφ/dθ: weighted rows for parameters φ that follow from θ; they eliminate no states."""
 
     states: StartStates | None = None
 

@@ -28,12 +28,7 @@ from lfrtorch.least_squares.problem import Problem
 
 
 def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
-    """One cell whose weights have a leading axis: the weights of each cell, ``repeat`` times.
-
-    Args:
-        cells: models of one structure.
-        repeat: records of each cell; those of the first come first.
-    """
+    """One cell whose weights have a leading axis: the weights of each cell, ``repeat`` times."""
     first = cells[0]
     weights = {
         name: torch.stack([cell.get_parameter(name).detach() for cell in cells])
@@ -59,14 +54,7 @@ def stacked(cells: Sequence[LFRCell], repeat: int) -> LFRCell:
 
 
 class JointProblem:
-    """Simulation problems of several models of one structure over the same records.
-
-    Args:
-        problems: one for each model.
-
-    Raises:
-        ValueError: problems that share a model, or differ in records, scaling or parameters.
-    """
+    """Simulation problems of several models of one structure over the same records."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = list(problems)

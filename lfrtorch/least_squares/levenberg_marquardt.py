@@ -47,13 +47,10 @@ class Jacobian(Protocol):
     """The Jacobian J of a residual r, as far as the search needs it: never the whole matrix."""
 
     def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
-        """The system (JᵀJ + λI) δ = -gradient, and the gradient Jᵀr.
-
-        Args:
-            damping: λ of the next trial relative to the largest eigenvalue of JᵀJ, roughly. Errors
-                of the system may be as large as a small part of it.
-            truncation: singular values below this part of the largest are left out.
-        """
+        """The system (JᵀJ + λI) δ = -gradient, and the gradient Jᵀr."""
+        # ``damping`` is about λ of the next trial relative to the largest eigenvalue of JᵀJ; errors
+        # of the system may be a small part of it. Singular values below ``truncation`` of the
+        # largest are left out.
         ...
 
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
@@ -107,34 +104,19 @@ JACOBIAN, RESIDUAL, ADMISSIBLE = "jacobian", "residual", "admissible"
 
 @dataclass(frozen=True)
 class LMState:
-    """Where the search stands.
-
-    Args:
-        theta: parameters θ.
-        residual: r(θ).
-        cost: |r|².
-        damping: λ of the next trial; ``None`` before the first step.
-        scale: largest squared singular value of the Jacobian in the last step.
-        growth: factor of λ on the next rejection.
-        iteration: accepted and refused steps so far.
-        gain_ratio: actual over predicted decrease of the last trial.
-        trials: dampings tried in the last step.
-        rank: directions that the Jacobian of the last step saw.
-        quiet: steps in a row that changed the cost by less than the tolerance.
-        reason: why the search is over, a ``Reason``; empty while it is not.
-    """
+    """Where the search stands: θ, r(θ), its cost |r|² and the damping λ of the next trial."""
 
     theta: Float[Tensor, " P"]
     residual: Float[Tensor, " M"]
     cost: float
-    damping: float | None = None
-    scale: float = 1.0
-    growth: float = 2.0
-    iteration: int = 0
+    damping: float | None = None  # None before the first step
+    scale: float = 1.0  # largest squared singular value of the Jacobian in the last step
+    growth: float = 2.0  # factor of λ on the next rejection
+    iteration: int = 0  # accepted and refused steps
     gain_ratio: float = float("nan")
     trials: int = 0
     rank: int = 0
-    quiet: int = 0
+    quiet: int = 0  # steps in a row that changed the cost by less than the tolerance
     reason: str = ""
 
     @property
@@ -220,11 +202,7 @@ class LevenbergMarquardt:
         return self.max_iter
 
     def init(self, problem: LeastSquares, theta: Tensor) -> LMState:
-        """State at the first θ.
-
-        Raises:
-            ValueError: the residual at the start is not finite.
-        """
+        """State at the first θ."""
         residual = problem.residual(theta)
         cost = problem.cost(residual)
         if not math.isfinite(cost):
@@ -234,10 +212,8 @@ class LevenbergMarquardt:
         return LMState(theta, residual, cost)
 
     def step(self, problem: LeastSquares, state: LMState) -> LMState:
-        """One iteration: linearise, then raise the damping until a step lowers the cost.
-
-        The first one also lowers it, as long as the next step is better.
-        """
+        """One iteration: linearise, then raise the damping until a step lowers the cost."""
+        # The first one also lowers it, as long as the next step is better.
         search = self._search(problem.cost, state)
         answer = None
         while True:
@@ -269,11 +245,7 @@ class LevenbergMarquardt:
         return replace(state, reason="") if spent else state
 
     def steps(self, joint: ManyLeastSquares, states: Sequence[LMState]) -> list[LMState]:
-        """One iteration of each of several searches, evaluated together.
-
-        Each round collects what the searches ask for and answers all of it at once. A search that
-        is over keeps its state.
-        """
+        """One iteration of each of several searches, evaluated together; one that is over stays."""
         after = list(states)
         searches = {
             i: self._search(joint.problems[i].cost, state)

@@ -56,12 +56,7 @@ class System(Protocol):
 
 
 class SVDSystem:
-    """From R with RᵀR = JᵀJ, by singular values: exact for any damping.
-
-    Args:
-        R: the factor.
-        truncation: singular values below this part of the largest are left out.
-    """
+    """From R with RᵀR = JᵀJ, by singular values: exact for any damping."""
 
     def __init__(self, R: Float[Tensor, "K P"], truncation: float) -> None:
         self.scale, self.rank = float("nan"), 0
@@ -83,12 +78,7 @@ class SVDSystem:
 
 
 class CholeskySystem:
-    """From G = JᵀJ, by Cholesky: three times faster, for λ well above the rounding errors of G.
-
-    Args:
-        G: the matrix.
-        rank: its rank, as far as it is known.
-    """
+    """From G = JᵀJ, by Cholesky: three times faster, for λ well above the rounding errors of G."""
 
     def __init__(self, G: Float[Tensor, "P P"], rank: int) -> None:
         finite = bool(torch.isfinite(G).all())
@@ -107,16 +97,11 @@ class CholeskySystem:
 
 
 class ReducedSystem:
-    """From G = JᵀJ in K columns of which all P are combinations, J = J[:, kept] E.
+    """From G = JᵀJ in K columns of which all P are combinations, J = J[:, kept] E."""
 
-    With E Eᵀ = L Lᵀ the rows of L⁻¹ E are orthonormal, and span all that J sees. In their
-    coordinates JᵀJ is Lᵀ G L, so nothing of size P × P is formed.
-
-    Args:
-        G: the matrix.
-        expand: E.
-        ridge: what is added to each eigenvalue of JᵀJ, those of other directions included.
-    """
+    # With E Eᵀ = L Lᵀ the rows of L⁻¹ E are orthonormal, and span all that J sees. In their
+    # coordinates JᵀJ is Lᵀ G L, so nothing of size P × P is formed. The ridge is added to each
+    # eigenvalue of JᵀJ, those of other directions included.
 
     def __init__(self, G: Float[Tensor, "K K"], expand: Float[Tensor, "K P"], ridge: float) -> None:
         self._expand, self._ridge, self.rank = expand, ridge, len(G)
@@ -156,11 +141,7 @@ def largest_eigenvalue(G: Float[Tensor, "P P"]) -> float:
 
 
 class BroadcastSystem:
-    """A system that all processes solve alike: the first one solves it and broadcasts the solution.
-
-    Each process has the same system but for rounding errors. These differ between processors, and
-    a search amplifies them.
-    """
+    """A system that the first process solves for all: each has its own rounding errors."""
 
     def __init__(self, system: System, ranks: Ranks) -> None:
         self._system, self._ranks = system, ranks
@@ -262,12 +243,7 @@ class GramAccumulator:
 
 
 def tied(rows: Float[Tensor, "M columns"], tie: Float[Tensor, "m n"]) -> Float[Tensor, "M n+1"]:
-    """Rows of n + 1 columns from n + m + 1: m, all before the last, follow from the first n.
-
-    Args:
-        rows: what is multiplied by a change of n parameters, m that depend on them, and one more.
-        tie: the change of the m by that of the n.
-    """
+    """Rows of n + 1 columns from n + m + 1: m, all before the last, follow from the first n."""
     m, n = tie.shape
     return torch.cat([rows[:, :n] + rows[:, n : n + m] @ tie, rows[:, -1:]], dim=1)
 
@@ -275,10 +251,8 @@ def tied(rows: Float[Tensor, "M columns"], tie: Float[Tensor, "m n"]) -> Float[T
 def _of_pieces(
     kernel: Callable[[int, Sequence[Tensor], list[Tensor]], None], rows: Tensor
 ) -> list[Tensor]:
-    """The kernel's results for pieces of the rows, which the threads share.
-
-    The pieces do not depend on the number of threads, and so neither do the digits of their sum.
-    """
+    """The kernel's results for pieces of the rows, which the threads share."""
+    # The pieces do not depend on the number of threads, and so neither do the digits of their sum.
     pieces = rows.tensor_split(_pieces(rows))
     parts: list[Tensor] = [rows[:0]] * len(pieces)
     spread(kernel, len(pieces), pieces, parts)

@@ -11,16 +11,11 @@ from lfrtorch.least_squares.linear_systems import product, tied
 
 
 class OutputColumns:
-    """The columns of Cy, Dyu and Dyw, and their products with the others.
+    """The columns of Cy, Dyu and Dyw, and their products with the others."""
 
-    The derivative of an output by a factor of a signal in v = [x; u; w] is that signal, and that of
-    the other outputs is zero. So the products of these columns are those of a few signals, and the
-    columns need not be made.
-
-    Args:
-        linearisation: the model along records whose samples count alike.
-        own: the parameters that have a column.
-    """
+    # The derivative of an output by a factor of a signal in v = [x; u; w] is that signal, and that
+    # of the other outputs is zero. So the products of these columns are those of a few signals, and
+    # the columns need not be made. All samples must count alike.
 
     def __init__(self, linearisation: Linearisation, own: Int[Tensor, " K"]) -> None:
         self._linearisation = linearisation
@@ -51,14 +46,7 @@ class OutputColumns:
         width: int,
         tie: Float[Tensor, "m n-1"] | None,
     ) -> Float[Tensor, "{width} {width}"]:
-        """JᵀJ, of ``width`` columns, without the products of the other columns.
-
-        Args:
-            of: the sum.
-            place: where the other columns stand.
-            width: how many columns there are.
-            tie: see ``linear_systems.tied``.
-        """
+        """JᵀJ, of ``width`` columns, without the products of the others, at ``place``."""
         outputs = self._linearisation.trajectory.y.shape[2]
         with_rows = self._with_rows[of].unflatten(1, (outputs, -1))[self._signal, self._output]
         if tie is not None:

@@ -53,24 +53,11 @@ class Term(Protocol):
 
 
 class Problem(LeastSquares):
-    """r(θ): the residual of each term, one after another, then √ridge (θ - θ_0).
+    """r(θ): the residual of each term, one after another, then √ridge (θ - θ_0)."""
 
-    θ are the free parameters of an LFR, then the initial states of the records whose start is
-    ``"estimated"``. The LFR gets a θ by ``write`` alone.
-
-    Args:
-        lfr: the model; θ_0 is what its parameters are now.
-        errors: the term whose records and initial states the problem is about.
-        others: more terms.
-        ridge: weight of |θ - θ_0|²; that of |y_hat - y|² is 1. As a prior on each parameter: noise
-            variance over prior variance, both normalised. One number, or one for each group of
-            parameters, see ``Parameters.ridge``.
-        guarantee: what every θ of a search must keep. Default: nothing.
-        fixed: which free parameters are constants. Default: those of ``fixed_parameters``.
-
-    Raises:
-        ValueError: nothing to fit, a negative ridge or one of an unknown group.
-    """
+    # θ are the free parameters of an LFR, then the initial states of the records whose start is
+    # ``"estimated"``; θ_0 is θ now. The LFR gets a θ by ``write`` alone. The ridge is a prior on
+    # each parameter: noise variance over prior variance, both normalised.
 
     def __init__(
         self,
@@ -108,20 +95,10 @@ class Problem(LeastSquares):
         longest: int | None = None,
         ranks: Ranks | None = None,
     ) -> Self:
-        """The simulation errors of a model over records of its channels and rate.
-
-        Args:
-            model, records: in physical units.
-            ridge: see the class.
-            guarantee: what every model on the way of a search keeps.
-            longest: samples of the longest record before they were cut into windows, which
-                ``"stable"`` goes by. Default: of these records.
-            ranks: the processes that share the records. All have the same θ, cost and gradient;
-                each has the residual of its own records.
-
-        Raises:
-            ValueError: records that are not the model's, or fewer records than processes.
-        """
+        """The simulation errors of a model over records of its channels and rate."""
+        # ``longest``: samples of the longest record before they were cut into windows, which
+        # ``"stable"`` goes by. Processes share the records: all have the same θ, cost and gradient,
+        # each the residual of its own records.
         errors = _errors_of(model, records, Ranks() if ranks is None else ranks)
         longest = longest or max(record.samples for record in as_records(records))
         kept = guarantee_of(guarantee, model.lfr.cell, longest, errors.ranks)
@@ -137,17 +114,9 @@ class Problem(LeastSquares):
         ridge: Ridge = 0.0,
         ranks: Ranks | None = None,
     ) -> Self:
-        """The errors of a predictor and, with a weight, those of the simulations of its system.
-
-        Predictions lean on the measured outputs: a model that predicts well may simulate badly, or
-        run away.
-
-        Args:
-            model, records: the predictor, and records with past outputs among the inputs.
-            simulation: weight of the errors of simulations if those of predictions were as large
-                at the start.
-            ridge, ranks: see ``of``.
-        """
+        """The errors of a predictor and, with a weight, those of the simulations of its system."""
+        # Predictions lean on the measured outputs: a model that predicts well may simulate badly,
+        # or run away. ``simulation`` is the weight if both errors were as large at the start.
         errors = _errors_of(model, records, Ranks() if ranks is None else ranks)
         found = cls(model.lfr, errors, ridge=ridge)
         normalised = [model.scaler.normalise(record) for record in as_records(records)]
@@ -163,12 +132,7 @@ class Problem(LeastSquares):
     def judge(
         cls, model: Model, records: Record | Sequence[Record], like: Problem | None = None
     ) -> Self:
-        """The errors on records that are not fitted, each from its most probable initial state.
-
-        Args:
-            model, records: in physical units.
-            like: the problem whose terms are to be judged, of this model or another.
-        """
+        """The errors on records that are not fitted, each from its most probable initial state."""
         errors = _errors_of(model, records, Ranks(), solve_initial_states=True)
         others = []
         for term in like._terms[1:] if like is not None else ():
@@ -225,14 +189,9 @@ class Problem(LeastSquares):
     def linearise(
         self, theta: Float[Tensor, " P"], *, reduce: bool = True, eliminate: bool = True
     ) -> Jacobian:
-        """dr/dθ at θ.
-
-        Args:
-            theta: θ.
-            reduce: whether columns that gauge directions make dependent are left out of the rows.
-            eliminate: whether initial states are eliminated if they outnumber the parameters; a
-                system without damping needs them all.
-        """
+        """dr/dθ at θ; ``reduce``: without columns that gauge directions make dependent."""
+        # Initial states are eliminated if they outnumber the parameters; a system without damping
+        # needs them all.
         own = self.errors.parameters.own
         states = len(theta) - own
         eliminate = eliminate and states > own and self.ranks.world == 1
@@ -299,11 +258,7 @@ class Problem(LeastSquares):
         return tensors
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what the same problem had.
-
-        Raises:
-            ValueError: it is of another problem.
-        """
+        """Take over what the same problem had."""
         theta_0 = tensors["start"]
         if theta_0.shape != self._theta_0.shape or not torch.allclose(
             theta_0, self._theta_0, 1e-6, 1e-6

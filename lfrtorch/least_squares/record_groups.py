@@ -24,32 +24,18 @@ EVERY = slice(None)
 
 @dataclass
 class RecordGroup:
-    """Records of one length and start, normalised, and how their errors are weighted.
-
-    Args:
-        u, y: input and output.
-        x0: the initial states, if they are given.
-        estimated: which of the estimated initial states is each record's, if they are estimated.
-        scored: 1 if a sample counts in the score, else 0.
-        weight: factors of the errors by sample, or by spectral line with m = T // 2 + 1; 0 if a
-            sample or a line does not count.
-        start_weight: the factors with which the initial state of a given model is estimated.
-        spectral: whether the weight is by spectral line.
-        start: how the records begin.
-        beyond: which way an output may be beyond a limit of its sensor, 1, -1 or 0; None if there
-            are no limits.
-        limits: least and greatest output that the sensors show.
-    """
+    """Records of one length and start, normalised, and how their errors are weighted."""
 
     u: Float[Tensor, "R T nu"]
     y: Float[Tensor, "R T ny"]
     x0: Float[Tensor, "R nx"] | None
-    estimated: Int[Tensor, " R"] | None
+    estimated: Int[Tensor, " R"] | None  # numbers of the estimated initial states
     scored: Float[Tensor, "R T ny"]
-    weight: Float[Tensor, "R m ny"]
-    start_weight: Float[Tensor, "R T ny"] | None
+    weight: Float[Tensor, "R m ny"]  # of samples, or of spectral lines, m = T // 2 + 1
+    start_weight: Float[Tensor, "R T ny"] | None  # estimates the initial state of a given model
     spectral: bool
     start: Start
+    # Which way an output may be beyond a limit of its sensor: 1, -1 or 0.
     beyond: Float[Tensor, "R T ny"] | None = None
     limits: Float[Tensor, "R 2 1 ny"] | None = None
 
@@ -58,10 +44,8 @@ class RecordGroup:
         return y_hat if self.limits is None else y_hat.clamp(*self.limits.unbind(1))
 
     def counted(self, y_hat: Float[Tensor, "R T ny"]) -> RecordGroup:
-        """The group with the weights of the samples that count at an output.
-
-        Where the measurement is at a limit and the model beyond it, there is no error.
-        """
+        """The group with the weights of the samples that count at an output."""
+        # Where the measurement is at a limit and the model beyond it, there is no error.
         if self.beyond is None:
             return self
         return replace(self, weight=self.weight * (self.beyond * (y_hat - self.y) <= 0))
@@ -72,11 +56,9 @@ class RecordGroup:
         records: slice = EVERY,
         time: slice = EVERY,
     ) -> Float[Tensor, "R T ny *columns"]:
-        """Weighted errors, or weighted rows of their Jacobian.
-
-        A spectrum needs all samples. Its T real numbers are the real parts of all lines, and the
-        imaginary parts of those between 0 and fs / 2.
-        """
+        """Weighted errors, or weighted rows of their Jacobian."""
+        # A spectrum needs all samples. Its T real numbers are the real parts of all lines, and the
+        # imaginary parts of those between 0 and fs / 2.
         weight = self.weight[records]
         if not self.spectral:
             weight = weight[:, time]

@@ -35,12 +35,7 @@ LARGEST_RIDGE = 1e100
 
 
 class Parameters:
-    """θ: the parameters of a cell that require a gradient, then initial states of records.
-
-    Args:
-        cell: the model.
-        states: number of records whose initial state is a parameter.
-    """
+    """θ: the parameters of a cell that require a gradient, then initial states of records."""
 
     def __init__(self, cell: LFRCell, states: int) -> None:
         free = [(name, p) for name, p in cell.named_parameters() if p.requires_grad]
@@ -67,15 +62,9 @@ class Parameters:
             parameter.data = part.view(parameter.shape)
 
     def ridge(self, ridge: Ridge) -> Float[Tensor, " P"]:
-        """The weight of every entry of θ.
-
-        Args:
-            ridge: one number, or one for each group of parameters by the beginning of their names,
-                ``{"static": 1e-3, "A": 1e-2, "x0": 0}``; other groups get 0.
-
-        Raises:
-            ValueError: a negative ridge, one above ``LARGEST_RIDGE``, or an unknown group.
-        """
+        """The weight of every entry of θ."""
+        # One number, or one for each group of parameters by the beginning of their names,
+        # ``{"static": 1e-3, "A": 1e-2, "x0": 0}``; other groups get 0.
         groups = ridge if isinstance(ridge, Mapping) else {"": ridge}
         names, sizes = list(self.names), list(self._sizes)
         if self.states:
@@ -103,16 +92,10 @@ def _belongs(name: str, group: str) -> bool:
 
 
 class SimulationErrors:
-    """A term of a problem: weighted y_hat - y in normalised units, 0 where a sample does not count.
+    """A term of a problem: weighted y_hat - y, normalised; 0 where a sample does not count."""
 
-    Args:
-        cell: the model; its weights are copied.
-        records: the data.
-        ranks: the processes that share the records.
-        y_scale: (ny,), from normalised to physical outputs, for ``rmse``.
-        solve_initial_states: estimated initial states are no part of θ, but solved for at every θ,
-            and outputs end at the limits of a record, as in a score.
-    """
+    # ``solve_initial_states``: estimated initial states are no part of θ, but solved for at every
+    # θ, and outputs end at the limits of a record, as in a score.
 
     eliminates = True
 
@@ -243,18 +226,11 @@ class SimulationErrors:
 
 
 class SystemErrors:
-    """A term of a problem: errors of simulations by the system that a predictor stands for.
+    """A term of a problem: errors of simulations by the system that a predictor stands for."""
 
-    θ are the parameters of the one-step predictor (``lfrtorch.engine.innovation``), and φ(θ) are
-    those of the system. An estimated initial state is one parameter for both: before the first
-    sample the predictor's state is the system's.
-
-    Args:
-        predictor: the model.
-        records: of the predictor, with past outputs among the inputs.
-        ranks, solve_initial_states: see ``SimulationErrors``.
-        weight: of the errors.
-    """
+    # θ are the parameters of the one-step predictor (``engine.innovation``), and φ(θ) are those of
+    # the system. An estimated initial state is one parameter for both: before the first sample the
+    # predictor's state is the system's.
 
     eliminates = False
 

@@ -23,13 +23,7 @@ from lfrtorch.least_squares.linear_systems import System
 
 
 def largest_modulus(samples: int) -> float:
-    """Of an eigenvalue that fades to 1/e within a record of so many samples.
-
-    Example:
-        >>> from lfrtorch.least_squares.stable_states import largest_modulus
-        >>> largest_modulus(1000)
-        0.999
-    """
+    """Largest modulus of an eigenvalue that fades to 1/e within a record of so many samples."""
     return 1.0 - 1.0 / samples
 
 
@@ -46,23 +40,9 @@ def fading(A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"]) -> Float
 def stabilised(
     A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"], limit: float
 ) -> Float[Tensor, "nx nx"]:
-    """A with each eigenvalue of a modulus above the limit scaled to it.
-
-    In A = Q T Qᵀ, the real Schur form, the blocks of these eigenvalues on the diagonal are scaled,
-    and nothing else changes.
-
-    Args:
-        A: matrix.
-        integrating: its exact integrators (``exact_integrators.integrating_states``), which stay.
-        limit: of the moduli.
-
-    Example:
-        >>> from lfrtorch.least_squares.stable_states import stabilised
-        >>> A = torch.tensor([[0.5, 7.0], [0.0, 1.25]])
-        >>> stabilised(A, torch.tensor([False, False]), limit=0.75)
-        tensor([[0.5000, 7.0000],
-                [0.0000, 0.7500]])
-    """
+    """A with each eigenvalue of a modulus above the limit scaled to it."""
+    # In A = Q T Qᵀ, the real Schur form, the blocks of these eigenvalues on the diagonal are
+    # scaled, and nothing else changes. Exact integrators stay.
     own = fading(A, integrating)
     if spectral_radius(own) <= limit:
         return A
@@ -80,16 +60,10 @@ def stabilised(
 
 
 class Stable:
-    """A's eigenvalues on the way of a search, which fade within a record.
+    """A's eigenvalues on the way of a search, which fade within a record."""
 
-    If they are not within the unit circle at the start, they stay within the circle that they are
-    in.
-
-    Args:
-        cell: the model at the start; A is the first part of θ.
-        samples: of the longest record.
-        ranks: the processes that share the records.
-    """
+    # If they are not within the unit circle at the start, they stay within the circle that they are
+    # in.
 
     def __init__(self, cell: LFRCell, samples: int, ranks: Ranks) -> None:
         self._nx, self._integrating = cell.nx, integrating_states(cell)
@@ -114,13 +88,7 @@ class Stable:
 
 
 class PoleBounds:
-    """Bounds of steps that keep the eigenvalues of A within a limit.
-
-    Args:
-        A: where the step begins; its entries are the first ones of θ.
-        integrating: its exact integrators.
-        limit: of the moduli.
-    """
+    """Bounds of steps that keep the eigenvalues of A within a limit."""
 
     trusted, corrections = True, 5
 

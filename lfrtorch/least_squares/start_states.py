@@ -30,13 +30,9 @@ from lfrtorch.least_squares.linear_systems import (
 
 
 class StartStates(NamedTuple):
-    """What the rows of records say about their start states, in the coordinates Vᵀ x0.
+    """What the rows of records say about their start states, in the coordinates Vᵀ x0."""
 
-    Args:
-        place: where each start state stands in θ.
-        s, Vh: B = U s Vᵀ.
-        A, r: Uᵀ A and Uᵀ r.
-    """
+    # B = U s Vᵀ; A and r are Uᵀ A and Uᵀ r; ``place`` is where each start state stands in θ.
 
     place: Int[Tensor, "R nx"]
     s: Float[Tensor, "R nx"]
@@ -46,13 +42,7 @@ class StartStates(NamedTuple):
 
 
 class Eliminator:
-    """Folds the rows of φ that the start states leave into an accumulator.
-
-    Args:
-        place: where each record's start state stands in θ.
-        samples: of each record.
-        total: takes in rows of [A r].
-    """
+    """Folds the rows [A r] of φ that the start states leave into an accumulator."""
 
     def __init__(
         self,
@@ -96,15 +86,10 @@ class Eliminator:
 
 
 class EliminatedSystem:
-    """The system of φ and start states, from what is left in φ.
+    """The system of φ and start states, from what is left in φ."""
 
-    Args:
-        left: GramAccumulator's matrix or QRAccumulator's factor of the rows that are left for φ.
-        gram: which of the two it is.
-        states: of all records.
-        ridge: what is added to the diagonal of JᵀJ; the same for all start states.
-        truncation: singular values below this part of the largest are left out, from a factor.
-    """
+    # ``left`` is GramAccumulator's matrix (``gram``) or QRAccumulator's factor. The ridge is the
+    # same for all start states.
 
     def __init__(
         self,
