@@ -101,14 +101,7 @@ def distil(
 
 
 def shuffled(u: Array, rng: np.random.Generator) -> Array:
-    """An input (T, nu) of the same amplitudes and nearly the same spectrum, in another order.
-
-    Example:
-        >>> from lfrtorch.fitting.distillation import shuffled
-        >>> other = shuffled(record.u, np.random.default_rng(0))
-        >>> np.array_equal(np.sort(other, axis=0), np.sort(record.u, axis=0))
-        True
-    """
+    """An input (T, nu) of the same amplitudes and nearly the same spectrum, in another order."""
     amplitudes, spectrum = np.sort(u, axis=0), np.abs(np.fft.rfft(u, axis=0))
     found = u[rng.permutation(len(u))]
     for _ in range(PASSES):

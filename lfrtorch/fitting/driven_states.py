@@ -38,21 +38,9 @@ DECADES = 100.0
 def distortion_frequencies(
     inputs: Sequence[Float[Array, "T nu"]], errors: Sequence[Float[Array, "T ny"]], count: int
 ) -> Float[Array, " count"]:
-    """Frequencies that split the power of the nonlinear distortions into equal parts.
-
-    Above the band of the inputs a linear model has no output, and all of its error is distortion.
-
-    Args:
-        inputs: of every record.
-        errors: measured output minus that of the linear model, normalised.
-        count: how many frequencies.
-
-    Returns:
-        Angles per sample, between 0 and π, rising.
-
-    Raises:
-        ValueError: the inputs reach up to half the sampling rate, or there are no errors above.
-    """
+    """Frequencies, rad per sample, that split the power of the nonlinear distortions alike."""
+    # Above the band of the inputs a linear model has no output, and all of its error, normalised,
+    # is distortion.
     edge = _edge(inputs)
     grid = np.linspace(edge, np.pi, GRID)
     power = np.zeros(GRID)  # of all frequencies from the edge up to each
@@ -72,15 +60,7 @@ def distortion_frequencies(
 def relaxation_frequencies(
     inputs: Sequence[Float[Array, "T nu"]], count: int
 ) -> Float[Array, " count"]:
-    """Corner frequencies that divide two decades below half the inputs' band into equal ratios.
-
-    Args:
-        inputs: of every record.
-        count: how many frequencies.
-
-    Returns:
-        Angles per sample, falling.
-    """
+    """Corner frequencies, rad per sample: two decades below half the band in equal ratios."""
     return 0.5 * _edge(inputs) * DECADES ** -((np.arange(count) + 0.5) / count)
 
 
@@ -91,17 +71,10 @@ def with_driven_states(
     modes: Float[Array, " m"],
     generator: torch.Generator,
 ) -> LFRCell:
-    """A cell with the same output, and states beside its own that w alone drives.
-
-    Their entries of Bw and Cy are random; those of Bu are 0, so that they are at rest as long as w
-    is 0. z sees the relaxations, and not the modes.
-
-    Args:
-        cell: is copied.
-        relaxations: corner frequency of each, rad per sample: a state.
-        modes: natural frequency of each, rad per sample: two states.
-        generator: of the random entries.
-    """
+    """A cell with the same output, and states beside its own that w alone drives."""
+    # Their entries of Bw and Cy are random; those of Bu are 0, so that they are at rest as long as
+    # w is 0. z sees the relaxations, a state each, and not the modes, two states each. Frequencies
+    # are in rad per sample.
     like = {"dtype": cell.A.dtype, "device": cell.A.device}
     decay = np.exp(-np.concatenate([relaxations, np.repeat(DAMPING * modes, 2)]))
     nx, states = cell.nx, len(decay)

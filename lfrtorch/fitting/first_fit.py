@@ -18,15 +18,7 @@ from lfrtorch.records import Record, common_unit
 
 
 def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Model]]:
-    """The best start after the first iterations, on a part of the training records.
-
-    Args:
-        stage: its settings name the part.
-        models: of all starts.
-
-    Returns:
-        The settings, with the seed of the start that is kept, and its model.
-    """
+    """The best start after iterations on a part of the records, and settings with its seed."""
     dataset, settings, observer = stage.dataset, stage.settings, stage.observer
     train = dataset.train
     part = part_of(train, settings.first_part)
@@ -62,15 +54,9 @@ def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Mod
 
 
 def part_of(records: Sequence[Record], part: float) -> list[Record]:
-    """Records with a part of all samples: the shortest, or the beginning of each.
-
-    Of records of one length some are taken, spread evenly. If even the shortest record has more
-    samples than the part, that is the beginning of each record, unless it is in steady state.
-
-    Args:
-        records: of any lengths.
-        part: of their samples, more than 0, 1 at most.
-    """
+    """Records with a part of all samples: the shortest, or the beginning of each."""
+    # Of records of one length some are taken, spread evenly. If even the shortest record has more
+    # samples than the part, that is the beginning of each record, unless it is in steady state.
     room, found = part * sum(record.samples for record in records), []
     if room < min(r.samples for r in records) and all(r.start != "periodic" for r in records):
         return [_beginning(record, part) for record in records]

@@ -60,14 +60,9 @@ def distilled(stage: Stage, result: FitResult) -> FitResult:
 
 
 def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | None]:
-    """The fit and that to all estimation records; None if the model that was chosen stays.
-
-    A fit that was interrupted here has that for its reason.
-
-    Args:
-        stage: has the records without windows for scores: what need not be skipped is fitted.
-        result: of the fit.
-    """
+    """The fit and that to all estimation records; None if the model that was chosen stays."""
+    # A fit that was interrupted here has that for its reason. The stage has the records without
+    # windows for scores: what need not be skipped is fitted.
     dataset, settings, observer = stage.dataset, stage.settings, stage.observer
     held_out = [*dataset.validation, *dataset.selection]
     if result.reason in CUT_SHORT:

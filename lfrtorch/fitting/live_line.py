@@ -20,18 +20,7 @@ _DIGITS = 4  # of errors: an iteration often moves the fourth alone
 
 
 class LiveLine:
-    """A line that the next text replaces, on a terminal and in a notebook; elsewhere there is none.
-
-    Args:
-        stream: where to write. Default: standard output.
-
-    Example:
-        >>> from lfrtorch.fitting.live_line import LiveLine
-        >>> line = LiveLine()
-        >>> line.show("1/3  train 0.5 V")  # which is seen on a terminal
-        >>> line.say("the fit has converged")
-        the fit has converged
-    """
+    """A line that the next text replaces, on a terminal and in a notebook; none elsewhere."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = sys.stdout if stream is None else stream  # None without a console

@@ -346,13 +346,7 @@ def _check(starts: Sequence[Model], watching: Sequence[Sequence[Monitor]], avera
 
 
 def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]:
-    """How many starts take part in each round, and the iteration at which it ends.
-
-    Example:
-        >>> from lfrtorch.fitting.multistart import schedule
-        >>> schedule(8, 200)
-        [(8, 13), (4, 25), (2, 200)]
-    """
+    """How many starts take part in each round, and the iteration at which it ends."""
     parts = ROUNDS if starts > 1 else ()
     planned = []
     for until in sorted({ceil(part * limit) for part in parts} | {limit}):
@@ -362,13 +356,7 @@ def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]
 
 
 def iterations_of(planned: Sequence[tuple[int, int]]) -> int:
-    """Iterations of all starts together.
-
-    Example:
-        >>> from lfrtorch.fitting.multistart import iterations_of
-        >>> iterations_of([(8, 13), (4, 25), (2, 200)])
-        502
-    """
+    """Iterations of all starts together."""
     ends = [0, *(until for _, until in planned)]
     return sum(count * (b - a) for (count, _), a, b in zip(planned, ends, ends[1:], strict=False))
 
@@ -384,14 +372,10 @@ def line_of(
 
 
 class _Judge:
-    """Ranks starts by their best iterates.
+    """Ranks starts by their best iterates."""
 
-    Args:
-        fits: of all starts.
-        records: that they are judged on, and none of them is fitted to. If empty, the fits' own
-            validation or training errors judge, which say nothing of a mean.
-        together: has the processes that must judge alike.
-    """
+    # Without records that none of them is fitted to, the fits' own validation or training errors
+    # judge, which say nothing of a mean.
 
     def __init__(self, fits: Sequence[Fit], records: Sequence[Record], together: Together) -> None:
         self.fits, self._records, self._together = fits, records, together
@@ -420,10 +404,9 @@ class _Judge:
         return tuple(found)
 
     def stable(self, fits: Sequence[Fit], train: Sequence[Record]) -> list[Model]:
-        """The models that stay stable on louder inputs, the best first: with one a mean runs away.
-
-        Rounding may differ between processes, and the choice must not.
-        """
+        """The models that stay stable on louder inputs, the best first."""
+        # With one that does not, a mean runs away. Rounding may differ between processes, and the
+        # choice must not.
         models = [fit.model for fit in self.ranked(fits)]
         reach = torch.tensor(
             [largest_stable_amplitude(model, train) for model in models], dtype=torch.float64
@@ -432,11 +415,9 @@ class _Judge:
         return [model for model, to in zip(models, reach, strict=True) if to >= max(LOUDER)]
 
     def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
-        """The mean of as many of the models as do about as well as the best, and of how many.
-
-        None if a single start is better than all means. Without records to judge on, the mean of
-        all.
-        """
+        """The mean of as many models as do about as well as the best, and of how many."""
+        # None if a single start is better than all means. Without records to judge on, the mean of
+        # all.
         if not self._records:
             return (mean_model(best), len(best)) if len(best) > 1 else (None, 1)
         means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]

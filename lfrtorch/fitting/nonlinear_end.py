@@ -30,16 +30,9 @@ are looked at, at equal distances, as more tell the same."""
 def nonlinear_end(
     linear: Model, data: Sequence[Record], found: Sequence[Trajectory]
 ) -> Literal["input", "output"] | None:
-    """The end of the linear model at which a static map explains most of its error, if one does.
-
-    The map is a polynomial of each input, whose response is that of the linear model to it, or of
-    each output. What its affine part explains does not count.
-
-    Args:
-        linear: the linear model.
-        data: records.
-        found: its trajectory in each of them.
-    """
+    """The end of the linear model at which a static map explains most of its error, if one does."""
+    # The map is a polynomial of each input, whose response is that of the linear model to it, or of
+    # each output. What its affine part explains does not count.
     responses: dict[Literal["input", "output"], list[Array]] = {"input": [], "output": []}
     step, errors = -(-sum(record.samples for record in data) // SAMPLES), []
     for record, trajectory in zip(data, found, strict=True):

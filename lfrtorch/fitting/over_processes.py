@@ -39,17 +39,11 @@ def same_weights(models: Sequence[Model], ranks: Ranks) -> None:
 
 
 class OverProcesses(Together):
-    """Fits of which each process has a share; after ``advance`` each has all of them.
+    """Fits of which each process has a share; after ``advance`` each has all of them."""
 
-    Args:
-        fits: of all starts, the same on each process.
-        monitors: of each fit. They are called after each iteration of this process's own, and, at
-            the end of a round, with the best and the last iterate of the others'.
-        halt: set if Ctrl-C ends one thread.
-        ranks: the processes.
-        stop: asked at the end of a leg, as well as by the fits.
-        take: called at the end of a leg with the others' fits.
-    """
+    # Monitors are called after each iteration of this process's own fits and, at the end of a
+    # round, with the best and the last iterate of the others'; ``take`` with the others' at the end
+    # of a leg.
 
     def __init__(
         self,
@@ -68,11 +62,7 @@ class OverProcesses(Together):
         self._states: dict[int, bytes] = {}
 
     def advance(self, fits: Sequence[Fit], until: int) -> None:
-        """Go on with some of them to an iteration, each process with its share.
-
-        Raises:
-            ProcessLostError: before there was an iterate to keep.
-        """
+        """Go on with some of them to an iteration, each process with its share."""
         own = self.ranks.share(list(fits))
         others = [fit for fit in fits if not any(fit is mine for mine in own)]
         self._states = {}

@@ -29,11 +29,7 @@ def without_gain(models: Model | Sequence[Model]) -> Model | list[Model]:
 def predicting(
     models: Model | Sequence[Model], *records: Record | Sequence[Record]
 ) -> tuple[Model | list[Model], *tuple[list[Record], ...]]:
-    """The predictors of models, and the records that drive them.
-
-    Raises:
-        ValueError: a model without K, or one with exact integrators.
-    """
+    """The predictors of models, and the records that drive them."""
     given = [models] if isinstance(models, Model) else list(models)
     for model in given:
         count = int(integrating_states(model.lfr.cell).sum())

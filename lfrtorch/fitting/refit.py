@@ -99,15 +99,7 @@ def refit(
 
 
 def all_records(train: Sequence[Record], held_out: Sequence[Record]) -> list[Record]:
-    """Training records and others; one that begins in a training record continues that one.
-
-    Example:
-        >>> from dataclasses import replace
-        >>> from lfrtorch.fitting.refit import all_records
-        >>> train, validation = record[:300], replace(record[200:], skip=100)
-        >>> [each.samples for each in all_records([train], [validation])]
-        [400]
-    """
+    """Training records and others; one that begins in a training record continues that one."""
     found = list(train)
     for record in held_out:
         at = next((i for i, other in enumerate(found) if _continues(record, other)), None)

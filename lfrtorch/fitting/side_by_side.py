@@ -68,11 +68,7 @@ class Together:
 def advance_in_step(
     fits: Sequence[Fit], until: int, monitors: Sequence[Sequence[Monitor]] = ()
 ) -> None:
-    """Go on with several fits by Levenberg-Marquardt to an iteration, evaluated together.
-
-    Raises:
-        KeyboardInterrupt: by Ctrl-C.
-    """
+    """Go on with several fits by Levenberg-Marquardt to an iteration, evaluated together."""
     watching = dict(zip(map(id, fits), monitors or [()] * len(fits), strict=True))
     trainer = fits[0].trainer
     assert isinstance(trainer, LevenbergMarquardt)

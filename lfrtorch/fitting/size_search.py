@@ -235,8 +235,7 @@ class SizeSearch:
 
 
 def size_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
-    """Head and rows of a table of the chosen model and those of the last round, by rising number of
-    net parameters."""
+    """Head and rows of a table of the chosen model and those of the last round."""
     sizes = [name for name in ("nx", "nz", "nw", "nn", "degree") if entries and name in entries[0]]
     numbers = ["iterations", "parameters", "parameters_net", "seconds"]
     numbers += ["error", "error_std", "ratio", "standard_errors_above"]
@@ -421,13 +420,7 @@ def _crossed(candidate: Candidate, fits: Sequence[Fit], judges: Sequence[Judge])
 
 
 def race(models: int, finalists: int, limit: int) -> list[tuple[int, int]]:
-    """How many models take part in each round, and the iteration at which it ends.
-
-    Example:
-        >>> from lfrtorch.fitting.size_search import race
-        >>> race(48, 6, 75), race(8, 6, 75)
-        ([(48, 13), (24, 25), (6, 75)], [(8, 25), (6, 75)])
-    """
+    """How many models take part in each round, and the iteration at which it ends."""
     planned: list[tuple[int, int]] = []
     for part, to in ROUNDS:
         count, until = min(models, part * finalists), ceil(to * limit)

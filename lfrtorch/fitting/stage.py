@@ -27,14 +27,7 @@ class FitOptions(TypedDict):
 
 @dataclass(frozen=True)
 class Stage:
-    """What a stage is given, and hands on.
-
-    Args:
-        dataset: records by use.
-        settings: as far as they are chosen.
-        observer: who is told.
-        ranks, stop: see :func:`lfrtorch.fit`.
-    """
+    """What a stage is given, and hands on; the settings are as far as they are chosen."""
 
     dataset: Dataset
     settings: Settings

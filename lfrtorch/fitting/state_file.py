@@ -32,11 +32,7 @@ def write(path: Path, numbers: Numbers, tensors: Tensors) -> None:
 
 
 def read(path: Path) -> tuple[Numbers, Tensors]:
-    """Numbers and tensors of a file.
-
-    Raises:
-        ValueError: a damaged file, or one of another program or version.
-    """
+    """Numbers and tensors of a file."""
     try:
         tensors, about = read_tensors(path)
     except OSError as error:

@@ -17,27 +17,13 @@ ROUNDING = 1e-9
 def scale_states(
     model: Model, records: Record | Sequence[Record], *, keep_coordinates: bool = False
 ) -> None:
-    """Give a model states of unit rms over records, in place, and note their covariance there.
-
-    The covariance is E x xᵀ about 0: an observer or a simulation that begins at x = 0 amid such
-    data is wrong by so much. The coordinates change by a diagonal matrix. So zeros of A stay zeros,
-    and its diagonal keeps its bits: an exact integrator stays one, and P of a proof that the model
-    contracts becomes another P. A state that never moves stays as it is, and all do if one of their
-    matrices is frozen. Of a model that diverges on the records they stay, and the covariance is 1.
-
-    Args:
-        model: a predictor has the states that the measured outputs correct.
-        records: the data.
-        keep_coordinates: whether the covariance alone is noted, as start states are given in the
-            coordinates that the model has.
-
-    Example:
-        >>> from lfrtorch.fitting.state_scaling import scale_states
-        >>> from lfrtorch.model import state_moment
-        >>> scale_states(model, record)
-        >>> np.allclose(state_moment(model, record), model.state_covariance)
-        True
-    """
+    """Give a model states of unit rms over records, in place, and note their covariance there."""
+    # The covariance is E x xᵀ about 0: an observer or a simulation that begins at x = 0 amid such
+    # data is wrong by so much. The coordinates change by a diagonal matrix. So zeros of A stay
+    # zeros, and its diagonal keeps its bits: an exact integrator stays one, and P of a proof that
+    # the model contracts becomes another P. All states stay if one of their matrices is frozen or
+    # start states are given in them (``keep_coordinates``); of a model that diverges, too, and the
+    # covariance is 1.
     cell, moment = model.lfr.cell, state_moment(model, records)
     if not torch.isfinite(moment).all():
         moment = torch.eye(cell.nx, dtype=torch.float64)

@@ -235,22 +235,10 @@ def nothing(fit: Fit, paused: bool) -> None:
 
 
 class Fit:
-    """A fit that goes on for as many iterations as it is asked for, and keeps the best iterate.
+    """A fit that goes on for as many iterations as it is asked for, and keeps the best iterate."""
 
-    Args:
-        model, train, validation, trainer, ridge, ranks: see :func:`lfrtorch.fit`.
-        simulation: weight of simulation errors beside those of predictions, of a predictor; see
-            ``Problem.of_predictor``.
-        horizon: samples of the windows that the records are cut into, see
-            ``lfrtorch.fitting.windows``. Default: they are whole.
-        keep: called with the fit after every iteration, when it may be saved, and with True when
-            it pauses.
-        stop: asked before each iteration whether to end there. If there are several processes,
-            each has its own, and one that says so ends all.
-
-    Raises:
-        ValueError: see :func:`lfrtorch.fit`.
-    """
+    # ``keep`` is called after every iteration, when the fit may be saved, and with True when it
+    # pauses. Each process has its own ``stop``, and one that says so ends all.
 
     def __init__(
         self,
@@ -347,11 +335,7 @@ class Fit:
 
     @spread_by_hand()
     def advance(self, until: int | None = None, monitors: Sequence[Monitor] = ()) -> Self:
-        """Go on to an iteration (default: the trainer's last); the best is in the model.
-
-        Raises:
-            ProcessLostError: before there was an iterate to keep.
-        """
+        """Go on to an iteration (default: the trainer's last); the best is in the model."""
         until = self.trainer.limit if until is None else until
         try:
             if not self.history:
@@ -393,11 +377,7 @@ class Fit:
         state_file.write(path, numbers, tensors | {"best": self._theta_best})
 
     def restore(self, path: Path) -> None:
-        """Take over the state of a fit of the same model, records and trainer.
-
-        Raises:
-            ValueError: a damaged file, or another fit.
-        """
+        """Take over the state of a fit of the same model, records and trainer."""
         numbers, tensors = state_file.read(path)
         device = self.problem.theta.device
         like = self.trainer.init(self.problem, self.problem.theta)
@@ -439,10 +419,8 @@ class Fit:
         self._show(start.theta, progress, monitors)
 
     def take(self, after: Any, seconds: float, monitors: Sequence[Monitor] = ()) -> None:
-        """Go on from the trainer's next state, which took ``seconds`` to find.
-
-        If the model there explodes on validation, the search goes back and takes smaller steps.
-        """
+        """Go on from the trainer's next state, which took ``seconds`` to find."""
+        # If the model there explodes on validation, the search goes back and takes smaller steps.
         before, last = self.state, self._score
         progress = self._progress(after, seconds)
         if after.theta is not before.theta:

@@ -48,29 +48,12 @@ and 100 of 61 of 84: where small changes grow, the error over more samples has m
 def windows(
     records: Sequence[Record], horizon: int, nx: int, *, fitted: bool = True
 ) -> list[Record]:
-    """The samples that a fit scores, in windows of ``horizon`` samples.
-
-    Windows of a record are spread evenly and overlap as little as they can; their samples have the
-    weight of the record's together. The first one begins as the record does, with what is skipped,
-    and all others in states to be estimated. A record of no more samples than that stays whole.
-
-    Args:
-        records: of any lengths.
-        horizon: samples.
-        nx: states of the model.
-        fitted: whether start states are parameters of a fit. Otherwise a window skips samples
-            before it, to estimate its start from: ``BEFORE`` for each state or, if these are more,
-            as many as the record skips. A window that has fewer begins as the record does.
-
-    Raises:
-        ValueError: a horizon below 2, too few samples for the states, or a record with weights by
-            spectral line.
-
-    Example:
-        >>> from lfrtorch.fitting.windows import windows
-        >>> [(w.samples, w.start) for w in windows([record[:400]], 150, nx=2)]
-        [(150, 'zero'), (150, 'estimated'), (150, 'estimated')]
-    """
+    """The samples that a fit scores, in windows of ``horizon`` samples."""
+    # Windows of a record are spread evenly and overlap as little as they can; their samples have
+    # the weight of the record's together. The first one begins as the record does, with what is
+    # skipped, and all others in states to be estimated: parameters of a fit, or else estimated from
+    # skipped samples before the window, ``BEFORE`` for each state or, if these are more, as many as
+    # the record skips. A window that has fewer begins as the record does.
     integer("horizon", horizon, 2)
     found = []
     for record in records:

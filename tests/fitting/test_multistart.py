@@ -17,7 +17,7 @@ from lfrtorch._support.reasons import Reason
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.means import mean_model
-from lfrtorch.fitting.multistart import Round, fit
+from lfrtorch.fitting.multistart import Round, fit, iterations_of, schedule
 from lfrtorch.fitting.side_by_side import advance_in_step
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.trainer import Fit, Progress
@@ -39,6 +39,12 @@ def several(count: int = 5, T: int = 60) -> tuple[list[Model], list[Record], Rec
         move(model, 0.05 * (i + 1))
         models.append(model)
     return models, train, validation
+
+
+def test_eight_starts_share_two_and_a_half_fits():
+    planned = schedule(8, 200)
+    assert planned == [(8, 13), (4, 25), (2, 200)]
+    assert iterations_of(planned) == 8 * 13 + 4 * 12 + 2 * 175
 
 
 def test_the_better_half_goes_on_round_by_round():
