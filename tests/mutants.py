@@ -59,7 +59,6 @@ TESTS: dict[str, str] = {
     "least_squares/record_groups": "least_squares/problem",
     "least_squares/gauge": "least_squares/gauge least_squares/problem",
     "least_squares/problem": "least_squares/problem fitting/trainer",
-    "least_squares/joint": "least_squares/joint",
     "least_squares/levenberg_marquardt": "least_squares/levenberg_marquardt",
     "least_squares/adam": "least_squares/adam",
     "fitting/nonlinear_end": "fitting/starts",

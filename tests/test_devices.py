@@ -9,7 +9,6 @@ from reference import measure, random_cell, random_model
 from torch.testing import assert_close
 
 from lfrtorch.engine.activations import ACTIVATIONS
-from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt, LMState
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.model import Model
@@ -68,23 +67,6 @@ def test_search_without_kernels_is_the_one_with_them(activation: str, device: st
     assert_close(gradient, 2 * J.mT @ r / problem.size, rtol=0, atol=1e-8)
     y = model.simulate(measure(model, 30))
     assert isinstance(y, np.ndarray)
-
-
-def test_several_starts_without_kernels(device: str):
-    models = [some_model("tanh") for _ in range(3)]
-    with torch.no_grad():
-        for shift, model in enumerate(models):
-            model.lfr.to(device)
-            model.lfr.cell.A.mul_(1.0 - 0.1 * shift)
-    stack = JointProblem([some_problem(model, models[0]) for model in models])
-    optimiser = LevenbergMarquardt()
-    states = [optimiser.init(p, p.theta) for p in stack.problems]
-    for _ in range(3):
-        states = optimiser.steps(stack, states)
-    for model, state in zip(models, states, strict=True):
-        problem = some_problem(model, models[0])
-        assert problem.rmse(state.theta) < 1.0
-        assert state.iteration == 3
 
 
 @pytest.mark.parametrize("kernels", [True, False])

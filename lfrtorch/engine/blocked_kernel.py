@@ -41,10 +41,8 @@ def blocked_rows(
     BLAS rounds by the sizes of a product, so these are the same for any number of jobs.
     """
     r, chunk = job // chunks, job % chunks
-    m = min(r, len(A) - 1)  # which model
-    A, Bw, Cz, Cy, Dyw = A[m], Bw[m], Cz[m], Cy[m], Dyw[m]
     J, v, by_weight, rows, S = J[r], v[r], by_weight[r], rows[r], S[r]
-    slope, h, z, Ww = slope[r], h[r], z[r], Ww[min(m, len(Ww) - 1)]
+    slope, h, z = slope[r], h[r], z[r]
     (nx, nw), nn, (T, ny) = Bw.shape, h.shape[1], rows.shape[:2]
     n_x, n_z, n_y, C = len(x_entries), len(z_entries), len(y_entries), S.shape[1]
     # The columns are those of x, z, y, the static map and the initial state, in this order.

@@ -134,8 +134,7 @@ class LFRCell(nn.Module):
     def check(self) -> None:
         """Refuse weights that do not fit each other, which machine code would not notice.
 
-        The weights may have a leading axis: one model a record. A map of a class that has no
-        ``weight_shapes`` is left to torch.
+        A map of a class that has no ``weight_shapes`` is left to torch.
 
         Raises:
             ValueError: a weight of another shape, dtype or device.
@@ -155,7 +154,7 @@ class LFRCell(nn.Module):
         weights = {**dict(self.named_parameters()), **dict(self.named_buffers())}
         for name, shape in shapes.items():
             found = tuple(weights[name].shape) if name in weights else ()
-            if found[-len(shape) :] != shape:
+            if found != shape:
                 raise InputError(
                     f"{name} has the shape {found}; with nu={nu}, ny={ny}, nx={nx}, nz={nz} and "
                     f"nw={nw} it is {shape}: give a matrix or a static map of these sizes."

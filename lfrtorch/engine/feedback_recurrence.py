@@ -71,16 +71,13 @@ def monodromy(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx 
 
 
 def _matrices(weights: Weights) -> list[NDArray]:
-    """A, Bw and Cz with a leading axis: one model, or one a record."""
-    found = (weights[name] for name in ("A", "Bw", "Cz"))
-    return [to_numpy(m if m.ndim == 3 else m.unsqueeze(0)) for m in found]
+    return [to_numpy(weights[name]) for name in ("A", "Bw", "Cz")]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _forwards(r, A, Bw, Cz, J, g, s):
-    m = min(r, len(A) - 1)  # which model
     # Transposed, so that inner loops run over neighbours in memory: vector instructions.
-    AT, BwT, Cz, J, g, s = A[m].T.copy(), Bw[m].T.copy(), Cz[m], J[r], g[r], s[r]
+    AT, BwT, J, g, s = A.T.copy(), Bw.T.copy(), J[r], g[r], s[r]
     nw, nx = BwT.shape
     for k in range(len(g)):
         now, after = s[k], s[k + 1]
@@ -103,8 +100,7 @@ def _forwards(r, A, Bw, Cz, J, g, s):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _backwards(r, A, Bw, Cz, J, g, s):
-    m = min(r, len(A) - 1)
-    A, BwT, Cz, J, g, s = A[m], Bw[m].T.copy(), Cz[m], J[r], g[r], s[r]
+    BwT, J, g, s = Bw.T.copy(), J[r], g[r], s[r]
     nw, nx = BwT.shape
     for k in range(len(g) - 1, -1, -1):
         now, before = s[k + 1], s[k]
@@ -127,8 +123,7 @@ def _backwards(r, A, Bw, Cz, J, g, s):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _transition(r, A, Bw, Cz, J, Phi):
-    m = min(r, len(A) - 1)
-    A, BwT, Cz, J, Phi = A[m], Bw[m].T.copy(), Cz[m], J[r], Phi[r]
+    BwT, J, Phi = Bw.T.copy(), J[r], Phi[r]
     F, X = np.empty_like(A), Phi.T.copy()
     X_next = np.empty_like(X)
     for k in range(len(J)):

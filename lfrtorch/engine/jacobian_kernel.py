@@ -21,10 +21,9 @@ def jacobian_rows(
 ):  # fmt: skip
     """Write the rows of one record and one chunk of the columns; S goes on to the block's end.
 
-    Job r * chunks + c is chunk c of the columns of record r. The weights have a leading axis: one
-    model for all records, or one a record. The derivatives of the static map are ``by_weight``, or
-    come from slope, h, Ww and z of a network; the others are empty. Entries are those of
-    ``sensitivity.DirectTerms``.
+    Job r * chunks + c is chunk c of the columns of record r. The derivatives of the static map are
+    ``by_weight``, or come from slope, h, Ww and z of a network; the others are empty. Entries are
+    those of ``sensitivity.DirectTerms``.
 
     Shape:
         S: (R, nx, C), J: (R, B, nw, nz), v: (R, B, nx + nu + nw), by_weight: (R, B, nw, columns),
@@ -33,10 +32,8 @@ def jacobian_rows(
     r, chunk = job // chunks, job % chunks
     B, ny, C = rows.shape[1], rows.shape[2], S.shape[2]
     c0, c1 = C * chunk // chunks, C * (chunk + 1) // chunks
-    m = min(r, len(A) - 1)  # which model
-    A, Bw, Cz, Cy, Dyw = A[m], Bw[m], Cz[m], Cy[m], Dyw[m]
     J, v, by_weight, rows, S = J[r], v[r], by_weight[r], rows[r], S[r]
-    slope, h, z, Ww = slope[r], h[r], z[r], Ww[min(m, len(Ww) - 1)]
+    slope, h, z = slope[r], h[r], z[r]
     (nx, nw), nn, nz = Bw.shape, h.shape[1], z.shape[1]
     network = nn > 0
     n_weights = nn * (nz + 1 + nw) + nw if network else by_weight.shape[2]

@@ -35,13 +35,11 @@ def filter_record(
 ):
     """Filter all samples: x and U go to the end, and log p(y) is returned; NaN in y is missing.
 
-    The weights between y and G are those that ``simulate_record`` takes, of one model.
+    The weights between y and G are those that ``simulate_record`` takes.
 
     Shape:
         u: (T, nu), y: (T, ny), G: (ny + nx, ny + nx), x: (nx,), U: (nx, nx).
     """
-    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = A[0], Bu[0], Bw[0], Cz[0], Dzu[0], Cy[0], Dyu[0], Dyw[0]
-    WzT, Ww, bz, bw = WzT[0], Ww[0], bz[0, 0], bw[0, 0]
     (nx, nw), nz, ny = Bw.shape, len(Cz), len(Cy)
     z, w, J, by_x = np.empty(nz), np.empty(nw), np.empty((nw, nz)), np.empty((nw, nx))
     e, H, F, w_hat = np.empty(ny), np.empty((ny, nx)), np.empty((nx, nx)), np.empty(nx)

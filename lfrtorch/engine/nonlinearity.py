@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.func import functional_call, vmap
-from torch.nn import Module, Parameter, ParameterList
+from torch.nn import Module, Parameter
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
@@ -233,33 +232,6 @@ class Polynomial(Module):
         return f"nz={self.nz}, nw={len(self.C)}, degree={self.degree}"
 
 
-class Stacked(Module):
-    """One map with its own weights for every record: (R, T, nz) -> (R, T, nw).
-
-    Args:
-        base: the map; its own weights are not used.
-        weights: by the names of its parameters, each with a leading axis of length R.
-    """
-
-    def __init__(self, base: Module, weights: dict[str, Tensor]) -> None:
-        super().__init__()
-        self._base, self.names = [base], list(weights)  # a list hides the module's own weights
-        self.weights = ParameterList(weights.values())
-
-    @property
-    def base(self) -> Module:
-        """The map."""
-        return self._base[0]
-
-    def forward(self, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R T nw"]:
-        """w of z."""
-
-        def one(weights: dict[str, Tensor], z: Tensor) -> Tensor:
-            return functional_call(self.base, weights, (z,))
-
-        return vmap(one)(dict(zip(self.names, self.weights, strict=True)), z)
-
-
 class Beyond(Module):
     """What a map f is beyond a linear one, in other coordinates: w = W (f(Z z) - L Z z).
 
@@ -328,8 +300,5 @@ def linearise_static(
     static: Module | None, z: Float[Tensor, "R T nz"], weights: Weights
 ) -> StaticJacobian:
     """A map linearised at z, with the given weights instead of its own."""
-    if isinstance(static, Stacked):
-        own = dict(zip(static.names, weights.values(), strict=True))
-        return ModuleJacobian(static.base, z, own, by_record=0)
     found = known(static)
     return ModuleJacobian(static, z, weights) if found is None else found.linearised(z, weights)

@@ -82,9 +82,8 @@ class DirectTerms(NamedTuple):
 
 def layout(cell: LFRCell, *, every: bool = False) -> Layout:
     """Layout of the free parameters, or of every one; cells of one structure share the object."""
-    models = cell.A.numel() // cell.nx**2
     parameters = tuple(
-        (name, p.numel() // models, every or p.requires_grad) for name, p in cell.named_parameters()
+        (name, p.numel(), every or p.requires_grad) for name, p in cell.named_parameters()
     )
     return _layout(cell.nx, cell.nu, cell.ny, cell.nz, cell.nw, parameters)
 
@@ -197,12 +196,12 @@ class _Block:
         static: StaticJacobian,
         weights: dict[str, Tensor],
     ) -> None:
-        self.time, self.v, self.static, self.weights = time, v, static, weights
+        self.time, self.v, self.static, self._weights = time, v, static, weights
 
     @cached_property
     def linearised(self) -> Linearised:
         """x+ = F x, y = H x."""
-        return linearise_at(self.weights, self.static.J)
+        return linearise_at(self._weights, self.static.J)
 
 
 class Linearisation:
@@ -210,7 +209,7 @@ class Linearisation:
 
     Args:
         cell: the model; parameters with ``requires_grad=False`` are no part of θ. Its weights are
-            copied. They may have a leading axis of length R: one model a record.
+            copied.
         u, trajectory: input and signals of this cell.
         periodic: whether the initial state is the end state, whatever the parameters. Otherwise it
             does not depend on them.
@@ -306,7 +305,7 @@ class Linearisation:
 
     @torch.no_grad()
     def tangent(
-        self, d_theta: Float[Tensor, "*records P"], d_x0: Float[Tensor, "R nx"] | None = None
+        self, d_theta: Float[Tensor, " P"], d_x0: Float[Tensor, "R nx"] | None = None
     ) -> Float[Tensor, "R T ny"]:
         """dy of a change dθ and of the initial state, which follows if a record is periodic."""
         start = self.state if d_x0 is None else d_x0
@@ -317,7 +316,7 @@ class Linearisation:
         return torch.cat([d_y for d_y, _ in self._changes(d_theta, start)], dim=1)
 
     def _changes(
-        self, d_theta: Float[Tensor, "*records P"], s: Float[Tensor, "R nx"]
+        self, d_theta: Float[Tensor, " P"], s: Float[Tensor, "R nx"]
     ) -> Iterator[tuple[Float[Tensor, "R _ ny"], Float[Tensor, "R nx"]]]:
         """Changes of the outputs in each block, and of the state after it."""
         d_x, d_z, d_y, d_static = self.layout.matrices(d_theta)
@@ -402,17 +401,12 @@ class Linearisation:
         if self._whole is None:
             return self._at(records, time)
         v, static = self._whole.v[records, time], self._whole.static.part(records, time)
-        return _Block(time, v, static, self._of(records))
+        return _Block(time, v, static, self.weights)
 
     def _at(self, records: slice, time: slice) -> _Block:
-        weights = self._of(records)
-        static = linearise_static(self.static, self.trajectory.z[records, time], of_static(weights))
-        return _Block(time, self.signals(records, time), static, weights)
-
-    def _of(self, records: slice) -> dict[str, Tensor]:
-        """The weights of some of the records."""
-        one = self.weights["A"].ndim == 2
-        return self.weights if one else {name: p[records] for name, p in self.weights.items()}
+        of_map = of_static(self.weights)
+        static = linearise_static(self.static, self.trajectory.z[records, time], of_map)
+        return _Block(time, self.signals(records, time), static, self.weights)
 
     def _by_weight(self, block: _Block, columns: DirectTerms) -> Tensor:
         by_weight = block.static.by_weight()
@@ -428,8 +422,7 @@ class Linearisation:
         x, z, y = (entries.to(v.device) for entries in columns[:3])
         d_w[..., z[:, 0]] = J[..., z[:, 1]] * v[..., z[:, 2]].unsqueeze(2)
         d_w[..., columns.first : columns.first + by_weight.shape[-1]] = by_weight
-        G = block.weights["Bw"].unsqueeze(-3) @ d_w
-        E = block.weights["Dyw"].unsqueeze(-3) @ d_w
+        G, E = self.weights["Bw"] @ d_w, self.weights["Dyw"] @ d_w
         G[..., x[:, 1], x[:, 0]] += v[..., x[:, 2]]
         E[..., y[:, 1], y[:, 0]] += v[..., y[:, 2]]
         every = linear_recurrence(block.linearised.F, G, S)
@@ -441,16 +434,14 @@ class Linearisation:
     ) -> Tensor:
         """The same in machine code; S is never stored over time, and is changed in place."""
         R = len(S)
-        W = [block.weights[name] for name in ("A", "Bw", "Cz", "Cy", "Dyw")]
-        W = [m if m.ndim == 3 else m.unsqueeze(0) for m in W]
+        W = [self.weights[name] for name in ("A", "Bw", "Cz", "Cy", "Dyw")]
         chunks = 1 if R % workers() == 0 else workers()
         static, none = block.static, S.new_zeros(R, len(block.v[0]), 0)
         whole = len(columns.static) == self.layout.weights
         if isinstance(static, NetworkJacobian) and whole:
-            Ww = static.Ww if static.Ww.ndim == 3 else static.Ww.unsqueeze(0)
-            by_weight = (none.unsqueeze(2), static.slope, static.h, Ww, static.z)
+            by_weight = (none.unsqueeze(2), static.slope, static.h, static.Ww, static.z)
         else:
-            by_weight = (self._by_weight(block, columns), none, none, none[:1], none)
+            by_weight = (self._by_weight(block, columns), none, none, none[0], none)
         tensors = (*W, static.J, block.v, *by_weight, *columns[:3])
         arguments = (*map(to_numpy, tensors), columns.first, chunks, S.numpy(), rows.numpy())
         kernel = blocked_rows if S.shape[1] >= MANY_STATES else jacobian_rows

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -66,8 +65,7 @@ def simulate(
 
     On the CPU a linear model, a ``Network`` and a ``Polynomial`` run in machine code. Any other map
     or device goes through Newton's method over all of time, from the states ``guess`` of a nearby
-    trajectory; records for which that fails are simulated step by step. Weights may have a leading
-    axis R: one model a record.
+    trajectory; records for which that fails are simulated step by step.
     """
     if is_compiled(cell, u):
         return _compiled(cell, u, x0, None)
@@ -240,9 +238,4 @@ def kernel_arguments(cell: LFRCell) -> list[Any]:
     nothing = Kernel(zeros(0, 0), zeros(0, 0), zeros(0), zeros(cell.nw))
     *own, code, growth = nothing if static is None else static.kernel
     lti = (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
-    # A leading axis, for one model or one a record; in numpy that takes half the time.
-    weights = [w.detach().numpy() for w in (*lti, *own)]
-    weights = [w if w.ndim == 3 else w[(np.newaxis,) * (3 - w.ndim)] for w in weights]
-    count = len(weights[0])
-    weights = [w if len(w) == count else w.repeat(count, axis=0) for w in weights]
-    return [*map(np.ascontiguousarray, weights), code, growth]
+    return [*map(to_numpy, (*lti, *own)), code, growth]

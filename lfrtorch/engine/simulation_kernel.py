@@ -21,17 +21,12 @@ def simulate_record(
     It stops once a state agrees, within ``met_within``, with the one that it would overwrite: the
     rest of the earlier trajectory then holds for this one, too.
 
-    The weights have a leading axis: one model for all records, or one a record. The hidden layer
-    is σ(Wz z + bz), or has the monomials of a polynomial if these have a growth.
+    The hidden layer is σ(Wz z + bz), or has the monomials of a polynomial if these have a growth.
 
     Shape:
-        WzT: (models, nz, nn), bz: (models, 1, nn), bw: (models, 1, nw), growth: (nn - 1, 2) as
-        that of ``Polynomial``, or (0, 2), x: (R, T + 1, nx), u: (R, T, nu), z: (R, T, nz),
-        w: (R, T, nw), y: (R, T, ny).
+        growth: (nn - 1, 2) as that of ``Polynomial``, or (0, 2), x: (R, T + 1, nx),
+        u: (R, T, nu), z: (R, T, nz), w: (R, T, nw), y: (R, T, ny).
     """
-    m = min(r, len(A) - 1)  # which model
-    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = A[m], Bu[m], Bw[m], Cz[m], Dzu[m], Cy[m], Dyu[m], Dyw[m]
-    WzT, Ww, bz, bw = WzT[m], Ww[m], bz[m, 0], bw[m, 0]
     u, x, z, w, y = u[r], x[r], z[r], w[r], y[r]
     h = np.empty(Ww.shape[1], u.dtype)
     for k in range(len(u)):

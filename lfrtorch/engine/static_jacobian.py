@@ -17,10 +17,7 @@ Weights = dict[str, Tensor]
 
 
 class StaticJacobian(Protocol):
-    """dw = J dz + (∂w/∂φ) dφ; φ are all weights of the map in the order of its parameters.
-
-    dφ has an axis R if every record has weights of its own.
-    """
+    """dw = J dz + (∂w/∂φ) dφ; φ are all weights of the map in the order of its parameters."""
 
     @property
     def J(self) -> Float[Tensor, "R T nw nz"]:
@@ -35,7 +32,7 @@ class StaticJacobian(Protocol):
         """∂w/∂φ."""
         ...
 
-    def tangent(self, d_weights: Float[Tensor, "*records weights"]) -> Float[Tensor, "R T nw"]:
+    def tangent(self, d_weights: Float[Tensor, " weights"]) -> Float[Tensor, "R T nw"]:
         """(∂w/∂φ) dφ."""
         ...
 
@@ -67,8 +64,6 @@ class NetworkJacobian:
         part.z, part.h, part.slope, part.J = (
             signal[records, time] for signal in (self.z, self.h, self.slope, self.J)
         )
-        if self.Wz.ndim == 3:
-            part.Wz, part.Ww = self.Wz[records], self.Ww[records]
         return part
 
     def by_weight(self) -> Float[Tensor, "R T nw weights"]:
@@ -87,7 +82,7 @@ class NetworkJacobian:
         bw.diagonal(dim1=2, dim2=3).fill_(1.0)
         return out
 
-    def tangent(self, d_weights: Float[Tensor, "*records weights"]) -> Float[Tensor, "R T nw"]:
+    def tangent(self, d_weights: Float[Tensor, " weights"]) -> Float[Tensor, "R T nw"]:
         """(∂w/∂φ) dφ."""
         d_Wz, d_bz, d_Ww, d_bw = d_weights.split(self.sizes, dim=-1)
         d_v = self.z @ d_Wz.unflatten(-1, self.Wz.shape[-2:]).mT + d_bz.unsqueeze(-2)
@@ -107,7 +102,7 @@ class PolynomialJacobian:
     def __init__(
         self,
         m: Float[Tensor, "R T monomials"],
-        C: Float[Tensor, "*records nw monomials"],
+        C: Float[Tensor, "nw monomials"],
         slopes: Sequence[tuple[int, int, int, int]],
         nz: int,
     ) -> None:
@@ -131,7 +126,7 @@ class PolynomialJacobian:
             return self.m.unsqueeze(2)
         return torch.einsum("rtm,qp->rtqpm", self.m, torch.eye(nw).to(self.m)).flatten(-2)
 
-    def tangent(self, d_weights: Float[Tensor, "*records weights"]) -> Float[Tensor, "R T nw"]:
+    def tangent(self, d_weights: Float[Tensor, " weights"]) -> Float[Tensor, "R T nw"]:
         """(∂w/∂φ) dφ."""
         return self.m @ d_weights.unflatten(-1, (self.J.shape[2], -1)).mT
 
@@ -148,10 +143,8 @@ class ModuleJacobian:
         static: nn.Module | None,
         z: Float[Tensor, "R T nz"],
         weights: Weights,
-        by_record: int | None = None,
     ) -> None:
         self.z, self.static, self.weights = z, static, weights
-        self.by_record = by_record  # axis of the weights that counts the records, for vmap
         if static is None:
             self.J = z.new_zeros(*z.shape, 0)
         else:
@@ -162,14 +155,12 @@ class ModuleJacobian:
 
     def _at_every_sample(self, function: Callable[[Weights, Tensor], Any]) -> Any:
         over_time = vmap(function, in_dims=(None, 0))
-        return vmap(over_time, in_dims=(self.by_record, 0))(self.weights, self.z)
+        return vmap(over_time, in_dims=(None, 0))(self.weights, self.z)
 
     def part(self, records: slice, time: slice) -> StaticJacobian:
         """The same for some of the records and samples."""
         part = copy.copy(self)
         part.z, part.J = self.z[records, time], self.J[records, time]
-        if self.by_record is not None:
-            part.weights = {name: p[records] for name, p in self.weights.items()}
         return part
 
     def by_weight(self) -> Float[Tensor, "R T nw weights"]:
@@ -180,7 +171,7 @@ class ModuleJacobian:
             dim=-1,
         )
 
-    def tangent(self, d_weights: Float[Tensor, "*records weights"]) -> Float[Tensor, "R T nw"]:
+    def tangent(self, d_weights: Float[Tensor, " weights"]) -> Float[Tensor, "R T nw"]:
         """(∂w/∂φ) dφ."""
         return (self.by_weight() @ d_weights[..., None, :, None]).squeeze(-1)
 
@@ -190,7 +181,7 @@ class ModuleJacobian:
         def one(weights: Weights, z: Tensor, d_w: Tensor) -> Weights:
             return vjp(lambda weights: self._map(weights, z), weights)[1](d_w)[0]
 
-        parts = vmap(one, in_dims=(self.by_record, 0, 0))(self.weights, self.z, d_w)
+        parts = vmap(one, in_dims=(None, 0, 0))(self.weights, self.z, d_w)
         return torch.cat(
             [d_w[:, 0, :0], *(part.reshape(len(d_w), -1) for part in parts.values())], dim=-1
         )

@@ -106,8 +106,8 @@ def fit(
     records) is kept, also if the search is interrupted by Ctrl-C, or one of the processes that
     share the records is lost: ``reason`` then begins with "a process was lost".
 
-    On a CPU each start is fitted on a thread of its own, as many at a time as torch has threads. On
-    another device all go in step, their simulations and Jacobians computed together.
+    On a CPU each start is fitted on a thread of its own, as many at a time as torch has threads, on
+    another device one after another.
 
     At the end the states are scaled to unit rms over the training records, of predictions if they
     are fitted, and ``model.state_covariance`` is theirs. They keep their coordinates where a record

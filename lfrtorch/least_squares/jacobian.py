@@ -265,8 +265,6 @@ class OutputRows:
         self._cached: _Cached | None = None
         self._tied: tuple[Tensor, Tensor, Tensor] | None = None
         """Kept parameters, those of them that move the initial state, and how."""
-        self.computed: Rows | None = None
-        """All rows with one spare column, if someone has computed them already."""
 
     @property
     def count(self) -> int:
@@ -291,14 +289,13 @@ class OutputRows:
         cache = size <= room
         among_kept = torch.arange(len(own), device=own.device)
         direct = None
-        computed = size <= room or self.computed is not None
         plain = group.plain and not self._eliminate
-        if isinstance(total, GramAccumulator) and plain and not computed:
+        if isinstance(total, GramAccumulator) and plain and not cache:
             direct = OutputColumns(linearisation, own)
             own, among_kept = direct.without(own), direct.without(among_kept)
             shape = (*errors.shape, shape[-1] - len(direct.place))
         # A spectrum is taken of whole records, too.
-        blocks = self._blocks(own, shape if size <= room or group.spectral else None)
+        blocks = self._blocks(own, shape if cache or group.spectral else None)
 
         # The columns of the initial state turn into others, for each record in its own way. So each
         # record has an accumulator of its own then.
@@ -349,10 +346,6 @@ class OutputRows:
 
     def _blocks(self, own: Int[Tensor, " K"], shape: tuple[int, ...] | None) -> Iterable[Rows]:
         """The rows in those columns, written to a buffer if it has a shape."""
-        if self.computed is not None:
-            computed, self.computed = self.computed, None  # they are weighted in place, once
-            self._buffer = computed.rows
-            return [computed]
         if shape is not None and (self._buffer is None or self._buffer.shape != shape):
             self._buffer = self._memory.take(self, shape, self.group.y)
         return self.linearisation.rows(

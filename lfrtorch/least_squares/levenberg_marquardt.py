@@ -15,9 +15,8 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -80,26 +79,6 @@ class LeastSquares(Protocol):
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
         """θ, or one near it that the search may go to."""
         return theta
-
-
-class ManyLeastSquares(Protocol):
-    """Several such problems, evaluated together."""
-
-    @property
-    def problems(self) -> Sequence[LeastSquares]:
-        """Each of them."""
-        ...
-
-    def residuals(self, models: Sequence[int], thetas: Sequence[Tensor]) -> Sequence[Tensor]:
-        """r of some of them (by their numbers), each at its own θ."""
-        ...
-
-    def linearise(self, models: Sequence[int], thetas: Sequence[Tensor]) -> Sequence[Jacobian]:
-        """dr/dθ of some of them."""
-        ...
-
-
-JACOBIAN, RESIDUAL, ADMISSIBLE = "jacobian", "residual", "admissible"
 
 
 @dataclass(frozen=True)
@@ -214,67 +193,7 @@ class LevenbergMarquardt:
     def step(self, problem: LeastSquares, state: LMState) -> LMState:
         """One iteration: linearise, then raise the damping until a step lowers the cost."""
         # The first one also lowers it, as long as the next step is better.
-        search = self._search(problem.cost, state)
-        answer = None
-        while True:
-            try:
-                wanted, theta = search.send(answer)
-            except StopIteration as end:
-                return end.value
-            if wanted is ADMISSIBLE:
-                answer = problem.admissible(theta)
-            else:
-                answer = problem.linearise(theta) if wanted is JACOBIAN else problem.residual(theta)
-
-    def refused(self, before: LMState, after: LMState) -> LMState:
-        """State to go on from after a step that is undone: it was too long."""
-        assert after.damping is not None
-        return replace(
-            before,
-            damping=TAKEN_BACK * after.damping,
-            scale=after.scale,
-            iteration=after.iteration,
-            trials=after.trials,
-            rank=after.rank,
-            reason=after.reason,
-        )
-
-    def prolonged(self, state: LMState) -> LMState:
-        """State to go on from if all iterations were spent and there are more now."""
-        spent = state.reason == Reason.ALL_ITERATIONS and state.iteration < self.max_iter
-        return replace(state, reason="") if spent else state
-
-    def steps(self, joint: ManyLeastSquares, states: Sequence[LMState]) -> list[LMState]:
-        """One iteration of each of several searches, evaluated together; one that is over stays."""
-        after = list(states)
-        searches = {
-            i: self._search(joint.problems[i].cost, state)
-            for i, state in enumerate(states)
-            if not state.reason
-        }
-        answers: dict[int, Any] = dict.fromkeys(searches)
-        while answers:
-            asked: dict[str, list[tuple[int, Tensor]]] = {JACOBIAN: [], RESIDUAL: []}
-            for i, answer in answers.items():
-                try:
-                    wanted, theta = searches[i].send(answer)
-                    while wanted is ADMISSIBLE:
-                        wanted, theta = searches[i].send(joint.problems[i].admissible(theta))
-                    asked[wanted].append((i, theta))
-                except StopIteration as end:
-                    after[i] = end.value
-            answers = {}
-            for wanted, evaluate in ((JACOBIAN, joint.linearise), (RESIDUAL, joint.residuals)):
-                if asked[wanted]:
-                    models, thetas = zip(*asked[wanted], strict=True)
-                    answers |= dict(zip(models, evaluate(models, thetas), strict=True))
-        return after
-
-    def _search(
-        self, cost_of: Callable[[Tensor], float], state: LMState
-    ) -> Generator[tuple[str, Tensor], Any, LMState]:
-        """One iteration, which yields (what, θ) for each residual or Jacobian that it needs."""
-        jacobian: Jacobian = yield JACOBIAN, state.theta
+        jacobian = problem.linearise(state.theta)
         damping, least = state.damping, math.inf
         first = min(self.damping, self.least_damping)
         relative = first if damping is None else damping / state.scale
@@ -288,7 +207,7 @@ class LevenbergMarquardt:
         best: _Trial | None = None
         while damping / scale <= self.max_damping:
             trials += 1
-            trial = yield from self._trial(cost_of, state, jacobian, system, gradient, damping)
+            trial = self._trial(problem, state, jacobian, system, gradient, damping)
             gain_ratio, decrease = trial.gain_ratio, state.cost - trial.cost
             before = 0.0 if best is None else state.cost - best.cost
             if decrease > before:  # False for NaN: a diverging trial is a rejected step
@@ -324,7 +243,7 @@ class LevenbergMarquardt:
             rank=system.rank,
             quiet=quiet,
         )
-        floor = self.floor**2 * cost_of(torch.ones_like(best.residual))
+        floor = self.floor**2 * problem.cost(torch.ones_like(best.residual))
         if max(accepted.cost, state.cost) <= floor:  # one more step for what is hardly determined
             return replace(accepted, reason=Reason.RESIDUAL_VANISHES)
         if quiet >= self.patience:
@@ -333,43 +252,59 @@ class LevenbergMarquardt:
             return replace(accepted, reason=Reason.ALL_ITERATIONS)
         return accepted
 
+    def refused(self, before: LMState, after: LMState) -> LMState:
+        """State to go on from after a step that is undone: it was too long."""
+        assert after.damping is not None
+        return replace(
+            before,
+            damping=TAKEN_BACK * after.damping,
+            scale=after.scale,
+            iteration=after.iteration,
+            trials=after.trials,
+            rank=after.rank,
+            reason=after.reason,
+        )
+
+    def prolonged(self, state: LMState) -> LMState:
+        """State to go on from if all iterations were spent and there are more now."""
+        spent = state.reason == Reason.ALL_ITERATIONS and state.iteration < self.max_iter
+        return replace(state, reason="") if spent else state
+
     def _trial(
         self,
-        cost_of: Callable[[Tensor], float],
+        problem: LeastSquares,
         state: LMState,
         jacobian: Jacobian,
         system: System,
         gradient: Float[Tensor, " P"],
         damping: float,
-    ) -> Generator[tuple[str, Tensor], Any, _Trial]:
+    ) -> _Trial:
         """The step at one damping."""
         delta = system.solve(gradient, damping)
         # Decrease of |r + J δ|² by the δ with (JᵀJ + λI) δ = -gradient.
         predicted = float(damping * delta.square().sum() - gradient @ delta)
         theta = state.theta + delta
         if self.acceleration:
-            theta = theta + (
-                yield from self._acceleration(cost_of, state, jacobian, system, delta, damping)
-            )
-        theta = yield ADMISSIBLE, theta
-        residual = yield RESIDUAL, theta
-        cost = cost_of(residual)
+            theta = theta + self._acceleration(problem, state, jacobian, system, delta, damping)
+        theta = problem.admissible(theta)
+        residual = problem.residual(theta)
+        cost = problem.cost(residual)
         gain_ratio = (state.cost - cost) / predicted if predicted > 0 else float("nan")
         return _Trial(theta, residual, cost, damping, gain_ratio)
 
     def _acceleration(
         self,
-        cost_of: Callable[[Tensor], float],
+        problem: LeastSquares,
         state: LMState,
         jacobian: Jacobian,
         system: System,
         delta: Float[Tensor, " P"],
         damping: float,
-    ) -> Generator[tuple[str, Tensor], Any, Tensor]:
+    ) -> Tensor:
         """Second-order correction a = ½ argmin |J a + r''|² + λ|a|², or 0 if it is too long."""
         h = self.finite_step
-        ahead = yield RESIDUAL, state.theta + h * delta
-        if not math.isfinite(cost_of(ahead)):
+        ahead = problem.residual(state.theta + h * delta)
+        if not math.isfinite(problem.cost(ahead)):
             return torch.zeros_like(delta)
         # r'' along δ, from r(θ + hδ) = r + h J δ + h² r'' / 2 + O(h³).
         second = (ahead - state.residual).div_(h).sub_(jacobian.tangent(delta)).mul_(2.0 / h)

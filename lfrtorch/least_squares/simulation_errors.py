@@ -163,20 +163,19 @@ class SimulationErrors:
         if self._latest is None or not torch.equal(self._latest[0], theta):
             self._latest = None  # free its memory first
             found = [self._trajectory(i, theta) for i in range(len(self.groups))]
-            self.remember(theta, found)
-            return found
+            self._latest = theta.clone(), found
         return self._latest[1]
 
     def _trajectory(self, i: int, theta: Float[Tensor, " P"]) -> Trajectory:
         """The trajectory of a group at θ."""
-        group, x0 = self.groups[i], self.initial_state(i, theta)
+        group, x0 = self.groups[i], self._initial_state(i, theta)
         cell = self.cell_at(theta)  # whose sizes and dtype θ cannot change: no check
         if group.start == "periodic":
             return steady_state(cell, group.u, self._guesses[i])
         x0 = group.u.new_zeros(len(group.u), cell.nx) if x0 is None else x0
         return simulate(cell, group.u, x0, guess=self._guesses[i])
 
-    def initial_state(self, i: int, theta: Float[Tensor, " P"]) -> Float[Tensor, "R nx"] | None:
+    def _initial_state(self, i: int, theta: Float[Tensor, " P"]) -> Float[Tensor, "R nx"] | None:
         """Initial states of group i at θ, unless they are zero or periodic."""
         group = self.groups[i]
         if group.estimated is None:
@@ -197,14 +196,6 @@ class SimulationErrors:
                     weight = weight * (group.beyond == 0)
                 states[group.estimated] = start_from_beginning(cell, group.u, group.y, weight)
         return self.ranks.sum(states)
-
-    def remember(self, theta: Float[Tensor, " P"], trajectories: list[Trajectory]) -> None:
-        """Cache trajectories at θ, one for each group."""
-        self._latest = theta.clone(), trajectories
-
-    def guess(self, i: int) -> Tensor | None:
-        """States of group i near the next θ, if they are known."""
-        return self._guesses[i]
 
     def release(self) -> None:
         """Free the memory of what only speeds up the next evaluation."""

@@ -21,28 +21,23 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(threads, "COMPILED_ON", set())
 
 
-def weights(nx: int, nz: int, nw: int, models: int | None, dtype: torch.dtype):
-    """Random matrices of a stable model, or of one for each record."""
+def weights(nx: int, nz: int, nw: int, dtype: torch.dtype):
+    """Random matrices of a stable model."""
     generator = torch.Generator().manual_seed(nx + nz)
-    lead = () if models is None else (models,)
     sizes = {"A": (nx, nx), "Bw": (nx, nw), "Cz": (nz, nx), "Cy": (1, nx), "Dyw": (1, nw)}
     found = {
-        name: torch.randn(*lead, *size, generator=generator, dtype=dtype)
-        for name, size in sizes.items()
+        name: torch.randn(*size, generator=generator, dtype=dtype) for name, size in sizes.items()
     }
     found["A"] *= 0.5 / nx**0.5
     return found
 
 
-@pytest.mark.parametrize("models", [None, 2])
 @pytest.mark.parametrize(("nx", "nz", "nw"), [(1, 1, 1), (5, 2, 3), (9, 4, 2)])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_they_are_the_recurrences_of_the_products(
-    nx: int, nz: int, nw: int, models: int | None, dtype: torch.dtype
-):
+def test_they_are_the_recurrences_of_the_products(nx: int, nz: int, nw: int, dtype: torch.dtype):
     R, T = 2, 300
     generator = torch.Generator().manual_seed(0)
-    W = weights(nx, nz, nw, models, dtype)
+    W = weights(nx, nz, nw, dtype)
     J = 0.3 * torch.randn(R, T, nw, nz, generator=generator, dtype=dtype)
     J /= W["Bw"].norm() * W["Cz"].norm()
     g = torch.randn(R, T, nx, generator=generator, dtype=dtype)
@@ -68,7 +63,7 @@ def test_they_are_the_recurrences_of_the_products(
 
 
 def test_what_has_faded_is_zero_and_what_overflows_is_not_finite():
-    W = weights(3, 1, 1, None, torch.float64)
+    W = weights(3, 1, 1, torch.float64)
     eye = torch.eye(3, dtype=torch.float64).unsqueeze(0)
     none = torch.zeros(1, 4000, 1, 1, dtype=torch.float64)
     assert transition(W, none, eye).abs().max() < 1e-30

@@ -19,7 +19,6 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linear_recurrence import linear_recurrence, scan
 from lfrtorch.engine.linearised import linearise as linearise_of
 from lfrtorch.engine.newton import newton_states
-from lfrtorch.engine.nonlinearity import Network
 
 pytestmark = pytest.mark.numeric
 
@@ -177,28 +176,6 @@ def test_nearby_guess_takes_fewer_iterations_to_the_same_states(periodic: bool):
     few = iterations(cell, u, x0, periodic=periodic, guess=guess)
     # The error is squared by each: 1e-12, then nothing. From far off it takes some more.
     assert few <= 3 < iterations(cell, u, x0, periodic=periodic)
-
-
-# --- one model a record ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("periodic", [False, True])
-@pytest.mark.parametrize("way", WAYS)
-def test_each_model_of_a_batch_is_what_it_is_alone(way, periodic: bool):
-    cells = [random_cell(2, 1, 3, 2, 1, 4, seed=seed, feedback=0.5) for seed in range(3)]
-    batch = LFRCell(2, 1, 3, 2, 1, Network(2, 1, 4))
-    for name, _ in cells[0].named_parameters():
-        stacked = torch.stack([cell.get_parameter(name).detach() for cell in cells])
-        if name in ("static.bz", "static.bw"):
-            stacked = stacked.unsqueeze(1)  # one for all samples
-        module, _, entry = name.rpartition(".")
-        setattr(batch.get_submodule(module), entry, nn.Parameter(stacked))
-
-    u, x0 = normal(3, 60, 2), normal(3, 3, seed=1)
-    together = states(batch, u, x0, way, periodic=periodic)
-    for r, cell in enumerate(cells):
-        alone = states(cell, u[r : r + 1], x0[r : r + 1], way, periodic=periodic)
-        assert_close(together[r], alone[0], rtol=1e-12, atol=1e-12)
 
 
 def test_a_large_record_does_not_hide_a_small_one():

@@ -8,7 +8,7 @@ from torch.func import functional_call
 from torch.testing import assert_close
 
 from lfrtorch.engine.activations import ACTIVATIONS
-from lfrtorch.engine.nonlinearity import Network, Polynomial, Stacked, linearise_static
+from lfrtorch.engine.nonlinearity import Network, Polynomial, linearise_static
 from lfrtorch.engine.static_jacobian import StaticJacobian
 
 pytestmark = pytest.mark.numeric
@@ -59,11 +59,11 @@ def expected_slopes(static: nn.Module, weights: dict[str, Tensor], z: Tensor):
     return torch.stack(J), torch.stack(by_weight)
 
 
-def check(jacobian: StaticJacobian, static: nn.Module, weights: list[dict[str, Tensor]], z: Tensor):
+def check(jacobian: StaticJacobian, static: nn.Module, weights: dict[str, Tensor], z: Tensor):
     by_weight = jacobian.by_weight()
     for r in range(R):
         for k in range(T):
-            J, by = expected_slopes(static, weights[r], z[r, k])
+            J, by = expected_slopes(static, weights, z[r, k])
             assert_close(jacobian.J[r, k], J, rtol=1e-12, atol=1e-14)
             assert_close(by_weight[r, k], by.double(), rtol=1e-12, atol=1e-14)
     direction, d_w = normal(by_weight.shape[-1], seed=8), normal(*by_weight.shape[:3], seed=9)
@@ -79,7 +79,7 @@ def check(jacobian: StaticJacobian, static: nn.Module, weights: list[dict[str, T
 def test_network(activation: str):
     static, z = network(activation), normal(R, T, nz)
     weights = weights_of(static)
-    check(linearise_static(static, z, weights), static, [weights, weights], z)
+    check(linearise_static(static, z, weights), static, weights, z)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 5])
@@ -88,16 +88,13 @@ def test_network(activation: str):
 def test_polynomial(nz: int, nw: int, degree: int):
     static, z = Polynomial(nz, nw, degree, dtype=torch.float64), normal(R, T, nz)
     weights = weights_of(static)
-    check(linearise_static(static, z, weights), static, [weights, weights], z)
-    each = [weights_of(static, seed=10 * r + 1) for r in range(R)]
-    stacked = {"C": torch.stack([w["C"] for w in each])}
-    check(linearise_static(static, z, stacked), static, each, z)
+    check(linearise_static(static, z, weights), static, weights, z)
 
 
 def test_own_module():
     static, z = Bend(), normal(R, T, nz)
     weights = weights_of(static)
-    check(linearise_static(static, z, weights), static, [weights, weights], z)
+    check(linearise_static(static, z, weights), static, weights, z)
 
 
 def test_map_without_parameters():
@@ -113,25 +110,3 @@ def test_no_map():
     jacobian = linearise_static(None, normal(R, T, 0), {})
     assert jacobian.J.shape == (R, T, 0, 0)
     assert jacobian.by_weight().shape == (R, T, 0, 0)
-
-
-def test_values_and_slopes_of_own_weights_for_every_record():
-    base, z = Bend(), normal(R, T, nz)
-    each = [weights_of(base, seed=10 * r + 1) for r in range(R)]
-    stacked = Stacked(base, {name: torch.stack([w[name] for w in each]) for name in each[0]})
-    for r in range(R):
-        assert_close(stacked(z)[r], functional_call(base, each[r], (z[r],)), rtol=1e-14, atol=1e-14)
-    check(
-        linearise_static(stacked, z, {n: p.detach() for n, p in stacked.named_parameters()}),
-        base,
-        each,
-        z,
-    )
-
-
-def test_network_with_own_weights_for_every_record():
-    base, z = network("tanh"), normal(R, T, nz)
-    each = [weights_of(base, seed=10 * r + 1) for r in range(R)]
-    stacked = {name: torch.stack([w[name] for w in each]) for name in each[0]}
-    stacked |= {name: w.unsqueeze(1) for name, w in stacked.items() if w.ndim == 2}
-    check(linearise_static(base, z, stacked), base, each, z)

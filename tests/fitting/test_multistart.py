@@ -18,9 +18,8 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import Polynomial
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import Round, fit, iterations_of, schedule
-from lfrtorch.fitting.side_by_side import advance_in_step
 from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.trainer import Fit, Progress
+from lfrtorch.fitting.trainer import Progress
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.metrics import rmse
@@ -125,46 +124,14 @@ def test_one_start_is_a_fit():
     assert len(result.starts) == 1
 
 
-def test_starts_in_step_are_what_they_are_alone():
-    models, train, validation = several(3)
-    alone = several(3)[0]
-    optimiser = LevenbergMarquardt(max_iter=6)
-    fits = [Fit(m, train, validation, trainer=optimiser) for m in models]
-    seen: list[int] = []
-    watching: Any = [[lambda _, p, i=i: seen.append(i)] for i in range(3)]
-    advance_in_step(fits, 4, watching)
-    assert [fit.history[-1].iteration for fit in fits] == [4, 4, 4]
-    advance_in_step(fits, 6)
-    for stepped, model in zip(fits, alone, strict=True):
-        expected = fit(model, train, validation, trainer=optimiser)
-        # Sums in another order, and no gauge columns left out.
-        assert stepped.result().history[-1].train == pytest.approx(
-            expected.history[-1].train, rel=1e-5
-        )
-    assert sorted(seen) == 5 * [0] + 5 * [1] + 5 * [2]
-
-
 class Slow(LevenbergMarquardt):
-    """8 s an iteration, whether of one search or of several in step, by a clock of its own."""
+    """8 s an iteration, by a clock of its own."""
 
     now = 1000.0
 
     def step(self, problem, state):
         Slow.now += 8.0
         return super().step(problem, state)
-
-    def steps(self, joint, states):
-        Slow.now += 8.0
-        return super().steps(joint, states)
-
-
-def test_starts_in_step_share_the_time_of_an_iteration(monkeypatch):
-    monkeypatch.setattr("time.perf_counter", lambda: Slow.now)
-    models, train, validation = several(2, T=20)
-    fits = [Fit(m, train, validation, trainer=Slow(max_iter=2)) for m in models]
-    advance_in_step(fits, 2)
-    for begun in fits:
-        assert [p.seconds for p in begun.history] == [0.0, 4.0, 8.0]
 
 
 def test_a_fit_takes_as_long_as_its_rounds(monkeypatch):

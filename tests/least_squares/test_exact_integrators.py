@@ -10,9 +10,7 @@ from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.side_by_side import advance_in_step
 from lfrtorch.fitting.starts import initialise
-from lfrtorch.fitting.trainer import Fit
 from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.exact_integrators import fixed_parameters, integrating_states
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
@@ -76,15 +74,6 @@ def test_a_shift_stays_for_good():
     u = np.random.default_rng(1).standard_normal(2000)
     at, ahead = (model.simulate(u, start="given", x0=[0.0, shift]) for shift in (0.0, 1.0))
     assert np.allclose(ahead - at, (ahead - at)[0], rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_starts_that_go_in_step_keep_them():
-    record, models = axis(1), [started(1, seed=seed) for seed in range(2)]
-    before = [bits(model, 1) for model in models]
-    trainer = LevenbergMarquardt(max_iter=5)
-    advance_in_step([Fit(model, record, trainer=trainer) for model in models], 5)
-    assert [bits(model, 1) for model in models] == before
 
 
 @pytest.mark.slow

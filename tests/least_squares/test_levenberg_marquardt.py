@@ -1,6 +1,6 @@
 """Published problems, gauge directions, undefined regions, and the options."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -317,41 +317,6 @@ def test_step_that_is_taken_back_is_tried_again_with_more_damping():
     again = optimiser.step(problem, back)
     assert (again.theta - before.theta).norm() < (after.theta - before.theta).norm()
     assert again.iteration == 2
-
-
-class Several(NamedTuple):
-    """Problems that are evaluated one after another."""
-
-    problems: list[Problem]
-
-    def residuals(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[Tensor]:
-        return [self.problems[i].residual(theta) for i, theta in zip(models, thetas, strict=True)]
-
-    def linearise(self, models: Sequence[int], thetas: Sequence[Tensor]) -> list[DenseJacobian]:
-        return [self.problems[i].linearise(theta) for i, theta in zip(models, thetas, strict=True)]
-
-
-@BOTH
-@pytest.mark.parametrize("damping", [1e-9, 1.0])
-def test_searches_in_step_are_each_what_they_are_alone(damping: float, acceleration: bool):
-    """They need different numbers of trials, and end one after another."""
-    published = [PUBLISHED[0], PUBLISHED[5], PUBLISHED[4]]
-    optimiser = LevenbergMarquardt(max_iter=8, damping=damping, acceleration=acceleration)
-    stack = Several([Problem(p.f) for p in published])
-    states = [optimiser.init(Problem(p.f), p.start) for p in published]
-    states[1] = replace(states[1], iteration=4)  # half of its iterations are gone
-    alone = list(states)
-    for _ in range(9):
-        states = optimiser.steps(stack, states)
-        alone = [
-            state if state.reason else optimiser.step(problem, state)
-            for problem, state in zip(stack.problems, alone, strict=True)
-        ]
-        for mine, other in zip(states, alone, strict=True):
-            assert torch.equal(mine.theta, other.theta)
-            assert (mine.iteration, mine.trials) == (other.iteration, other.trials)
-            assert (mine.cost, mine.reason) == (other.cost, other.reason)
-    assert all(state.reason for state in states)
 
 
 def test_patience_begins_anew_with_progress():

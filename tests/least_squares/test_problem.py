@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lfrtorch.least_squares.jacobian import Jacobian, OutputRows
-from lfrtorch.least_squares.joint import JointProblem
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.metrics import rmse
@@ -523,22 +522,3 @@ def test_search_leaves_fixed_entries_and_brings_the_rest_home(
     assert torch.equal(state.theta[problem.fixed], theta[problem.fixed])
     # Noise-free, and θ_start of the ridge is the planted θ: the search ends at rounding.
     assert problem.rmse(state.theta) < 1e-8
-
-
-@pytest.mark.parametrize("kept", [True, False])
-def test_stack_leaves_fixed_entries(kept: bool, monkeypatch):
-    """The searches of a stack compute all columns, and move the free entries alone."""
-    monkeypatch.setattr("lfrtorch.least_squares.jacobian.CACHED_BYTES", 1 << 20 if kept else 0)
-    models = [random_model(random_cell(2, 2, 2, 2, 1, 3, seed=i)) for i in range(2)]
-    record = measure(models[0], 60)
-    problems = [Problem.of(m, replace(record, y=record.y + 0.1)) for m in models]
-    for problem, m in zip(problems, models, strict=True):
-        problem.fixed = some_fixed(m)
-    starts = [p.theta for p in problems]
-    optimiser = LevenbergMarquardt()
-    states = [optimiser.init(p, p.theta) for p in problems]
-    for _ in range(3):
-        states = optimiser.steps(JointProblem(problems), states)
-    for problem, state, theta in zip(problems, states, starts, strict=True):
-        assert torch.equal(state.theta[problem.fixed], theta[problem.fixed])
-        assert not torch.equal(state.theta, theta)
