@@ -40,10 +40,6 @@ from lfrtorch.records import Channel, Record, as_records
 
 Method = Literal["auto", "robust", "fast", "local_polynomial"]
 
-SPARE_FREEDOM = 4
-"""The windows of the local polynomial method leave this many degrees of freedom more than outputs:
-covariances are regular, and with one output a variance has a standard deviation of 45 %."""
-
 
 @dataclass(frozen=True, eq=False)
 class Level:
@@ -341,7 +337,8 @@ def _local_polynomial(
     cut = any(record.samples - record.skip > spectra.N for record in data)
     spectra, data, repeated = united(spectra, data, shifted=False)
     last = (spectra.N - 1) // 2
-    freedom = len(data[0].outputs) + SPARE_FREEDOM
+    # Covariances are regular, and with one output a variance has a standard deviation of 45 %.
+    freedom = len(data[0].outputs) + 4
     n = half_width(order, freedom, len(data[0].inputs), len(data))
     if 2 * n + 1 > last:
         raise InputError(

@@ -20,20 +20,14 @@ from lfrtorch.linear.response_fit import ResponseFit
 from lfrtorch.linear.signal_fit import SignalFit
 from lfrtorch.linear.subspace import SubspaceEstimate
 
-FIRST_STEPS, FINALISTS = 8, 6
-"""Iterations after which the searches are compared, and how many of them go on."""
+FIRST_STEPS = 8
+"""Iterations after which the searches are compared."""
 
-SAME, AGREED = 1.0 + 2e-6, 3
-"""Ratio of two costs up to which two searches are in the same minimum; the comparison ends if this
-many in a row are in the best one."""
+_SAME = 1.0 + 2e-6
+"""Ratio of two costs up to which two searches are in the same minimum."""
 
-RACERS, APART, LEADERS, SETTLED = 4, 1.03, 3, 1e-3
-"""Of many unknowns: starts that are compared, the factor between their costs, how many go on, and
-the decrease in some iterations below which the best of these alone goes on."""
-
-ALIKE, HOPELESS = 1.001, 10.0
-"""Candidates whose costs differ by a factor below ALIKE count as one; a candidate whose cost is
-HOPELESS times the best is dropped."""
+ALIKE = 1.001
+"""Candidates whose costs differ by a factor below this count as one."""
 
 
 Problem = ResponseFit | SignalFit
@@ -83,25 +77,25 @@ def best_minimum(
     last, nx = 0.0, len(tried[0].estimate.A)
     many = problem.many(nx)
     for candidate in tried[: problem.most_candidates(nx)]:
-        hopeless = field and candidate.cost >= HOPELESS * tried[0].cost
-        if candidate.cost > (APART if many else ALIKE) * last and not hopeless:
+        hopeless = field and candidate.cost >= 10.0 * tried[0].cost
+        if candidate.cost > (1.03 if many else ALIKE) * last and not hopeless:
             field.append(candidate)
             last = candidate.cost
     searches: list[tuple[SubspaceEstimate, Search]] = []
     if max_iter <= FIRST_STEPS:
         field = field[:1]
-    for _, estimate, matrices in field[:RACERS] if many else field:
+    for _, estimate, matrices in field[:4] if many else field:
         search = search_from(problem, matrices)
         searches.append((estimate, search.advance(min(FIRST_STEPS, max_iter))))
         costs = [search.state.cost for _, search in searches]
-        if len(costs) >= AGREED and max(costs[-AGREED:]) <= SAME * min(costs):
-            break  # the last ones are all in the best minimum: the others would be, too
+        if len(costs) >= 3 and max(costs[-3:]) <= _SAME * min(costs):
+            break  # the last three are all in the best minimum: the others would be, too
     searches.sort(key=lambda each: each[1].state.cost)
-    apart = distinct([search.state.cost for _, search in searches], SAME)
+    apart = distinct([search.state.cost for _, search in searches], _SAME)
     finalists = [searches[i] for i in apart] or searches
-    finalists = finalists[: LEADERS if many else FINALISTS]
+    finalists = finalists[: 3 if many else 6]
     for _, search in finalists:
-        search.advance(max_iter, SETTLED if many else 0.0)
+        search.advance(max_iter, 1e-3 if many else 0.0)
     if many:
         finalists = [min(finalists, key=lambda each: each[1].state.cost)]
         finalists[0][1].advance(max_iter)

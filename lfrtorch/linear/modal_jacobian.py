@@ -21,11 +21,6 @@ from lfrtorch._support.types import Array, Booleans, Complex
 from lfrtorch.linear.pole_limits import Excess
 from lfrtorch.linear.spectral_data import SpectralData
 
-DEFECTIVE = 1e6
-"""Modes are not used if sᵢ sⱼ / |λᵢ - λⱼ| of two poles is above this, s being how far a pole moves
-with A. The derivatives of modes grow with it and cancel in those of the response: JᵀJ then has four
-digits left."""
-
 
 class Modes(NamedTuple):
     """Linear model by its modes."""
@@ -45,10 +40,12 @@ class Modes(NamedTuple):
             W = np.asarray(np.linalg.inv(V), dtype=np.complex128)
         except np.linalg.LinAlgError:
             return None
+        # The derivatives of modes grow with sᵢ sⱼ / |λᵢ - λⱼ|, s being how far a pole moves with A,
+        # and cancel in those of the response: at 1e6 JᵀJ has four digits left.
         with np.errstate(over="ignore"):
             s = np.linalg.norm(V, axis=0) * np.linalg.norm(W, axis=1)
             apart = np.abs(poles - poles[:, None]) + np.diag(np.full(len(poles), np.inf))
-            if not (np.outer(s, s) < DEFECTIVE * apart).all():
+            if not (np.outer(s, s) < 1e6 * apart).all():
                 return None
         return cls(poles, V, W, W @ B, C @ V, D)
 
@@ -106,42 +103,12 @@ class ModalJacobian:
         of_errors = self._gradient(real + 1j * imaginary)
         return torch.as_tensor(of_errors + self._excess.jacobian.T @ residual[-nx:].numpy())
 
-    def covariance(self, *, known: bool) -> Array | None:
-        """Return the covariance of ``ResponseProblem``; ``None`` if JᵀJ has too few digits."""
-        Q = np.linalg.qr(_without_scaling(self._modes, self._change).T)[0]
-        Z = self._change @ Q
-        system = GramSystem((Z.conj().T @ (self._products() @ Z)).real, np.eye(Q.shape[1]))
-        if system.rank < Q.shape[1]:
-            return None
-        inverse = system.inverse.numpy()
-        data, last = self._data, Z @ inverse @ Q.T
-        if data.errors is not None:
-            return data.errors.covariance(lambda e: self._scores(data.weighted(e)) @ last, len(Q))
-        if known:
-            return Q @ (inverse / 2) @ Q.T
-        root = (self._scores(self._errors) @ last).real
-        M, K = 2 * self._errors.size, Q.shape[1]
-        return root.T @ root * (M / max(1, M - K))
-
     def _products(self) -> Complex:
         """JᴴJ with λ, b, c and the free entries of D, (Kc, Kc)."""
         functions = _with_one(self._functions)
         left, right = _constants(self._modes, self._data.U.shape[1])
         free = np.concatenate([np.ones(left.shape[1] - self._free.size, bool), self._free.ravel()])
         return _products(functions, self._data, left[:, free], right[:, free])
-
-    def _scores(self, r: Complex) -> Complex:
-        """Return what each line adds to Jᴴ r with λ, b, c and D, conjugate: (F, Kc)."""
-        m, (squares, singles) = self._modes, np.split(self._functions, 2, axis=1)
-        F, H = len(r), self._data.weighted(r).conj() @ self._data.U.swapaxes(1, 2)
-        with_b, with_c = H @ m.b.T, m.c.T @ H  # (F, ny, nx), (F, nx, nu)
-        parts = [
-            squares * np.einsum("foi,oi->fi", with_b, m.c),
-            (singles[:, :, None] * with_c).reshape(F, -1),
-            (singles[:, None] * with_b).swapaxes(1, 2).reshape(F, -1),
-            H[:, self._free],
-        ]
-        return np.hstack(parts)
 
     def _tangent(self, change: Complex) -> Complex:
         """Return the change of G (F, ny, nu) with a change of λ, b, c and D."""
@@ -191,11 +158,6 @@ class GramSystem:
         """-(JᵀJ + λI)⁻¹ gradient."""
         along = self._axes.T @ gradient.numpy()
         return torch.as_tensor(-self._axes @ (along / (self._squares + damping)))
-
-    @property
-    def inverse(self) -> Tensor:
-        """Pseudo-inverse (P, P) of JᵀJ."""
-        return torch.as_tensor((self._axes / self._squares) @ self._axes.T)
 
 
 def _gains(functions: Complex, products: Complex) -> Complex:

@@ -36,20 +36,11 @@ from lfrtorch.records import Record, Scaler
 Window = tuple[int, int]
 """First sample, and the one after the last."""
 
-LOW = 12
-"""Highest order of the first subspaces; others are made when a scan comes there."""
+_MOST_STEPS = 80
+"""Iterations of a search."""
 
-MOST_PARTS = 8
-"""Initial states are unknowns: of more records this many are fitted, evenly spaced."""
-
-STARTS, FIRST_STEPS, FINALISTS, MOST_STEPS = 4, 4, 2, 80
-"""Starts that are refined, iterations after which the best few go on, and their last one."""
-
-NEAR_STEPS = 12
-"""The last one from a model that is near the minimum."""
-
-SETTLED, STRIDE = 1e-4, 4
-"""The search ends if STRIDE iterations lower the cost by less than the part SETTLED."""
+_SETTLED, _STRIDE = 1e-4, 4
+"""The search ends if _STRIDE iterations lower the cost by less than the part _SETTLED."""
 
 
 def description_length(rmse: float, parameters: int, equations: float) -> float:
@@ -102,7 +93,7 @@ class OrderFits:
 
     def _subspaces_for(self, nx: int) -> list[SpectralSubspace]:
         """Return subspaces that hold the order: small ones as long as it is low."""
-        most = LOW
+        most = 12
         while most < nx:
             most *= 2
         most = min(most, self._most)
@@ -119,7 +110,7 @@ class OrderFits:
             return None
         default = "frequency" if isinstance(data, FRF) else default_criterion(data)
         offset, through = given.get("offset", True), given.get("feedthrough", True)
-        most_steps = given.get("max_iter", MOST_STEPS)
+        most_steps = given.get("max_iter", _MOST_STEPS)
         settings = Settings(
             given.get("refine", default), given.get("weight"), offset, through, most_steps
         )
@@ -142,7 +133,7 @@ class OrderFits:
         offset: bool,
         feedthrough: bool,
         most: int,
-        max_iter: int = MOST_STEPS,
+        max_iter: int = _MOST_STEPS,
     ) -> Self:
         """Return the fits of parts of records, each with its initial state as a parameter."""
         scaler = Scaler.of(records, offset=offset)
@@ -155,7 +146,8 @@ class OrderFits:
         longest = max(len(u) for u, _ in parts)
         enough = min(longest, 4 * (most + 1))  # samples of a part that is fitted
         kept = [i for i, (u, _) in enumerate(parts) if len(u) >= enough]
-        kept = [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, MOST_PARTS).astype(int))]
+        # Initial states are unknowns: of more parts eight are fitted, evenly spaced.
+        kept = [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, 8).astype(int))]
         spectra = spectral_data_of_parts(
             [parts[i] for i in kept], [weights[i] for i in kept], offset=offset
         )
@@ -172,12 +164,12 @@ class OrderFits:
         searches = [search_from(self.problem, matrices) for matrices in self._starts(nx)]
         found = [self.problem.refined(searches[0])]
         for search in searches:
-            self._advance(search, FIRST_STEPS)
+            self._advance(search, 4)
         first, *others = sorted(searches, key=lambda search: search.state.cost)
-        same = (1.0 + SETTLED) * first.state.cost
+        same = (1.0 + _SETTLED) * first.state.cost
         finalists = [first, *(search for search in others if search.state.cost > same)]
-        for search in finalists[:FINALISTS]:
-            self._advance(search, MOST_STEPS)
+        for search in finalists[:2]:
+            self._advance(search, _MOST_STEPS)
             found.append(self.problem.refined(search))
         best, model, _ = self._best(found, clock, self._y_offset)
         self._found[nx], self._y_offset = best.matrices, model.y_offset
@@ -199,7 +191,7 @@ class OrderFits:
         C = model.C / self._scaler.y_scale[:, None]
         search = search_from(self.problem, self.problem.with_input_matrices(model.A, C)[1])
         found = [self.problem.refined(search)]
-        self._advance(search, NEAR_STEPS)
+        self._advance(search, 12)  # it is near the minimum
         found.append(self.problem.refined(search))
         return self._best(found, clock, model.y_offset)[1:]
 
@@ -230,7 +222,7 @@ class OrderFits:
         if not ranked:
             raise no_start(nx)
         apart = distinct([cost for cost, _ in ranked], ALIKE) or range(len(ranked))
-        return [ranked[i][1] for i in apart][:STARTS]
+        return [ranked[i][1] for i in apart][:4]
 
     def _extended(self, below: Matrices, more: int) -> list[tuple[Array, Array]]:
         """Return A and C of a model with ``more`` states that describe its errors."""
@@ -248,8 +240,8 @@ class OrderFits:
         steps = min(steps, self._max_iter)
         while not search.state.reason and search.state.iteration < steps:
             before = search.state.cost
-            search.advance(min(steps, search.state.iteration + STRIDE))
-            if search.state.cost > (1.0 - SETTLED) * before:
+            search.advance(min(steps, search.state.iteration + _STRIDE))
+            if search.state.cost > (1.0 - _SETTLED) * before:
                 break
 
     def _model(

@@ -2,7 +2,7 @@
 
 The fewest states are taken that do as well as the best, see ``lfrtorch.paired_blocks``. Where the
 validation records are short against the system's memory, or unlike the training records, they say
-little of an order: the scores are then those of a cross-validation in time over both. Each of FOLDS
+little of an order: the scores are then those of a cross-validation in time over both. Each of five
 stretches is left out of a fit to the rest, and scored in a simulation of its whole record.
 """
 
@@ -42,12 +42,7 @@ from lfrtorch.paired_blocks import (
 from lfrtorch.records import Record, Scaler, as_records, without_coordinates
 from lfrtorch.score_window import with_window
 
-ORDERS = range(1, 13)
-
-PATIENCE = 3
-"""The scan ends after this number of orders in a row that bring less than 1 %."""
-
-FOLDS = 5
+_FOLDS = 5
 """Stretches of a cross-validation."""
 
 UNLIKE = 1.5
@@ -117,7 +112,7 @@ class OrderScan:
 @typed("validation")
 def scan_orders(
     data: Record | Sequence[Record] | FRF,
-    orders: Sequence[int] = ORDERS,
+    orders: Sequence[int] = range(1, 13),
     *,
     validation: Record | Sequence[Record] = (),
     watch: Callable[[str], None] = lambda _: None,
@@ -168,7 +163,7 @@ def scan_orders(
             f"order {new.model.nx}: fitted {number(fitted(new.model))}, {how} "
             f"{number(scores[-1])}, {quantity(time.perf_counter() - clock, 's')}"
         )
-        return no_progress(scores, PATIENCE)
+        return no_progress(scores, 3)
 
     tried: list[_Tried] = []
     for nx in orders:
@@ -323,7 +318,7 @@ class _Folds:
         self._scale = Scaler.of(self._records).y_scale
         whole = [(r.skip, r.samples) for r in self._records]
         ends = np.cumsum([0] + [last - first for first, last in whole])
-        cuts = np.linspace(0, ends[-1], FOLDS + 1).astype(int)
+        cuts = np.linspace(0, ends[-1], _FOLDS + 1).astype(int)
         self._left_out: list[list[Window]] = []
         self._fits: list[OrderFits] = []
         chosen = {name: options.get(name, True) for name in ("offset", "feedthrough")}
@@ -344,7 +339,7 @@ class _Folds:
     def errors(self, model: LinearModel) -> list[Array]:
         """Return the relative errors in each stretch, of fits that begin at the model."""
         return [
-            error for some in each_alone(partial(self._of, model), range(FOLDS)) for error in some
+            error for some in each_alone(partial(self._of, model), range(_FOLDS)) for error in some
         ]
 
     def _of(self, model: LinearModel, fold: int) -> list[Array]:

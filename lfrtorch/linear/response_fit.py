@@ -35,15 +35,8 @@ from lfrtorch.linear.resolvent import (
 from lfrtorch.linear.spectral_data import SpectralData
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_spectra
 
-MOST_CANDIDATES, LARGE = 12, 250_000
-"""Subspace estimates that are refined; only one if errors times unknowns are LARGE or more."""
-
-
 MANY = 40
 """Unknowns from which on the derivatives are computed by modes."""
-
-COARSE = 1e-7
-"""A relative decrease of the cost below this ends a search for many unknowns."""
 
 
 class ResponseFit:
@@ -68,7 +61,7 @@ class ResponseFit:
     def most_candidates(self, nx: int) -> int:
         """Return how many subspace estimates are refined: one if an iteration takes long."""
         nu, ny = self.data.U.shape[1], self.data.Y.shape[1]
-        return MOST_CANDIDATES if self.data.Y.size * nx * (nu + ny) < LARGE else 1
+        return 12 if self.data.Y.size * nx * (nu + ny) < 250_000 else 1
 
     def many(self, nx: int) -> bool:
         """Tell if a model of the order has so many unknowns that its modes save work."""
@@ -138,7 +131,7 @@ class ResponseFit:
             limits=None if self.starts else PoleLimits(self.data.z),
         )
         theta = torch.as_tensor(np.concatenate([m.ravel() for m in matrices]))
-        return Search(problem, theta, COARSE if self.many(len(matrices[0])) else TOLERANCE)
+        return Search(problem, theta, 1e-7 if self.many(len(matrices[0])) else TOLERANCE)
 
     def _free_inputs(self, nx: int) -> Booleans:
         """Mask of the entries of B (nx, nu) that are parameters."""
@@ -238,11 +231,6 @@ class ResponseProblem(LeastSquares):
         Unless the weights are ``known`` to be inverse variances, the error found at each line
         stands for its variance (White's estimate).
         """
-        jacobian = self.linearise(theta)
-        if isinstance(jacobian, ModalJacobian):
-            found = jacobian.covariance(known=known)
-            if found is not None:
-                return found
         errors, nx = self.errors(theta), self.shapes[0][0]
         none = np.zeros(nx), np.zeros((nx, len(theta)))
         jacobian = ResponseJacobian(*self._jacobian(theta), errors, none)

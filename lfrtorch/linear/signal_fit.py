@@ -34,15 +34,6 @@ from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signal
 from lfrtorch.model import simulate_record
 from lfrtorch.records import PAST_OUTPUTS, NormalisedRecord
 
-MOST_CANDIDATES, SHORT = 8, 200_000
-"""Subspace estimates that are refined; only one if samples times squared states exceed SHORT."""
-
-LARGEST_ROWS = 50_000_000
-"""Entries of the largest Jacobian that is formed as a whole for a covariance: 400 MB."""
-
-ROUNDING = 1e-12
-"""Smallest variance of a state, relative to the largest: the inputs do not move it."""
-
 OBSERVERS = (1e-4, 1e-2, 1.0)
 """Variances of the state noise that the initial innovation models of a prediction-error fit assume,
 besides none, relative to those of the states and in units of the output noise."""
@@ -71,7 +62,7 @@ class SignalFit:
 
     def most_candidates(self, nx: int) -> int:
         """Return how many subspace estimates are refined: one of long records, as it is good."""
-        return MOST_CANDIDATES if sum(map(len, self._us)) * nx**2 <= SHORT else 1
+        return 8 if sum(map(len, self._us)) * nx**2 <= 200_000 else 1
 
     def many(self, nx: int) -> bool:
         """Return False: all searches go to the end."""
@@ -134,7 +125,7 @@ class SignalFit:
             [problem.lfr.trajectory(group.u).x.flatten(0, 1) for group in problem.errors.groups]
         )
         spread, axes = torch.linalg.eigh(driven.mT @ driven / len(driven))
-        variances = spread.clamp_min(ROUNDING * float(spread[-1]))
+        variances = spread.clamp_min(1e-12 * float(spread[-1]))  # not moved by the inputs
         unlikely = float(((x0 @ axes).square() / variances).sum())
         return state.cost * (1.0 + unlikely / problem.size)
 
@@ -186,7 +177,7 @@ class SignalFit:
         takes too much memory.
         """
         inverse, spare = system.inverse.numpy(), max(1, problem.size - system.rank)
-        if self._prediction or problem.size * len(theta) > LARGEST_ROWS:
+        if self._prediction or problem.size * len(theta) > 50_000_000:  # 400 MB
             return inverse * (cost / spare)
         rows, errors = problem.jacobian(theta).numpy(), problem.residual(theta).numpy()
         found, first = np.zeros_like(inverse), 0
