@@ -89,7 +89,11 @@ def of_mirror(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
 
 def of_f16(root: Path) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
     """Multisines of three levels."""
-    data = f16.load(root=root, levels=[1, 3, 7], validation=["multisine_5", "sweep_5"])
+    data = f16.load(
+        root=root,
+        train=[f"multisine_{n}" for n in (1, 3, 7)],
+        validation=["multisine_5", "sweep_5"],
+    )
     heads = "nz, nw, nn", "modes", "net parameters", *(r.name for r in data.validation)
 
     def rows() -> Iterable[Sequence[Any]]:

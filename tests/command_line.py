@@ -24,8 +24,8 @@ SHORTER = {  # fewer samples and iterations, so that two iterations take a secon
     "cascaded_tanks": "bla.max_iter=1 starts=1",
     "ced": "bla.max_iter=1 starts=1",
     "emps": "data.validation=0.8 bla.max_iter=1 starts=1 refit=false",
-    "f16": "data.levels=[3] data.validation_level=5 nx=6 modes=1 bla.max_iter=1 starts=1"
-    " first_part=1 refit=false",
+    "f16": "data.train=[multisine_3] data.validation=[multisine_5] nx=6 modes=1"
+    " bla.max_iter=1 starts=1 first_part=1 refit=false",
     "fine_steering_mirror": "data.levels=[100] data.validation=5 nx=4 nz=1 nw=1 nn=4 relaxations=1"
     " bla.max_iter=1 first_part=1 refit=false",
     "parwh": "data.source=stand-in data.levels=[325] bla.max_iter=1 starts=1",

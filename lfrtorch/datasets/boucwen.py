@@ -41,16 +41,12 @@ _ALPHA, _BETA, _GAMMA, _DELTA = 5e4, 1e3, 0.8, -1.1
 
 _FS = 750.0  # Hz, of the records
 _RATIO = 20  # integration rate over _FS
-_H = 1 / (_RATIO * _FS)  # s, step of the integration
-_TOLERANCE = 1e-13  # of Newton's residual, relative; rounding leaves about 1e-15
-_MAX_NEWTON = 50  # iterations a step; 2 or 3 are usual
 _TAPS = 31  # of each low-pass filter
 
 _BAND = (5.0, 150.0)  # Hz, of the multisines
 _PERIOD = 8192  # samples at 750 Hz, of the multisine test
 _SWEEP = 153_000  # samples at 750 Hz, of the sweep test: 204 s
 _TESTS = {"multisine": _PERIOD, "sinesweep": _SWEEP}  # official file names, and samples
-_SWEEP_SKIP = 2000  # samples, unscored transient of the sweep test
 _TEST_OFFSET = 2000  # seed of the simulated multisine test, beyond the training seed
 
 _FILES = "BoucWen/BoucWenFiles/Test signals/Validation signals"  # below the benchmarks' folder
@@ -186,8 +182,7 @@ def multisine(
             f"a period of {samples} samples at {_FS:g} Hz cannot hold the excited band, "
             f"{_BAND[0]:g} to {_BAND[1]:g} Hz; give a whole number of at least {least} samples."
         )
-    if not (np.isfinite(rms) and rms > 0):
-        raise InputError(f"the input's rms is {rms} N; give a positive number (officially 50 N).")
+    number("rms", rms, positive=True)
     f0 = _FS / samples
     lines = np.arange(floor(_BAND[0] / f0), ceil(_BAND[1] / f0) + 1)
     phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, lines.size)
@@ -255,11 +250,7 @@ def simulate(
             f"decimation factors {tuple(factors)}: 15 kHz to 750 Hz needs factors of 2 or more "
             f"that multiply to {_RATIO}, for example (2, 2, 5)."
         )
-    if not (np.isfinite(noise_rms) and noise_rms >= 0):
-        raise InputError(
-            f"the noise rms is {noise_rms} m; give 0 (no noise) or a positive number "
-            "(officially 8e-6 m)."
-        )
+    number("noise_rms", noise_rms)
     y = _newmark(u)
     if not np.isfinite(y[-1]):
         raise InputError(
@@ -282,7 +273,7 @@ def _newmark(u: Array) -> Array:
     Newmark (1/2, 1/4), with the trapezoidal rule for z. The balance of forces is linear in the
     acceleration a, so that a step is one equation in the rate s = z', solved by Newton.
     """
-    half = _H / 2
+    half = 1 / (_RATIO * _FS) / 2  # s, of a step
     inertia = _M + half * _C + half**2 * _K
     out = np.full(u.size, np.nan)
     y = v = z = s = 0.0
@@ -295,12 +286,12 @@ def _newmark(u: Array) -> Array:
         z_last = z + half * s
         force = u[i] - _C * v_last - _K * y_last - z_last
         scale = 1 + abs(s) + (_ALPHA + _BETA * abs(z_last)) * abs(v_last)
-        for _ in range(_MAX_NEWTON):
+        for _ in range(50):  # 2 or 3 are usual
             a = (force - half * s) / inertia
             v = v_last + half * a
             z = z_last + half * s
             residual = s - _ALPHA * v + _BETA * (_GAMMA * abs(v) * z + _DELTA * v * abs(z))
-            if abs(residual) <= _TOLERANCE * scale:
+            if abs(residual) <= 1e-13 * scale:  # rounding leaves about 1e-15
                 break
             dv = -_ALPHA + _BETA * (_GAMMA * np.sign(v) * z + _DELTA * abs(z))
             dz = _BETA * (_GAMMA * abs(v) + _DELTA * v * np.sign(z))
@@ -360,7 +351,7 @@ def _sweep_test(folder: Path) -> Record:
     if signals is None:
         u = sweep()
         signals, source = (u[::_RATIO], simulate(u, factors=(_RATIO,))), "simulated"
-    return _record(*signals, name="sweep", start="zero", skip=_SWEEP_SKIP, source=source)
+    return _record(*signals, name="sweep", start="zero", skip=2000, source=source)
 
 
 def _record(u: Array, y: Array, **kwargs: Any) -> Record:
@@ -373,8 +364,8 @@ def _official_folder(root: str | Path | None, download: bool) -> Path:
         first = f"{_FILES}/uval_multisine.mat"
         return official.find(root, first, _LOADER, download=True).parent
     if root is None:
-        return official.cache() / _FILES
-    folder = Path(root).expanduser() / _FILES
+        return official.folder(None) / _FILES
+    folder = official.folder(root) / _FILES
     if not any(path.is_file() for test in _TESTS for path in _pair(folder, test)):
         raise FileNotFoundError(
             f"no Bouc-Wen test files in '{root}': expected '{_FILES}/uval_multisine.mat', "
@@ -399,7 +390,5 @@ def _read_official(folder: Path, test: str) -> tuple[Array, Array] | None:
             f"'{missing[0]}' is missing although its partner is there; put it back, or remove "
             "both to have the test simulated."
         )
-    advice = "download the file again, or remove it and its partner to have the test simulated."
-    shape = (_TESTS[test],)
-    u, y = (official.read_arrays(p, {p.stem: shape}, advice=advice)[p.stem] for p in paths)
+    u, y = (official.read_arrays(p, {p.stem: (_TESTS[test],)})[p.stem] for p in paths)
     return u, y

@@ -30,7 +30,6 @@ __all__ = ["load"]
 
 _FILE = "CED/DATAUNIF.MAT"
 _ARCHIVES = ("CED/FULLTEXT01.zip", "CED/CoupledElectricDrivesDataSetAndReferenceModels.zip")
-_ADVICE = f"remove '{_FILE}' and the archive beside it, and download them again."
 _FS = 50.0  # Hz
 _SAMPLES, _ESTIMATION = 500, 400
 _WINDOW = 10  # samples, unscored, of the tests
@@ -76,7 +75,7 @@ def load(
     trained = _ESTIMATION - official.held_out(_ESTIMATION, validation)
     path = official.find(root, _FILE, "CED", others=_ARCHIVES, download=download)
     shapes = {signal: (_SAMPLES, 1) for signals in _LEVELS.values() for signal in signals}
-    arrays = official.read_arrays(path, shapes, Path(_FILE).name, _ADVICE)
+    arrays = official.read_arrays(path, shapes, Path(_FILE).name)
 
     whole = {
         level: official.record(arrays[u], arrays[z], {"u": "V"}, {"z": "ticks/s"}, fs=_FS)

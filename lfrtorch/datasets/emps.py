@@ -116,7 +116,6 @@ def load(
 
 def _measured(path: Path, file: str) -> Record:
     """One file, or the archive with it, as a record."""
-    advice = f"remove '{file}' and '{_ARCHIVE}', and download them again."
     shapes = {"vir": (_SAMPLES, 1), "qm": (_SAMPLES, 1)}
-    u, y = official.read_arrays(path, shapes, Path(file).name, advice).values()
+    u, y = official.read_arrays(path, shapes, Path(file).name).values()
     return official.record(u, y, {"vir": "V"}, {"qm": "m"}, fs=_FS)

@@ -34,7 +34,6 @@ from pathlib import Path
 import numpy as np
 
 from lfrtorch._support.errors import InputError
-from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset, Published
 from lfrtorch.datasets import official
 from lfrtorch.metrics import rms
@@ -47,7 +46,6 @@ _KINDS = {"multisine": "FullMSine", "sweep": "SineSw"}
 _FS = 400.0  # Hz
 _PERIOD, _PERIODS = 8192, 9  # samples of a multisine, and how many; the first is a transient
 _ESTIMATION, _TESTS = (1, 3, 5, 7), (2, 4, 6)  # levels
-_MULTISINES = tuple(f"multisine_{level}" for level in _ESTIMATION)
 _SKIP = 50  # samples, unscored, of records from rest
 
 
@@ -76,10 +74,12 @@ _NOTE = "RMSE is that of the three accelerations together; published figures are
 
 def load(
     *,
-    train: Sequence[str] = (*_MULTISINES, "sweep_3", "sweep_7"),
+    train: Sequence[str] = (
+        *(f"multisine_{level}" for level in _ESTIMATION),
+        "sweep_3",
+        "sweep_7",
+    ),
     validation: Sequence[str] = ("sweep_5",),
-    levels: Sequence[int] | None = None,
-    validation_level: int | None = None,
     download: bool = False,
     root: str | Path | None = None,
 ) -> Dataset:
@@ -95,8 +95,6 @@ def load(
     Args:
         train: what is fitted, ``"multisine_1"`` or ``"sweep_1"``, of the levels 1, 3, 5 and 7.
         validation: what is chosen by, of the same; it may be empty.
-        levels: those whose multisines train, in the place of ``train``.
-        validation_level: that whose multisine validates, in the place of ``validation``.
         download: whether files that are missing are downloaded (148 MB) by nonlinear_benchmarks.
         root: folder that holds ``F16/F16GVT_Files/BenchmarkData/F16Data_FullMSine_Level1.mat`` and
             so on.
@@ -108,10 +106,6 @@ def load(
     Example:
         >>> data = lfrtorch.datasets.f16.load(download=True)  # doctest: +SKIP
     """
-    if levels is not None:
-        train = _multisines("levels", levels)
-    if validation_level is not None:
-        validation = _multisines("validation_level", [validation_level])
     _check(train, validation)
 
     def measured(use: str, name: str) -> Record:
@@ -150,8 +144,8 @@ def _whole(path: Path, name: str, called: str) -> Record:
     acceleration = official.read_arrays(path, {"Acceleration": shape})["Acceleration"]
     if force.shape[1] <= _SKIP:
         raise InputError(
-            f"'{path}': 'Force' has {force.shape[1]} samples; expected more than {_SKIP}; download "
-            "the file again."
+            f"'{path}': 'Force' has {force.shape[1]} samples; expected more than {_SKIP}; "
+            f"{official.again(path)}"
         )
     outputs = {f"acc{i}": "m/s²" for i in (1, 2, 3)}
     return official.record(
@@ -176,24 +170,10 @@ def _fitted(record: Record) -> Record:
     """For training: of a multisine one period, the mean of those without transient."""
     if record.period is None:
         return record
-    u, y = _mean(record.u), _mean(record.y)
+    u, y = (
+        signal.reshape(_PERIODS, _PERIOD, -1)[1:].mean(axis=0) for signal in (record.u, record.y)
+    )
     return replace(record, u=u, y=y, start="periodic", skip=0, weight=float(_PERIODS - 1))
-
-
-def _mean(signal: Array) -> Array:
-    """Mean of all periods but the first: (8192, channels)."""
-    return signal.reshape(_PERIODS, _PERIOD, -1)[1:].mean(axis=0)
-
-
-def _multisines(option: str, levels: Sequence[int]) -> list[str]:
-    """The names of the multisines of some levels."""
-    try:
-        return [f"multisine_{_ESTIMATION[_ESTIMATION.index(level)]}" for level in levels]
-    except (TypeError, ValueError):
-        raise InputError(
-            f"{option} is {levels}; give of {', '.join(map(str, _ESTIMATION))}, for example "
-            "levels=[1, 3, 7] and validation_level=5."
-        ) from None
 
 
 def _check(train: Sequence[str], validation: Sequence[str]) -> None:

@@ -100,7 +100,7 @@ def load(
         if u.ndim != 4 or u.shape != y.shape or u.shape[1] != _CHANNELS or len(u) <= _WINDOW:
             raise InputError(
                 f"'{path}': u_{level}mV_{use} has shape {u.shape} and y_{level}mV_{use} {y.shape}; "
-                f"expected (samples, {_CHANNELS}, realisations, periods); download the file again."
+                f"expected (samples, {_CHANNELS}, realisations, periods); {official.again(path)}"
             )
         return u, y
 

@@ -32,8 +32,6 @@ BOARD = "leaderboard of nonlinearbenchmark.org"
 LEGACY = f"{BOARD}, before it fixed its splits"
 """The same for one on other samples, estimation or test, than it asks for now."""
 
-_AGAIN = "download the file again."
-
 
 def cache() -> Path:
     """Where the package nonlinear_benchmarks keeps its downloads."""
@@ -123,9 +121,7 @@ def archive_note(archive: Path, md5: str, file: str) -> str:
     )
 
 
-def read_arrays(
-    path: Path, shapes: Mapping[str, Shape], member: str = "", advice: str = _AGAIN
-) -> dict[str, Array]:
+def read_arrays(path: Path, shapes: Mapping[str, Shape], member: str = "") -> dict[str, Array]:
     """Read arrays of a .mat file by name.
 
     Args:
@@ -133,22 +129,21 @@ def read_arrays(
         shapes: of the arrays, by name; None for an axis of any length, and (samples,) for a signal
             that is a row or a column of the file.
         member: name of the file in the archive, in whatever folder.
-        advice: what to do about a file that cannot be used.
 
     Raises:
         ValueError: a file that cannot be read, or another shape or type, or NaN.
     """
-    content = _unpacked(path, member, advice) if path.suffix == ".zip" else path
+    content = _unpacked(path, member) if path.suffix == ".zip" else path
     found: dict[str, Array] = {}
     for name, shape in shapes.items():
         signal = len(shape) == 1
         allowed = ((1, *shape), (*shape, 1)) if signal else (shape,)
-        array = _variable(path, content, name, allowed, advice)
+        array = _variable(path, content, name, allowed)
         found[name] = array.ravel() if signal else array
     return found
 
 
-def read_struct(path: Path, name: str, fields: Sequence[str], advice: str = _AGAIN) -> list[Array]:
+def read_struct(path: Path, name: str, fields: Sequence[str]) -> list[Array]:
     """Read matrices of one shape, (samples, records), from a struct of a .mat file, in this order.
 
     Raises:
@@ -161,16 +156,16 @@ def read_struct(path: Path, name: str, fields: Sequence[str], advice: str = _AGA
     except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
         raise InputError(
             f"'{path}' holds no readable struct '{name}' with {' and '.join(fields)} ({error!r}); "
-            f"{advice}"
+            f"{again(path)}"
         ) from error
     shape = matrices[0].shape
     if len(shape) != 2 or 0 in shape:
         raise InputError(
             f"'{path}': '{name}.{fields[0]}' has shape {shape}; expected (samples, records); "
-            f"{advice}"
+            f"{again(path)}"
         )
     return [
-        _numbers(path, f"{name}.{field}", matrix, (shape,), advice)
+        _numbers(path, f"{name}.{field}", matrix, (shape,))
         for field, matrix in zip(fields, matrices, strict=True)
     ]
 
@@ -181,10 +176,8 @@ def read_npz(path: Path) -> dict[str, Array]:
         with path.open("rb") as content, np.load(content) as file:
             found = {name: file[name] for name in file.files}
     except Exception as error:  # a damaged archive makes for several kinds
-        raise InputError(f"'{path}' is no readable .npz file ({error!r}); {_AGAIN}") from error
-    return {
-        name: _numbers(path, name, array, (array.shape,), _AGAIN) for name, array in found.items()
-    }
+        raise InputError(f"'{path}' is no readable .npz file ({error!r}); {again(path)}") from error
+    return {name: _numbers(path, name, array, (array.shape,)) for name, array in found.items()}
 
 
 def without_tests(missing: Sequence[str], why: str, *, partly: bool) -> tuple[str, ...]:
@@ -288,38 +281,30 @@ def _download(below: Path, file: str, loader: str) -> None:
         ) from error
 
 
-def _unpacked(path: Path, member: str, advice: str) -> BytesIO:
+def _unpacked(path: Path, member: str) -> BytesIO:
     """The content of a file in a zip archive."""
     try:
         with ZipFile(path) as archive:
             (name,) = (n for n in archive.namelist() if n.rpartition("/")[2] == member)
             return BytesIO(archive.read(name))
     except Exception as error:  # a damaged archive, too, makes for several kinds
-        raise InputError(f"'{path}' holds no readable '{member}' ({error!r}); {advice}") from error
+        raise InputError(
+            f"'{path}' holds no readable '{member}' ({error!r}); {again(path)}"
+        ) from error
 
 
-def _variable(
-    path: Path,
-    content: Path | BytesIO,
-    name: str,
-    shapes: Sequence[Shape],
-    advice: str,
-) -> Array:
+def _variable(path: Path, content: Path | BytesIO, name: str, shapes: Sequence[Shape]) -> Array:
     """A variable of a .mat file with one of the shapes."""
     try:
         found = np.asarray(scipy.io.loadmat(content, variable_names=[name])[name])
     except Exception as error:  # a damaged file makes loadmat raise any of a dozen kinds
-        raise InputError(f"'{path}' holds no readable '{name}' ({error!r}); {advice}") from error
-    return _numbers(path, name, found, shapes, advice)
+        raise InputError(
+            f"'{path}' holds no readable '{name}' ({error!r}); {again(path)}"
+        ) from error
+    return _numbers(path, name, found, shapes)
 
 
-def _numbers(
-    path: Path,
-    name: str,
-    found: NDArray[Any],
-    shapes: Sequence[Shape],
-    advice: str,
-) -> Array:
+def _numbers(path: Path, name: str, found: NDArray[Any], shapes: Sequence[Shape]) -> Array:
     """What was found of a name, if it has one of the shapes and is real and finite."""
     fits = any(
         len(shape) == found.ndim
@@ -327,12 +312,15 @@ def _numbers(
         for shape in shapes
     )
     if found.dtype.kind not in "iuf" or not fits or not np.isfinite(found).all():
+        expected = " or ".join(map(str, shapes)).replace("None", "any")
         raise InputError(
             f"'{path}': '{name}' has shape {found.shape} and type {found.dtype}; expected "
-            f"{' or '.join(map(_shape, shapes))} and real numbers without NaN; {advice}"
+            f"{expected} and real numbers without NaN; "
+            f"{again(path)}"
         )
     return found.astype(np.float64)
 
 
-def _shape(shape: Shape) -> str:
-    return str(shape).replace("None", "any")
+def again(path: Path) -> str:
+    """Say what to do about a file that cannot be used."""
+    return f"remove '{path.name}' and any archive beside it, and download them again."

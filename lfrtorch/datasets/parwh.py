@@ -17,8 +17,9 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.dataset import Dataset
 from lfrtorch.datasets import official
-from lfrtorch.datasets.parwh_simulator import FS, PERIOD, Signals, StandIn, multisine, simulate
+from lfrtorch.datasets.parwh_simulator import FS, PERIOD, Signals, multisine, simulate, stand_in
 from lfrtorch.records import Record
 
 __all__ = ["LEVELS", "load", "multisine", "simulate"]
@@ -36,14 +37,13 @@ __all__ = ["LEVELS", "load", "multisine", "simulate"]
 LEVELS = (100, 325, 550, 775, 1000)
 """Amplitudes of the records, mV rms."""
 
-_ARROW_SKIP = 500  # samples, unscored
 _WINDOW = 50  # samples that nonlinearbenchmark.org leaves unscored
 
 _SOURCES = ("auto", "official", "stand-in")
 _FILE = "ParWH/ParWHFiles/ParWHData.mat"  # below the benchmarks' folder
 _ARCHIVE = "ParWH/ParWHFiles.zip"
 _OTHERS = ("ParWH/ParWHData.mat", _ARCHIVE)
-_MD5 = "5836dc66b0296b43ba4b8613a032408b"  # of the archive of 58203304 bytes
+_MD5 = "5836dc66b0296b43ba4b8613a032408b"  # of the archive
 _PERIODS, _REALISATIONS = 2, 20  # of the estimation part, at each level
 _SHAPES = {  # samples, periods, realisations, levels
     **dict.fromkeys(("uEst", "yEst"), (PERIOD, _PERIODS, _REALISATIONS, len(LEVELS))),
@@ -51,7 +51,6 @@ _SHAPES = {  # samples, periods, realisations, levels
     **dict.fromkeys(("uValArr", "yValArr"), (PERIOD, _PERIODS)),
 }
 
-_ADVICE = f"remove '{_FILE}' and '{_ARCHIVE}', and download them again."
 _NOT_FOUND = (
     "the official data are not at hand: all records are the simulated stand-in's "
     "(source='official' downloads the data, root=DIR says where they are)"
@@ -136,30 +135,33 @@ def load(
     number("noise_rms", noise_rms)
     chosen = official.chosen_levels(levels, LEVELS)
     path = _found(source, root)
+    signals: Callable[[str, int, int], Signals]
     if path is None:
-        data = StandIn(seed=seed, periods=periods, noise_rms=noise_rms)
+        signals = partial(stand_in, seed=seed, periods=periods, noise_rms=noise_rms)
         notes = (_NOT_FOUND,) if source == "auto" else ()
     else:
-        data = _Official(path, seed=seed, realisations=realisations, periods=periods)
+        _check_official(realisations, periods)
+        arrays = official.read_arrays(path, _SHAPES, Path(_FILE).name)
+        signals = partial(_official, arrays, seed=seed, periods=periods)
         archive = official.folder(root) / _ARCHIVE
         notes = (official.archive_note(archive, _MD5, Path(_FILE).name),)
 
-    def record(name: str, u: Array, y: Array, *, skip: int = 0) -> Record:
+    def record(name: str, use: str, level: int, r: int = 0, *, skip: int = 0) -> Record:
         return official.record(
-            u, y, {"u": "V"}, {"y": "V"}, fs=FS, start="periodic", skip=skip, name=name,
-            source=data.source, period=PERIOD,
+            *signals(use, level, r), {"u": "V"}, {"y": "V"}, fs=FS, start="periodic", skip=skip,
+            name=name, source="stand-in" if path is None else "official", period=PERIOD,
         )  # fmt: skip
 
-    levels_alone = [record(f"level_{level}", *data.test(level)) for level in LEVELS]
+    levels_alone = [record(f"level_{level}", "level", level) for level in LEVELS]
     return Dataset(
         name="parwh",
         train=[
-            record(name, *data.train(level, r))
+            record(name, "train", level, r)
             for level in chosen
             for r, name in enumerate(_names(level, realisations))
         ],
-        validation=[record(f"validation_{level}", *data.validation(level)) for level in chosen],
-        tests=[*levels_alone, record("arrow", *data.arrow(), skip=_ARROW_SKIP)],
+        validation=[record(f"validation_{level}", "validation", level) for level in chosen],
+        tests=[*levels_alone, record("arrow", "arrow", 0, skip=500)],
         noise_rms=noise_rms if path is None else None,
         seed=seed,
         published=_PUBLISHED,
@@ -182,54 +184,33 @@ def _linear(levels: Sequence[int], realisations: int) -> dict[str, tuple[str, ..
     return of_level | ({"arrow": of_level["level_1000"]} if "level_1000" in of_level else {})
 
 
-class _Official:
-    """Signals of the records, from the official file.
+def _check_official(realisations: int, periods: int) -> None:
+    """Refuse to train on more than the official file has."""
+    for name, asked, most in (
+        ("realisations", realisations, _REALISATIONS - 1),
+        ("periods", periods, _PERIODS),
+    ):
+        if asked > most:
+            raise InputError(
+                f"{name} is {asked}, and the official data have {most} for training; give "
+                f"1 to {most} (source='stand-in' simulates as many as are asked for)."
+            )
 
-    Args:
-        path: of the file, or of the archive that holds it.
-        seed, realisations, periods: see :func:`load`.
 
-    Raises:
-        ValueError: more than the file has, or a file that cannot be used.
-    """
-
-    source = "official"
-
-    def __init__(self, path: Path, *, seed: int, realisations: int, periods: int) -> None:
-        for name, asked, most in (
-            ("realisations", realisations, _REALISATIONS - 1),
-            ("periods", periods, _PERIODS),
-        ):
-            if asked > most:
-                raise InputError(
-                    f"{name} is {asked}, and the official data have {most} for training; give "
-                    f"1 to {most} (source='stand-in' simulates as many as are asked for)."
-                )
-        self.seed, self.periods = seed, periods
-        self.arrays = official.read_arrays(path, _SHAPES, Path(_FILE).name, _ADVICE)
-
-    def train(self, level: int, r: int) -> Signals:
-        """Training record r of a level (mV rms)."""
-        return self._estimation((self.seed + r) % (_REALISATIONS - 1), level)
-
-    def validation(self, level: int) -> Signals:
-        """The validation record of a level."""
-        return self._estimation(_REALISATIONS - 1, level)
-
-    def test(self, level: int) -> Signals:
-        """The test record of a level."""
-        last = np.s_[:, -1, 0, LEVELS.index(level)]
-        return self.arrays["uVal"][last], self.arrays["yVal"][last]
-
-    def arrow(self) -> Signals:
-        """The test of growing amplitude."""
-        return self.arrays["uValArr"][:, -1], self.arrays["yValArr"][:, -1]
-
-    def _estimation(self, realisation: int, level: int) -> Signals:
-        """The last periods, one after the other; copied, to let go of the whole arrays."""
-        part = np.s_[:, -self.periods :, realisation, LEVELS.index(level)]
-        u, y = (self.arrays[name][part].flatten(order="F") for name in ("uEst", "yEst"))
-        return u, y
+def _official(
+    arrays: dict[str, Array], use: str, level: int, r: int, *, seed: int, periods: int
+) -> Signals:
+    """Return record r of a use and a level, from the official file."""
+    if use == "arrow":
+        return arrays["uValArr"][:, -1], arrays["yValArr"][:, -1]
+    at = LEVELS.index(level)
+    if use == "level":
+        return arrays["uVal"][:, -1, 0, at], arrays["yVal"][:, -1, 0, at]
+    last = _REALISATIONS - 1
+    part = np.s_[:, -periods:, last if use == "validation" else (seed + r) % last, at]
+    # The periods follow one another; copied, to let go of the whole arrays.
+    u, y = (arrays[name][part].flatten(order="F") for name in ("uEst", "yEst"))
+    return u, y
 
 
 def _found(source: str, root: str | Path | None) -> Path | None:

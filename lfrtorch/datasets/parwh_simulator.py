@@ -33,52 +33,23 @@ PERIOD = 16384
 """Samples of a period."""
 
 _LINES = slice(1, 4096)  # of rfft, that are excited: 2 to 4096 counted from 1 at DC
-_ARROW_RMS = 1.0  # V, of its last tenth
-
-_USES = ("train", "validation", "level", "arrow")  # first number of a record's seed
 
 Signals = tuple[Array, Array]
 """Input and output, (samples,) each, V."""
 
 
-class StandIn:
-    """Signals of the records, in steady state.
-
-    Args:
-        seed, periods, noise_rms: see :func:`lfrtorch.datasets.parwh.load`.
-    """
-
-    source = "stand-in"
-
-    def __init__(self, *, seed: int, periods: int, noise_rms: float) -> None:
-        self.seed, self.periods, self.noise_rms = seed, periods, noise_rms
-
-    def train(self, level: int, r: int) -> Signals:
-        """Training record r of a level (mV rms)."""
-        return self._multisine("train", level, r, self.periods, self.noise_rms)
-
-    def validation(self, level: int) -> Signals:
-        """The validation record of a level."""
-        return self._multisine("validation", level, 0, self.periods, self.noise_rms)
-
-    def test(self, level: int) -> Signals:
-        """The test record of a level."""
-        return self._multisine("level", level, 0, 1, 0.0)
-
-    def arrow(self) -> Signals:
-        """The test of growing amplitude."""
-        u = _arrow(self._generator("arrow", 0, 0))
+def stand_in(use: str, level: int, r: int, *, seed: int, periods: int, noise_rms: float) -> Signals:
+    """Return record r of a use and a level (mV rms), in steady state; tests are noise free."""
+    key = ("train", "validation", "level", "arrow").index(use), level, r
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+    if use == "arrow":
+        u = _arrow(rng)
         return u, simulate(u)
-
-    def _multisine(self, use: str, level: int, r: int, periods: int, noise_rms: float) -> Signals:
-        rng = self._generator(use, level, r)
-        u = multisine(rms=1e-3 * level, seed=rng)
-        noise = rng.standard_normal(periods * PERIOD)
-        return np.tile(u, periods), np.tile(simulate(u), periods) + noise_rms * noise
-
-    def _generator(self, use: str, level: int, r: int) -> np.random.Generator:
-        key = (_USES.index(use), level, r)
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
+    u = multisine(rms=1e-3 * level, seed=rng)
+    if use == "level":
+        return u, simulate(u)
+    noise = rng.standard_normal(periods * PERIOD)
+    return np.tile(u, periods), np.tile(simulate(u), periods) + noise_rms * noise
 
 
 def multisine(
@@ -161,4 +132,4 @@ def _arrow(rng: np.random.Generator) -> Array:
     spectrum = np.zeros_like(white)
     spectrum[_LINES] = white[_LINES]
     u = np.linspace(0, 1, PERIOD) * np.fft.irfft(spectrum, PERIOD)
-    return _ARROW_RMS * u / rms_of(u[-PERIOD // 10 :])
+    return u / rms_of(u[-PERIOD // 10 :])

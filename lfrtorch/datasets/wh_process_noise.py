@@ -78,7 +78,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
         if len(u) <= _SKIP:
             raise InputError(
                 f"'{path}': 'dataMeas.u' has shape {u.shape}; expected (samples, records) and more "
-                f"than {_SKIP} samples; download the file again."
+                f"than {_SKIP} samples; {official.again(path)}"
             )
         return u, y
 
@@ -105,7 +105,7 @@ def load(*, validation: int = 2, download: bool = False, root: str | Path | None
         if u.shape[1] != len(_TESTS):
             raise InputError(
                 f"'{path}': 'dataMeas.u' has shape {u.shape}; expected (samples, {len(_TESTS)}), "
-                f"{' and '.join(_TESTS)}; download the file again."
+                f"{' and '.join(_TESTS)}; {official.again(path)}"
             )
         tests = [record(*test) for test in zip(_TESTS, u.T, y.T, strict=True)]
     return Dataset(

@@ -25,13 +25,9 @@ __all__ = ["load"]
 _FILE = "WienerHammerBenchMark/WienerHammerBenchMark.mat"
 _FS = 51200.0  # Hz
 _SAMPLES, _ESTIMATION = 188_000, 100_000
-_AT_REST = 5000  # samples at the beginning of the file; the input starts at 4999
 _WARM_UP = 1000  # samples, unscored, of the official test: a BLA's transient is 1e-12 V after 300
 
-_SITE = (5200, 105_200), (105_200, 184_000)
-"""Estimation and test of nonlinearbenchmark.org."""
-
-_SITE_WINDOW = 50  # samples, unscored, of its test
+_SITE = (5200, 105_200), (105_200, 184_000)  # estimation and test of nonlinearbenchmark.org
 
 
 _COMPARISON = "Beintema, Schoukens and Tóth (2023)"
@@ -85,7 +81,7 @@ def load(
         raise InputError(f"split is {split!r}; give 'official' or 'site'.")
     site = split == "site"
     if skip is None:
-        skip = _WARM_UP if site else _AT_REST
+        skip = _WARM_UP if site else 5000  # the input starts at 4999
     integer("skip", skip, 0)
     first, last = _SITE[0] if site else (0, _ESTIMATION)
     held_out = official.held_out(last - first, validation, least=_WARM_UP + skip + 1)
@@ -94,7 +90,7 @@ def load(
     u, y = official.read_arrays(path, shapes).values()
     whole = official.record(u, y, {"u": "V"}, {"y": "V"}, fs=_FS)
     trained = last - held_out
-    of_site = replace(whole[slice(*_SITE[1])], start="estimated", skip=_SITE_WINDOW, name="site")
+    of_site = replace(whole[slice(*_SITE[1])], start="estimated", skip=50, name="site")
     of_paper = official.part(whole, _ESTIMATION + _WARM_UP, _SAMPLES, warm_up=_WARM_UP, name="test")
     return Dataset(
         name="wiener_hammerstein",

@@ -361,7 +361,7 @@ def test_refused_signals(brief, tmp_path, stem, signal, match):
     with pytest.raises(ValueError, match=match) as refusal:
         boucwen.load(root=tmp_path, samples=150, selection_rms=[])
     assert f"{stem}.mat'" in str(refusal.value)
-    assert str(refusal.value).endswith("to have the test simulated.")
+    assert str(refusal.value).endswith("and download them again.")
 
 
 @pytest.mark.parametrize(

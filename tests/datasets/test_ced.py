@@ -85,7 +85,7 @@ def test_the_archive_does_as_well(tmp_path, archive):
 
 def test_a_wrong_file_is_refused_with_advice(tmp_path):
     write(tmp_path, **numbers() | {"z12": np.zeros((400, 1))})
-    with pytest.raises(ValueError, match=r"'z12' has shape \(400, 1\).*remove 'CED/DATAUNIF.MAT'"):
+    with pytest.raises(ValueError, match=r"'z12' has shape \(400, 1\).*remove 'DATAUNIF.MAT'"):
         ced.load(root=tmp_path)
 
 

@@ -81,8 +81,10 @@ def test_split(numbered):
     assert (data.name, data.noise_rms) == ("f16", None)
 
 
-def test_levels_are_multisines(numbered):
-    data = f16.load(root=str(numbered), levels=[7, 5], validation_level=1)
+def test_multisines_in_any_order(numbered):
+    data = f16.load(
+        root=str(numbered), train=["multisine_7", "multisine_5"], validation=["multisine_1"]
+    )
     assert [r.name for r in data.train] == ["train_multisine_7", "train_multisine_5"]
     assert [int(r.u[0, 0]) // 1_000_000 for r in data.train] == [7, 5]
     assert [r.name for r in data.validation] == ["validation_multisine_1"]
@@ -100,7 +102,7 @@ def test_zeros_that_fill_a_sweep_are_no_measurement(tmp_path, numbered):
     signals[:, 300] = 0
     for level in (2, 5):
         write(tmp_path, level, signals[:1], signals[1:], "SineSw")
-    data = f16.load(root=tmp_path, levels=[1], validation=["sweep_5"])
+    data = f16.load(root=tmp_path, train=["multisine_1"], validation=["sweep_5"])
     assert data.validation[0].samples == 400
     assert next(r for r in data.tests if r.name == "sweep_2").samples == 500
 
@@ -156,7 +158,7 @@ def test_another_layout(tmp_path, force, acceleration, match):
     with pytest.raises(ValueError, match=match) as told:
         f16.load(root=tmp_path)
     assert str(told.value).startswith(f"'{path}'")
-    assert str(told.value).endswith("download the file again.")
+    assert str(told.value).endswith("beside it, and download them again.")
 
 
 # --- a system of the kind -------------------------------------------------------------------
@@ -201,7 +203,7 @@ def test_the_mean_of_the_periods_has_less_noise(shaken):
 
     The transient fades by exp(-0.03 · 2 π 5 / 400 · 8192) = 4e-9 in the period that is left out.
     """
-    for record in f16.load(root=shaken, levels=[1, 3, 7]).train:
+    for record in f16.load(root=shaken, train=[f"multisine_{n}" for n in (1, 3, 7)]).train:
         level = int(record.name[-1])
         design = multisine(PERIOD, fs=400.0, band=(2.0, 15.0), rms=RMS[level - 1], seed=level)
         u = design.u[0, :, 0]
@@ -216,7 +218,7 @@ def test_the_mean_of_the_periods_has_less_noise(shaken):
 @pytest.mark.slow
 def test_run(shaken, tmp_path, capsys):
     """The bench from its files to the table: errors of all outputs and of each."""
-    sizes = "nx=4 nn=5 starts=1 data.levels=[7]"
+    sizes = "nx=4 nn=5 starts=1 data.train=[multisine_7]"
     shorter = "trainer.max_iter=2 figures=false"
     overrides = ["+bench=f16", f"data.root='{shaken}'", *sizes.split(), *shorter.split()]
     cfg = composed("config", overrides)

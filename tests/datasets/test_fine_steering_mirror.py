@@ -104,7 +104,7 @@ def test_one_realisation_trains_at_least(tmp_path):
 def test_another_layout(tmp_path, changed, match):
     with pytest.raises(ValueError, match=match) as told:
         fine_steering_mirror.load(root=write(tmp_path, "train", **changed))
-    assert str(told.value).endswith("download the file again.")
+    assert str(told.value).endswith("beside it, and download them again.")
 
 
 @pytest.mark.numeric

@@ -429,7 +429,7 @@ def test_a_damaged_archive(tmp_path):
     with pytest.raises(ValueError, match="holds no readable") as told:
         parwh.load(root=tmp_path)
     assert str(told.value).startswith(f"'{tmp_path / file}'")
-    assert str(told.value).endswith(f"remove '{MAT}' and '{ARCHIVE}', and download them again.")
+    assert str(told.value).endswith("beside it, and download them again.")
 
 
 def test_a_file_of_another_shape(tmp_path):

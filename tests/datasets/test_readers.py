@@ -63,11 +63,8 @@ REFUSED: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"validation": 0.2, "warm_up": 19_874}, "is 19874, and there are 19873 samples before"),
     ],
     "f16": [
-        ({"levels": [2]}, "levels is .2.; give of 1, 3, 5, 7"),
-        ({"levels": 3}, "levels is 3; give of 1, 3, 5, 7"),
-        ({"levels": []}, "give one or more to train"),
-        ({"levels": [1, 1]}, "each once in all"),
-        ({"validation_level": [5]}, "validation_level is ..5..; give of"),
+        ({"train": []}, "give one or more to train"),
+        ({"train": ["multisine_1", "multisine_1"]}, "each once in all"),
         ({"train": ["multisine_2"]}, "train is .'multisine_2'.; give a list of multisine_1"),
         ({"train": "sweep_1"}, "train is sweep_1; give a list of"),
         ({"train": ["sweep_5"], "validation": ["sweep_5"]}, "each once in all"),
