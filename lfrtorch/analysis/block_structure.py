@@ -35,9 +35,6 @@ _SMALL = 0.1
 _MINOR = 0.01
 """Directions of z and w with less than this part of the nonlinearity do not count."""
 
-_POINTS, _STARTS, _SWEEPS = 400, 5, 300
-"""Slopes that branches are fitted to, random starts of that fit, and its sweeps."""
-
 
 @dataclass(frozen=True, eq=False)
 class Structure:
@@ -167,7 +164,7 @@ def _slopes(
     cell = model.lfr.cell
     points = np.zeros((len(z), len(bent)))
     points[:, bent] = z
-    points = points[:: 1 + len(points) // _POINTS]
+    points = points[:: 1 + len(points) // 400]  # as many slopes tell the branches
     return static_slope(cell, torch.as_tensor(points)[None])[0].numpy()[:, :, bent]
 
 
@@ -185,10 +182,10 @@ def _branches(
     T = R.reshape(-1, nw, nz)
     n, size, generator = max(nw, nz), float(np.linalg.norm(T)), np.random.default_rng(0)
     best = (np.eye(n, nz), np.eye(nw, n), 0.0 if size == 0 else np.inf)
-    for _ in range(_STARTS if size > 0 else 0):
+    for _ in range(5 if size > 0 else 0):  # random starts
         W, V = generator.standard_normal((nw, n)), generator.standard_normal((n, nz))
         left = np.inf
-        for _ in range(_SWEEPS):
+        for _ in range(300):
             G = _solved(T.reshape(len(T), -1), _products(W.T, V))
             W = _solved(T.transpose(1, 0, 2).reshape(nw, -1), _products(G.T, V))
             V = _solved(T.transpose(2, 0, 1).reshape(nz, -1), _products(G.T, W.T)).T

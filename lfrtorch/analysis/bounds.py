@@ -50,9 +50,6 @@ _REST = 1e-4
 _BLOCK = 256
 """Samples of impulse responses that are computed together."""
 
-_SHRINKS, _ROUNDS = 0.99, 50
-"""The bounds are final if none shrinks below this part in a round, or after so many."""
-
 
 @dataclass(frozen=True, eq=False)
 class Bound:
@@ -159,7 +156,7 @@ def amplitudes(given: ArrayLike, nu: int) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
+class _Reach:
     """Bounds of all signals, normalised, and what the static map does in them."""
 
     x: Interval
@@ -169,17 +166,17 @@ class Reach:
     map: Enclosure | None
 
 
-def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]) -> Reach:
+def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]) -> _Reach:
     """Bounds of all signals for |u| <= amplitude, normalised; the cell is in float64 on the CPU."""
     static = _bounded_map(cell)
     loop = _Loop(cell, static, amplitude, x0)
     K = np.zeros((cell.nw, cell.nz))
     if static is None:
         nothing = Interval(np.empty(0), np.empty(0))
-        return Reach(*loop.signals(loop.bounds(K, nothing))[:3], nothing, None)
+        return _Reach(*loop.signals(loop.bounds(K, nothing))[:3], nothing, None)
     found = loop.bounds(K, enclosure(static, everywhere(cell.nz)).w)
     closed = False
-    for _ in range(_ROUNDS):
+    for _ in range(50):
         inside = enclosure(static, *loop.signals(found)[2:])
         if closed:
             K = inside.J.middle
@@ -187,13 +184,13 @@ def reach(cell: LFRCell, amplitude: Float[Array, " nu"], x0: Float[Array, " nx"]
                 break
             inside = enclosure(static, *loop.signals(found)[2:], K)
         before, found = found, found.within(loop.bounds(K, inside.w))
-        if (found.radius >= _SHRINKS * before.radius).all():
+        if (found.radius >= 0.99 * before.radius).all():  # a round shrinks none
             if closed:
                 break
             closed = True
     x, y, z, a = loop.signals(found)
     inside = enclosure(static, z, a)
-    return Reach(x, y, z, inside.w, inside)
+    return _Reach(x, y, z, inside.w, inside)
 
 
 class _Loop:

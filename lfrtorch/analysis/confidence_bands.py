@@ -48,12 +48,6 @@ from lfrtorch.records import Channel, Record, as_records, as_signal
 _TRUNCATION = 1e-8
 """Singular values of J, of columns of unit length, that count as zero relative to the largest."""
 
-_HELD = 1 << 25
-"""Most numbers in the rows of the records that are kept rather than computed again."""
-
-_UNFINISHED = 1.0
-"""Distance to the minimum in standard errors, rms over the directions, that makes a doubt."""
-
 
 @dataclass(frozen=True, eq=False)
 class Band:
@@ -313,7 +307,8 @@ def uncertainty(model: Model, records: Record | Sequence[Record]) -> Uncertainty
     none = cell.A.new_zeros(0, cell.nx)
     kept = reduction(cell, none, coordinates=not given, fixed=fixed_parameters(cell)).kept
     size = sum(record.y.size for record in listed) * (len(kept) + cell.nx)
-    every = [Gradients(model, r, kept, fitted=True, hold=size <= _HELD) for r in listed]
+    hold = size <= 1 << 25  # numbers in memory rather than computed again
+    every = [Gradients(model, r, kept, fitted=True, hold=hold) for r in listed]
     for along in every:
         if not torch.isfinite(along.errors.square().sum()):
             raise InputError(
@@ -504,7 +499,7 @@ def _doubts(
             f"the residuals of {part.output.name} in record '{part.record}' depend on {what} "
             "still: the model is too small, and the bands are too narrow, as they know noise only."
         )
-    if left[0] > _UNFINISHED:
+    if left[0] > 1.0:  # standard errors, rms over the directions
         found.append(
             f"the fit is not at its minimum: a step would be {number(left[0], 2)} standard errors "
             f"long and lower the squared error by {percent(left[1])}; bands are about the minimum."

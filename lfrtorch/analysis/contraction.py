@@ -27,19 +27,11 @@ from lfrtorch.least_squares.certificate import SLOWEST, Certificate, Differences
 from lfrtorch.model import Model
 from lfrtorch.records import Channel
 
-_LOCAL = 500
-"""Most points at which the model is linearised to find out why there is no certificate."""
+_FARTHEST = 2.0**20
+"""Factor of the data's rms to within which the largest amplitude is looked for."""
 
-_CLOSE, _FARTHEST = 1.02, 2.0**20
-"""Factors: to within the first the largest amplitude is found, to within the second of the data's
-rms it is looked for."""
-
-_LEAST, _HALVINGS = 1e-3, 9
-"""The rate is looked for between this part of the best possible 1 - ρ and all of it, by so many
-halvings of the logarithm."""
-
-_SLOW = 2
-"""Time to forget, over the one that the spectral radius allows, above which a hint is given."""
+_LEAST = 1e-3
+"""The rate is looked for between this part of the best possible 1 - ρ and all of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +164,8 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
     )  # fmt: skip
     proven = gain(physical)
     proven = math.nan if proven is None else proven
-    slow = np.isinf(size).all() and rate**_SLOW > _radius(system)
+    # It takes more than twice as long to forget as the spectral radius allows.
+    slow = np.isinf(size).all() and rate**2 > _radius(system)
     hint = ""
     if slow and static is not None:
         hint = (
@@ -211,7 +204,7 @@ def _steepest(cell: LFRCell, slopes: Enclosure) -> tuple[float, str]:
 
     Only z that some state and input bring about are tried.
     """
-    every = max(1, len(slopes.centres) // _LOCAL)
+    every = max(1, len(slopes.centres) // 500)
     z = torch.as_tensor(slopes.centres[::every])
     onto = torch.cat([cell.Cz, cell.Dzu], dim=1).detach()
     z = z @ (onto @ torch.linalg.pinv(onto)).mT
@@ -240,7 +233,7 @@ def _largest(cell: LFRCell, reason: str) -> tuple[Array, _Proof | str]:
             f"{at_rest}\nSo it is within the bounds that are proven for the smallest inputs.",
         )
     low, high, best = 1.0 / _FARTHEST, _FARTHEST, at_rest
-    while high > _CLOSE * low:
+    while high > 1.02 * low:
         factor = math.sqrt(low * high)
         proof = attempt(factor)
         if isinstance(proof, str):
@@ -264,7 +257,7 @@ def _fastest(system: Differences, slow: Certificate) -> tuple[float, Certificate
     """The smallest rate that is proven, with its certificate."""
     rate, found, best = _slow(system), slow, _radius(system)
     low, high = _LEAST, 1.0
-    for _ in range(_HALVINGS):
+    for _ in range(9):  # halvings of the logarithm
         part = math.sqrt(low * high)
         tried = 1.0 - part * (1.0 - best)
         closer = certificate(system, tried)

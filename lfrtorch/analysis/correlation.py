@@ -18,15 +18,6 @@ from lfrtorch._support.checks import integer
 from lfrtorch._support.powers import near_one
 from lfrtorch._support.types import Array, Integers
 
-_LAGS, LEAST = 25, 5
-"""Lags of a test, as in MATLAB's ``resid``, and the fewest of a short record."""
-
-_SAMPLES_A_LAG = 40
-"""Samples for each lag of a short record: with 20 the test of whiteness rejects 1.5 % at 1 %."""
-
-_BOUND = 0.99
-"""Probability that a correlation of independent signals at one lag is within its bounds."""
-
 _NO_POWER = 1e-24
 """Power of prediction errors over the signal's power, below which it is rounding."""
 
@@ -72,22 +63,8 @@ def autocorrelation(e: Float[Array, " T"], lags: int | None = None) -> Correlati
     """Correlation of a signal with its own past, and a portmanteau test of whiteness.
 
     The sum of the squared correlations, each over its standard deviation, is that of χ² with as
-    many degrees of freedom as lags if the signal is white.
-
-    Args:
-        e: the signal; its mean is taken off.
-        lags: how many. Default: 25, fewer in less than 1000 samples.
-
-    References:
-        Dalla, Giraitis and Phillips, "Robust tests for white noise and cross-correlation",
-        Econometric Theory 38(5), 2022. With 1/√T as the standard deviation it is the test of Box
-        and Pierce (1970).
-
-    Example:
-        >>> from lfrtorch.analysis.correlation import autocorrelation
-        >>> found = autocorrelation(np.tile([1.0, -1.0], 100), lags=3)
-        >>> found.lags.tolist(), found.values.round(1).tolist(), found.p < 1e-9
-        ([1, 2, 3], [-1.0, 1.0, -1.0], True)
+    many degrees of freedom as lags if the signal is white (Dalla, Giraitis and Phillips, "Robust
+    tests for white noise and cross-correlation", Econometric Theory 38(5), 2022).
     """
     e = e - e.mean()
     K = lags_for(len(e), lags)
@@ -95,39 +72,15 @@ def autocorrelation(e: Float[Array, " T"], lags: int | None = None) -> Correlati
     return Correlation(np.arange(1, K + 1), values, bounds, float(chdtrc(K, np.sum(scores**2))))
 
 
-def cross_correlation(
-    e: Float[Array, " T"], x: Float[Array, " T"], lags: int | None = None
-) -> Correlation:
-    """Correlation of a signal with the past and the future of another one, both made white before.
+def cross_correlation(e: Float[Array, " S"], x: Float[Array, " T"], lags: int) -> Correlation:
+    """Correlation of two ``whitened`` signals that end together, at lags from -lags to lags.
 
-    Correlations of slow signals are large by chance. So each signal is replaced by its prediction
-    errors under an autoregressive model of its own (Haugh, 1976). The test is on the largest score
-    at lags from 0 on: by Šidák's inequality it holds for inputs of any kind, also for those that no
-    model makes white, as steps and multisines. Correlations at negative lags mean that x follows e.
-
-    Args:
-        e, x: the signals, made white here.
-        lags: from -lags to lags. Default: 25, fewer in less than 1000 samples.
-
-    References:
-        Haugh, "Checking the independence of two covariance-stationary time series", Journal of the
-        American Statistical Association 71(354), 1976.
-
-    Example:
-        >>> from lfrtorch.analysis.correlation import cross_correlation
-        >>> x = signal.lfilter([1.0], [1.0, -0.95], np.random.default_rng(0).standard_normal(2000))
-        >>> e = np.random.default_rng(1).standard_normal(2000)
-        >>> e[3:] += 0.5 * x[:-3]
-        >>> found = cross_correlation(e, x)
-        >>> found.largest, found.p < 1e-9
-        (3, True)
+    Correlations of slow signals are large by chance, so both are white (Haugh, "Checking the
+    independence of two covariance-stationary time series", Journal of the American Statistical
+    Association 71(354), 1976). The test is on the largest score at lags from 0 on: by Šidák's
+    inequality it holds for inputs of any kind, also for those that no model makes white, as steps
+    and multisines. Correlations at negative lags mean that x follows e.
     """
-    K = lags_for(len(e), lags)
-    return white_cross_correlation(whitened(near_one(e)), whitened(near_one(x)), K)
-
-
-def white_cross_correlation(e: Float[Array, " S"], x: Float[Array, " T"], lags: int) -> Correlation:
-    """The same for signals that end together and are ``whitened`` already."""
     T = min(len(e), len(x))
     every = range(-lags, lags + 1)
     values, bounds, scores = _correlated(e[-T:], x[-T:], every)
@@ -176,22 +129,19 @@ def _correlated(
     if not size > 0:
         return np.zeros(len(lags)), np.zeros(len(lags)), np.zeros(len(lags))
     scores = np.divide(sums, deviations, out=np.zeros(len(lags)), where=deviations > 0)
-    z = -float(ndtri((1.0 - _BOUND) / 2))
+    z = -float(ndtri((1.0 - 0.99) / 2))  # bounds of 99 %
     return sums / size, z * deviations / size, scores
 
 
 def _dot(a: Float[Array, " T"], b: Float[Array, " T"]) -> float:
-    """Σ a b on one thread.
-
-    The sum of ``@`` depends on the threads of BLAS, which wait long where other work keeps them
-    from their processors (34 s instead of 0.2 s were seen).
-    """
+    """Σ a b on one thread: those of BLAS wait long if other work has their processors."""
     return float(np.einsum("t,t->", a, b))
 
 
 def lags_for(T: int, lags: int | None = None) -> int:
     """Number of lags in a test of T samples."""
     if lags is None:
-        return min(_LAGS, max(LEAST, T // _SAMPLES_A_LAG))
+        # 25 as in MATLAB's ``resid``; with 20 samples a lag whiteness is rejected in 1.5 % at 1 %.
+        return min(25, max(5, T // 40))
     integer("lags", lags, 1)
     return min(lags, T // 2)

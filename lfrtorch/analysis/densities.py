@@ -19,13 +19,6 @@ _SEGMENT, SHORTEST = 4096, 16
 _STRETCHES = 256
 """Most frequencies of the density of noise, which is a mean over the lines about each."""
 
-_PARTS = 10
-"""Parts of time in which the differences between periods are looked at."""
-
-_STEADY = 4.0
-"""Power of the differences between periods in a tenth of them over the median of all tenths, from
-which on they are no noise but a transient or a disturbance."""
-
 
 @dataclass(frozen=True, eq=False)
 class Densities:
@@ -58,11 +51,7 @@ def power_density(
 
 
 def noise_of_periods(records: Sequence[Record]) -> Float[Array, " ny"] | None:
-    """Standard deviation of the noise in the outputs, from the differences between periods.
-
-    None if no record has two periods, if an input does not repeat, if the periods differ, or if the
-    differences are not steady: those of a transient or a disturbance are no noise.
-    """
+    """Standard deviation of the outputs' noise from steady differences of periods, or None."""
     spectra = _steady_spectra(records)
     return None if spectra is None else np.sqrt(_noise_power(spectra).sum(axis=0))
 
@@ -107,5 +96,5 @@ def _steady(record: Record, N: int) -> bool:
         return True
     periods = record.y[record.samples - count * N :].reshape(count, N, -1)
     power = np.diff(periods, axis=0).reshape((count - 1) * N, -1) ** 2
-    parts = np.array([part.mean(axis=0) for part in np.array_split(power, min(_PARTS, len(power)))])
-    return bool(np.all(parts.max(axis=0) <= _STEADY * np.median(parts, axis=0)))
+    tenths = np.array([part.mean(axis=0) for part in np.array_split(power, min(10, len(power)))])
+    return bool(np.all(tenths.max(axis=0) <= 4.0 * np.median(tenths, axis=0)))

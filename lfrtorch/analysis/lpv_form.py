@@ -29,9 +29,6 @@ from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.engine.simulation import folded
 from lfrtorch.model import Model
 
-_NODES = 32
-"""Nodes of the Gauss-Legendre rule for a static map whose integral is not known."""
-
 _ROUNDING = 1e-14
 """Error of f(z) - f(z0), relative to both, that is one of rounding."""
 
@@ -245,7 +242,7 @@ def gauss_legendre(static: Module | None) -> tuple[Float[Array, " n"], Float[Arr
     The slope of a polynomial is one in t, for which few nodes are exact.
     """
     found = known(static)
-    nodes = (found.degree + 1) // 2 if isinstance(found, Polynomial) else _NODES
+    nodes = (found.degree + 1) // 2 if isinstance(found, Polynomial) else 32
     t, weight = np.polynomial.legendre.leggauss(nodes)
     return (t + 1.0) / 2, weight / 2
 

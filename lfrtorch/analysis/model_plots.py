@@ -34,11 +34,8 @@ from lfrtorch.metrics import rms
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
-_MOST_CHANNELS, _MOST_MAPS = 4, 4
-"""Frequency responses and outputs of the static map that are drawn."""
-
-_MOST_SAMPLES = 20_000
-"""Samples of the data that say where the static map is drawn."""
+_MOST_MAPS = 4
+"""Outputs of the static map that are drawn."""
 
 _GRID = 121
 """Points of a curve, and of each side of a plane."""
@@ -47,7 +44,7 @@ _HEIGHT, _LEAST_HEIGHT = 2.7, 3.6
 """Height of a panel, and least height of the figure, in inches."""
 
 
-class Visited(NamedTuple):
+class _Visited(NamedTuple):
     """Where the static map is used, and its nearest affine map there.
 
     z (S, nz) are its inputs and w = slope z + offset is that map; ``nonlinear`` is the part of the
@@ -67,7 +64,7 @@ def model_figure(model: Model, records: Record | Sequence[Record] | None = None)
     with suppress(InputError):  # it may have no rest at the offsets
         systems["at rest"] = linearise(model)
     cell = double(model.lfr.cell)
-    pairs = [(i, j) for i in range(cell.ny) for j in range(cell.nu)][:_MOST_CHANNELS]
+    pairs = [(i, j) for i in range(cell.ny) for j in range(cell.nu)][:4]
     maps = min(cell.nw, _MOST_MAPS)
     height = max(_LEAST_HEIGHT, _HEIGHT * max(len(pairs), -(-maps // 2)))
     widths = [4.5, 3.5, *([4.0 if maps == 1 else 6.5] if maps else [])]
@@ -94,7 +91,7 @@ def static_figure(model: Model, records: Record | Sequence[Record] | None = None
     return figure
 
 
-def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | None) -> Visited:
+def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | None) -> _Visited:
     """Inputs of the static map along simulations, and its nearest affine map there."""
     if records is None:
         noise = np.random.default_rng(0).standard_normal((4000, cell.nu))
@@ -102,7 +99,7 @@ def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | No
     else:
         signals = as_records(records)
     z = np.concatenate([model.signals(one).z[0].double().numpy() for one in signals])
-    z = z[:: 1 + len(z) // _MOST_SAMPLES]
+    z = z[:: 1 + len(z) // 20_000]
     if not np.isfinite(z).all():
         raise InputError(
             "the model diverges on the records; give others." if records is not None else
@@ -112,7 +109,7 @@ def visited(model: Model, cell: LFRCell, records: Record | Sequence[Record] | No
     slope, offset = nearest_affine(z, w)
     deviation = np.std(w, axis=0)
     left = rms(w - z @ slope.T - offset, axis=0) / np.where(deviation > 0, deviation, 1.0)
-    return Visited(z, slope, offset, left, records is not None)
+    return _Visited(z, slope, offset, left, records is not None)
 
 
 @torch.no_grad()
@@ -157,7 +154,7 @@ def _poles(part: SubFigure, systems: Mapping[str, LinearModel]) -> None:
     ax.set_title("poles in the z plane", fontsize="medium")
 
 
-def _maps(part: Figure | SubFigure, cell: LFRCell, where: Visited, count: int) -> None:
+def _maps(part: Figure | SubFigure, cell: LFRCell, where: _Visited, count: int) -> None:
     """What the static map is beyond an affine one, a panel for each w."""
     z, nz = where.z, where.z.shape[1]
     low, high = z.min(axis=0), z.max(axis=0)
@@ -201,12 +198,11 @@ def _maps(part: Figure | SubFigure, cell: LFRCell, where: Visited, count: int) -
     part.suptitle(f"static map less its linear part, {where_from}", fontsize="medium")
 
 
-def most_nonlinear(cell: LFRCell, where: Visited, j: int) -> tuple[Float[Array, " S"], float]:
-    """Where z is along the direction in which output j of the static map changes its slope most.
+def most_nonlinear(cell: LFRCell, where: _Visited, j: int) -> tuple[Float[Array, " S"], float]:
+    """Where z is along the direction in which output j of the map changes its slope most, its part.
 
     It is the leading eigenvector of the mean of g gᵀ, g the slope less its mean, where z has unit
-    covariance (Constantine, "Active Subspaces", SIAM, 2015). The second result is the part of the
-    mean of |g|² in that direction: 100 % of a nonlinearity that is a function of one variable.
+    covariance (Constantine, "Active Subspaces", SIAM, 2015).
     """
     T = whitening(where.z)
     J = static_slope(cell, torch.as_tensor(where.z)[None])[0, :, j].numpy()

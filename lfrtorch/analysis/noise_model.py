@@ -21,9 +21,6 @@ from lfrtorch._support.types import Array
 _SEGMENT = 1024
 """Longest stretch of which a spectrum is taken, in samples."""
 
-_RESOLUTION = 8
-"""Spectra are smoothed by a window of so many times fewer lags than a stretch has samples."""
-
 LEAST = 0.1
 """Least part 1 - ρ of the noise that is taken to be left in the residuals."""
 
@@ -55,7 +52,7 @@ class Spectra:
     def autocovariance(self) -> Float[Array, "L ny"]:
         """Autocovariance of the noise, by lag."""
         n = 2 * self.segment
-        L = max(2, self.segment // _RESOLUTION)
+        L = max(2, self.segment // 8)  # lags of the window that smooths the spectra
         taper = np.zeros((n, 1))
         taper[:L, 0] = 1.0 - np.arange(L) / L
         taper[n - L + 1 :] = taper[1:L][::-1]
@@ -66,14 +63,9 @@ class Spectra:
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Noise e = ε / a(q) of each output, and the covariance of ε.
+    """Noise e = ε / a(q) of each output, and the covariance of ε."""
 
-    Args:
-        a: coefficients 1, a1, a2 ... of each output.
-        covariance: of ε.
-    """
-
-    a: tuple[Array, ...]
+    a: tuple[Array, ...]  # coefficients 1, a1, a2 ... of each output
     covariance: Float[Array, "ny ny"]
 
     def coloured(self, Q: Float[Array, "m ny K"]) -> Float[Array, "m2 K"]:

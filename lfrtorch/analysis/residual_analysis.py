@@ -17,8 +17,8 @@ from lfrtorch._support.tables import in_lines, number, quantity, table
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.correlation import (
     autocorrelation,
+    cross_correlation,
     lags_for,
-    white_cross_correlation,
     whitened,
 )
 from lfrtorch.analysis.densities import (
@@ -166,7 +166,7 @@ def residuals(
 
     Each output of each record has its own tests, so that records of several levels tell at which
     level a model fails. Samples that a record skips are left out. Correlations with inputs are
-    those of signals made white (see :func:`lfrtorch.analysis.correlation.cross_correlation`).
+    those of signals made white, as slow ones correlate by chance.
     Records that the model was not fitted to tell most.
 
     Args:
@@ -237,9 +237,9 @@ def of_simulation(
                 error=error,
                 fit=fit if finite else -math.inf,
                 whiteness=autocorrelation(tested, K),
-                linear=tuple(white_cross_correlation(e, x, K) for x in linear),
-                even=tuple(white_cross_correlation(e, x, K) for x in squares),
-                odd=tuple(white_cross_correlation(ey, x, K) for x in squares),
+                linear=tuple(cross_correlation(e, x, K) for x in linear),
+                even=tuple(cross_correlation(e, x, K) for x in squares),
+                odd=tuple(cross_correlation(ey, x, K) for x in squares),
                 densities=Densities(
                     f,
                     of_y[:, i],

@@ -19,19 +19,13 @@ class TrainingReach:
     """How far the training data went: in the static map's input z, and in what they tell of y.
 
     Two distances count, whichever is larger, each relative to the one of 99 % of the training
-    samples. The first is z from the middle of its cloud, in standard deviations of the cloud: it
-    says that the static map is asked where it was not seen. The second is the standard deviation of
-    the simulated output: it tells of dynamics, too, as of another band of frequencies.
-
-    Args:
-        middle: mean of z.
-        white: so that white (z - middle) has unit covariance.
-        farthest: of 99 % of the training samples: both distances, and then the larger ratio.
+    samples: of z from the middle of its cloud, in standard deviations of the cloud, and the
+    standard deviation of the simulated output, which tells of dynamics, too.
     """
 
     middle: Float[Array, " nz"]
-    white: Float[Array, "nz nz"]
-    farthest: tuple[float, float, float]
+    white: Float[Array, "nz nz"]  # white (z - middle) has unit covariance
+    farthest: tuple[float, float, float]  # of 99 %: both distances, and then the larger ratio
 
     @classmethod
     def of(cls, z: Float[Array, "S nz"], variance: Float[Array, "S ny"]) -> TrainingReach:

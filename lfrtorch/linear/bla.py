@@ -188,7 +188,7 @@ class Settings(NamedTuple):
     max_iter: int
 
 
-class Posed(NamedTuple):
+class _Posed(NamedTuple):
     """Least-squares problem in normalised units, and the data that it stands for."""
 
     problem: Problem
@@ -198,7 +198,7 @@ class Posed(NamedTuple):
     notes: list[str]
 
 
-def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> Posed:
+def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> _Posed:
     """Pose the problem of a criterion: on spectra where that is the same as on signals.
 
     The last ``direct`` inputs act on the output alone; of a response they are differences of its
@@ -231,7 +231,7 @@ def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> Posed
                 feedthrough=feedthrough,
                 direct=direct,
             )
-            return Posed(problem, scaler, about, records, notes)
+            return _Posed(problem, scaler, about, records, notes)
         problem = ResponseFit(spectra, known=False, feedthrough=feedthrough)
     if spectra.left_out:
         f = np.abs(np.angle(spectra.z)) * about.fs / (2 * np.pi)
@@ -240,7 +240,7 @@ def pose(data: list[Record] | FRF, settings: Settings, direct: int = 0) -> Posed
             f"{f.max():.4g} Hz; {spectra.left_out} lines with noise, hum or distortion at the "
             "input are left out."
         )
-    return Posed(problem, scaler, about, records, notes)
+    return _Posed(problem, scaler, about, records, notes)
 
 
 def _stable(

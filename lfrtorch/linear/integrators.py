@@ -31,7 +31,7 @@ from lfrtorch.metrics import rms
 from lfrtorch.model import simulate_record
 from lfrtorch.records import Channel, NormalisedRecord, Record, Scaler
 
-SAME_LINE = 1e-9
+_SAME_LINE = 1e-9
 """Distance from z = 1 below which a line is the one at 0, where the response is infinite."""
 
 
@@ -110,7 +110,7 @@ def _filter_starts(samples: int, n: int, pole: float) -> Array:
 def differenced_response(frf: FRF, integrators: int) -> FRF:
     """(z - 1)ⁿ times a response, without the line at 0."""
     z = np.exp(2j * np.pi * frf.frequencies / frf.fs)
-    kept = np.abs(z - 1.0) > SAME_LINE
+    kept = np.abs(z - 1.0) > _SAME_LINE
     z = z[kept]
     factor = (z - 1.0) ** integrators
     size = np.abs(factor)[:, None, None] ** 2
@@ -129,7 +129,7 @@ def differenced_response(frf: FRF, integrators: int) -> FRF:
 def differenced_weight(frf: FRF, weight: Array, integrators: int) -> Array:
     """Weights (F, ny, nu) of the errors of a response for those of G₁."""
     size = np.abs(np.exp(2j * np.pi * frf.frequencies / frf.fs) - 1.0)
-    kept = size > SAME_LINE
+    kept = size > _SAME_LINE
     return weight[kept] / size[kept, None, None] ** (2 * integrators)
 
 
@@ -170,8 +170,7 @@ def integrated(
 ) -> LinearModel:
     """Put integrators behind each output of a model; their states come last.
 
-    The operating point of the input moves to where the output of the given model is 0, so that the
-    integrators stay where they are; with fewer inputs than outputs as close to it as it can.
+    The operating point of the input moves to where they stand still, or as close to it as it can.
     """
     nu, ny = len(like.inputs), len(like.outputs)
 

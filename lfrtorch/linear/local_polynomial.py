@@ -46,11 +46,7 @@ class WindowErrors(NamedTuple):
 
     @property
     def sharing(self) -> float:
-        """Lines for each independent one, to models that are smooth over a window.
-
-        It is the power of the sum of all errors, of unit variance each, over that if they were
-        independent.
-        """
+        """Power of the sum of all errors, of unit variance each, over that of independent ones."""
         F, _, _, width = self.weights.shape
         power = np.sum(np.abs(self.weights) ** 2, axis=(2, 3), keepdims=True)
         unit = self.weights / np.sqrt(power)

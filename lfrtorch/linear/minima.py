@@ -64,14 +64,10 @@ def no_start(nx: int) -> InputError:
 def best_minimum(
     problem: Problem, tried: list[Candidate], max_iter: int
 ) -> tuple[SubspaceEstimate, Refined]:
-    """Search from the candidates; after a few steps the best few go on.
-
-    The candidate that fits best may lead to a poor minimum: at the highest level of the parallel
-    Wiener-Hammerstein system to one whose error on the data fitted is 4 % above the best one's.
+    """Search from the candidates; after a few steps the best few go on, and the best is taken.
 
     If initial states are estimated, the most probable minimum is taken. The one of least cost may
-    spend a mode on drift: on seven eighths of the cascaded tanks' record a pole of 0.999996, which
-    the input hardly moves, from an initial state of 500 times its deviation.
+    spend a mode on drift: on the cascaded tanks' record a pole of 0.999996.
     """
     field: list[Candidate] = []
     last, nx = 0.0, len(tried[0].estimate.A)

@@ -76,7 +76,7 @@ class ModalJacobian:
         size = float(np.linalg.norm(errors))
         self._excess = Excess(*excess, size, self._gradient_of_errors)
 
-    def system(self, damping: float, truncation: float) -> tuple[GramSystem, Tensor]:
+    def system(self, damping: float, truncation: float) -> tuple[_GramSystem, Tensor]:
         """Return the system and the gradient, see ``levenberg_marquardt.Jacobian``."""
         del damping, truncation
         Q = np.linalg.qr(_without_scaling(self._modes, self._change).T)[0]
@@ -88,7 +88,7 @@ class ModalJacobian:
             TQ = T @ Q
             G = G + TQ.T @ TQ
             gradient = gradient + T.T @ self._excess.residual
-        return GramSystem(G, Q), torch.as_tensor(gradient)
+        return _GramSystem(G, Q), torch.as_tensor(gradient)
 
     def tangent(self, d_theta: Tensor) -> Tensor:
         """J dθ."""
@@ -143,7 +143,7 @@ class ModalJacobian:
         return poles, b.reshape(n, nu), c.reshape(n, ny), D
 
 
-class GramSystem:
+class _GramSystem:
     """Normal equations JᵀJ = G in a basis Q of the directions that change the response."""
 
     def __init__(self, G: Float[Array, "K K"], Q: Float[Array, "P K"]) -> None:
@@ -209,7 +209,7 @@ def with_best_inputs(
     Z = scipy.linalg.block_diag(np.kron(m.W, np.eye(nu)), np.eye(int(free.sum())))
     G = (Z.conj().T @ _products(functions, data, left[:, columns], right) @ Z).real
     size = np.sqrt(np.maximum(np.diagonal(G), 1e-300))
-    system = GramSystem(G / np.outer(size, size), np.eye(len(G)))
+    system = _GramSystem(G / np.outer(size, size), np.eye(len(G)))
     if not system.rank:
         return None
     for _ in range(2):  # solving again for what is left is as precise as a solution by J

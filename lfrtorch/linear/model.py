@@ -242,7 +242,7 @@ class LinearModel:
             >>> y_hat.shape, lfrtorch.nrmse(record, y_hat) < 0.3
             ((400, 1), True)
         """
-        data = without_units(without_coordinates(data)) if isinstance(data, Record) else data
+        data = _without_units(without_coordinates(data)) if isinstance(data, Record) else data
         return self.to_model().simulate(data)
 
     def predict(self, record: Record) -> Array:
@@ -459,7 +459,7 @@ def control_labels(channels: Sequence[Channel]) -> list[str]:
     return labels
 
 
-def without_units(record: Record) -> Record:
+def _without_units(record: Record) -> Record:
     """Return the record with weights by which its outputs count alike in physical units."""
     if record.y.shape[1] == 1:
         return record

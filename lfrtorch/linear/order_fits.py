@@ -1,8 +1,7 @@
 """Linear models of several orders, each started from those below it and from one subspace.
 
-A full estimate takes a dozen subspace estimates of its order and refines them to the last digit. A
-scan of orders shares the work: the spectra, and one decomposition that holds estimates of all
-orders. A model of a lower order, and as many more states as describe its errors best, is a start
+A scan of orders shares the spectra, and one decomposition that holds estimates of all orders. A
+model of a lower order, and as many more states as describe its errors best, is a start
 that is at least as good as that model, so that the error fitted falls with the order.
 
 Records that are not periodic are fitted by their spectra, too, from initial states that are free at
@@ -46,12 +45,9 @@ _SETTLED, _STRIDE = 1e-4, 4
 def description_length(rmse: float, parameters: int, equations: float) -> float:
     """Return the error times M^(p / 2M), for p parameters and M independent equations.
 
-    Its logarithm is the description length M ln V + p ln M of a mean square V, over 2M. (The usual
-    √(1 + p ln M / M) is the same for p ln M « M. Of 200 lines of local polynomials, which are 100
-    equations, it chose the true order in 13 of 20 cases as against 18.)
-
-    References:
-        Rissanen, "Modeling by shortest data description", Automatica 14, 1978.
+    Its logarithm is the description length M ln V + p ln M of a mean square V, over 2M (Rissanen,
+    Automatica 14, 1978). With the usual √(1 + p ln M / M) the true order was chosen in 13 of 20
+    cases as against 18.
     """
     return rmse * equations ** (parameters / (2.0 * equations))
 
@@ -198,11 +194,9 @@ class OrderFits:
     def _best(
         self, found: Sequence[Refined], clock: float, y_offset: Array
     ) -> tuple[Refined, LinearModel, list[Array]]:
-        """Choose the system of least simulation error, or least criterion of a response.
-
-        A free initial state may bring a mode that explains drift and fails in a simulation; the
-        start of a search has it less than its minimum.
-        """
+        """Choose the system of least simulation error, or least criterion of a response."""
+        # A free initial state may bring a mode that explains drift and fails in a simulation; the
+        # start of a search has it less than its minimum.
         models = [self._model(each, clock, y_offset) for each in found]
         best = int(np.argmin([fitted(model) for model, _ in models]))
         return found[best], *models[best]
@@ -247,11 +241,8 @@ class OrderFits:
     def _model(
         self, found: Refined, clock: float, y_offset: Array
     ) -> tuple[LinearModel, list[Array]]:
-        """Return the model in physical units, and its errors in each record.
-
-        The states that records begin from depend on the offset of the output, so that a guess of it
-        comes first, and is corrected by the mean of the errors.
-        """
+        """Return the model in physical units, and its errors in each record."""
+        # The states that records begin from depend on the output's offset: a guess comes first.
         found = self._without_starts(found)
         model = physical(found, self._scaler, self._about)
         model = model.transformed(*transformation(self._driven, found.matrices))

@@ -14,7 +14,7 @@ from lfrtorch.metrics import rms
 from lfrtorch.periods import find_transient
 from lfrtorch.records import Record
 
-REPEATS = 0.1
+_REPEATS = 0.1
 """Largest deviation of periods of an input, and of the means of an output, over the signal's."""
 
 
@@ -82,7 +82,9 @@ def _steady_part(record: Record) -> Record | None:
     periods = repeated.reshape(P, N, -1)
     changes = (periods - periods.mean(axis=0)).std(axis=(0, 1))
     drift = y.reshape(P, N, -1).mean(axis=1).std(axis=0)
-    if (changes > REPEATS * repeated.std(axis=0)).any() or (drift > REPEATS * y.std(axis=0)).any():
+    if (changes > _REPEATS * repeated.std(axis=0)).any() or (
+        drift > _REPEATS * y.std(axis=0)
+    ).any():
         return None
     return replace(record, **part, start="periodic", skip=0)
 

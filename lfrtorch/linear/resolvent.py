@@ -18,12 +18,8 @@ from lfrtorch._support.types import Array, Complex, Integers
 def solve_resolvent(
     A: Float[Array, "nx nx"], B: Float[Array, "nx nu"], z: Complex128[Complex, " F"]
 ) -> Complex128[Complex, "F nx nu"]:
-    """X = (zI - A)⁻¹ B.
-
-    A Schur form A = Q T Qᴴ turns this into a back substitution with zI - T, done for all z at once.
-    It is as accurate as a solution for every z; eigenvectors would lose digits if poles lie close
-    together.
-    """
+    """X = (zI - A)⁻¹ B, by a Schur form A = Q T Qᴴ and back substitution for all z at once."""
+    # Eigenvectors would lose digits if poles lie close together.
     T, Q = scipy.linalg.schur(A, output="complex")
     return _substituted(T, Q, (Q.conj().T @ B)[:, :, None], z)
 

@@ -112,9 +112,7 @@ class SignalFit:
     def improbability(self, search: Search) -> float:
         """Return the cost plus x0ᵀ P⁻¹ x0 of each estimated start, times the error's variance.
 
-        P is the covariance of the states that the inputs lead to from rest. The sum is the cost of
-        the most probable model and initial states, if the inputs before the records were like those
-        in the records.
+        P is the covariance of the states that the inputs lead to from rest.
         """
         problem, state = search.problem, search.state
         x0 = problem.errors.parameters.initial_states(state.theta)

@@ -27,7 +27,7 @@ RELATIVE_POWER = 1e-4
 NOISE_LINES = 21
 """Lines about each one that noise is averaged over."""
 
-NO_POWER = 1e-12
+_NO_POWER = 1e-12
 """An input has no power at a line if it has less than this part of that of its best line."""
 
 SILENT = 1e-10
@@ -167,7 +167,7 @@ def excited_lines(spectra: Spectra, data: Sequence[Record], given: ArrayLike | N
     power = np.mean(np.abs(spectra.excitation[1 : last + 1]) ** 2, axis=1)  # (lines, nu), from 1
     if given is not None:
         lines = dft_lines(given, spectra.N)
-        weak = np.argwhere(power[lines - 1] <= NO_POWER * power.max(axis=0))
+        weak = np.argwhere(power[lines - 1] <= _NO_POWER * power.max(axis=0))
         if weak.size:
             line, channel = weak[0]
             raise InputError(
@@ -211,13 +211,10 @@ def carrying(power: Array) -> Booleans:
 
 
 def powered_lines(spectra: Spectra, n: int) -> Integers:
-    """Return the lines between 0 and fs / 2 within n lines of which every input has power.
-
-    Estimates at other lines would be made of rounding errors.
-    """
+    """Return the lines between 0 and fs / 2 within n lines of which every input has power."""
     last = (spectra.N - 1) // 2
     power = smoothed(np.mean(np.abs(spectra.excitation[1 : last + 1]) ** 2, axis=1), 2 * n + 1)
-    return 1 + np.flatnonzero((power > NO_POWER * power.max(axis=0)).all(axis=1))
+    return 1 + np.flatnonzero((power > _NO_POWER * power.max(axis=0)).all(axis=1))
 
 
 def smoothed(power: Array, width: int) -> Array:

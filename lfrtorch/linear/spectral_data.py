@@ -32,7 +32,7 @@ from lfrtorch.records import NormalisedRecord, Scaler, rms_scale
 
 Weight = Literal["total", "noise", "none"]
 
-DEGREES_OF_FREEDOM = 20
+_DEGREES_OF_FREEDOM = 20
 """Degrees of freedom that a variance needs before it is used as a weight; neighbouring lines are
 averaged until it has them."""
 
@@ -75,13 +75,10 @@ def spectral_data_of_records(
 ) -> SpectralData | None:
     """Spectra of periodic records, or ``None`` if their simulation error is no sum over lines.
 
-    The spectra of many records are compressed to nu columns by a QR decomposition: the rest of the
-    outputs is a constant error, which no linear model changes.
-
     Noise of the inputs would make every response too small, and what a controller feeds back would
     bias it, too. What the periods of a record differ by tells its share in U Uᴴ and Y Uᴴ, on which
-    alone the fit depends: it is subtracted (Pintelon and Schoukens, 2012, chapter 9). References
-    of several experiments tell more: there, only what follows them is kept.
+    alone the fit depends: it is subtracted (Pintelon and Schoukens, 2012, chapter 9). Of records
+    with references only what follows these is kept.
     """
     records, ny = [each.record for each in normalised], normalised[0].y.shape[1]
     if any(r.start != "periodic" or r.skip for r in records):
@@ -314,14 +311,12 @@ def _weights(frf: FRF, weight: Weight | Array | None) -> tuple[Array | None, boo
 def _of_other_windows(variance: Array, sizes: Array, errors: WindowErrors) -> Array:
     """Variances (F, ny, nu) by the nearest lines whose windows share no line with the own.
 
-    A variance with a reference is that of the residual, times ``sizes``, which are exact, times
-    what the reference drives through the input. Residual and input share the noise of G in the
-    window: weights that know it favour lines where it makes G small, a bias that does not fall with
-    the length of the records. So these factors are means over other windows.
+    Residual and input share the noise of G in a window: weights that know it favour lines where it
+    makes G small, a bias that does not fall with the length of the records.
     """
     variance = variance / sizes[:, None]
     first, F, width = errors.first, len(variance), errors.weights.shape[3]
-    near = np.arange(DEGREES_OF_FREEDOM // 2)
+    near = np.arange(_DEGREES_OF_FREEDOM // 2)
     below = np.searchsorted(first, first - width, side="right")[:, None] - 1 - near
     above = np.searchsorted(first, first + width)[:, None] + near
     total, count = np.zeros_like(variance), np.zeros((F, 1, 1))
@@ -338,7 +333,7 @@ def _smoothed(variance: Array, degrees_of_freedom: int) -> Array:
     A weight is one over a variance; one over an estimate of few degrees of freedom has no finite
     mean, and some lines would outweigh all others by chance.
     """
-    half = min((DEGREES_OF_FREEDOM // max(1, degrees_of_freedom)) // 2, (len(variance) - 1) // 2)
+    half = min((_DEGREES_OF_FREEDOM // max(1, degrees_of_freedom)) // 2, (len(variance) - 1) // 2)
     if half == 0:
         return variance
     padded = np.pad(variance, ((half, half), (0, 0), (0, 0)), mode="reflect")

@@ -37,7 +37,7 @@ LARGEST_POLE = 1.0 - 1e-6
 MOVED_POLE = 0.999
 """Largest radius of an unstable pole after it is moved."""
 
-SPECTRAL_HORIZONS = (1, 2)
+_SPECTRAL_HORIZONS = (1, 2)
 """Block rows for spectra, in multiples of nx + 1; the fewest that tell the states apart are tried
 as well."""
 
@@ -74,7 +74,7 @@ def from_spectra(
     fewest = -(-nx // Y.shape[1]) + 1
     # Few lines carry few block rows, which must still tell nx states apart.
     most = _most_rows(U, Y)
-    wanted = (fewest, *(multiple * (nx + 1) for multiple in SPECTRAL_HORIZONS))
+    wanted = (fewest, *(multiple * (nx + 1) for multiple in _SPECTRAL_HORIZONS))
     rows = [q for q in sorted({min(q, most) for q in wanted}) if q >= fewest]
     ny, nu, m = Y.shape[1], *U.shape[1:]
     limit = MOST_OPERATIONS / 5  # there are three frequency axes
@@ -116,7 +116,7 @@ def spectral_subspaces(
     most: int,
 ) -> list[SpectralSubspace]:
     """Subspaces for the orders up to ``most``, or what these lines carry; see ``from_spectra``."""
-    rows = {min(multiple * (most + 1), _most_rows(U, Y)) for multiple in SPECTRAL_HORIZONS}
+    rows = {min(multiple * (most + 1), _most_rows(U, Y)) for multiple in _SPECTRAL_HORIZONS}
     return [each for q in sorted(rows) if q > 1 for each in _subspaces(z, U, Y, q)]
 
 
@@ -160,8 +160,7 @@ def from_signals(
 ) -> list[SubspaceEstimate]:
     """Estimates from the normalised signals (T, nu) and (T, ny) of records, by MOESP.
 
-    Past inputs and outputs, or past inputs alone, serve as instruments: they depend on the state
-    and not on the later noise.
+    Past inputs and outputs, or past inputs alone, are the instruments.
     """
     nu, ny = us[0].shape[1], ys[0].shape[1]
     estimates = []
