@@ -145,7 +145,7 @@ def load(
         ],
         validation=[chosen[0]],
         selection=chosen[1:],
-        tests=[_multisine_test(folder, seed + _TEST_OFFSET), _sweep_test(folder)],
+        tests=_tests(folder, seed + _TEST_OFFSET),
         noise_rms=noise_rms,
         seed=seed,
         published=_PUBLISHED,
@@ -339,19 +339,18 @@ def _realisation(
     return _record(u[::_RATIO], y, name=name, start="periodic", source="simulated")
 
 
-def _multisine_test(folder: Path, seed: int) -> Record:
-    official = _read_official(folder, "multisine")
-    if official is None:
-        return _realisation("multisine", seed, samples=_PERIOD, rms=50.0, noise_rms=0.0)
-    return _record(*official, name="multisine", start="periodic", source="official")
-
-
-def _sweep_test(folder: Path) -> Record:
-    signals, source = _read_official(folder, "sinesweep"), "official"
-    if signals is None:
+def _tests(folder: Path, seed: int) -> list[Record]:
+    """The multisine and the sweep; simulated if their files are not there."""
+    found = _read_official(folder, "multisine")
+    if found is None:
+        multisine = _realisation("multisine", seed, samples=_PERIOD, rms=50.0, noise_rms=0.0)
+    else:
+        multisine = _record(*found, name="multisine", start="periodic", source="official")
+    found, source = _read_official(folder, "sinesweep"), "official"
+    if found is None:
         u = sweep()
-        signals, source = (u[::_RATIO], simulate(u, factors=(_RATIO,))), "simulated"
-    return _record(*signals, name="sweep", start="zero", skip=2000, source=source)
+        found, source = (u[::_RATIO], simulate(u, factors=(_RATIO,))), "simulated"
+    return [multisine, _record(*found, name="sweep", start="zero", skip=2000, source=source)]
 
 
 def _record(u: Array, y: Array, **kwargs: Any) -> Record:

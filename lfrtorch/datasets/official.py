@@ -57,15 +57,9 @@ def find(
     others: Sequence[str] = (),
     download: bool = False,
 ) -> Path:
-    """Return the path of a benchmark's file, below ``root`` or the cache folder.
+    """Return the path of a benchmark's ``root / file``, or of the first of others that do as well.
 
-    Args:
-        root, file: the file is ``root / file``, with the benchmark's folder first.
-        loader: function of nonlinear_benchmarks that downloads it, after its submodule and a dot
-            if it is in one.
-        others: files that do as well, the zip archive for example; in order of preference. An empty
-            archive is a placeholder and counts as missing.
-        download: whether a missing file is downloaded, by ``loader``.
+    With ``download`` the function ``loader`` of nonlinear_benchmarks fetches a missing file.
     """
     true_or_false("download", download)
     below = folder(root)
@@ -122,16 +116,9 @@ def archive_note(archive: Path, md5: str, file: str) -> str:
 
 
 def read_arrays(path: Path, shapes: Mapping[str, Shape], member: str = "") -> dict[str, Array]:
-    """Read arrays of a .mat file by name.
+    """Read arrays of a .mat file, or of the ``member`` of a zip archive, by name.
 
-    Args:
-        path: the file, or a zip archive that holds it.
-        shapes: of the arrays, by name; None for an axis of any length, and (samples,) for a signal
-            that is a row or a column of the file.
-        member: name of the file in the archive, in whatever folder.
-
-    Raises:
-        ValueError: a file that cannot be read, or another shape or type, or NaN.
+    (samples,) is the shape of a signal that is a row or a column of the file.
     """
     content = _unpacked(path, member) if path.suffix == ".zip" else path
     found: dict[str, Array] = {}
@@ -144,12 +131,7 @@ def read_arrays(path: Path, shapes: Mapping[str, Shape], member: str = "") -> di
 
 
 def read_struct(path: Path, name: str, fields: Sequence[str]) -> list[Array]:
-    """Read matrices of one shape, (samples, records), from a struct of a .mat file, in this order.
-
-    Raises:
-        ValueError: a file that cannot be read, or fields that are missing, empty, no matrices, of
-            different shapes or another type, or NaN.
-    """
+    """Read matrices (samples, records) of one shape from a struct of a .mat file, in this order."""
     try:
         (struct,) = scipy.io.loadmat(path, variable_names=[name])[name].ravel()
         matrices = [np.asarray(struct[field]) for field in fields]
