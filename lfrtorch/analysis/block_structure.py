@@ -49,9 +49,6 @@ class Structure:
         coupling: part of the rms of the changing slope that branches leave.
         V, W: of the branches: w is about the sum of W[:, i] g_i(V[i] · z), in the canonical form.
 
-    Shape:
-        V: (branches, nz), W: (nw, branches).
-
     Example:
         >>> _ = model.lfr.cell.static.Ww.data.normal_()
         >>> lfrtorch.analysis.structure(model, record).V.shape

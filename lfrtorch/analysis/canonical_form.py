@@ -53,9 +53,6 @@ class Canonical:
         bends: part of the mean squared change of the map's slope, by z; w counts by its share.
         X, Z: from the coordinates before to these.
 
-    Shape:
-        shares: (nw,), bends: (nz,), X: (nx, nx), Z: (nz, nz).
-
     Example:
         >>> _ = model.lfr.cell.static.Ww.data.normal_()
         >>> found = lfrtorch.analysis.canonical(model, record)

@@ -62,9 +62,6 @@ class Band:
         surprises: how far each sample is from what the data taught: 1 is as far as they went; 99 %
             of their samples are below. NaN if it is not known.
 
-    Shape:
-        y, std: (T, ny), noise: (ny,), surprises: (T,).
-
     Example:
         >>> band = lfrtorch.analysis.uncertainty(model, record).simulate(record)
         >>> low, high = band.interval()
@@ -117,9 +114,6 @@ class Uncertainty:
         doubts: why the bands may be wrong; empty if nothing is known against them.
         colour: the noise over time, normalised.
         reach: how far the data went.
-
-    Shape:
-        kept: (K,), factor: (K, m), noise, relative: (ny,).
 
     Example:
         >>> found = lfrtorch.analysis.uncertainty(model, record)

@@ -32,9 +32,6 @@ class Correlation:
         bounds: where a correlation of independent signals is with a probability of 99 %, ±.
         p: probability of such correlations at lags from 0 on (of a signal with itself from 1 on) if
             the signals are independent: below 0.01 they hardly are.
-
-    Shape:
-        lags, values, bounds: (K,).
     """
 
     lags: Int64[Integers, " K"]

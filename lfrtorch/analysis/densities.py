@@ -28,9 +28,6 @@ class Densities:
         frequencies: of output and error, Hz.
         output, error: measured output and error.
         noise_frequencies, noise: from the differences between periods, if the record repeats.
-
-    Shape:
-        frequencies, output, error: (F,), noise_frequencies, noise: (K,).
     """
 
     frequencies: Float[Array, " F"]
@@ -58,8 +55,8 @@ def noise_of_periods(records: Sequence[Record]) -> Float[Array, " ny"] | None:
 
 def noise_density(
     record: Record,
-) -> tuple[Float[Array, " F"], Float[Array, "F ny"]] | None:
-    """Frequencies in Hz and power spectral densities of that noise, or None."""
+) -> tuple[Float[Array, " F"], Float[Array, "F ny"], Float[Array, " ny"]] | None:
+    """Frequencies in Hz, power spectral densities and deviations of that noise, or None."""
     spectra = _steady_spectra([record])
     if spectra is None:
         return None
@@ -68,7 +65,8 @@ def noise_density(
     whole = len(power) // width * width
     lines = np.arange(1, len(power) + 1)
     f = spectra.frequencies(lines)[:whole].reshape(-1, width).mean(axis=1)
-    return f, power[:whole].reshape(len(f), width, -1).mean(axis=1) / spectra.resolution
+    density = power[:whole].reshape(len(f), width, -1).mean(axis=1) / spectra.resolution
+    return f, density, np.sqrt(power.sum(axis=0))
 
 
 def _steady_spectra(records: Sequence[Record]) -> Spectra | None:

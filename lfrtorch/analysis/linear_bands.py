@@ -24,9 +24,6 @@ class ResponseBand:
         response: complex.
         covariance: of its real and imaginary part.
 
-    Shape:
-        frequencies: (F,), response: (F, ny, nu), covariance: (F, ny, nu, 2, 2).
-
     Example:
         >>> band = lfrtorch.analysis.response_band(bla, [1.0, 10.0])
         >>> band.magnitude.shape, bool((band.magnitude_std <= band.std).all())

@@ -54,10 +54,6 @@ class LPV:
         Cz, Dzu: z - z0 = Cz (x - x0) + Dzu (u - u0).
         slopes: z - z0 -> p.
 
-    Shape:
-        A: (1 + P, nx, nx), B: (1 + P, nx, nu), C: (1 + P, ny, nx), D: (1 + P, ny, nu),
-        bounds: (P, 2), Cz: (nz, nx), Dzu: (nz, nu).
-
     Example:
         >>> form = lfrtorch.analysis.lpv(model)
         >>> form.A.shape, form.bounds.tolist()[0]

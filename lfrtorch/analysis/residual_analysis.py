@@ -21,12 +21,7 @@ from lfrtorch.analysis.correlation import (
     lags_for,
     whitened,
 )
-from lfrtorch.analysis.densities import (
-    Densities,
-    noise_density,
-    noise_of_periods,
-    power_density,
-)
+from lfrtorch.analysis.densities import Densities, noise_density, power_density
 from lfrtorch.analysis.output_residuals import ROUNDING, OutputResiduals
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.metrics import rms
@@ -215,7 +210,7 @@ def of_simulation(
     squares = [whitened(near_one(channel) ** 2) for channel in (u - u.mean(axis=0)).T]
     deviation = np.std(y, axis=0)
     f, of_y = power_density(y, record.fs)
-    noise, of_noise = noise_of_periods([record]), noise_density(record)
+    of_noise = noise_density(record)
     found = []
     for i, output in enumerate(record.outputs):
         error = errors[:, i]
@@ -246,7 +241,7 @@ def of_simulation(
                     power_density(error[:, None], record.fs)[1][:, 0] if finite else np.nan * f,
                     *(() if of_noise is None else (of_noise[0], of_noise[1][:, i])),
                 ),
-                noise=None if noise is None else float(noise[i]),
+                noise=None if of_noise is None else float(of_noise[2][i]),
                 exact=exact,
             )
         )

@@ -160,7 +160,7 @@ class OrderFits:
         searches = [search_from(self.problem, matrices) for matrices in self._starts(nx)]
         found = [self.problem.refined(searches[0])]
         for search in searches:
-            self._advance(search, 4)
+            self._advance(search, 4)  # after which the best few go on
         first, *others = sorted(searches, key=lambda search: search.state.cost)
         same = (1.0 + _SETTLED) * first.state.cost
         finalists = [first, *(search for search in others if search.state.cost > same)]

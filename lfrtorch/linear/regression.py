@@ -56,12 +56,9 @@ def divided(fitted: Regression, ny: int) -> Regression:
     return Regression(G, inverse.swapaxes(1, 2) @ fitted.weights, residual, determined)
 
 
-def outer(
-    errors: Complex128[Complex, "F R n"], other: Complex128[Complex, "F R m"] | None = None
-) -> Complex128[Complex, "F n _"]:
-    """Sum over the rows r of e_r e_rᴴ at every line, or of e_r o_rᴴ with the rows of ``other``."""
-    other = errors if other is None else other
-    return errors.swapaxes(1, 2) @ other.conj()
+def outer(errors: Complex128[Complex, "F R n"]) -> Complex128[Complex, "F n n"]:
+    """Sum over the rows r of e_r e_rᴴ at every line."""
+    return errors.swapaxes(1, 2) @ errors.conj()
 
 
 def covariance(

@@ -35,6 +35,7 @@ def test_densities_of_any_periods_are_numbers(
     deviation, found = noise_of_periods([record]), noise_density(record)
     assert (deviation is None) == (found is None)
     if deviation is not None and found is not None:
-        f, density = found  # each line by itself: the mean density times the lines' distance
+        f, density, same = found  # each line by itself: the mean density times the lines' distance
+        assert np.array_equal(same, deviation)
         power = density.sum(axis=0) * record.fs / N
         assert power == pytest.approx(deviation**2, rel=1e-9, abs=1e-24 * 10.0 ** (2 * unit))
