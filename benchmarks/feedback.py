@@ -33,7 +33,7 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.types import Array, Complex
-from lfrtorch.fitting.prediction import Noise
+from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.linear.bla import Criterion
 from lfrtorch.metrics import rms
 from lfrtorch.records import Scaler

@@ -45,7 +45,7 @@ import torch
 
 import lfrtorch
 from lfrtorch._support.types import Array
-from lfrtorch.fitting.prediction import Noise
+from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.bla import Criterion
 from lfrtorch.metrics import rms

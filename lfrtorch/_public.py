@@ -36,7 +36,8 @@ from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 
 # the whole job
-from lfrtorch.fitting.settings import Settings, SizesSearch
+from lfrtorch.fitting.plain_settings import SizesSearch
+from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.job import identify
 from lfrtorch.reporting.run import Run

@@ -6,8 +6,9 @@ import math
 from collections.abc import Sequence
 from contextlib import closing
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
+from inspect import signature
 from typing import Any, cast
 
 import torch
@@ -20,10 +21,11 @@ from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
-from lfrtorch.fitting.first_fit import begun_on_part, part_of
+from lfrtorch.fitting.first_fit import begun_on_part, first_records
 from lfrtorch.fitting.last_fits import distilled, refitted
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.observer import LineObserver, Observer
+from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
@@ -135,8 +137,7 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     models = starting_models(dataset.train, settings, linear)
     if settings.init_from is not None and settings.starts > 1:
         observer.say("note: starts is 1: the fit starts from the model of init_from alone")
-    if settings.first_part < 1.0:
-        settings, models = begun_on_part(replace(stage, settings=settings), models)
+    settings, models = begun_on_part(replace(stage, settings=settings), models)
     average = _most_averaged(models, settings.average, observer)
     samples = sum(record.samples for record in dataset.train)
     if samples >= SLOW_SAMPLES and not is_compiled(cell := models[0].lfr.cell, cell.A.cpu()):
@@ -350,7 +351,7 @@ def choose_sizes(stage: Stage, linear: LinearModel) -> SizeSearch | None:
         tried["nx"] = list(linears)
     search = search_sizes(
         start,
-        part_of(dataset.train, settings.first_part),
+        first_records(stage),
         dataset.validation,
         **tried,
         linear=linear,
@@ -398,20 +399,9 @@ def starting_model(
     train: Sequence[Record], settings: Settings, linear: LinearModel, seed: int
 ) -> Model:
     """The model that one start begins with."""
-    model = initialise(
-        linear,
-        train,
-        nz=cast(int, settings.nz),
-        nw=cast(int, settings.nw),
-        method=settings.init,
-        seed=seed,
-        relaxations=settings.relaxations,
-        modes=settings.modes,
-        z_feedthrough=settings.z_feedthrough,
-        feedthrough=settings.feedthrough,
-        structure=settings.structure,
-        **settings.static_map(),
-    )
+    names = {one.name for one in fields(PlainSettings)} & {*signature(initialise).parameters}
+    options = {name: getattr(settings, name) for name in names} | settings.static_map()
+    model = initialise(linear, train, **options | {"method": settings.init, "seed": seed})
     model.lfr.to(device=settings.device, dtype=settings.dtype)
     return model
 

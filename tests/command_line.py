@@ -35,7 +35,7 @@ SHORTER = {  # fewer samples and iterations, so that two iterations take a secon
 }
 SIMULATED = ("boucwen", "boucwen_record", "parwh")
 """All others are measured."""
-GROUPS = ("+bench", "data", "bla", "static", "init", "trainer")
+GROUPS = ("+bench", "data", "bla", "static", "trainer")
 
 
 @cache

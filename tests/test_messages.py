@@ -29,9 +29,11 @@ def text(node: ast.AST) -> str:
 
 
 def said(tree: ast.AST) -> Iterator[str]:
-    """All texts of a module but the docstrings."""
+    """All texts of a module but the docstrings, and what becomes part of one."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            continue
+        if getattr(getattr(node, "func", None), "id", "") == "setting":
             continue
         if isinstance(node, ast.JoinedStr | ast.BinOp) or (
             isinstance(node, ast.Constant) and isinstance(node.value, str)

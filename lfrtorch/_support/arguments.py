@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import is_dataclass
 from functools import cache, wraps
 from numbers import Integral, Real
 from types import NoneType, SimpleNamespace, UnionType
@@ -42,8 +43,10 @@ def typed(*own: str) -> Callable[[Function], Function]:
             left = {"return", *several, *own}
             texts = {name: t for name, t in inner.__annotations__.items() if name not in left}
             names = inspect.unwrap(inner).__globals__
-            found = get_type_hints(SimpleNamespace(__annotations__=texts), names)
-            return {name: hint for name, hint in found.items() if hint not in _NUMBERS}
+            # The fields of a dataclass may be inherited from one of another module.
+            one = function if is_dataclass(function) else SimpleNamespace(__annotations__=texts)
+            found = get_type_hints(one, None if is_dataclass(function) else names)
+            return {n: hint for n, hint in found.items() if n in texts and hint not in _NUMBERS}
 
         @wraps(inner)
         def checked(*args: Any, **kwargs: Any) -> Any:

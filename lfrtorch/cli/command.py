@@ -43,8 +43,10 @@ def start(command: str) -> None:
     else:
         import hydra
 
+        from lfrtorch.cli import declared
         from lfrtorch.cli.hydra_versions import MAIN
 
+        declared.register()
         name = "config" if command == "fit" else command
         hydra.main(**MAIN, config_path=str(CONF), config_name=name)(lambda _: None)()
 

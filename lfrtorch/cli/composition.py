@@ -20,11 +20,13 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from lfrtorch._support.errors import InputError
-from lfrtorch.cli import CONF
+from lfrtorch.cli import CONF, declared
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import COMPOSED, MAIN
 from lfrtorch.cli.quotes import in_quotes, quoted
 from lfrtorch.cli.words import GROUPS
+
+declared.register()
 
 SWEEPS = {"-m", "--multirun"}
 """Options that make several runs of several values."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,8 @@ from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.words import translated
 from lfrtorch.dataset import Dataset
-from lfrtorch.fitting.settings import Settings, SizesSearch
+from lfrtorch.fitting.plain_settings import PlainSettings, SizesSearch
+from lfrtorch.fitting.settings import Settings
 from lfrtorch.records import Record
 from lfrtorch.survey.notes import notes_on
 
@@ -37,14 +38,13 @@ def configured(cfg: DictConfig) -> Settings:
     if cfg.dtype not in ("float32", "float64"):
         raise InputError(f"dtype is {cfg.dtype}; give float64 or float32.")
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    plain["sizes_search"] = SizesSearch(**plain["sizes_search"])
     return Settings(
-        **{name: plain[name] for name in AS_THEY_ARE},
+        **{one.name: plain[one.name] for one in fields(PlainSettings)},
         static=partial(own_map, cfg) if cfg.static.kind == "own" else cfg.static.kind,
-        init=cfg.init.method,
         linear=plain["bla"],
         trainer=instantiate(cfg.trainer),
         init_from=None if cfg.init_from is None else opened(cfg),
-        sizes_search=SizesSearch(**plain["sizes_search"]),
         dtype=getattr(torch, cfg.dtype),
     )
 
@@ -54,14 +54,6 @@ def limit_threads(cfg: DictConfig) -> None:
     if cfg.threads is not None:
         integer("threads", cfg.threads, 1)
         torch.set_num_threads(min(cfg.threads, os.cpu_count() or 1))
-
-
-AS_THEY_ARE = (
-    "nx", "nx_max", "relaxations", "modes", "nz", "nw", "nn", "z_feedthrough", "feedthrough",
-    "structure", "activation", "degree", "ridge", "noise", "horizon", "average",
-    "distil", "refit", "first_part", "first_iterations", "starts", "seed", "device",
-)  # fmt: skip
-"""Settings that are the words of the configuration."""
 
 
 def own_map(cfg: DictConfig, nz: int, nw: int) -> Module:

@@ -6,13 +6,11 @@ import re
 
 from omegaconf import DictConfig
 
+from lfrtorch.cli.declared import YAML
 from lfrtorch.reporting.console import Console
 
 GROUPS = ("bla", "frf", "data", "trainer")
 """Groups whose words are arguments of functions. Of a name in several, the last one is meant."""
-
-YAML = {"True": "true", "False": "false", "None": "null"}
-"""Values that YAML writes in another way than Python."""
 
 
 def translated(text: str, cfg: DictConfig) -> str:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 from lfrtorch._support.errors import InputError
+from lfrtorch.fitting.plain_settings import PlainSettings
 
-USUAL: dict[str, Any] = {
-    "nz": 2, "nw": 1, "nn": 15, "degree": 3, "static": "network", "structure": "free",
-    "relaxations": 0, "modes": 0, "z_feedthrough": True, "noise": "output", "horizon": None,
-    "first_part": 1.0, "average": 1, "distil": False, "guarantee": None, "integrators": 0,
+USUAL = {one.name: one.default for one in fields(PlainSettings)} | {
+    "static": "network", "guarantee": None, "integrators": 0,
 }  # fmt: skip
 """Defaults, which exclude nothing."""
 

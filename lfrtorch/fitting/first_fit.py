@@ -20,8 +20,10 @@ from lfrtorch.records import Record, common_unit
 def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Model]]:
     """The best start after iterations on a part of the records, and settings with its seed."""
     dataset, settings, observer = stage.dataset, stage.settings, stage.observer
+    if settings.first_part == 1.0:
+        return settings, models
     train = dataset.train
-    part = part_of(train, settings.first_part)
+    part = first_records(stage)
     samples, all_samples = (sum(r.samples for r in records) for records in (part, train))
     if max(len(models), len(part)) < stage.ranks.world or samples == all_samples:
         observer.say(
@@ -51,6 +53,17 @@ def begun_on_part(stage: Stage, models: list[Model]) -> tuple[Settings, list[Mod
         f"seed {seed}"
     )
     return replace(settings, seed=seed, starts=1), [result.model]
+
+
+def first_records(stage: Stage) -> list[Record]:
+    """The training records that the first iterations fit."""
+    return part_of(stage.dataset.train, stage.settings.first_part)
+
+
+def cost_in_full(settings: Settings) -> int:
+    """How many iterations on all records cost as much as the first ones."""
+    part = settings.first_part
+    return round(part * settings.first_iterations) if part < 1.0 else 0
 
 
 def part_of(records: Sequence[Record], part: float) -> list[Record]:

@@ -12,6 +12,7 @@ from lfrtorch._support.reasons import CUT_SHORT, Reason
 from lfrtorch._support.tables import number, quantity
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
 from lfrtorch.fitting.distillation import distil
+from lfrtorch.fitting.first_fit import cost_in_full
 from lfrtorch.fitting.multistart import AS_GOOD
 from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.stage import Stage
@@ -70,9 +71,6 @@ def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | No
     if not held_out:
         observer.say("note: refit: there are no validation records, so all were fitted before")
         return result, None
-    iterations = result.chosen_iteration
-    if settings.first_part < 1.0:  # as many as cost the same with all records
-        iterations += round(settings.first_part * settings.first_iterations)
     again = _whole_or_cut(
         result,
         partial(
@@ -80,7 +78,7 @@ def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | No
             result,
             dataset.train,
             held_out,
-            iterations=iterations,
+            iterations=result.chosen_iteration + cost_in_full(settings),
             monitor=observer.searching(),
             **stage.options,
         ),

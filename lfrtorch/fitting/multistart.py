@@ -41,9 +41,9 @@ from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.live_line import ProgressLine, StartsLine
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.over_processes import OverProcesses, same_weights
+from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.prediction import (
     SIMULATION,
-    Noise,
     predicting,
     shown_innovation_form,
     without_gain,

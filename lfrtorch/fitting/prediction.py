@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.trainer import Monitor
 from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, with_past_outputs
-
-Noise = Literal["output", "innovation", "both"]
-"""What is fitted: simulations, as if noise were at the outputs alone, predictions, or both."""
 
 SIMULATION: dict[str, float] = {"innovation": 0.0, "both": 3.0}
 """Weight of simulation errors beside those of predictions, if both were as large at the start."""

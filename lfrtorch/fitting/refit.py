@@ -20,7 +20,7 @@ import numpy as np
 from lfrtorch._support.arguments import typed
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.prediction import Noise
+from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.trainer import FitResult, Monitor, Stop, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.simulation_errors import Ridge

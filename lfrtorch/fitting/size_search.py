@@ -44,7 +44,8 @@ from lfrtorch.fitting.exclusions import refuse_together
 from lfrtorch.fitting.folds import folds as folds_of
 from lfrtorch.fitting.live_line import StartsLine
 from lfrtorch.fitting.multistart import iterations_of
-from lfrtorch.fitting.prediction import SIMULATION, Noise, predicting
+from lfrtorch.fitting.plain_settings import Noise
+from lfrtorch.fitting.prediction import SIMULATION, predicting
 from lfrtorch.fitting.refit import all_records
 from lfrtorch.fitting.side_by_side import Together, any_of
 from lfrtorch.fitting.trainer import Fit, Monitor, Stop, StoppedError, Trainer

@@ -8,7 +8,7 @@ from typing import TypedDict
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.observer import Observer
-from lfrtorch.fitting.prediction import Noise
+from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import Stop, Trainer
 from lfrtorch.least_squares.simulation_errors import Ridge

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.arguments import typed
-from lfrtorch._support.checks import integer, number
 from lfrtorch._support.reasons import Reason
+from lfrtorch._support.settings import documented
+from lfrtorch.least_squares.options import AdamOptions
 
 
 class Differentiable(Protocol):
@@ -46,18 +47,10 @@ class AdamState:
 
 
 @typed()
+@documented
 @dataclass(frozen=True)
-class Adam:
+class Adam(AdamOptions):
     """Options of ``torch.optim.Adam``; ``init`` and ``step`` run it.
-
-    Args:
-        max_iter: most steps; each sees all the data.
-        learning_rate: step size, in normalised units.
-        guarantee: what every model on the way keeps. ``"stable"``: A's eigenvalues stay within the
-            unit circle, so that no bounded input makes a model with a bounded static map run away;
-            if they are not inside at the start, they stay within the circle that they are in.
-            ``"contracting"``: the model is proven to contract, for all inputs, see
-            ``lfrtorch.analysis.contraction``; the start must be. Default: nothing.
 
     Example:
         >>> trainer = lfrtorch.Adam(max_iter=20, learning_rate=1e-2)
@@ -65,14 +58,6 @@ class Adam:
         >>> result.history[-1].train < result.history[0].train
         True
     """
-
-    max_iter: int = 2000
-    learning_rate: float = 1e-3
-    guarantee: Literal["stable", "contracting"] | None = None
-
-    def __post_init__(self) -> None:
-        number("learning_rate", self.learning_rate, positive=True)
-        integer("max_iter", self.max_iter, 0)
 
     @property
     def limit(self) -> int:

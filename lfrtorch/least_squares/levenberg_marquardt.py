@@ -16,17 +16,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.arguments import typed
-from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.reasons import Reason
+from lfrtorch._support.settings import documented
 from lfrtorch.least_squares.linear_systems import System
+from lfrtorch.least_squares.options import LevenbergMarquardtOptions
 
 FASTEST_DECREASE = 0.2
 """Smallest factor on λ after an accepted step; Nielsen has 1/3."""
@@ -122,29 +123,10 @@ class _Trial(NamedTuple):
 
 
 @typed()
+@documented
 @dataclass(frozen=True)
-class LevenbergMarquardt:
+class LevenbergMarquardt(LevenbergMarquardtOptions):
     """Options of the search; ``init`` and ``step`` run it.
-
-    Args:
-        max_iter: most steps.
-        acceleration: geodesic acceleration, one more residual a trial.
-        damping: first λ relative to the largest squared singular value of the Jacobian.
-        tolerance: relative decrease of the cost that counts as no progress ...
-        patience: ... and the number of such steps in a row that ends the search.
-        floor: root mean square of the residual that counts as zero: the search ends one step later.
-        truncation: singular values below this part of the largest are left out as gauge. They are
-            computed only if the damping is not far above rounding errors.
-        finite_step: h of the directional second derivative (Transtrum et al. use 0.1).
-        acceleration_limit: largest 2|a| / |δ| at which the acceleration is trusted.
-        max_damping: λ relative to the largest squared singular value that ends the search.
-        least_damping: to which the first step may lower λ, in trials from the same Jacobian; with
-            ``damping`` or more it does not.
-        guarantee: what every model on the way keeps. ``"stable"``: A's eigenvalues stay within the
-            unit circle, so that no bounded input makes a model with a bounded static map run away;
-            if they are not inside at the start, they stay within the circle that they are in.
-            ``"contracting"``: the model is proven to contract, for all inputs, see
-            ``lfrtorch.analysis.contraction``; the start must be. Default: nothing.
 
     Example:
         >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=10, acceleration=False)
@@ -152,28 +134,6 @@ class LevenbergMarquardt:
         >>> result.history[-1].train < result.history[0].train
         True
     """
-
-    max_iter: int = 200
-    acceleration: bool = True
-    damping: float = 1e-2
-    tolerance: float = 1e-7
-    patience: int = 5
-    floor: float = 1e-13
-    truncation: float = 1e-12
-    finite_step: float = 0.1
-    acceleration_limit: float = 0.75
-    max_damping: float = 1e12
-    least_damping: float = 1e-8
-    guarantee: Literal["stable", "contracting"] | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("damping", "truncation", "finite_step", "acceleration_limit", "max_damping"):
-            number(name, getattr(self, name), positive=True)
-        number("least_damping", self.least_damping, positive=True)
-        for name in ("tolerance", "floor"):
-            number(name, getattr(self, name))
-        integer("max_iter", self.max_iter, 0)
-        integer("patience", self.patience, 1)
 
     @property
     def limit(self) -> int:

@@ -89,14 +89,3 @@ def test_divergence_is_a_reason():
     adam = Adam()
     state = adam.step(Broken(), adam.init(Broken(), ZERO))
     assert state.reason == "diverged: lower the learning rate"
-
-
-@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
-def test_learning_rate_must_be_positive(rate: float):
-    with pytest.raises(ValueError, match="give a positive number"):
-        Adam(learning_rate=rate)
-
-
-def test_iterations_cannot_be_negative():
-    with pytest.raises(ValueError, match="max_iter is -1; give a whole number of at least 0"):
-        Adam(max_iter=-1)

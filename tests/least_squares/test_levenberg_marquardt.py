@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -381,30 +381,3 @@ def test_report_holds_numbers():
     assert start.report == {}
     assert report.keys() == {"damping", "gain_ratio", "trials", "rank"}
     assert all(isinstance(value, float | int) for value in report.values())
-
-
-def build(**options: Any) -> LevenbergMarquardt:
-    return LevenbergMarquardt(**options)
-
-
-@pytest.mark.parametrize(
-    "option",
-    [
-        "damping",
-        "least_damping",
-        "truncation",
-        "finite_step",
-        "acceleration_limit",
-        "max_damping",
-    ],
-)
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
-def test_options_that_must_be_positive(option: str, value: float):
-    with pytest.raises(ValueError, match=f"{option} is {value}; give a positive number"):
-        build(**{option: value})
-
-
-@pytest.mark.parametrize("option", ["max_iter", "tolerance", "floor"])
-def test_options_that_cannot_be_negative(option: str):
-    with pytest.raises(ValueError, match=f"{option} is -1; give a .*number of at least 0"):
-        build(**{option: -1})

@@ -1,0 +1,163 @@
+"""Settings that are numbers, texts and lists, as Python and the command line have them.
+
+Nothing heavy is imported here: the help of the command line reads the declarations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from lfrtorch._support.settings import check_settings, documented, setting
+
+Size = int | Literal["auto"]
+"""A number, or one that the data choose."""
+
+Noise = Literal["output", "innovation", "both"]
+"""What is fitted: simulations, as if noise were at the outputs alone, predictions, or both."""
+
+
+@documented
+@dataclass(frozen=True, kw_only=True)
+class SizesSearch:
+    """What is tried for the sizes that are ``"auto"``, see :func:`lfrtorch.search_sizes`.
+
+    Example:
+        >>> lfrtorch.SizesSearch(nn=(5, 10), starts=2).nn
+        (5, 10)
+    """
+
+    nx: Sequence[int] = setting(
+        (2, 3, 4, 6, 8, 10, 12),
+        "the numbers of states to try above the linear model's order, up to ``nx_max``, if nx and "
+        'another size are ``"auto"``.',
+    )
+    nz: Sequence[int] = setting((1, 2, 3), "the numbers to try.")
+    nw: Sequence[int] = setting((1, 2, 3), "likewise.")
+    nn: Sequence[int] = setting((5, 10, 15, 25), "likewise.")
+    degree: Sequence[int] = setting((2, 3, 5), "likewise.")
+    starts: int = setting(4, "random starts of each size, at most.", least=1)
+    finalists: int = setting(
+        6, "models that get all iterations of the search; 8 times as many begin it.", least=1
+    )
+    iterations: float = setting(
+        0.375, "part of the iterations of the fit that they get.", positive=True
+    )
+    folds: int = setting(
+        0,
+        "if not 0, the finalists are compared by cross-validation over so many stretches of the "
+        "training and validation records: for short records.",
+        least=0,
+    )
+
+    def __post_init__(self) -> None:
+        check_settings(self, "sizes_search.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlainSettings:
+    """The part of :class:`lfrtorch.Settings` that the command line hands on as it is."""
+
+    nx: Size | None = setting(
+        None,
+        'states. ``"auto"``: the lowest order up to ``nx_max`` whose linear model does as well as '
+        'the best, and more if an NL-LFR makes use of them and another size is ``"auto"``, too. '
+        "Required, unless ``init_from`` brings it.",
+        least=1,
+        word="auto",
+    )
+    nx_max: int = setting(12, 'highest order that ``nx="auto"`` tries.', least=1)
+    nz: Size = setting(
+        2, 'inputs of the static nonlinearity; ``"auto"`` searches for them.', least=1, word="auto"
+    )
+    nw: Size = setting(1, 'its outputs, or ``"auto"``.', least=1, word="auto")
+    nn: Size = setting(15, 'neurons of ``static="network"``, or ``"auto"``.', least=1, word="auto")
+    activation: str = setting(
+        "tanh",
+        'their function: ``"tanh"``, ``"sigmoid"``, ``"relu"``, ``"rbf"`` or ``"softplus"``.',
+    )
+    degree: Size = setting(3, 'of ``static="polynomial"``, or ``"auto"``.', least=1, word="auto")
+    init: Literal["zero_output", "paper"] = setting(
+        "zero_output", "where the fit starts, see :func:`lfrtorch.initialise`."
+    )
+    relaxations: int = setting(
+        0,
+        "real poles that w alone drives, a state each beside the ``nx`` of the linear model: for "
+        "hysteresis, see :func:`lfrtorch.initialise`.",
+        least=0,
+    )
+    modes: int = setting(
+        0, "modes that w alone drives, two states each: for structures that rattle.", least=0
+    )
+    z_feedthrough: bool = setting(
+        True,
+        "whether the input acts on z at once; False for a nonlinearity of the states alone, see "
+        ":func:`lfrtorch.initialise`.",
+    )
+    feedthrough: bool = setting(
+        True,
+        "whether it acts on the output at once; False for data under feedback without a delay. "
+        "The linear model has none then, either.",
+    )
+    structure: str = setting(
+        "free",
+        'of which blocks the model is made, and a fit keeps to: ``"wiener"``, ``"hammerstein"``, '
+        '``"wiener_hammerstein"`` or ``"parallel"``, see :func:`lfrtorch.initialise`.',
+    )
+    ridge: float | Mapping[str, float] = setting(
+        0.0,
+        "weight of the squared distance to the start, against overfitting; or weights by the "
+        "parameters' names, see :func:`lfrtorch.fit`.",
+    )
+    noise: Noise = setting(
+        "output",
+        'where it acts, ``"output"`` or ``"innovation"``, or ``"both"``, see :func:`lfrtorch.fit`. '
+        'If it is not the output, the linear model has ``refine="prediction"``, too, and '
+        "validation errors are those of predictions one sample ahead.",
+    )
+    horizon: int | None = setting(
+        None,
+        "samples of the windows that training and validation records are cut into in a fit, see "
+        ":func:`lfrtorch.fit`. Default: records are simulated whole.",
+        least=2,
+    )
+    average: int = setting(
+        1,
+        "the model is the mean of at most so many of the best starts, as long as it validates as "
+        "well, see :func:`lfrtorch.fit`.",
+        least=1,
+    )
+    distil: bool = setting(
+        False,
+        "whether one model takes the place of a mean of several if it does as well, see "
+        ":func:`lfrtorch.distil`.",
+    )
+    refit: bool = setting(
+        False,
+        "whether the model that validation chose is fitted to all estimation records at last, see "
+        ":func:`lfrtorch.refit`.",
+    )
+    first_part: float = setting(
+        1.0,
+        "part of the training samples that the first iterations fit, which cost as much less and "
+        "choose one of the starts: the shortest records, those of a length spread evenly; the "
+        "beginning of each if the part is less than a record. The search for sizes fits them, too. "
+        "1 is for all.",
+        positive=True,
+        most=1,
+    )
+    first_iterations: int = setting(40, "how many of these there are.", least=1)
+    starts: int = setting(
+        1, "random starts, of which the best is kept; at least 2 if sizes are searched.", least=1
+    )
+    seed: int = setting(
+        0,
+        "of the first start; the others have seed + 1000, seed + 2000, ... If sizes are searched, "
+        "the first start of the fit is the one that brought the sizes chosen.",
+        least=0,
+    )
+    sizes_search: SizesSearch = setting(
+        SizesSearch, 'what is tried for the sizes that are ``"auto"``.'
+    )
+    device: str = setting("cpu", 'of the fit: ``"cpu"`` or ``"cuda"``.')
