@@ -400,7 +400,10 @@ def starting_model(
 ) -> Model:
     """The model that one start begins with."""
     names = {one.name for one in fields(PlainSettings)} & {*signature(initialise).parameters}
-    options = {name: getattr(settings, name) for name in names} | settings.static_map()
+    options = {name: getattr(settings, name) for name in names}
+    with torch.random.fork_rng(devices=[]):  # maps draw their weights as torch modules do
+        torch.manual_seed(seed)
+        options |= settings.static_map()
     model = initialise(linear, train, **options | {"method": settings.init, "seed": seed})
     model.lfr.to(device=settings.device, dtype=settings.dtype)
     return model

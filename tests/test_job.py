@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -165,6 +166,24 @@ def test_a_map_of_ones_own_is_made_with_its_sizes_and_a_slow_one_is_told(
     for static in ("polynomial", Cubic):
         identify(dataset, settings(static=static, degree=2), observer=Console())
         assert ("not compiled" in capsys.readouterr().out) == (static is Cubic)
+
+
+@pytest.mark.parametrize(
+    "static",
+    ["polynomial", lambda nz, nw: torch.nn.Linear(nz, nw)],  # noqa: PLW0108
+)
+def test_the_seed_draws_the_weights_of_any_map(dataset: Dataset, static: Any):
+    given = settings(static=static, init="paper", trainer=LevenbergMarquardt(max_iter=0))
+    torch.manual_seed(5)
+    first, state = identify(dataset, given), torch.random.get_rng_state()
+    torch.manual_seed(6)
+    weights = [
+        [*identify(dataset, replace(given, seed=seed)).model.lfr.parameters()] for seed in (0, 1)
+    ]
+    assert all(map(torch.equal, first.model.lfr.parameters(), weights[0]))
+    assert not all(map(torch.equal, *weights))
+    torch.manual_seed(5)
+    assert torch.equal(torch.random.get_rng_state(), state)  # which is the user's
 
 
 @pytest.mark.parametrize("starts", [1, 3])
