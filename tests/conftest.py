@@ -38,7 +38,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(autouse=True)
 def shapes_are_checked() -> None:
-    """The first calls of each test."""
+    """The first call in each test, again."""
     calls.clear()
 
 

@@ -1,4 +1,4 @@
-"""Checks the shapes that stand in the package's annotations, at the first calls in each test.
+"""Checks the shapes that stand in the package's annotations, wherever they may be new.
 
 jaxtyping's own import hook decorates every function. Numba cannot compile the decorated kernels,
 and types without a shape are basedpyright's business.
@@ -18,23 +18,39 @@ from typing import Any
 from beartype import beartype
 from jaxtyping import jaxtyped
 
-FIRST = 5
-"""Calls of each function that are checked in a test: all of them would cost a third more time."""
-
 calls: Counter[str] = Counter()
 """Of each function, in this test."""
 
+seen: set[tuple[Any, ...]] = set()
+"""Each function with the shapes and the options of its calls, in all tests so far."""
+
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Check the shapes of the first calls in each test."""
+    """Check the first call in each test, and each one whose shapes or options are new.
+
+    To check all calls would cost a third more time.
+    """
     strict, name = jaxtyped(_shapes_alone(function), typechecker=beartype), function.__qualname__
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         calls[name] += 1
-        return (strict if calls[name] <= FIRST else function)(*args, **kwargs)
+        kind = (name, *map(_kind, args), *((key, _kind(value)) for key, value in kwargs.items()))
+        if calls[name] > 1 and kind in seen:
+            return function(*args, **kwargs)
+        result = strict(*args, **kwargs)
+        seen.add(kind)
+        return result
 
     return call
+
+
+def _kind(argument: Any) -> Any:
+    """Shape and type of an array, an option itself, the type of all else."""
+    shape = getattr(argument, "shape", None)
+    if shape is not None:
+        return tuple(shape), getattr(argument, "dtype", None)
+    return argument if isinstance(argument, bool | str) else type(argument)
 
 
 def install() -> None:
