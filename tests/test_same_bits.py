@@ -154,7 +154,7 @@ LM = LevenbergMarquardt(max_iter=2)
         (LM, dict, math.inf, 0),
         pytest.param(LM, own_map, 0.0, jacobian.CACHED_BYTES, marks=pytest.mark.slow),
         (Adam(max_iter=2), dict, 0.0, jacobian.CACHED_BYTES),
-        (Adam(max_iter=2), own_map, 0.0, jacobian.CACHED_BYTES),
+        (Adam(max_iter=1), own_map, 0.0, jacobian.CACHED_BYTES),
     ],
 )
 def test_single_fit(

@@ -37,7 +37,7 @@ import lfrtorch
 from lfrtorch import InputError
 from lfrtorch.cli import claim, config, errors, evaluate, fit, interrupts, run_folder, words
 from lfrtorch.cli.hydra_versions import instantiate
-from lfrtorch.datasets import boucwen, official
+from lfrtorch.datasets import boucwen, f16, official
 from lfrtorch.reporting import plots
 from lfrtorch.reporting.advice import Advice
 
@@ -54,6 +54,7 @@ def short(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFact
     """The Bouc-Wen system is simulated, official files at hand or not, and for short."""
     nothing = tmp_path_factory.mktemp("nothing")
     monkeypatch.setattr(official, "cache", lambda: nothing)
+    monkeypatch.setattr(f16, "_TESTS", (2,))  # of three levels of 74 000 samples
     monkeypatch.setattr(boucwen, "_PERIOD", PERIOD)
     monkeypatch.setattr(boucwen, "_SWEEP", SWEEP)
 
@@ -89,14 +90,11 @@ ADAM = "init=paper trainer=adam trainer.max_iter=2"
 
 
 @pytest.mark.parametrize(
-    ("bench", "choice"),
-    [*((bench, "trainer.max_iter=2") for bench in BENCHES), ("boucwen", ADAM)],
+    ("bench", "choice"), [*((bench, "trainer.max_iter=2") for bench in BENCHES), ("boucwen", ADAM)]
 )
 @pytest.mark.numeric
 @pytest.mark.usefixtures("short", "coarse")
-def test_every_bench_runs_two_iterations(
-    bench: str, choice: str, tmp_path: Path, request: pytest.FixtureRequest
-):
+def test_every_bench_runs_two_iterations(bench: str, choice: str, tmp_path, request):
     cfg = configuration(f"+bench={bench}", *SHORTER.get(bench, "").split(), *choice.split())
     if bench not in SIMULATED:
         cfg.data.root = str(request.getfixturevalue("benchmark_root"))
@@ -116,9 +114,7 @@ def test_every_bench_runs_two_iterations(
     assert (tmp_path / "report.html").is_file() == cfg.figures
 
 
-def test_notes_on_the_data_are_printed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_notes_on_the_data_are_printed(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(official, "cache", lambda: tmp_path)  # without files
     cfg = configuration("+bench=parwh", "data.levels=[100]")
     data = config.loaded(cfg)
@@ -179,9 +175,7 @@ def test_the_paper_cases_are_one_override():
 
 @pytest.mark.numeric
 @pytest.mark.usefixtures("coarse")
-def test_run_writes_its_folder_and_the_checkpoint_simulates(
-    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_run_writes_its_folder_and_the_checkpoint_simulates(csv, tmp_path, monkeypatch, capsys):
     words = [f"hydra.run.dir='{tmp_path}'", *file_overrides(csv), "nx=1", "trainer.max_iter=20"]
     launched(monkeypatch, *words)
     for name in ("metrics.json", "config.yaml", "model/model.json", "figures/test.png"):
@@ -218,9 +212,7 @@ def test_init_from_continues_where_the_run_ended(csv: Path, tmp_path: Path):
     assert validation == pytest.approx(before, abs=ROUNDING)
 
 
-def test_polynomial_is_chosen_and_continued(
-    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_polynomial_is_chosen_and_continued(csv, tmp_path, capsys):
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):
         folder.mkdir()
@@ -235,9 +227,7 @@ def test_polynomial_is_chosen_and_continued(
 
 
 @pytest.mark.usefixtures("short")
-def test_init_from_says_which_sizes_it_takes(
-    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_init_from_says_which_sizes_it_takes(csv, tmp_path, capsys):
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):
         folder.mkdir()
@@ -391,9 +381,7 @@ def test_a_run_of_searched_sizes_goes_on(csv: Path, tmp_path: Path):
 
 
 @pytest.mark.numeric
-def test_a_run_of_before_there_were_structures_goes_on_and_is_scored(
-    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_run_of_before_there_were_structures_goes_on_and_is_scored(csv, tmp_path, monkeypatch):
     folder, out = tmp_path / "run", tmp_path / "scores.json"
     folder.mkdir()
     settings = [*file_overrides(csv), "nx=1", "trainer.max_iter=3"]
@@ -473,10 +461,7 @@ def test_resume_takes_the_settings_of_the_run(tmp_path: Path):
 def test_a_run_that_goes_on_has_searched_its_sizes():
     search = Advice("Let validation choose.", "", {"nx": "auto", "nn": "auto"})
     other = Advice("Try several starts.", "", {"starts": 8})
-    for asked, left in (
-        (["nx=auto", "nn=auto"], [other]),
-        (["nx=auto"], [search, other]),
-    ):
+    for asked, left in ((["nx=auto", "nn=auto"], [other]), (["nx=auto"], [search, other])):
         assert fit.unsearched([search, other], configuration(*asked)) == left
 
 
@@ -526,9 +511,7 @@ def test_damaged_settings_of_a_run_that_goes_on(tmp_path: Path, text: str):
         run_folder.chosen_before(cfg, tmp_path)
 
 
-def refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str
-) -> str:
+def refused(monkeypatch, capsys, *words: str) -> str:
     """What the command line says as it ends."""
     with pytest.raises(SystemExit) as end:
         launched(monkeypatch, *words)
@@ -536,9 +519,7 @@ def refused(
     return capsys.readouterr().err
 
 
-def test_a_folder_with_a_run_is_replaced_only_where_asked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_a_folder_with_a_run_is_replaced_only_where_asked(tmp_path, monkeypatch, capsys):
     (tmp_path / "config.yaml").touch()
     word = f"++hydra.run.dir={tmp_path.parent}/../{tmp_path.parent.name}/{tmp_path.name}"
     assert "overwrite=true to replace it" in refused(monkeypatch, capsys, word)
@@ -546,9 +527,7 @@ def test_a_folder_with_a_run_is_replaced_only_where_asked(
     assert "overwrite" not in refused(monkeypatch, capsys, word, "overwrite=true")
 
 
-def test_a_folder_where_a_run_is_at_work_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_a_folder_where_a_run_is_at_work_is_refused(tmp_path, monkeypatch, capsys):
     fcntl = pytest.importorskip("fcntl", reason="this system has no such locks")
     handle = os.open(tmp_path, os.O_RDONLY)
     try:
@@ -561,9 +540,7 @@ def test_a_folder_where_a_run_is_at_work_is_refused(
 
 
 @pytest.mark.parametrize("below", ["", "/below"])
-def test_a_folder_that_is_a_file_is_one_message(
-    tmp_path: Path, below: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_a_folder_that_is_a_file_is_one_message(tmp_path, below: str, monkeypatch, capsys):
     (tmp_path / "file").touch()
     said = refused(monkeypatch, capsys, f"hydra.run.dir={tmp_path}/file{below}")
     assert "which cannot be written to" in said
