@@ -330,10 +330,7 @@ def commands(run: Path, values: Sequence[str]) -> Iterator[Case]:
     linear += "bla.coordinates frf.method noise"
     words = {
         "simulate": ([made, f"data.path={csv}", "out=y.csv"], SIMULATE.split()),
-        "export": (
-            [made, "to=c"],
-            EXPORT.split(),
-        ),
+        "export": ([made, "to=c"], EXPORT.split()),
         "evaluate": ([made, *given], ["checkpoint", "out", "overwrite", *data]),
         "linear": ([*given, "nx=1", "threads=1", "hydra.run.dir=r"], [*linear.split(), *data]),
         "preview": ([str(csv)], data),

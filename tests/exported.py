@@ -38,8 +38,7 @@ MODELS: dict[str, Model] = {
 
 OBSERVED: dict[str, Model] = {
     name: replace(
-        MODELS[name],
-        K=0.1 * normal(MODELS[name].lfr.cell.nx, len(MODELS[name].outputs), seed=2),
+        MODELS[name], K=0.1 * normal(MODELS[name].lfr.cell.nx, len(MODELS[name].outputs), seed=2)
     )
     for name in ("softplus", "polynomial", "linear", "canonical", "smallest")
 }

@@ -190,10 +190,8 @@ def starts() -> tuple[list[Model], list[Record], Record]:
     train = measure(truth, 120)
     models = [random_model(random_cell(1, 1, 2, 1, 1, 3, radius=0.6)) for _ in range(5)]
     for number, model in enumerate(models):
-        vector_to_parameters(
-            theta(model) * (1 + 0.2 * normal(len(theta(model)), seed=number)),
-            model.lfr.parameters(),
-        )
+        vector = theta(model) * (1 + 0.2 * normal(len(theta(model)), seed=number))
+        vector_to_parameters(vector, model.lfr.parameters())
     return models, [train], measure(truth, 60, seed=3)
 
 
@@ -251,9 +249,8 @@ def losing(ranks: Ranks) -> Any:
     model, train, validation = case()
     monitors = [Checkpoint("model", every=0.0)] if ranks.rank == 0 else []
     begin = time.monotonic()
-    result = fit(
-        model, train, validation, trainer=Dying(max_iter=50), monitors=monitors, ranks=ranks
-    )
+    options: Any = {"trainer": Dying(max_iter=50), "monitors": monitors, "ranks": ranks}
+    result = fit(model, train, validation, **options)
     seconds = time.monotonic() - begin
     try:
         ranks.sum(torch.ones(1))

@@ -34,12 +34,7 @@ CELL = re.compile(r"^```{code-cell}.*?$(.*?)^```$", re.MULTILINE | re.DOTALL)
 @pytest.mark.parametrize(
     "notebook", sorted((DOCS / "notebooks").glob("*.md")), ids=lambda p: p.stem
 )
-def test_notebook_fits_better_than_the_linear_model(
-    notebook: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-):
+def test_notebook_fits_better_than_the_linear_model(notebook: Path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     matplotlib.use("agg")
     cells = "".join(CELL.findall(notebook.read_text(encoding="utf-8")))

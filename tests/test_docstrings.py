@@ -77,9 +77,7 @@ def names() -> dict[str, Any]:
 
 @pytest.mark.numeric
 @pytest.mark.parametrize("name", SHOWN)
-def test_example_runs(
-    name: str, names: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_example_runs(name: str, names: dict[str, Any], tmp_path, monkeypatch):
     known = names | {"model": deepcopy(names["model"])}  # which a fit changes
     finder = doctest.DocTestFinder(recurse=False)
     tests = [test for test in finder.find(SHOWN[name], name, False, known) if test.examples]

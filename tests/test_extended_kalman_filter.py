@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 import scipy
 import torch
-from exported import (
-    MODELS,
-    cell_step,
-    inputs,
-    jacobians,
-    measured_with_gaps,
-    some_noise,
-)
+from exported import MODELS, cell_step, inputs, jacobians, measured_with_gaps, some_noise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import (

@@ -86,10 +86,8 @@ def test_the_job_scores_every_record_and_advises(dataset: Dataset):
 
 @pytest.mark.numeric
 def test_chosen_sizes_are_returned_and_what_was_asked_for_stays(dataset: Dataset):
-    asked = settings(
-        nx="auto", nx_max=2, nn="auto", starts=1, sizes_search=SizesSearch(nn=(1, 3), starts=1)
-    )
-    observer = Said()
+    search, observer = SizesSearch(nn=(1, 3), starts=1), Said()
+    asked = settings(nx="auto", nx_max=2, nn="auto", starts=1, sizes_search=search)
     run = identify(dataset, asked, observer=observer)
     assert (asked.nx, asked.nn) == ("auto", "auto")
     assert run.order_scan is not None
@@ -113,11 +111,8 @@ def test_chosen_sizes_are_returned_and_what_was_asked_for_stays(dataset: Dataset
 
 @pytest.mark.numeric
 def test_sizes_are_searched_as_far_as_short_records_carry():
-    rng = np.random.default_rng(0)
-    u, y = rng.standard_normal(120), np.zeros(120)
-    for k in range(119):
-        y[k + 1] = 0.7 * y[k] + np.tanh(u[k])
-    parts = [Record(u[p], y[p], skip=5) for p in (slice(72), slice(72, 120))]
+    whole = saturation("whole", 0, 120)
+    parts = [Record(whole.u[p], whole.y[p], skip=5) for p in (slice(72), slice(72, 120))]
     some = SizesSearch(nx=(3, 6), nz=(1,), nw=(1,), nn=(2,), finalists=1)  # 6 needs 84 samples
     asked = settings(nx="auto", nn="auto", sizes_search=some)
     k = np.arange(300)
@@ -209,9 +204,8 @@ def test_the_command_line_calls_the_same_function(tmp_path: Path):
     y = np.convolve(np.tanh(u), [0.0, 0.6, 0.3])[: len(u)]
     np.savez(tmp_path / "x.npz", u=u, y=y)
     words = ["data=file", f"data.path={tmp_path / 'x.npz'}", "data.inputs=[u]", "data.outputs=[y]"]
-    cfg = configuration(
-        *words, "data.fs=10", "nx=1", "starts=2", "trainer.max_iter=3", "refit=true"
-    )
+    words += ["data.fs=10", "nx=1", "starts=2", "trainer.max_iter=3", "refit=true"]
+    cfg = configuration(*words)
     fit.run(cfg, tmp_path)
     run = identify(config.loaded(cfg), config.configured(cfg))
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -220,9 +214,7 @@ def test_the_command_line_calls_the_same_function(tmp_path: Path):
 
 
 @pytest.mark.numeric
-def test_a_run_is_written_for_people_and_programs(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_run_is_written_for_people_and_programs(dataset: Dataset, tmp_path, monkeypatch):
     logged = []
     monkeypatch.setattr(plots, "_DPI", 40)
     monkeypatch.setattr(SummaryWriter, "add_scalar", lambda _, name, *__: logged.append(name))
@@ -236,12 +228,9 @@ def test_a_run_is_written_for_people_and_programs(
     for name in ("report.html", "figures/test.png", "figures/residuals.png"):
         assert (tmp_path / "run" / name).is_file()
     test = dataset.tests[0]
-    for saved in (
-        lfrtorch.load(tmp_path / "run"),
-        lfrtorch.LinearModel.load(tmp_path / "run" / "linear"),
-    ):
-        found = run.model if isinstance(saved, lfrtorch.Model) else run.linear
-        assert np.array_equal(saved.simulate(test), found.simulate(test))
+    saved = lfrtorch.load(tmp_path / "run"), lfrtorch.LinearModel.load(tmp_path / "run" / "linear")
+    for model, found in zip(saved, (run.model, run.linear), strict=True):
+        assert np.array_equal(model.simulate(test), found.simulate(test))
     write(run, tmp_path / "bare", draw=False)
     assert not (tmp_path / "bare" / "report.html").exists()
     (earlier,) = (tmp_path / "bare").glob("events.*")
@@ -256,12 +245,8 @@ def test_a_run_is_written_for_people_and_programs(
 def test_starts_that_are_kept_go_on(dataset: Dataset, tmp_path: Path):
     whole = identify(dataset, settings(starts=2))
     asked = iter([False] * 3)
-    cut = identify(
-        dataset,
-        settings(starts=2),
-        snapshots=Snapshots(tmp_path),
-        stop=lambda: next(asked, True),
-    )
+    kept = Snapshots(tmp_path)
+    cut = identify(dataset, settings(starts=2), snapshots=kept, stop=lambda: next(asked, True))
     assert cut.fit.reason == "interrupted"
     on = identify(dataset, settings(starts=2), snapshots=Snapshots(tmp_path))
     assert on.metrics["scores"] == whole.metrics["scores"]
@@ -313,13 +298,8 @@ def _periodic(periods: int) -> tuple[np.ndarray, np.ndarray]:
 def test_a_part_has_the_shortest_records():
     lengths = [400, 100, 400, 100, 100, 400]
     records = [saturation(str(i), i, samples) for i, samples in enumerate(lengths)]
-    chosen = {
-        part: [r.name for r in part_of(records, part)] for part in (0.07, 0.14, 0.2, 0.5, 0.8)
-    }
-    assert chosen == {
-        0.07: ["1"], 0.14: ["1", "3"], 0.2: ["1", "3", "4"], 0.5: ["1", "3", "4", "0"],
-        0.8: ["1", "3", "4", "0", "2"],
-    }  # fmt: skip
+    for part, names in ((0.07, "1"), (0.14, "13"), (0.2, "134"), (0.5, "1340"), (0.8, "13402")):
+        assert [r.name for r in part_of(records, part)] == list(names)
     short = part_of(records, 0.05)  # less than one record: of each that much beyond what it skips
     assert [r.samples for r in short] == [39, 24, 39, 24, 24, 39]
     assert all(np.array_equal(a.y, b.y[: a.samples]) for a, b in zip(short, records, strict=True))
@@ -365,28 +345,21 @@ def test_a_refit_is_scored_on_tests_and_validation_is_that_before(
 @pytest.mark.numeric
 def test_a_refit_that_is_interrupted_is_done_again(dataset: Dataset, tmp_path: Path):
     asked = iter([False] * (SHORT.limit + 2))
-    cut = identify(
-        dataset,
-        settings(refit=True),
-        snapshots=Snapshots(tmp_path),
-        stop=lambda: next(asked, True),
-    )
+    kept = Snapshots(tmp_path)
+    cut = identify(dataset, settings(refit=True), snapshots=kept, stop=lambda: next(asked, True))
     assert (cut.fit.reason, cut.fit.iterations, cut.refit) == ("interrupted", SHORT.limit, None)
     on = identify(dataset, settings(refit=True), snapshots=Snapshots(tmp_path))
     assert on.metrics["scores"] == identify(dataset, settings(refit=True)).metrics["scores"]
 
 
-def test_a_refit_that_cannot_help_leaves_the_model(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_a_refit_that_cannot_help_leaves_the_model(dataset: Dataset, monkeypatch, capsys):
     alone = Dataset("alone", dataset.train, [], dataset.tests)
     run = identify(alone, settings(refit=True), observer=Console())
     assert run.refit is None
     assert "note: refit: there are no validation records" in capsys.readouterr().out
     margins = iter([1.0, 2.0])
-    monkeypatch.setattr(
-        "lfrtorch.fitting.last_fits.largest_stable_amplitude", lambda *_: next(margins)
-    )
+    margin = "lfrtorch.fitting.last_fits.largest_stable_amplitude"
+    monkeypatch.setattr(margin, lambda *_: next(margins))
     run = identify(dataset, settings(refit=True), observer=Console())
     assert run.model is run.fit.model
     assert "unstable on louder inputs" in capsys.readouterr().out

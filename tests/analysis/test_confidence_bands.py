@@ -151,9 +151,7 @@ def test_an_estimated_start_moves_along(known: tuple[Model, Uncertainty]):
     assert np.median(band.std[25:] ** 2 / variance[25:]) < 100
 
 
-def test_bands_do_not_depend_on_blocks(
-    known: tuple[Model, Uncertainty], monkeypatch: pytest.MonkeyPatch
-):
+def test_bands_do_not_depend_on_blocks(known: tuple[Model, Uncertainty], monkeypatch):
     model, found = known
     record = measure(model, 100, seed=7, start="periodic")
     whole = found.simulate(record)

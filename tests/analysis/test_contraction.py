@@ -44,10 +44,8 @@ def differences(
     found = []
     for _ in range(10):
         u = model.scaler.u_offset + size * rng.uniform(-1.0, 1.0, (T, len(model.inputs)))
-        a, b = (
-            model.signals(u, start="given", x0=start * rng.normal(size=nx)).x[0].numpy()
-            for _ in range(2)
-        )
+        starts = [start * rng.normal(size=nx) for _ in range(2)]
+        a, b = (model.signals(u, start="given", x0=x0).x[0].numpy() for x0 in starts)
         assert contraction.P is not None
         found.append(np.sqrt(np.einsum("ti,ij,tj->t", a - b, contraction.P, a - b)))
     return np.array(found)

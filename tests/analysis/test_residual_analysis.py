@@ -69,13 +69,12 @@ SLOW = [1.0], [1.0, -0.98]
 INPUTS: dict[str, Callable[[np.random.Generator, int], Array]] = {
     "slow": lambda rng, T: signal.lfilter(*SLOW, rng.standard_normal(T)),
     "steps": lambda rng, T: np.repeat(rng.standard_normal(T // 50), 50),
-    "multisine": lambda rng, T: np.tile(
-        lfrtorch.multisine(T // 2, fs=1.0, band=(0.01, 0.15), seed=int(rng.integers(1 << 30))).u[
-            0, :, 0
-        ],
-        2,
-    ),
+    "multisine": lambda rng, T: np.tile(narrow(T // 2, int(rng.integers(1 << 30))), 2),
 }
+
+
+def narrow(T: int, seed: int) -> Array:
+    return lfrtorch.multisine(T, fs=1.0, band=(0.01, 0.15), seed=seed).u[0, :, 0]
 
 
 @pytest.mark.parametrize("kind", INPUTS)
@@ -138,9 +137,8 @@ def test_what_a_model_left_out_is_found_and_said():
     odd = planted(lambda u: u**3)
     assert odd.p["odd"] < 1e-6
     assert "an odd nonlinearity" in odd.verdict
-    slow = residuals_of(
-        odd.error.cumsum(), 0 * odd.error, np.random.default_rng(3).normal(size=3000)
-    )
+    u = np.random.default_rng(3).normal(size=3000)
+    slow = residuals_of(odd.error.cumsum(), 0 * odd.error, u)
     assert slow.verdict.startswith("not white: ")
     assert slow.verdict.endswith("independent of the inputs")
 
@@ -191,10 +189,8 @@ def test_each_record_and_output_of_either_model_has_its_row():
 def test_of_many_rows_the_worst_are_printed():
     rng = np.random.default_rng(0)
     u, y = rng.standard_normal((2, 100))
-    found = Residuals(
-        tuple(residuals_of(y, (1 - k / 100) * y, u, name=f"r{k}") for k in range(1, 31))
-    )
-    lines = str(found).splitlines()
+    parts = (residuals_of(y, (1 - k / 100) * y, u, name=f"r{k}") for k in range(1, 31))
+    lines = str(Residuals(tuple(parts))).splitlines()
     assert [line.split()[0] for line in lines[2:26]] == [f"r{k}" for k in range(7, 31)]
     assert "6 more of a better fit." in lines
 
@@ -263,10 +259,9 @@ def test_lags_are_those_asked_for_and_units_have_prefixes():
 def test_units_do_not_change_what_is_found():
     rng = np.random.default_rng(0)
     u, y = rng.standard_normal((2, 300, 1))
-    one, other = (
-        of_simulation(Record(a * u, b * y, fs=1.0), 0.5 * b * y + 0.1 * b * np.roll(u, 1, axis=0))[
-            0
-        ]
+    y_hat = 0.5 * y + 0.1 * np.roll(u, 1, axis=0)
+    ((one,), (other,)) = (
+        of_simulation(Record(a * u, b * y, fs=1.0), b * y_hat)
         for a, b in ((1.0, 1.0), (2.0**320, 2.0**-320))
     )
     for name in ("linear", "even", "odd"):

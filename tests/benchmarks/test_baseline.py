@@ -49,12 +49,8 @@ def test_only_a_whole_interval_beyond_the_limit_fails(
 def test_checkout_is_as_fast_as_itself():
     case = "Bouc-Wen, simulation"
     script = ROOT / "benchmarks" / "baseline.py"
-    run = subprocess.run(
-        [sys.executable, script, ROOT, "--pairs", "12", "--case", case],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, script, ROOT, "--pairs", "12", "--case", case]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert "Traceback" not in run.stderr
     (row,) = re.findall(rf"\| {case} \| .*", run.stdout)
     assert 0.5 < float(row.split("|")[4]) < 2  # the load of the machine may change
@@ -64,8 +60,7 @@ def test_checkout_is_as_fast_as_itself():
 
 def test_another_folder_than_a_checkout_is_refused(tmp_path: Path):
     script = ROOT / "benchmarks" / "baseline.py"
-    run = subprocess.run(
-        [sys.executable, script, tmp_path], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, script, tmp_path]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 2
     assert "no checkout of lfrtorch" in run.stderr

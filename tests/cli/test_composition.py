@@ -27,11 +27,7 @@ FILE = ["data=file", "data.path=x.csv"]
         ("config", [*FILE, "zzzz=1"], "no setting 'zzzz'; --help lists them all."),
         ("config", ["data.path=x.csv"], "add data=file, or +bench=NAME"),
         ("config", [*FILE, "data.inputs=a,b"], "for a list write data.inputs=[a,b], for a run"),
-        (
-            "config",
-            [*FILE, "nx=1,2"],
-            "nx=1,2 has several values: for a run of each of them add -m",
-        ),
+        ("config", [*FILE, "nx=1,2"], "nx=1,2 has several values: for a run of each of them add"),
         ("config", ["static=poly"], "no static=poly; give network, own, polynomial."),
         ("config", ["data=-1"], "no data=-1; give boucwen, "),
         ("config", ["static={a: 1}"], "no static={'a': 1}; give network, "),

@@ -36,12 +36,8 @@ def settings(**given: object) -> DictConfig:
 
 
 def written(folder: Path, command: str = "lfrtorch fit nn=2 seed=0", reason: str = "converged"):
-    metrics = {
-        "command": command,
-        "fit": {"reason": reason},
-        "validation": {"rmse": 0.5},
-        "ranking": [{"train": 0.1}],
-    }
+    metrics: dict[str, Any] = {"command": command, "fit": {"reason": reason}}
+    metrics |= {"validation": {"rmse": 0.5}, "ranking": [{"train": 0.1}]}
     (folder / "metrics.json").write_text(json.dumps(metrics))
 
 
@@ -158,12 +154,7 @@ def test_processes_that_are_killed_are_replaced(capsys: pytest.CaptureFixture[st
 
 @pytest.mark.numeric
 @pytest.mark.usefixtures("untraced")
-def test_runs_follow_each_other(
-    csv: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-):
+def test_runs_follow_each_other(csv, tmp_path, monkeypatch, capfd):
     words = ["-m", *file_overrides(csv), *SHORT, "nn=2,0", f"hydra.sweep.dir={tmp_path}"]
     with pytest.raises(SystemExit):
         launched(monkeypatch, *words)
@@ -236,9 +227,7 @@ def test_tasks_of_ray_keep_what_they_found_if_the_study_is_ended(
     assert (begun[0].parents[1] / "model").is_dir()
 
 
-def test_a_study_whose_runs_failed_says_so_also_if_they_cannot_be_compared(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_study_whose_runs_failed_says_so_also_if_they_cannot_be_compared(tmp_path, capsys):
     for name, file in (("nn=2", "metrics.json"), ("nn=3", study.FAILED)):
         (tmp_path / name / ".hydra").mkdir(parents=True)
         (tmp_path / name / ".hydra" / "overrides.yaml").write_text("[]")

@@ -218,12 +218,8 @@ def test_several_training_realisations(simulated, short_sweep):
 
 def test_tests_are_labelled(simulated):
     multisine, sweep = simulated.tests
-    assert (multisine.name, multisine.source, multisine.start) == (
-        "multisine",
-        "simulated",
-        "periodic",
-    )
-    assert (sweep.name, sweep.source, sweep.start) == ("sweep", "simulated", "zero")
+    said = [(record.name, record.source, record.start) for record in simulated.tests]
+    assert said == [("multisine", "simulated", "periodic"), ("sweep", "simulated", "zero")]
     assert (multisine.skip, sweep.skip) == (0, 2000)
     assert (multisine.samples, sweep.samples) == (PERIOD, SWEEP)
     u = boucwen.multisine(seed=2000)

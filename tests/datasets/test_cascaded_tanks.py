@@ -27,10 +27,8 @@ def numbered(tmp_path):
 def test_official_split(numbered):
     data = cascaded_tanks.load(root=numbered, validation=0.25, first=768)
     (train,), (validation,), (test,) = data.train, data.validation, data.tests
-    assert (data.name, [r.name for r in (train, validation, test)]) == (
-        "cascaded_tanks",
-        ["train", "validation", "test"],
-    )
+    assert data.name == "cascaded_tanks"
+    assert [r.name for r in (train, validation, test)] == ["train", "validation", "test"]
     assert scored(train) == (1, 768)
     assert scored(validation) == (769, 1024)
     assert scored(test) == (2051, 3024)

@@ -34,13 +34,7 @@ def test_split(numbered):
     assert scored(arrow) == (151, 40_575)
     assert scored(inside) == (151, 32_100)
     assert int(train.u[0, 0]) == 40_651
-    assert [r.skip for r in (train, validation, multisine, arrow, inside)] == [
-        500,
-        500,
-        550,
-        50,
-        50,
-    ]
+    assert [r.skip for r in (train, validation, *data.tests)] == [500, 500, 550, 50, 50]
     for record in (train, validation, *data.tests):
         assert np.array_equal(record.y, -record.u)
         assert (record.start, record.source) == ("zero", "official")

@@ -31,9 +31,7 @@ def test_estimated_initial_state_is_the_one_that_made_the_output():
     assert_close(found.y, made.y, rtol=0, atol=1e-9)
 
 
-def test_a_linear_model_is_not_simulated_from_states_that_cannot_be_better(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_a_linear_model_is_not_simulated_from_states_that_cannot_be_better(monkeypatch):
     cell, u = random_cell(1, 1, 2, 0, 0), normal(1, 60, 1)
     y = simulate(cell, u, normal(1, 2, seed=1)).y + 0.1 * normal(1, 60, 1, seed=2)
     tried = []
@@ -47,9 +45,7 @@ def test_a_linear_model_is_not_simulated_from_states_that_cannot_be_better(
 
 
 @pytest.mark.parametrize("counted", [20, 3000])
-def test_no_sample_is_looked_at_that_does_not_tell_the_initial_state(
-    counted: int, monkeypatch: pytest.MonkeyPatch
-):
+def test_no_sample_is_looked_at_that_does_not_tell_the_initial_state(counted: int, monkeypatch):
     """Those after the last weight, and those after the transition has faded."""
     cell, u = random_cell(1, 1, 2, 1, 1, 3, radius=0.5), normal(1, 3000, 1)
     y = simulate(cell, u, normal(1, 2, seed=1)).y

@@ -40,12 +40,9 @@ def test_gradients_are_those_of_finite_differences(start: Start, step: float, to
         return lfr(u, start=start)
 
     assert gradcheck(y, (u, *lfr.parameters()), eps=step, atol=tolerance, rtol=tolerance)
-
-
-def test_gradient_of_the_start_state_is_that_of_finite_differences():
-    lfr = small()
-    u, x0 = normal(2, 4, 2).requires_grad_(), normal(2, 2, seed=1).requires_grad_()
-    assert gradcheck(lfr, (u, x0), eps=1e-5, atol=1e-8, rtol=1e-8)
+    if start == "zero":
+        x0 = normal(2, 2, seed=1).requires_grad_()
+        assert gradcheck(lfr, (u, x0), eps=step, atol=tolerance, rtol=tolerance)
 
 
 @pytest.mark.parametrize("start", STARTS)
@@ -227,7 +224,5 @@ def test_a_model_of_a_dtype_without_kernels_is_refused():
 def test_a_weight_that_was_put_in_with_another_shape_is_refused():
     lfr = small()
     lfr.cell.Bu = torch.nn.Parameter(normal(2, 1))
-    with pytest.raises(
-        ValueError, match=r"Bu has the shape \(2, 1\); with nu=2, .* it is \(2, 2\)"
-    ):
+    with pytest.raises(ValueError, match=r"Bu has the shape \(2, 1\); with nu=2, .* is \(2, 2\)"):
         lfr(normal(1, 5, 2))

@@ -301,9 +301,7 @@ def test_model_that_stays_at_an_unstable_rest_counts_as_diverged():
 
 
 @pytest.mark.parametrize(("radius", "nw", "most"), [(1.0001, 0, 5), (1.01, 1, 8), (1.1, 1, 6)])
-def test_few_passes_tell_that_a_model_diverges(
-    radius: float, nw: int, most: int, monkeypatch: pytest.MonkeyPatch
-):
+def test_few_passes_tell_that_a_model_diverges(radius: float, nw: int, most: int, monkeypatch):
     passes = []
 
     def counted(*arguments: Any) -> Trajectory:

@@ -60,10 +60,8 @@ def test_observers_are_those_of_the_model(name: str, kind: str, tmp_path: Path):
     model, (u, y) = OBSERVED[name], measured_with_gaps(OBSERVED[name], 40)
     noise, nx = some_noise(model), model.lfr.cell.nx
     if kind == "ekf":
-        expected, paths = (
-            model.observer(noise=noise),
-            write(model, "casadi", tmp_path, observer=noise),
-        )
+        expected = model.observer(noise=noise)
+        paths = write(model, "casadi", tmp_path, observer=noise)
     else:
         expected, paths = model.observer(), write(model, "casadi", tmp_path, observer=True)
     assert [path.name for path in paths[2:]] == ["model_predict.casadi", "model_update.casadi"]
@@ -136,8 +134,6 @@ def test_channels_name_the_symbols():
 
 def test_a_missing_package_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(
-        InputError, match=r"casadi is not installed: pip install 'lfrtorch\[casadi\]'"
-    ):
+    with pytest.raises(InputError, match=r"casadi is not installed: pip install"):
         write(MODELS["linear"], "casadi", tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,6 @@ import pytest
 from exported import MODELS, check_output, check_rest, check_run, check_step, inputs, jacobians
 
 from lfrtorch.export import control_system, python_source, write
-from lfrtorch.model import Model
 from lfrtorch.records import Channel
 
 control = pytest.importorskip(
@@ -69,13 +68,10 @@ def test_the_file_stands_alone(tmp_path: Path):
     """It is imported without lfrtorch, and odd channel names are no code."""
     model = MODELS["smallest"]
     odd = (Channel('a.b"""\n', "'°"),)
-    (path,) = write(
-        Model(model.lfr, model.scaler, model.fs, odd, model.outputs), "control", tmp_path, name="it"
-    )
+    (path,) = write(replace(model, inputs=odd), "control", tmp_path, name="it")
     code = "import sys, it; s = it.system(); print(s.input_labels, 'lfrtorch' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=path.parent, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=path.parent, capture_output=True, text=True, check=False)
     assert done.stderr == ""
     assert done.stdout == '[\'a_b"""\\n\'] False\n'
 

@@ -140,9 +140,7 @@ def test_metadata_say_what_the_numbers_are():
 
 
 @pytest.mark.numeric
-def test_the_simulation_of_the_guide_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_the_simulation_of_the_guide_runs(tmp_path, monkeypatch, capsys):
     write(MODELS["smallest"], "onnx", tmp_path, name="engine")
     monkeypatch.chdir(tmp_path)
     guide = Path(__file__).resolve().parents[2] / "docs" / "guide" / "export.md"

@@ -260,9 +260,6 @@ def test_blanks_and_line_ends(tmp_path, newline):
 def test_header_in_a_comment(tmp_path, mark):
     content = f"{mark}made by a program\n{mark}u1,u2,y\n" + text()
     assert names(table_of(tmp_path, content)) == ["u1", "u2", "y"]
-
-
-def test_as_numpy_writes_a_table(tmp_path):
     np.savetxt(tmp_path / "a.txt", SIGNALS, header="u1 u2 y", fmt="%.17g")
     table = open_table(tmp_path / "a.txt")
     assert names(table) == ["u1", "u2", "y"]
@@ -339,6 +336,7 @@ def test_lines_count_comments_and_blanks(tmp_path):
         ("t,u,y\n2024-01-01,2,3\nnoon,2,3\n", "line 3: 'noon' in column 't' is not a date-time"),
         ("t,u,y\n2024-02-29,2,3\n2024-02-30,2,3\n", "line 3: '2024-02-30' in column 't' is not a"),
         ("u,v,y\n1,2,3\n１,2,3\n", "line 3: '１' in column 'u' is not a number"),
+        (b"\x89PNG\r\n\xff\x00\x00\x01" * 20, "is not text"),
     ],
 )
 def test_refused_text(tmp_path, content, match):
@@ -350,11 +348,6 @@ def test_a_bad_cell_late_in_the_file(tmp_path):
     table = table_of(tmp_path, "u,y\n" + "1,2\n" * 2500 + "1,x\n")
     with pytest.raises(ValueError, match="line 2502: 'x' in column 'y'"):
         list(table.blocks([1], samples=1000))
-
-
-def test_binary_is_no_text(tmp_path):
-    with pytest.raises(ValueError, match="is not text"):
-        table_of(tmp_path, b"\x89PNG\r\n\xff\x00\x00\x01" * 20)
 
 
 @pytest.mark.parametrize("mark", ["\x0b", "\x0c", "\x1c", "\x85", "\u2028"])
@@ -419,10 +412,6 @@ def test_npy(tmp_path):
     table = open_table(tmp_path / "rig.npy")
     assert names(table) == ["rig1", "rig2"]
     assert np.array_equal(whole(table, "rig"), U.astype(np.float32))
-
-
-@pytest.mark.numeric
-def test_npz_under_the_name_of_npy(tmp_path):
     np.savez(tmp_path / "a.npz", u=U)
     (tmp_path / "a.npz").rename(tmp_path / "a.npy")
     with pytest.raises(ValueError, match=r"a\.npy' holds several arrays; give it the extension"):
@@ -550,6 +539,7 @@ def test_packed_numbers_of_hdf5(tmp_path):
 def test_hdf5(tmp_path, name):
     with h5py.File(tmp_path / name, "w") as file:
         file["u"], file["y"] = U, Y
+        file["u"].attrs["units"] = np.bytes_(b"\xff")  # no text
         file["wide/u"] = U.T
         file["pairs"] = np.zeros(T, [("a", float), ("b", float)])
         file["words"] = ["a", "b"]
@@ -633,15 +623,11 @@ def test_the_length_of_a_vector_tells_the_axis_of_time(tmp_path):
 def test_lone_numbers_that_say_the_rate(tmp_path, name, value, fs):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["y"], file[name] = Y, value
-    assert open_table(tmp_path / "a.h5").rates == ({} if fs is None else {name: fs})
-
-
-def test_the_rate_as_an_attribute_of_hdf5(tmp_path):
-    with h5py.File(tmp_path / "a.h5", "w") as file:
         file["run/y"] = Y
-        file["run"].attrs["fs"] = 750
+        file["run"].attrs["fs"] = 75
         file.attrs["author"] = "me"
-    assert open_table(tmp_path / "a.h5").rates == {"run/fs": 750.0}
+    found = {"run/fs": 75.0} | ({} if fs is None else {name: fs})
+    assert open_table(tmp_path / "a.h5").rates == found
 
 
 def test_arrays_of_different_lengths(tmp_path):
@@ -800,16 +786,13 @@ def test_hdf5_opens_no_other_file_and_no_circle(tmp_path, matlab):
         refused(table, name, reason)
 
 
-def test_a_name_that_two_arrays_have(tmp_path):
+def test_arrays_that_cannot_be(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         for name in ("u", "u.npy"):
             with archive.open(name, "w") as stream:
                 np.lib.format.write_array(stream, U)
     with pytest.raises(ValueError, match="it has 'u' twice"):
         open_table(tmp_path / "a.npz")
-
-
-def test_a_matlab_array_of_negative_size(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"u": U})
     content = (tmp_path / "a.mat").read_bytes()
     shape = np.array(U.shape, "<i4").tobytes()
@@ -817,13 +800,6 @@ def test_a_matlab_array_of_negative_size(tmp_path):
     (tmp_path / "a.mat").write_bytes(content.replace(shape, fewer, 1))
     with pytest.raises(ValueError, match="an array of negative size"):
         open_table(tmp_path / "a.mat")
-
-
-def test_a_unit_that_is_no_text(tmp_path):
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["u"] = U[:, 0]
-        file["u"].attrs["units"] = np.bytes_(b"\xff")
-    assert names(open_table(tmp_path / "a.h5")) == ["u"]
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.mat", "a.h5", "a.parquet", "a.xlsx"])
@@ -853,15 +829,13 @@ def test_damaged_files(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    ("name", "package"),
-    [("a.h5", "h5py"), ("a.parquet", "pyarrow"), ("a.xlsx", "openpyxl")],
+    ("name", "package"), [("a.h5", "h5py"), ("a.parquet", "pyarrow"), ("a.xlsx", "openpyxl")]
 )
 def test_optional_packages(tmp_path, monkeypatch, name, package):
     (tmp_path / name).write_bytes(b"something")
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(
-        ValueError, match=rf"{package} is not installed: pip install 'lfrtorch\[files\]'"
-    ):
+    missing = rf"{package} is not installed: pip install 'lfrtorch\[files\]'"
+    with pytest.raises(ValueError, match=missing):
         open_table(tmp_path / name)
 
 
@@ -887,12 +861,8 @@ def test_refused_paths(tmp_path):
         open_table(tmp_path / "notes.pdf")
     with pytest.raises(ValueError, match=r"save it as \.xlsx"):
         open_table(tmp_path / "book.xls")
-    for name, match in (
-        (f"{'n' * 300}.csv", r"is no path \(File name too long\)"),
-        ("~nobody-of-that-name/a.csv", "is no path"),
-        ("a\0.csv", "is no path"),
-    ):
-        with pytest.raises(ValueError, match=match):
+    for name in (f"{'n' * 300}.csv", "~nobody-of-that-name/a.csv", "a\0.csv"):
+        with pytest.raises(ValueError, match=r"is no path \("):
             open_table(name)
     (tmp_path / "circle.csv").symlink_to(tmp_path / "circle.csv")
     with pytest.raises(FileNotFoundError, match=r"no file '.*circle\.csv'"):
@@ -916,6 +886,8 @@ def test_find(tmp_path):
     refused(table, -1, "no column number -1")
     for nothing in ([], None, [1.5], True, [True]):
         refused(table, nothing, r"inputs is .*give inputs=\[...\], names of columns.*'v'")
+    np.savez(tmp_path / "a.npz", fs=3.0)
+    refused(open_table(tmp_path / "a.npz"), "u", r"no columns of numbers \('fs' has one number")
 
 
 def test_a_name_that_is_nearly_right(tmp_path):
@@ -924,13 +896,6 @@ def test_a_name_that_is_nearly_right(tmp_path):
     refused(table, "positon", r"Did you mean 'position'\?$")
     refused(table, "voltage", r"'w'\.$")
     table = table_of(tmp_path, "force [N],rig.Level (mm)\n1,2\n1,2\n")
-    refused(
-        table, "forse", r"it has 2 column\(s\): 'force', 'rig\.Level'\. Did you mean 'force'\?$"
-    )
+    refused(table, "forse", r"has 2 column\(s\): 'force', 'rig\.Level'\. Did you mean 'force'\?$")
     refused(table, "Force", r"Did you mean 'force'\?$")
     refused(table, "level", r"Did you mean 'rig\.Level'\?$")
-
-
-def test_no_columns(tmp_path):
-    np.savez(tmp_path / "a.npz", fs=3.0)
-    refused(open_table(tmp_path / "a.npz"), "u", r"no columns of numbers \('fs' has one number")

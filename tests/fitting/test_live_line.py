@@ -141,9 +141,7 @@ def test_a_fit_shows_its_line_on_a_terminal_alone(
 
 
 @pytest.mark.numeric
-def test_an_identification_shows_one_line_unless_somebody_else_looks_on(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_an_identification_shows_one_line_unless_somebody_else_looks_on(monkeypatch):
     data = lfrtorch.Dataset("tanh", [RECORD], [], [])
     settings = lfrtorch.Settings(nx=1, nz=1, nw=1, nn=2, trainer=ONE)
     for observer, lines in ((None, 1), (lfrtorch.Observer(), 0)):
@@ -161,9 +159,7 @@ def test_an_error_ends_the_line(monkeypatch: pytest.MonkeyPatch):
     assert stream.screen() == ["sizes: ...", ""]
 
 
-def test_a_notebook_keeps_the_last_text_alone(
-    bla: lfrtorch.LinearModel, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_notebook_keeps_the_last_text_alone(bla: lfrtorch.LinearModel, monkeypatch):
     display = pytest.importorskip("IPython.display")
     shown: list[str] = []
 

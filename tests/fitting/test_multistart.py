@@ -171,9 +171,8 @@ def test_selection_chooses_among_starts_and_not_among_iterates():
     errors = [start.selection for start in result.starts]
     assert errors == sorted(errors)
     alone = fit(several(4)[0], train, selection=selection, **options)
-    assert alone.starts[0].selection == pytest.approx(
-        rmse(selection, alone.model.simulate(selection)), rel=1e-6
-    )
+    error = rmse(selection, alone.model.simulate(selection))
+    assert alone.starts[0].selection == pytest.approx(error, rel=1e-6)
     by_validation = fit(several(4)[0], train, validation, **options)
     assert all(math.isnan(start.selection) for start in by_validation.starts)
 
@@ -260,6 +259,13 @@ def test_a_failure_ends_all():
         fit(models, train, validation, monitors=[[fail]] * 3)
 
 
+def test_mean_is_of_the_starts_that_there_are():
+    models, train, _ = several(2)
+    optimiser = LevenbergMarquardt(max_iter=1)
+    assert fit(models, train, average=8, trainer=optimiser).averaged == 2
+    assert fit(models[:1], train, average=8, trainer=optimiser).model is models[0]
+
+
 def test_bad_calls_are_refused():
     models, train, _ = several(2)
     with pytest.raises(ValueError, match="no model to start from"):
@@ -271,6 +277,11 @@ def test_bad_calls_are_refused():
         fit(twice, train)
     with pytest.raises(ValueError, match=r"2 models and 1 lists"):
         fit(models, train, monitors=[[]])
+    with pytest.raises(ValueError, match="average is 0"):
+        fit(models, train, average=0)
+    models[1].lfr.cell.static = Polynomial(1, 1, 3, dtype=torch.float64)
+    with pytest.raises(ValueError, match="average is 2, and the mean is of models with a network"):
+        fit(models, train, average=2, trainer=Adam(max_iter=10**9))
 
 
 @pytest.mark.parametrize("judged_on", ["validation", "selection"])
@@ -299,9 +310,8 @@ def test_mean_of_more_starts_is_taken_if_it_is_as_good():
     stay = LevenbergMarquardt(max_iter=0)
     result = fit(models, train, validation, trainer=stay, average=3)
     assert result.averaged == 3
-    assert rmse(validation, result.model.simulate(validation)) > min(
-        start.validation for start in result.starts
-    )
+    best = min(start.validation for start in result.starts)
+    assert rmse(validation, result.model.simulate(validation)) > best
 
 
 def test_mean_of_starts_is_not_taken_if_one_is_better():
@@ -342,19 +352,3 @@ def test_mean_of_starts_is_taken_where_nothing_tells():
     result = fit(models, train, trainer=optimiser, average=3)
     assert result.averaged == 3
     assert result.model.lfr.cell.nx == 3 * models[0].lfr.cell.nx
-
-
-def test_mean_is_of_the_starts_that_there_are():
-    models, train, _ = several(2)
-    optimiser = LevenbergMarquardt(max_iter=1)
-    assert fit(models, train, average=8, trainer=optimiser).averaged == 2
-    assert fit(models[:1], train, average=8, trainer=optimiser).model is models[0]
-    with pytest.raises(ValueError, match="average is 0"):
-        fit(models, train, average=0)
-
-
-def test_mean_of_other_maps_is_refused_before_the_fit():
-    models, train, _ = several(2)
-    models[1].lfr.cell.static = Polynomial(1, 1, 3, dtype=torch.float64)
-    with pytest.raises(ValueError, match="average is 2, and the mean is of models with a network"):
-        fit(models, train, average=2, trainer=Adam(max_iter=10**9))

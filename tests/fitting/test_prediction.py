@@ -38,10 +38,8 @@ def noisy(T: int, *, level: float = 0.1, seed: int = 0) -> tuple[Model, Record, 
             y_hat, x = cell(now, x)
             y[k] = y_hat.numpy()[0] + e[k]
             x = x + torch.as_tensor(e[k]) @ model.K.mT
-    record = Record(
-        u, s.restore_y(y), fs=model.fs, inputs=model.inputs, outputs=model.outputs, name="noisy"
-    )
-    return model, record, e * s.y_scale
+    channels: dict[str, Any] = {"inputs": model.inputs, "outputs": model.outputs}
+    return model, Record(u, s.restore_y(y), model.fs, name="noisy", **channels), e * s.y_scale
 
 
 def test_a_prediction_leaves_the_innovations():
@@ -97,9 +95,8 @@ def test_a_fit_finds_the_innovations_and_the_past_outputs_stay_out_of_z():
     model = result.model
     least = rms(e[1100:])
     assert lfrtorch.rmse(test, model.predict(test)) < 1.1 * least
-    assert result.history[-1].train == pytest.approx(
-        lfrtorch.rmse(train, seen[-1].predict(train)), rel=1e-9
-    )
+    last = lfrtorch.rmse(train, seen[-1].predict(train))
+    assert result.history[-1].train == pytest.approx(last, rel=1e-9)
     predictor = model.predictor().lfr.cell
     assert not predictor.Dzu[:, 2:].any()
     assert not predictor.Dyu[:, 2:].any()
@@ -169,9 +166,8 @@ def test_the_derivatives_of_both_errors_are_those_of_differences(start: Start):
     theta = problem.theta + 0.01 * normal(len(free)) * free
     d_theta, h = normal(len(free), seed=1) * free, 1e-5
     r, jacobian = problem.residual(theta), problem.linearise(theta)
-    differences = (
-        problem.residual(theta + h * d_theta) - problem.residual(theta - h * d_theta)
-    ) / (2 * h)
+    ahead, back = problem.residual(theta + h * d_theta), problem.residual(theta - h * d_theta)
+    differences = (ahead - back) / (2 * h)
     error = (jacobian.tangent(d_theta) - differences).norm() / differences.norm()
     assert float(error) < 1e-6
     _, gradient = jacobian.system(1e-8, 1e-12)

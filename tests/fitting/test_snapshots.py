@@ -3,7 +3,7 @@
 import copy
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -193,17 +193,19 @@ def test_several_starts_end_as_without_interruption(tmp_path: Path):
         assert outcome(resumed) == outcome(whole)
 
 
+def stop_after(count: int) -> Callable[[], bool]:
+    """Asks to stop from the call of that number on."""
+    calls = itertools.count()
+    return lambda: next(calls) >= count
+
+
 def test_a_start_that_had_not_begun_takes_part_after_that(tmp_path: Path):
     data, optimiser = records(["zero"], "zero"), LevenbergMarquardt(max_iter=8)
     whole = run(starts(3), data, trainer=optimiser)
     for after in range(2, 9):
-        folder, calls = tmp_path / str(after), itertools.count()
+        folder = tmp_path / str(after)
         folder.mkdir()
-
-        def stop(calls: Iterator[int] = calls, after: int = after) -> bool:
-            return next(calls) >= after
-
-        cut = run(starts(3), data, folder, trainer=optimiser, own_stop=stop)
+        cut = run(starts(3), data, folder, trainer=optimiser, own_stop=stop_after(after))
         assert cut.reason == Reason.INTERRUPTED
         assert outcome(run(starts(3), data, folder, trainer=optimiser)) == outcome(whole)
 
@@ -213,13 +215,9 @@ def test_a_fit_is_cut_short_if_a_start_beside_the_best_is(tmp_path: Path):
     whole = run(starts(3), data, trainer=optimiser)
     ends = 0
     for after in range(9, 16):
-        folder, calls = tmp_path / str(after), itertools.count()
+        folder = tmp_path / str(after)
         folder.mkdir()
-
-        def stop(calls: Iterator[int] = calls, after: int = after) -> bool:
-            return next(calls) >= after
-
-        cut = run(starts(3), data, folder, trainer=optimiser, own_stop=stop)
+        cut = run(starts(3), data, folder, trainer=optimiser, own_stop=stop_after(after))
         if cut.reason != Reason.INTERRUPTED:
             assert outcome(cut) == outcome(whole)
             break
@@ -238,9 +236,7 @@ def test_more_iterations_than_were_asked_for(tmp_path: Path):
     assert outcome(resumed)[0] == outcome(whole)[0]
 
 
-def test_a_step_that_was_taken_back_is_taken_back_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_step_that_was_taken_back_is_taken_back_again(tmp_path, monkeypatch):
     """The state after a refusal is not that of the last iterate."""
     monkeypatch.setattr(trainer, "EXPLOSION", 0.0)
     train, validation = records()
@@ -275,10 +271,7 @@ def test_the_best_score_of_all(tmp_path: Path):
     assert Snapshots(tmp_path).least == Snapshots().least == float("inf")
     result = run(starts(3), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=2))
     assert Snapshots(tmp_path).least == min(p.score for p in result.history)
-
-
-def test_a_file_that_a_kill_left_half_written_is_no_start(tmp_path: Path):
-    result = run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=2))
+    # What a kill left half written is no start.
     (tmp_path / f"{TEMPORARY}0.safetensors").write_bytes(b"half")
     (tmp_path / ".0-half.safetensors").write_bytes(b"as an older version named it")
     assert Snapshots(tmp_path).least == min(p.score for p in result.history)
@@ -320,41 +313,29 @@ def test_processes_forget_the_periodic_orbits_of_the_first(tmp_path: Path):
 
 
 def test_the_first_process_alone_writes_files(tmp_path: Path):
-    result = fit(
-        starts(3),
-        *records(),
-        trainer=LevenbergMarquardt(max_iter=2),
-        snapshots=Snapshots(tmp_path, 0.0, writes=False),
-    )
-    assert result.iterations == 2
+    snapshots = Snapshots(tmp_path, 0.0, writes=False)
+    options: Any = {"trainer": LevenbergMarquardt(max_iter=2), "snapshots": snapshots}
+    assert fit(starts(3), *records(), **options).iterations == 2
     assert list(tmp_path.iterdir()) == []
 
 
 # --- what cannot go on ----------------------------------------------------------------------
 
 
-def test_another_number_of_starts(tmp_path: Path):
-    run(starts(2), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
-    with pytest.raises(ValueError, match=r"has 2 start\(s\), and now there are 3"):
-        run(starts(3), records(), tmp_path)
-
-
-def test_another_start(tmp_path: Path):
-    run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
-    with pytest.raises(ValueError, match="began elsewhere"):
-        run(starts(2)[1:], records(), tmp_path)
-
-
-def test_fewer_iterations_than_it_has_had(tmp_path: Path):
-    run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=3))
-    with pytest.raises(ValueError, match="has had 3 iterations, more than the 2 asked for"):
-        run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=2))
-
-
-def test_another_optimiser(tmp_path: Path):
-    run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
-    with pytest.raises(ValueError, match="another trainer than Adam"):
-        run(starts(1), records(), tmp_path, trainer=Adam(max_iter=3))
+@pytest.mark.parametrize(
+    ("before", "now", "trainer", "message"),
+    [
+        (starts(2), starts(3), LevenbergMarquardt(), r"has 2 start\(s\), and now there are 3"),
+        (starts(1), starts(2)[1:], LevenbergMarquardt(), "began elsewhere"),
+        (starts(1), starts(1), LevenbergMarquardt(max_iter=1), "has had 2 iterations, more than "),
+        (starts(1), starts(1), Adam(max_iter=3), "another trainer than Adam"),
+    ],
+)
+def test_another_fit_does_not_go_on(tmp_path: Path, before, now, trainer: Any, message: str):
+    data = records(["zero"], "zero")
+    run(before, data, tmp_path, trainer=LevenbergMarquardt(max_iter=2))
+    with pytest.raises(ValueError, match=message):
+        run(now, data, tmp_path, trainer=trainer)
 
 
 @pytest.mark.parametrize("name", ["0.safetensors", "rounds.json"])

@@ -74,25 +74,25 @@ def network(model: Model) -> Network:
     return model.lfr.cell.static
 
 
+def check_simulations(model: Model, bla: LinearModel, records: list[Record]) -> None:
+    """Equal but for rounding in other units and coordinates, and the periodic start.
+
+    That is eps κ, κ of some hundred.
+    """
+    for record in records:
+        expected = bla.simulate(record)
+        tolerance = (1e-11 if record.start == "zero" else 1e-9) * np.abs(expected).max()
+        np.testing.assert_allclose(model.simulate(record), expected, rtol=0, atol=tolerance)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_start_is_the_linear_model(bla: LinearModel, method):
     model = initialise(bla, RECORDS, **SIZES, method=method)
-    for record in (*RECORDS, RECORDS[0][50:120]):
-        expected = bla.simulate(record)
-        # Equal but for rounding in other units and coordinates (eps κ, κ of some hundred), and the
-        # periodic start.
-        tolerance = 1e-11 if record.start == "zero" else 1e-9
-        np.testing.assert_allclose(
-            model.simulate(record), expected, rtol=0, atol=tolerance * np.abs(expected).max()
-        )
+    check_simulations(model, bla, [*RECORDS, RECORDS[0][50:120]])
     assert (model.fs, model.inputs, model.outputs) == (bla.fs, bla.inputs, bla.outputs)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_poles_are_those_of_the_linear_model(bla: LinearModel, method):
-    A = initialise(bla, RECORDS, **SIZES, method=method).lfr.cell.A.detach().numpy()
     # eps κ of the change of coordinates, some hundred
-    np.testing.assert_allclose(np.poly(A), np.poly(bla.A), rtol=0, atol=1e-11)
+    poles = np.poly(model.lfr.cell.A.detach().numpy())
+    np.testing.assert_allclose(poles, np.poly(bla.A), rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -124,8 +124,8 @@ def test_weights_of_the_paper(bla: LinearModel):
     assert not static.bw.any()
 
 
-def test_weights_of_the_zero_output(bla: LinearModel):
-    model = initialise(bla, RECORDS, **SIZES, method="zero_output")
+def test_weights_of_the_zero_output_which_is_the_default(bla: LinearModel):
+    model = initialise(bla, RECORDS, **SIZES)
     cell, static = model.lfr.cell, network(model)
     assert not static.Ww.any()
     assert not static.bw.any()
@@ -135,10 +135,6 @@ def test_weights_of_the_zero_output(bla: LinearModel):
     for weight in (static.Wz, static.bz):
         assert weight.all()
         assert weight.abs().max() <= 1
-
-
-def test_zero_output_is_the_default(bla: LinearModel):
-    assert not network(initialise(bla, RECORDS, **SIZES)).Ww.any()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -161,16 +157,21 @@ def test_options_reach_the_model(bla: LinearModel):
     assert {p.dtype for p in model.lfr.parameters()} == {torch.float32}
 
 
-@pytest.mark.parametrize("size", ["nz", "nw", "nn"])
-def test_size_below_one(bla: LinearModel, size: str):
-    options: dict[str, Any] = SIZES | {size: 0}
-    with pytest.raises(ValueError, match=f"{size} is 0; give a whole number of at least 1"):
-        initialise(bla, RECORDS, **options)
-
-
-def test_unknown_method(bla: LinearModel):
-    with pytest.raises(ValueError, match="method is 'random'; give 'zero_output' or 'paper'"):
-        initialise(bla, RECORDS, **SIZES, method="random")  # pyright: ignore[reportArgumentType]
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        *(({size: 0}, f"{size} is 0; give a whole number of at le") for size in ("nz", "nw", "nn")),
+        ({"nn": None}, "nn is None; give a whole number of at least 1"),  # and no map
+        ({"method": "random"}, "method is 'random'; give 'zero_output' or 'paper'"),
+        *(
+            ({"dtype": dtype}, "dtype is .*; give torch.float64 or torch.float32")
+            for dtype in (torch.int64, torch.float16, "float64")
+        ),
+    ],
+)
+def test_what_makes_no_model_is_refused(bla: LinearModel, changed: dict[str, Any], message: str):
+    with pytest.raises(ValueError, match=message):
+        initialise(bla, RECORDS, **SIZES | changed)
 
 
 # --- a static map of the caller's -----------------------------------------------------------
@@ -185,12 +186,7 @@ def test_start_with_a_given_map_is_the_linear_model(bla: LinearModel, name: str,
     cell = model.lfr.cell
     assert type(cell.static) is type(static)
     assert {p.dtype for p in model.lfr.parameters()} == {torch.float64}
-    for record in RECORDS:
-        expected = bla.simulate(record)
-        tolerance = 1e-11 if record.start == "zero" else 1e-9
-        np.testing.assert_allclose(
-            model.simulate(record), expected, rtol=0, atol=tolerance * np.abs(expected).max()
-        )
+    check_simulations(model, bla, RECORDS)
     # What makes w vanish may move: the map's own output weights, or else Bw and Dyw.
     cleared = {"network": {"Ww", "bw"}, "polynomial": {"C"}, "own": set()}[name]
     cleared = cleared if method == "zero_output" else set()
@@ -227,17 +223,6 @@ def test_given_map_changes_nothing_else(bla: LinearModel):
 def test_given_map_of_other_sizes(bla: LinearModel, static: nn.Module):
     with pytest.raises(ValueError, match=r"with nz=2 and nw=3 it must give w of shape \(1, 2, 3\)"):
         initialise(bla, RECORDS, nz=2, nw=3, static=static)
-
-
-def test_neither_neurons_nor_a_map(bla: LinearModel):
-    with pytest.raises(ValueError, match="nn is None; give a whole number of at least 1"):
-        initialise(bla, RECORDS, nz=2, nw=3)
-
-
-@pytest.mark.parametrize("dtype", [torch.int64, torch.float16, "float64"])
-def test_numbers_that_a_model_does_not_compute_with(bla: LinearModel, dtype: Any):
-    with pytest.raises(ValueError, match=r"dtype is .*; give torch.float64 or torch.float32"):
-        initialise(bla, RECORDS, nz=2, nw=3, nn=4, dtype=dtype)
 
 
 # --- a nonlinearity at one end --------------------------------------------------------------

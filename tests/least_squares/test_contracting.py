@@ -34,10 +34,7 @@ def held(sizes: dict[str, Any]) -> tuple[BoundedSystem, MarginBound, int]:
     return found, found.bounds, len(theta)
 
 
-@pytest.mark.parametrize(
-    "sizes",
-    [{}, {"nz": 2, "nw": 2, "nn": 6}, {"nz": 3, "nw": 3, "nn": 4}],
-)
+@pytest.mark.parametrize("sizes", [{}, {"nz": 2, "nw": 2, "nn": 6}, {"nz": 3, "nw": 3, "nn": 4}])
 def test_the_slope_is_that_of_the_margin(sizes: dict[str, Any]):
     _, bound, size = held(sizes)
     step = 1e-5 * normal(size, seed=3)

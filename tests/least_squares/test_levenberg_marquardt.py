@@ -11,11 +11,7 @@ from reference import DenseJacobian, normal
 from torch import Tensor
 from torch.func import jacrev
 
-from lfrtorch.least_squares.levenberg_marquardt import (
-    LeastSquares,
-    LevenbergMarquardt,
-    LMState,
-)
+from lfrtorch.least_squares.levenberg_marquardt import LeastSquares, LevenbergMarquardt, LMState
 
 pytestmark = pytest.mark.numeric
 
@@ -147,17 +143,13 @@ def test_linear_problem_is_solved_in_one_step(acceleration: bool):
     assert (state.rank, state.trials) == (4, 1)
 
 
-def test_linear_problem_gains_what_is_predicted_at_any_damping():
+def test_damping_falls_to_a_fifth_where_the_model_is_exact():
+    """What is gained is what is predicted, at any damping."""
     J, b = normal(30, 4), normal(30, seed=1)
     problem = Problem(lambda x: J @ x - b)
     optimiser = LevenbergMarquardt(damping=1.0)
     state = optimiser.step(problem, optimiser.init(problem, torch.zeros(4, dtype=J.dtype)))
     assert state.gain_ratio == pytest.approx(1.0, abs=1e-9)
-
-
-def test_damping_falls_to_a_fifth_where_the_model_is_exact():
-    J, b = normal(30, 4), normal(30, seed=1)
-    problem = Problem(lambda x: J @ x - b)
     optimiser = LevenbergMarquardt(damping=1e-3, least_damping=1e-3)
     first = optimiser.step(problem, optimiser.init(problem, torch.zeros(4, dtype=J.dtype)))
     start = 1e-3 * float(torch.linalg.svdvals(J)[0]) ** 2

@@ -64,10 +64,6 @@ def test_residual_is_the_error_of_all_scored_samples(model: Model):
     # The order of the records is the problem's own, and samples that do not count are zero.
     mine, theirs = np.sort(r[r != 0].numpy()), np.sort(np.concatenate(expected).ravel())
     np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-9)
-
-
-def test_rmse_is_that_of_the_metrics(model: Model):
-    records = some_records(model)
     for record in records:
         problem = Problem.of(model, record)
         score = problem.rmse(problem.theta)
@@ -90,9 +86,8 @@ def test_samples_that_are_not_valid_have_no_error(model: Model):
     (group, _) = problem.errors.groups
     expected = ((model.simulate(zero) - zero.y) / model.scaler.y_scale)[kept[0]]
     assert np.count_nonzero(r[: group.y.numel()]) == len(expected)
-    np.testing.assert_allclose(
-        np.sort(r[: group.y.numel()][r[: group.y.numel()] != 0].numpy()), np.sort(expected)
-    )
+    mine = r[: group.y.numel()]
+    np.testing.assert_allclose(np.sort(mine[mine != 0].numpy()), np.sort(expected))
     alone = Problem.of(model, records[0])
     score = rmse(records[0], model.simulate(records[0]))
     assert alone.rmse(alone.theta) == pytest.approx(score, rel=1e-9)
@@ -163,9 +158,8 @@ def test_weights_multiply_the_squared_errors(model: Model):
     theta = plain.theta + 0.1
     squares = plain.residual(theta).reshape(-1, 2).square().sum(0)
     weighted = Problem.of(model, replace(record, weight=[0.5, 3.0]))
-    assert weighted.cost(weighted.residual(theta)) == pytest.approx(
-        float(0.5 * squares[0] + 3.0 * squares[1]), rel=1e-9
-    )
+    expected = float(0.5 * squares[0] + 3.0 * squares[1])
+    assert weighted.cost(weighted.residual(theta)) == pytest.approx(expected, rel=1e-9)
     assert weighted.rmse(theta) == pytest.approx(plain.rmse(theta), rel=1e-12)
 
 
@@ -252,13 +246,8 @@ def test_start_state_is_fitted_with_the_parameters(model: Model):
     solved = Problem.judge(model, [whole, later])
     assert len(solved.theta) == model.parameter_count
     assert solved.rmse(solved.theta) < 1e-8
-
-
-def test_given_start_state(model: Model):
-    whole = measure(model, 200)
-    state = model.signals(whole).x[0, 50].numpy()
-    problem = Problem.of(model, replace(whole[50:], start="given", x0=state))
-    assert problem.rmse(problem.theta) < 1e-9
+    given = Problem.of(model, replace(whole[50:], start="given", x0=states[50].numpy()))
+    assert given.rmse(given.theta) < 1e-9
 
 
 def test_ridge_by_group_is_of_its_parameters_only(model: Model):
@@ -275,14 +264,14 @@ def test_ridge_of_an_unknown_group(model: Model):
         Problem.of(model, some_records(model), ridge={"B": 1.0})
     with pytest.raises(ValueError, match=r"ridge of 'A' is -1; give"):
         Problem.of(model, some_records(model), ridge={"A": -1})
+    for ridge in (-1.0, float("nan")):
+        with pytest.raises(ValueError, match=r"ridge is .*; give a number of at least 0"):
+            Problem.of(model, some_records(model), ridge=ridge)
 
 
 def test_penalty_is_no_part_of_the_score(model: Model):
     records = some_records(model)
-    plain, ridged = (
-        Problem.of(model, records),
-        Problem.of(model, records, ridge=4.0),
-    )
+    plain, ridged = Problem.of(model, records), Problem.of(model, records, ridge=4.0)
     theta = plain.theta + 0.1
     r, longer = plain.residual(theta), ridged.residual(theta)
     assert_close(longer[: len(r)], r, rtol=0, atol=1e-9)
@@ -317,12 +306,6 @@ def test_divergence_is_a_residual_that_is_not_finite(model: Model):
     assert torch.isfinite(problem.residual(theta)).all()
 
 
-@pytest.mark.parametrize("ridge", [-1.0, float("nan")])
-def test_negative_ridge(model: Model, ridge: float):
-    with pytest.raises(ValueError, match=r"ridge is .*; give a number of at least 0"):
-        Problem.of(model, some_records(model), ridge=ridge)
-
-
 @pytest.mark.parametrize(
     ("nu", "ny", "fs", "message"),
     [(1, 2, 100.0, "input"), (2, 1, 100.0, "output"), (2, 2, 50.0, "50")],
@@ -331,6 +314,9 @@ def test_records_that_are_not_the_model_s(model: Model, nu: int, ny: int, fs: fl
     record = Record(np.ones((20, nu)), np.ones((20, ny)), fs, name="lab")
     with pytest.raises(ValueError, match=f"(?s)lab.*{message}"):
         Problem.of(model, record)
+    started = replace(some_records(model)[0], start="given", x0=[1.0])
+    with pytest.raises(ValueError, match=r"x0 of 1 entries and the model 2 states"):
+        Problem.of(model, started)
 
 
 def test_integrator_in_steady_state_ends_the_search_with_a_reason():
@@ -384,12 +370,6 @@ def test_an_output_without_weight_is_scored_all_the_same(model: Model):
     problem = Problem.of(model, off)
     expected = np.sqrt(np.mean(model.scaler.y_scale**2))
     assert problem.rmse(problem.theta) == pytest.approx(expected, rel=1e-9)
-
-
-def test_start_state_of_the_wrong_length(model: Model):
-    record = replace(some_records(model)[0], start="given", x0=[1.0])
-    with pytest.raises(ValueError, match=r"x0 of 1 entries and the model 2 states"):
-        Problem.of(model, record)
 
 
 def test_nothing_to_fit(model: Model):
@@ -474,9 +454,8 @@ def test_fixed_entries_have_columns_of_zeros(
     theta = Problem.of(model, records).theta + 0.1
     plain = Problem.of(model, records, ridge=ridge).jacobian(theta)
     problem = Problem.of(model, records, ridge=ridge)
-    held = torch.cat(
-        [some_fixed(model), torch.zeros(4 * 2, dtype=torch.bool)]
-    )  # start states follow
+    # Start states follow.
+    held = torch.cat([some_fixed(model), torch.zeros(4 * 2, dtype=torch.bool)])
     problem.fixed = held
     r, J = problem.residual(theta), problem.jacobian(theta)
     assert torch.equal(J[:, held], torch.zeros_like(J[:, held]))

@@ -210,11 +210,8 @@ def test_constant_signals_are_named():
 
 def test_record_that_is_too_short():
     u = some_input(35)[:, 0]  # 2 · 2 (nx + 1) (nu + ny + 1) = 36
-    refused(
-        "the longest of 1 record(s) has 35 samples; order nx=2 with 1 input(s) and 1 output(s) "
-        "needs one of 36, or many shorter ones",
-        Record(u, u),
-    )
+    refused("(s) has 35 samples; order nx=2 with 1 input(s) and 1 output(s) needs", Record(u, u))
+    refused(" needs one of 36, or many shorter ones", Record(u, u))
     u = some_input(36)[:, 0]
     assert np.abs(estimate_bla(Record(u, u), 2).poles).max() < 1
 
@@ -227,13 +224,6 @@ def test_many_short_records_do():
         records.append(Record(u, reference.dlsim(system, u)))
     assert frf_error(estimate_bla(records, 2, offset=False), system) < 1e-8
     refused("the longest of 2 record(s) has 13 samples", [r[:13] for r in records[:2]])
-
-
-@pytest.mark.parametrize("nx", [0, -1])
-def test_order(nx: int):
-    refused(
-        f"nx is {nx}; give a whole number of at least 1", record_of(random_system(1), "zero"), nx
-    )
 
 
 @pytest.mark.parametrize("start", ["estimated", "given"])
@@ -489,9 +479,8 @@ def test_error_of_periodic_records_is_that_of_their_deviations():
 
 def test_search_that_was_cut_short_says_so():
     record = record_of(random_system(4), "periodic", noise=0.5)
-    assert "stopped after 1 iterations: use estimate_bla(max_iter=2)" in notes_of(
-        record, 3, max_iter=1
-    )
+    notes = notes_of(record, 3, max_iter=1)
+    assert "stopped after 1 iterations: use estimate_bla(max_iter=2)" in notes
     assert "stopped" not in notes_of(record, 3, max_iter=0)
 
 
@@ -540,15 +529,14 @@ def test_fewer_lines_than_unknowns():
     N = 64
     u = np.cos(2 * np.pi * np.arange(N) * 5 / N) + np.cos(2 * np.pi * np.arange(N) * 9 / N)
     record = Record(u, np.roll(u, 1), start="periodic")
-    refused(
-        "2 excited line(s) make 4 equations; order nx=2 with 1 input(s) and 1 output(s) has 5 "
-        "unknowns: excite more lines, or lower nx.",
-        record,
-    )
+    refused("2 excited line(s) make 4 equations; order nx=2 with 1 input(s) and 1 output", record)
+    refused("has 5 unknowns: excite more lines, or lower nx.", record)
 
 
 def test_error_and_data_must_go_together():
     record = record_of(random_system(1), "periodic")
+    for nx in (0, -1):
+        refused(f"nx is {nx}; give a whole number of at least 1", record, nx)
     refused("refine is 'output'; give 'simulation', 'prediction'", record, refine="output")
     refused("weight is that of a response: use refine='frequency'.", record, weight="noise")
     with pytest.raises(ValueError, match="refine is 'simulation', an error of records"):

@@ -46,9 +46,8 @@ def fake(monkeypatch: pytest.MonkeyPatch, models: Sequence[LinearModel]):
 
 
 def model_of(nx: int, rmse: float, nu: int = 1, ny: int = 1) -> LinearModel:
-    inputs, outputs = (
-        tuple(Channel(f"{s}{i}") for i in range(n)) for s, n in (("u", nu), ("y", ny))
-    )
+    sizes = ("u", nu), ("y", ny)
+    inputs, outputs = (tuple(Channel(f"{s}{i}") for i in range(n)) for s, n in sizes)
     fit = LinearFit("simulation", rmse, 1, "converged", 0.0, (), ())
     matrices = random_system(nx, nu, ny)
     return LinearModel(*matrices, 10.0, np.zeros(nu), np.zeros(ny), inputs, outputs, fit=fit)
@@ -142,10 +141,8 @@ def test_description_length_counts_parameters_and_equations(monkeypatch):
     fake(monkeypatch, [model_of(3, 0.25, 2, 3)])
     p = 3 * (2 + 3) + 2 * 3  # an order has nx (nu + ny) beside its coordinates
     noise = np.random.default_rng(0).normal(size=(100, 5))
-    records = [
-        Record(noise[:, :2], noise[:, 2:], 10.0, skip=10),
-        Record(noise[:70, :2], noise[:70, 2:], 10.0),
-    ]
+    u, y = noise[:, :2], noise[:, 2:]
+    records = [Record(u, y, 10.0, skip=10), Record(u[:70], y[:70], 10.0)]
     M = (90 + 70) * 3
     expected = 0.25 * M ** (p / (2 * M))
     assert scan_orders(records, [3]).scores[0] == pytest.approx(expected, rel=1e-12)
@@ -153,8 +150,8 @@ def test_description_length_counts_parameters_and_equations(monkeypatch):
     more = p + 2 * 3  # a state of each record
     expected = 0.25 * M ** (more / (2 * M))
     assert scan_orders(free, [3]).scores[0] == pytest.approx(expected, rel=1e-12)
-    lines = estimate_frf(Record(noise[:, :2], noise[:, 2:], 10.0))
-    apart = estimate_frf(Record(noise[:, :2], noise[:, 2:], 10.0), lines=[12, 37])
+    lines = estimate_frf(Record(u, y, 10.0))
+    apart = estimate_frf(Record(u, y, 10.0), lines=[12, 37])
     for frf, least, most in ((lines, 4, 8), (apart, 1, 1)):
         M = 2 * len(frf.frequencies) * 3 * 2  # real and imaginary part of every entry
         at = [0.25 * (M / s) ** (p * s / (2 * M)) for s in (most, least)]

@@ -35,8 +35,8 @@ def test_noise_is_what_differs_between_periods():
     # 1500 degrees of freedom: 2 %; 4 σ.
     assert found[0] == pytest.approx(0.1, rel=0.08)
     assert found[1] < 1e-12
-    assert noise_of_periods([Record(u, y)]) is None
-    assert noise_of_periods([Record(u[:500], y[:500], start="periodic")]) is None
+    for record in (Record(u, y), Record(u[:500], y[:500], start="periodic")):
+        assert noise_of_periods([record]) is None
 
 
 def with_output(response: Response, y_hat: np.ndarray) -> Response:
@@ -64,9 +64,8 @@ def fitted() -> tuple[FitResult, list[Response]]:
         RestartSummary(1, 20, 1.5, np.nan, np.nan, "converged"),
         RestartSummary(2, 2, 1.2, np.nan, np.nan, Reason.OTHERS_BETTER),
     )
-    result = FitResult(
-        model, history([4.0, 2.0, 1.0]), 2, 1.0, 1.0, "maximum number of iterations", starts
-    )
+    reason = "maximum number of iterations"
+    result = FitResult(model, history([4.0, 2.0, 1.0]), 2, 1.0, 1.0, reason, starts)
     responses = [
         Response(r, use, {"linear": bla.simulate(r), "NL-LFR": model.simulate(r)})
         for r, use in ((train, "train"), (test, "test"))
@@ -90,9 +89,8 @@ def test_evidence_is_measured_on_the_records(fitted):
     assert found.falling == 1.0 - 0.25**0.1  # of two iterations: a tenth of them, at their pace
     assert list(found.starts) == [1.0, 1.5]
     assert found.started == 3
-    larger = replace(
-        result, model=lfrtorch.initialise(bla, responses[0].record, nz=1, nw=1, nn=2, relaxations=2)
-    )
+    relaxed = lfrtorch.initialise(bla, responses[0].record, nz=1, nw=1, nn=2, relaxations=2)
+    larger = replace(result, model=relaxed)
     assert evidence(larger, responses, bla=bla).sizes["nx"] == 1  # what a user gives
     assert set(found.outputs) == {"a", "b"}
     offset = result.model.scaler.u_offset
@@ -128,16 +126,12 @@ def test_the_history_says_whether_validation_rose_while_training_fell(fitted):
     result, _ = fitted
 
     def told(train: list[float], validation: list[float], chosen: int) -> tuple[float, float]:
-        entries = [
-            replace(progress, validation=v)
-            for progress, v in zip(history(train), validation, strict=True)
-        ]
+        pairs = zip(history(train), validation, strict=True)
+        entries = [replace(progress, validation=v) for progress, v in pairs]
         return after_kept(replace(result, history=entries, chosen_iteration=chosen))
 
-    falls, rises = (
-        [1.0 / (k + 1) for k in range(12)],
-        [2.0, 1.0, *(1.1 + 0.1 * k for k in range(10))],
-    )
+    falls = [1.0 / (k + 1) for k in range(12)]
+    rises = [2.0, 1.0, *(1.1 + 0.1 * k for k in range(10))]
     assert told(falls, rises, 1) == (pytest.approx(1.55), pytest.approx(1 / 6))
     assert told(falls, [*rises[:-1], np.nan], 1)[0] == pytest.approx(1.55)
     assert told(falls, falls, 11) == (1.0, 1.0)
@@ -181,11 +175,9 @@ WHITE = np.random.default_rng(7).standard_normal((2000, 1))
 def test_a_filtered_input_in_the_error_asks_for_states_and_white_noise_does_not(resonance):
     filtered = 0.1 * scipy.signal.lfilter([0.3], [1.0, -0.95], system()[0], axis=0)
     said = "The linear part is incomplete"
-    assert said in told(
-        resonance, ("train", filtered, filtered), ("validation", filtered, filtered)
-    )
-    for error in (0.1 * WHITE, 0.1 * system()[1] ** 2):
-        assert said not in told(resonance, ("train", error, error), ("validation", error, error))
+    for error, is_said in ((filtered, True), (0.1 * WHITE, False), (0.1 * system()[1] ** 2, False)):
+        parts = [(use, error, error) for use in ("train", "validation")]
+        assert (said in told(resonance, *parts)) is is_said
 
 
 def test_squares_in_the_error_ask_for_a_larger_map_and_white_noise_does_not(resonance):
@@ -215,9 +207,8 @@ def test_what_differs_between_periods_is_noise_if_it_is_steady(noisy: bool, reso
     # An error that is as large as the differences would have it.
     size = np.sqrt(np.mean(np.diff(record.y.reshape(2, 1000), axis=0) ** 2) / 2)
     y_hat = y if noisy else record.y + size * WHITE
-    found = evidence(
-        result, [Response(record, "train", {"linear": 0.0 * y, "NL-LFR": y_hat})], bla=bla
-    )
+    seen = Response(record, "train", {"linear": 0.0 * y, "NL-LFR": y_hat})
+    found = evidence(result, [seen], bla=bla)
     assert (advice.at_the_noise(found) is not None) is noisy
 
 

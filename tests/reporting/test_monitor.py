@@ -15,10 +15,7 @@ import lfrtorch
 from lfrtorch.fitting.trainer import Progress
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import plots
-from lfrtorch.reporting.monitor import (
-    Checkpoint,
-    TensorBoard,
-)
+from lfrtorch.reporting.monitor import Checkpoint, TensorBoard
 
 U = np.random.default_rng(0).standard_normal(100)
 RECORD = Record(U, np.tanh(U), 10.0, outputs=(Channel("y", "m"),))
@@ -50,9 +47,7 @@ def test_tensorboard_without_a_record_has_scalars_alone(model: lfrtorch.Model, t
 
 
 @pytest.mark.numeric
-def test_tensorboard_holds_scalars_figures_and_texts(
-    model: lfrtorch.Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_tensorboard_holds_scalars_figures_and_texts(model: lfrtorch.Model, tmp_path, monkeypatch):
     monkeypatch.setattr(plots, "_DPI", 40)
     board = TensorBoard(tmp_path, RECORD, 0.5 * RECORD.y, every=2)
     for iteration in range(3):
@@ -109,9 +104,7 @@ def test_iterations_that_are_done_again_are_shown_once(
     assert [e.step for e in events(tmp_path).Scalars("rmse/train")] == list(range(8))
 
 
-def test_checkpoint_holds_the_best_so_far_when_it_is_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_checkpoint_holds_the_best_so_far_when_it_is_time(tmp_path, monkeypatch):
     clock = {"now": 0.0}
     monkeypatch.setattr("lfrtorch.reporting.monitor.monotonic", lambda: clock["now"])
     bla = lfrtorch.estimate_bla(RECORD, nx=1)

@@ -79,11 +79,8 @@ def test_response_overlays_the_scored_samples_with_the_errors_below():
 def test_small_signals_have_axes_with_a_prefix():
     record = Record(T, 1e-6 * Y, 100.0, outputs=(Channel("a", "m"), Channel("b", "kg")))
     above, below, other, _ = plots.response(record, both(0.9e-6 * Y)).axes
-    assert (above.get_ylabel(), below.get_ylabel(), other.get_ylabel()) == (
-        "a (µm)",
-        "error (nm)",
-        "b (kg)",
-    )
+    said = [ax.get_ylabel() for ax in (above, below, other)]
+    assert said == ["a (µm)", "error (nm)", "b (kg)"]
     assert below.yaxis.get_major_formatter()(50e-9) == "50"
 
 

@@ -60,9 +60,8 @@ def evaluated(
 def test_starts_are_ranked_in_files_and_in_a_table(result):
     _, bla, data = result
     models = [lfrtorch.initialise(bla, data.train, nz=1, nw=1, nn=3, seed=seed) for seed in SEEDS]
-    fitted = lfrtorch.fit(
-        models, data.train, data.validation, trainer=lfrtorch.LevenbergMarquardt(max_iter=4)
-    )
+    trainer = lfrtorch.LevenbergMarquardt(max_iter=4)
+    fitted = lfrtorch.fit(models, data.train, data.validation, trainer=trainer)
     metrics = report.metrics(fitted, evaluated(fitted, bla, data), seeds=SEEDS)
     assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
     assert metrics["starts"] == 3

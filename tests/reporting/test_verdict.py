@@ -142,18 +142,8 @@ def test_a_failed_search_is_no_model():
 @pytest.mark.parametrize(
     ("ahead", "simulated", "kind", "said"),
     [
-        (
-            0.78,
-            0.69,
-            "better",
-            "error 10 ahead is 78.0 % of the linear model's, 97.0 % one",
-        ),
-        (
-            0.97,
-            0.69,
-            "better",
-            "simulation error is 69.0 % of the linear model's, 97.0 % one ahead.",
-        ),
+        (0.78, 0.69, "better", "error 10 ahead is 78.0 % of the linear model's, 97.0 % one"),
+        (0.97, 0.69, "better", "simulation error is 69.0 % of the linear model's, 97.0 % one"),
         (0.97, 0.97, "linear", "use the linear model"),
         (0.78, 1.50, "linear", "use the linear model"),
         (0.78, np.inf, "linear", "use the linear model"),

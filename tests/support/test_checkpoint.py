@@ -67,10 +67,17 @@ def refused(folder: Path, message: str):
 
 @pytest.mark.numeric
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("activation", ["tanh", "relu"])
-def test_the_same_bits_come_back(tmp_path: Path, activation: str, dtype: torch.dtype):
-    model = small(activation=activation, dtype=dtype)
+@pytest.mark.parametrize("kind", ["tanh", "relu", "polynomial", "linear"])
+def test_the_same_bits_come_back(tmp_path: Path, kind: str, dtype: torch.dtype):
+    if kind == "linear":
+        model = random_model(random_cell(2, 2, 3, 0, 0, dtype=dtype))
+    elif kind == "polynomial":
+        model = small(static=Polynomial(2, 1, 3), dtype=dtype)
+        model.lfr.cell.get_parameter("static.C").detach().mul_(0.1)
+    else:
+        model = small(activation=kind, dtype=dtype)
     back = load(model.save(tmp_path / "saved"))
+    assert repr(back.lfr) == repr(model.lfr)
     mine, other = model.lfr.state_dict(), back.lfr.state_dict()
     assert mine.keys() == other.keys()
     assert all(torch.equal(mine[name], other[name]) for name in mine)
@@ -81,26 +88,8 @@ def test_the_same_bits_come_back(tmp_path: Path, activation: str, dtype: torch.d
     assert isinstance(back.outputs[0], Channel)
     for start in ("zero", "periodic"):
         assert np.array_equal(model.simulate(U, start=start), back.simulate(U, start=start))
-
-
-@pytest.mark.numeric
-def test_linear_model_comes_back(tmp_path: Path):
-    model = random_model(random_cell(2, 1, 3, 0, 0))
-    back = load(model.save(tmp_path / "saved"))
-    assert back.lfr.cell.static is None
-    assert np.array_equal(model.simulate(U), back.simulate(U))
-
-
-@pytest.mark.numeric
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_polynomial_comes_back(tmp_path: Path, dtype: torch.dtype):
-    model = small(static=Polynomial(2, 1, 3), dtype=dtype)
-    model.lfr.cell.get_parameter("static.C").detach().mul_(0.1)
-    back = load(model.save(tmp_path / "saved"))
-    assert repr(back.lfr) == repr(model.lfr)
-    assert {p.dtype for p in back.lfr.parameters()} == {dtype}
-    assert np.array_equal(model.simulate(U), back.simulate(U))
     assert np.isfinite(model.simulate(U)).all()
+    assert (back.lfr.cell.static is None) == (kind == "linear")
 
 
 def test_the_folder_of_a_run_and_a_string_will_do(tmp_path: Path):
@@ -117,25 +106,15 @@ def test_the_folder_of_a_run_and_a_string_will_do(tmp_path: Path):
 def test_own_map_is_filled_with_the_saved_weights(tmp_path: Path):
     model = small(static=Cubic())
     folder = model.save(tmp_path / "saved")
-    back = load(folder, static=Cubic().double())
-    assert np.array_equal(back.simulate(U), model.simulate(U))
+    for static in (Cubic().double(), Cubic()):  # built in torch's single precision
+        assert np.array_equal(load(folder, static=static).simulate(U), model.simulate(U))
 
 
-def test_own_map_is_asked_for(tmp_path: Path):
+def test_own_map_is_asked_for_and_must_fit(tmp_path: Path):
     folder = small(static=Cubic()).save(tmp_path / "saved")
     refused(folder, "class Cubic, which is not part of this package; pass an instance of it: load(")
-
-
-def test_own_map_that_does_not_fit(tmp_path: Path):
-    folder = small(static=Cubic()).save(tmp_path / "saved")
     with pytest.raises(ValueError, match="its description and weights do not fit"):
         load(folder, static=nn.Linear(2, 1))
-
-
-def test_own_map_keeps_its_double_precision(tmp_path: Path):
-    model = small(static=Cubic())
-    back = load(model.save(tmp_path / "saved"), static=Cubic())  # built in torch's single precision
-    assert np.array_equal(back.simulate(U), model.simulate(U))
 
 
 def test_own_class_derived_from_the_network_is_not_the_network(tmp_path: Path):
@@ -163,18 +142,20 @@ def test_no_checkpoint(tmp_path: Path):
     refused(tmp_path, "is not a checkpoint")
 
 
+DAMAGED = b"", b'{"format": "lfrt', b"\xff\xfe\x00", b"{]", b"[" * 100_000, b"9" * 5000
+OTHERS = b"[]", b"null", b"{}", b'{"format": "other", "version": 1}'
+
+
 @pytest.mark.parametrize(
-    "text", [b"", b'{"format": "lfrt', b"\xff\xfe\x00", b"{]", b"[" * 100_000, b"9" * 5000]
+    ("text", "message"),
+    [
+        *((text, "is damaged") for text in DAMAGED),
+        *((text, "was not written by lfrtorch") for text in OTHERS),
+    ],
 )
-def test_damaged_description(saved: Path, text: bytes):
+def test_damaged_description_and_that_of_another_program(saved: Path, text: bytes, message: str):
     (saved / "model.json").write_bytes(text)
-    refused(saved, "is damaged")
-
-
-@pytest.mark.parametrize("text", ["[]", "null", "{}", '{"format": "other", "version": 1}'])
-def test_description_of_another_program(saved: Path, text: str):
-    (saved / "model.json").write_text(text)
-    refused(saved, "was not written by lfrtorch")
+    refused(saved, message)
 
 
 def test_newer_version_and_none(saved: Path):
@@ -233,6 +214,8 @@ def test_truncated_weights(saved: Path, kept: float):
     whole = file.read_bytes()
     file.write_bytes(whole[: int(kept if kept > 1 else kept * len(whole))])
     refused(saved, "is damaged or missing")
+    file.unlink()
+    refused(saved, "is damaged or missing")
 
 
 @pytest.mark.parametrize("at", [-1, -100, -500])
@@ -266,11 +249,6 @@ def test_the_covariance_of_the_states_comes_back_and_was_1_before(tmp_path: Path
 def test_a_file_that_no_memory_holds(saved: Path, name: str):
     os.truncate(saved / name, 10**13)
     refused(saved, "it takes 10 TB of memory")
-
-
-def test_missing_weights(saved: Path):
-    (saved / "weights.safetensors").unlink()
-    refused(saved, "is damaged or missing")
 
 
 def test_scales_of_another_model(saved: Path):
@@ -323,45 +301,35 @@ class Trap:
 @pytest.fixture
 def trap(tmp_path: Path) -> Path:
     """Files that run code when they are unpickled: trap.pkl and the zip archive trap.pt."""
-    sprung = tmp_path / "sprung"
-    (tmp_path / "trap.pkl").write_bytes(pickle.dumps(Trap(sprung)))
-    torch.save(Trap(sprung), tmp_path / "trap.pt")
+    folder = tmp_path / "traps"
+    folder.mkdir()
+    sprung = folder / "sprung"
+    (folder / "trap.pkl").write_bytes(pickle.dumps(Trap(sprung)))
+    torch.save(Trap(sprung), folder / "trap.pt")
     with pytest.raises(FileNotFoundError):  # so the trap works, where its folder is
         pickle.loads(pickle.dumps(Trap(sprung / "deeper")))
     return sprung
 
 
 @pytest.mark.parametrize("name", ["trap.pkl", "trap.pt"])
-def test_pickle_given_as_checkpoint_is_not_opened(trap: Path, name: str):
-    refused(trap.with_name(name), "carry code and are never opened")
-    with pytest.raises(ValueError, match="is a file, and a checkpoint is a folder"):
-        lfrtorch.LinearModel.load(trap.with_name(name))
-    assert not trap.exists()
-
-
-@pytest.mark.parametrize("name", ["trap.pkl", "trap.pt"])
-def test_pickle_in_the_place_of_the_weights_is_not_opened(trap: Path, saved: Path, name: str):
-    (saved / "weights.safetensors").write_bytes(trap.with_name(name).read_bytes())
+def test_pickle_is_never_opened(trap: Path, saved: Path, name: str):
+    """As the checkpoint, in a folder that is none, in the place of the weights, and beside them."""
+    pickled, folder = trap.with_name(name), "is a file, and a checkpoint is a folder"
+    refused(pickled, "carry code and are never opened")
+    with pytest.raises(ValueError, match=folder):
+        lfrtorch.LinearModel.load(pickled)
+    refused(trap.parent, "is not a checkpoint: no model.json in it or in its model/ or linear/ fo")
+    refused(trap.parent, "trap.pkl, trap.pt may carry code and is never opened")
+    weights = saved / "weights.safetensors"
+    whole = weights.read_bytes()
+    weights.write_bytes(pickled.read_bytes())
     refused(saved, "is damaged or missing")
-    assert not trap.exists()
-
-
-@pytest.mark.parametrize("name", ["trap.pkl", "trap.pt"])
-def test_pickle_beside_the_model_is_refused(trap: Path, saved: Path, name: str):
-    trap.with_name(name).rename(saved / name)
+    weights.write_bytes(whole)
+    pickled.rename(saved / name)
     refused(saved, f"holds {name} beside the model: a checkpoint carries no code")
-    assert not trap.exists()
-
-
-def test_folder_of_pickles(trap: Path, tmp_path: Path):
-    refused(tmp_path, "is not a checkpoint: no model.json in it or in its model/ or linear/ folder")
-    refused(tmp_path, "trap.pkl, trap.pt may carry code and is never opened")
-    assert not trap.exists()
-
-
-def test_file_of_a_checkpoint_is_not_the_checkpoint(saved: Path):
-    with pytest.raises(ValueError, match="is a file, and a checkpoint is a folder"):
+    with pytest.raises(ValueError, match=folder):
         load(saved / "model.json")
+    assert not trap.exists()
 
 
 # --- the two models of a run ----------------------------------------------------------------
@@ -388,13 +356,11 @@ def test_each_kind_of_model_is_found_in_a_run(tmp_path: Path):
 
 def test_foreign_folder_and_file_are_left_alone(tmp_path: Path):
     (tmp_path / "thesis.txt").write_text("three years")
-    with pytest.raises(ValueError, match="exists and is not a checkpoint; choose another folder"):
-        small().save(tmp_path)
-    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
-    assert (tmp_path / "thesis.txt").read_text() == "three years"
-    with pytest.raises(ValueError, match="exists and is not a checkpoint"):
-        small().save(tmp_path / "thesis.txt")
-    assert (tmp_path / "thesis.txt").read_text() == "three years"
+    for path in (tmp_path, tmp_path / "thesis.txt"):
+        with pytest.raises(ValueError, match="exists and is not a checkpoint; choose another fold"):
+            small().save(path)
+        assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+        assert (tmp_path / "thesis.txt").read_text() == "three years"
 
 
 def test_empty_folder_is_taken(tmp_path: Path):
@@ -402,20 +368,16 @@ def test_empty_folder_is_taken(tmp_path: Path):
     assert np.array_equal(load(small().save(tmp_path / "saved")).simulate(U), small().simulate(U))
 
 
-def test_old_checkpoint_is_replaced(saved: Path):
-    newer = small(seed=1)
+def test_other_weights_of_the_same_model_replace_one_file(saved: Path):
+    files = saved / "model.json", saved / "weights.safetensors"
+    before, newer = [file.stat().st_ino for file in files], small(seed=1)
     newer.save(saved)
+    after = [file.stat().st_ino for file in files]
+    assert after[0] == before[0]  # so that at no moment there is none
+    assert after[1] != before[1]
     assert np.array_equal(load(saved).simulate(U), newer.simulate(U))
     assert [p.name for p in saved.parent.iterdir()] == ["saved"]
     assert sorted(p.name for p in saved.iterdir()) == ["model.json", "weights.safetensors"]
-
-
-def test_other_weights_of_the_same_model_replace_one_file(saved: Path):
-    before = (saved / "model.json").stat().st_ino, (saved / "weights.safetensors").stat().st_ino
-    small(seed=1).save(saved)
-    after = (saved / "model.json").stat().st_ino, (saved / "weights.safetensors").stat().st_ino
-    assert after[0] == before[0]  # so that at no moment there is none
-    assert after[1] != before[1]
 
 
 def test_another_model_replaces_both_files_and_no_other(saved: Path):
@@ -428,9 +390,7 @@ def test_another_model_replaces_both_files_and_no_other(saved: Path):
     assert [p.name for p in saved.parent.iterdir()] == ["saved"]
 
 
-def test_a_checkpoint_is_readable_wherever_a_save_stops(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_checkpoint_is_readable_wherever_a_save_stops(tmp_path, monkeypatch):
     """Power fails after each of the renames; then a third model is saved, and power fails again."""
     models = [small(), random_model(random_cell(2, 2, 2)), small(activation="relu")]
     whole = [model.simulate(U) for model in models]

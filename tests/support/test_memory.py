@@ -20,9 +20,7 @@ from lfrtorch._support.memory import limit_of, memory_of
         ("9:cpu:/x\n8:memory,cpuset:/docker/a\n", "memory/docker/a", "memory.limit_in_bytes"),
     ],
 )
-def test_a_container_takes_what_its_groups_leave(
-    tmp_path: Path, groups: str, folder: str, name: str
-):
+def test_a_container_takes_what_its_groups_leave(tmp_path, groups: str, folder: str, name: str):
     listed, mounted = tmp_path / "cgroup", tmp_path / "mounted"
     listed.write_text(groups)
     assert limit_of(listed, mounted) == math.inf

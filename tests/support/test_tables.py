@@ -97,7 +97,4 @@ def test_columns_of_words_start_at_the_left_and_others_end_at_the_right():
     assert (first.index("test"), first.index("V")) == (0, head.index("unit"))
     assert len(first) == len(second) == len(head)
     assert first.index("300") + 3 == second.index("4") + 1 == head.index("samples") + 7
-
-
-def test_a_table_without_rows_is_its_head():
     assert table(["a", "b"], []).splitlines()[0].split() == ["a", "b"]
