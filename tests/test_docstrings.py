@@ -14,13 +14,12 @@ import pytest
 
 import lfrtorch
 from lfrtorch import FRF, LinearModel, Model, analysis, datasets, distributed, export
-from lfrtorch.reporting import linear_plots, plots, survey_plots
 
 REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "api" / "lfrtorch.md"
 
 MODULES = [
     *(getattr(datasets, name) for name in datasets.__all__),
-    analysis, distributed, export, plots, linear_plots, survey_plots,
+    analysis, distributed, export,
 ]  # fmt: skip
 
 WITHOUT = {"distributed.ProcessGroup"}

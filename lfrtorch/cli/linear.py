@@ -54,7 +54,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
         "notes": list(dict.fromkeys([*dataset.notes, *notes, *model.fit.notes])),
         "command": command,
     }
-    print(f"\n{in_lines(found['verdict']['text'])}\n\n{linear_report.table(found)}")
+    print(f"\n{in_lines(found['verdict']['text'])}\n\n{linear_report.table(found, evaluation)}")
     model.save(folder / "linear")
     text = json.dumps(found, indent=2, allow_nan=False)
     with whole_file(folder / "linear.json") as fresh:

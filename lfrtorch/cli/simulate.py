@@ -32,7 +32,7 @@ from lfrtorch.file_simulation import (
 from lfrtorch.files.load import listed_files
 from lfrtorch.files.stream import FileStream
 from lfrtorch.files.writer import FORMATS
-from lfrtorch.reporting.scores import of_samples
+from lfrtorch.reporting.score_columns import of_samples
 
 
 def simulate(cfg: DictConfig) -> None:

@@ -22,14 +22,8 @@ from lfrtorch.reporting.diagnosis import (
     Evidence,
 )
 
-BEYOND_NOISE = 1.5
-"""Training error over the noise from which on the model's own share is above the noise."""
-
 _TRANSIENT = 3.0  # error in the first twentieth of the scored samples over that in the rest
-_FREE = 0.5  # part of the error's power there that a free response of the linear model must explain
 
-ALONE = 1.2
-"""Error of the second best start over that of the best above which the best may be luck."""
 
 _LOUDER = 1.25  # largest test input over the largest in training above which the model extrapolates
 _FEW = 3  # most records or outputs that are named
@@ -87,7 +81,7 @@ def diverges(e: Evidence) -> Advice | None:
 
 def starts_in_a_transient(e: Evidence) -> Advice | None:
     """An error at the beginning of the records that another start state removes."""
-    if e.transient is None or e.transient <= _TRANSIENT or e.free is None or e.free <= _FREE:
+    if e.transient is None or e.transient <= _TRANSIENT or e.free is None or e.free <= 0.5:
         return None
     return Advice(
         "The records do not begin at the model's rest: skip more samples (skip=N), or estimate "
@@ -268,7 +262,8 @@ def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
     if e.gain is None or e.useless or e.lost_on_tests or e.states_missing or e.overtrained:
         return None
     if e.noise and e.train is not None:
-        if e.train <= BEYOND_NOISE * e.noise:
+        # From there on the model's own share is above the noise.
+        if e.train <= 1.5 * e.noise:
             return None
         evidence = f"training error {number(e.train / e.noise)} times the noise"
         if e.linear is not None:
@@ -285,7 +280,8 @@ def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
 def best_start_alone(e: Evidence) -> Advice | None:
     """Starts that end far apart: a better minimum may not have been met."""
     found = sorted(e.starts)
-    if len(found) < 2 or found[0] <= 0 or found[1] <= ALONE * found[0] or e.parts_differ:
+    # Beyond that ratio the best may be luck.
+    if len(found) < 2 or found[0] <= 0 or found[1] <= 1.2 * found[0] or e.parts_differ:
         return None
     starts = 2 * max(e.started, 4)
     return Advice(

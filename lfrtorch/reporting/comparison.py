@@ -29,7 +29,6 @@ from lfrtorch.score_window import with_window
 
 _SEEDS = ("seed", "data.seed")  # words that differ between repetitions of one setting
 _SHOWN = 20  # most runs that a terminal gets; the files have all
-_BOXES = 30  # most settings whose boxes are drawn, the best by their median
 _LONGEST = 40  # characters of a setting in a figure
 
 CAPTIONS = {
@@ -89,10 +88,7 @@ class Comparison:
 
     @cached_property
     def settings(self) -> dict[str, list[Compared]]:
-        """The runs that differ in seeds alone, by their other words, the best median first.
-
-        Empty if no setting has several runs.
-        """
+        """The runs that differ in seeds alone, by their other words; empty if none has several."""
         groups: dict[str, list[Compared]] = {}
         for run in self.runs:
             words = [f"{n}={run.words[n]}" for n in self.varied if n in run.words]
@@ -118,10 +114,7 @@ class Comparison:
         return [*head, *(f"{name}{unit}" for name in tests), "time (s)", "outcome"], rows
 
     def simulations(self, record: Record) -> dict[str, Array]:
-        """Simulations of a record by the best runs, one of each setting, and by a linear model.
-
-        Models of other channels are left out.
-        """
+        """Simulations of a record by the best runs, one of each setting, and by a linear model."""
         best = {label: runs[0] for label, runs in self.settings.items()}
         best = best or {self._name(run): run for run in self.runs}
         found: dict[str, Array] = {}
@@ -191,7 +184,8 @@ class Comparison:
 
     def _boxes(self) -> Figure:
         factor, _ = self._scale
-        labels = list(self.settings)[:_BOXES]
+        # The best by their median.
+        labels = list(self.settings)[:30]
         errors = [
             [factor * run.error for run in self.settings[label] if math.isfinite(run.error)]
             for label in labels

@@ -44,17 +44,6 @@ OVERFIT = 1.5
 """Growth from training to validation of the NL-LFR's error over that of the linear model's, which
 sees how the records differ."""
 
-RISEN, FELL = 1.05, 0.99
-"""Validation error after the kept iterate over that of the kept one, and the training error at the
-end over that: beyond these the training error fell while validation rose."""
-
-FEW_SAMPLES = 10
-"""Samples a parameter up to which that is overfitting: with as many, p/M = 0.1, fitted white noise
-is √((1 + p/M) / (1 - p/M)) = 1.1 times as large on other samples. If there are more, the map is too
-small instead: with 11 and 21 a larger one was the better on the coupled drives and the tanks."""
-
-BY_CHANCE = 0.01
-"""Probability of the ratio of the linear model's errors up to which records are unlike."""
 
 USELESS = 0.9
 """Error over the linear model's from which on the NL-LFR is hardly better."""
@@ -167,8 +156,13 @@ class Evidence:
     @property
     def overtrained(self) -> bool:
         """Whether validation rose after the kept iterate, as training went on with noise."""
-        many = self.samples <= FEW_SAMPLES * self.parameters
-        return many and self.risen >= RISEN and self.fell <= FELL and not self.states_missing
+        # Samples a parameter up to which that is overfitting: with as many, p/M = 0.1, fitted white
+        # noise is √((1 + p/M) / (1 - p/M)) = 1.1 times as large on other samples. If there are
+        # more, the map is too small instead: with 11 and 21 a larger one was the better on the
+        # coupled drives and the tanks.
+        many = self.samples <= 10 * self.parameters
+        # Training error falls while validation rises.
+        return many and self.risen >= 1.05 and self.fell <= 0.99 and not self.states_missing
 
     @property
     def noise_limited(self) -> bool:
@@ -195,7 +189,7 @@ class Evidence:
         if not self.linear_train or self.linear_validation is None:
             return False
         ratio = self.linear_validation / self.linear_train
-        return not 1.0 / UNLIKE <= ratio <= UNLIKE and self.unlike_chance <= BY_CHANCE
+        return not 1.0 / UNLIKE <= ratio <= UNLIKE and self.unlike_chance <= 0.01
 
 
 def evidence(
@@ -267,11 +261,9 @@ def evidence(
 
 
 def falling(result: FitResult) -> float:
-    """Part by which the error that chooses fell over a tenth of the iterations, at the last pace.
-
-    The pace is that of the last tenth, and of five iterations at least. 0 if the search ended for
-    another reason than its limit, or rises.
-    """
+    """Part by which the judging error fell over a tenth of the iterations, at the last pace."""
+    # The pace is that of the last tenth, five iterations at least; 0 unless the limit ended the
+    # search.
     history = result.history
     iterations = len(history) - 1
     if result.reason not in SPENT or not iterations:
@@ -286,12 +278,8 @@ def falling(result: FitResult) -> float:
 
 
 def after_kept(result: FitResult) -> tuple[float, float]:
-    """The errors after the kept iterate, over those of the kept one.
-
-    Returns:
-        The middle one of validation, and the last one of training. 1 and 1 if validation did not
-        choose, or if fewer than five iterations follow.
-    """
+    """Errors after the kept iterate over its own: median of validation, last of training."""
+    # 1 and 1 if validation did not choose, or if fewer than five iterations follow.
     if not result.history:
         return 1.0, 1.0
     kept, *later = result.history[result.chosen_iteration :]
@@ -302,16 +290,10 @@ def after_kept(result: FitResult) -> tuple[float, float]:
 
 
 def chance_of_ratio(here: Sequence[Array], there: Sequence[Array]) -> float:
-    """Probability that errors of one size differ by as much in power as these do, or by more.
-
-    An F test whose degrees of freedom are those that the powers of ten blocks of time show, of here
-    or there, whichever vary more: slow errors, or a few large ones, are few degrees of freedom.
-    1 if one side has fewer samples than blocks, or no error.
-
-    References:
-        Satterthwaite, "An approximate distribution of estimates of variance components",
-        Biometrics Bulletin 2(6), 1946 (equivalent degrees of freedom).
-    """
+    """Probability that errors of one size differ by as much in power as these do, or by more."""
+    # An F test with the degrees of freedom that ten blocks of time show, of the side that varies
+    # more (Satterthwaite, Biometrics Bulletin 2(6), 1946): slow errors, or a few large ones, are
+    # few. 1 if one side has fewer samples than blocks, or no error.
     powers, samples, spread = [], [], 0.0
     for errors in (here, there):
         squares = [np.mean(error**2, axis=1) for error in errors]
@@ -354,13 +336,9 @@ def _by_output(responses: Sequence[Response]) -> dict[str, float]:
 def _transient(
     train: Sequence[Response], scale: Array, bla: LinearModel
 ) -> tuple[float | None, float | None]:
-    """What the errors at the beginning of the records say of the start states.
-
-    Returns:
-        The error there over that in the rest, and the part of its power that free responses of the
-        linear model explain: their states are fitted to the first half of the beginning, and are to
-        be right in the second, too. None if the starts are known or fitted.
-    """
+    """Error at the beginning over the rest, and the part that free responses explain."""
+    # States of the linear model are fitted to the beginning's first half, and are to be right in
+    # the second, too. None if the starts are known or fitted.
     first, rest, left = [], [], []
     for response in train:
         if response.record.start in ("periodic", "estimated"):

@@ -64,14 +64,11 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What models make of a record, in physical units.
-
-    ``simulated`` has outputs (T, ny) by the names ``"linear"`` and ``"NL-LFR"``, of one or both.
-    """
+    """What models make of a record, in physical units."""
 
     record: Record
     use: str
-    simulated: Mapping[str, Array]
+    simulated: Mapping[str, Array]  # outputs (T, ny) by "linear" and "NL-LFR", one or both
     start_error: float | None = None
 
     @property
@@ -151,10 +148,8 @@ class Evaluation:
 
     @cached_property
     def simulations(self) -> list[Response]:
-        """All records with both simulations.
-
-        Estimated starts of training records are fitted to all samples, as in the fit.
-        """
+        """All records with both simulations."""
+        # Estimated starts of training records are fitted to all samples, as in the fit.
         found = []
         for use, record in self._records:
             linear, model = self._models(use, record)

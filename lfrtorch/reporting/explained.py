@@ -11,12 +11,9 @@ import scipy
 from lfrtorch._support.types import Array
 from lfrtorch.reporting.evaluation import Response
 
-_AVERAGES = 8  # segments for each regressor that a coherence is estimated from, at least
-
 LONGEST, SHORTEST = 1024, 64
 """Samples of a segment: as long as the memory of an error filter may be, and too few to tell."""
 
-_LAGS = 12  # least memory of a filter that is fitted in time, to records too short for segments
 
 SHIFTS = 0.276, 0.382, 0.618, 0.724
 """Parts of the records by which errors are shifted to see what is explained by chance: no fractions
@@ -24,13 +21,9 @@ of few periods."""
 
 
 def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | None]:
-    """Parts of the errors' power that linear filters would explain.
-
-    Returns:
-        What filters of the inputs explain, and what those of the squares and cubes of the simulated
-        outputs explain beyond: the first says that states are missing, the second that the static
-        map is too small. None if the records are too short, or a simulation diverges.
-    """
+    """Parts of the errors that filters of inputs explain, and of outputs² and ³ beyond."""
+    # The first says that states are missing, the second that the static map is too small. None if
+    # the records are too short, or a simulation diverges.
     errors = [response.error for response in train]
     inputs = [response.record.u[response.record.skip :] for response in train]
     if any(response.diverged for response in train):
@@ -50,21 +43,19 @@ def explained_parts(train: Sequence[Response]) -> tuple[float | None, float | No
 
 
 def coherent_part(
-    signals: Sequence[Array], errors: Sequence[Array], *, of: int | None = None
+    signals: Sequence[Array],
+    errors: Sequence[Array],
+    *,
+    of: int | None = None,  # signals that the filters' memory is short enough for; default: n
 ) -> float | None:
-    """Part of the errors' power that linear filters of the signals explain, by Welch's method.
-
-    At each line, it is the multiple coherence times the error's power. The coherence is corrected
-    for its bias with n signals and K segments, as the adjusted R² is. With several outputs the
-    largest part counts. None if the records are too short.
-
-    Args:
-        signals, errors: (T, n) and (T, ny) of each record.
-        of: number of signals that the filters' memory is short enough for. Default: n.
-    """
+    """Part of the errors' power that linear filters of the signals explain, by Welch's method."""
+    # At each line, it is the multiple coherence times the error's power, corrected for its bias
+    # with n signals and K segments, as the adjusted R² is. Of several outputs the largest part
+    # counts.
     n = signals[0].shape[1]
     T, shortest = sum(map(len, errors)), min(map(len, errors))
-    most = T / (_AVERAGES * (of or n))
+    # Segments for each regressor that a coherence is estimated from, at least.
+    most = T / (8 * (of or n))
     N = 2 ** int(math.log2(max(1, min(LONGEST, most, shortest))))
     if N < SHORTEST:
         return filtered_part(signals, errors, min(int(most), shortest // 2))
@@ -91,13 +82,11 @@ def coherent_part(
 
 
 def filtered_part(signals: Sequence[Array], errors: Sequence[Array], lags: int) -> float | None:
-    """Part of the errors' power that filters of a finite memory explain, by least squares.
-
-    What they explain by chance is taken off: the mean of what they explain of the errors shifted in
-    time, which is far more for slow errors than for white ones. With several outputs the largest
-    part counts. None if the memory is too short.
-    """
-    if lags < _LAGS:
+    """Part of the errors' power that filters of ``lags`` samples explain, by least squares."""
+    # What they explain by chance is taken off: the mean of what they explain of the errors shifted
+    # in time, which is far more for slow errors than for white ones.
+    # Too short a memory tells nothing.
+    if lags < 12:
         return None
     memory = np.concatenate(
         [

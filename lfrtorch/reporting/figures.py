@@ -19,20 +19,15 @@ from lfrtorch.reporting.run import Run
 MOST_OUTPUTS, MOST_RECORDS = 4, 4
 """Outputs in one figure, and records of which the report has all views."""
 
-MOST_MEASURED = 500_000
-"""Training samples up to which a nonparametric response is estimated for the report: 3 s."""
-
 
 Views = dict[str, dict[str, str]]
 """Captions by the names of records, then of figures."""
 
 
 def of_run(run: Run) -> tuple[dict[str, Figure], Views]:
-    """All figures of a run's folder by file name, and those of the records that the report shows.
-
-    The records are the tests; without tests those of validation, and else those of training. The
-    first is that with the largest error; of a group that make one score it is the only one.
-    """
+    """All figures of a run by file name, and captions of the records that the report shows."""
+    # These are the tests; without tests validation, else training. The first has the largest error;
+    # of a group that makes one score it is the only one.
     model, bla, dataset = run.fit.model, run.linear, run.dataset
     drawn, views = of_records(run.simulations, dataset)
     with suppress(InputError):  # a linear model, or one that diverges
@@ -95,7 +90,8 @@ def of_record(
 
 def measured(records: Sequence[Record]) -> FRF | None:
     """The nonparametric frequency response, if the records give one in seconds."""
-    if sum(record.samples for record in records) > MOST_MEASURED:
+    # It takes 3 s up to there.
+    if sum(record.samples for record in records) > 500_000:
         return None
     try:
         return estimate_frf(records)

@@ -6,9 +6,9 @@ import base64
 import math
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -25,7 +25,6 @@ from lfrtorch._support.tables import (
     quantities,
     quantity,
     radius,
-    times,
 )
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import poles_at_rest
@@ -34,36 +33,29 @@ from lfrtorch.fitting.size_search import LEGEND, size_table
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.records import common_unit
-from lfrtorch.reporting.evaluation import Evaluation, Score
+from lfrtorch.reporting.evaluation import Evaluation
 from lfrtorch.reporting.run import Run
+from lfrtorch.reporting.score_columns import (
+    ALL,
+    USES,
+    Row,
+    columns,
+    in_units,
+    of_samples,
+    rows_of,
+    start_matters,
+)
 from lfrtorch.reporting.scores import (
     linear_name,
-    neurons,
-    of_samples,
     origins,
     own_linear,
-    published_unit,
     stability,
-    start_matters,
     starts,
+    static_map,
 )
 from lfrtorch.reporting.verdict import LINEAR_MODEL, of_linear
 
-_USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
 _FEW = 3  # most tests that the verdict names one by one
-_ALL = "all"  # name of several outputs together
-
-
-class _Errors(NamedTuple):
-    """RMSE of the linear model and of the NL-LFR, linear / error, and both over the deviation."""
-
-    output: str
-    unit: str
-    linear: float
-    error: float
-    ratio: float
-    linear_relative: float
-    relative: float
 
 
 def render(
@@ -74,11 +66,7 @@ def render(
     command: str = "",
     config: str = "",
 ) -> str:
-    """Make the page of a run.
-
-    The images are PNG by the names of figures, and ``views`` has captions by the same names, of
-    each record that is shown. The first two of the first record follow the verdict.
-    """
+    """Make the page of a run; images are PNG by name, views captions by record and name."""
     tried = run.metrics["sizes_search"]
     groups = [(name, w) for name, w in run.fit.model.lfr.cell.named_parameters() if w.numel()]
     return page(
@@ -89,7 +77,7 @@ def render(
         command=command or UNKNOWN,
         config=config,
         date=datetime.now().strftime("%d %B %Y, %H:%M"),
-        sizes=_sizes(run.metrics["sizes"]),
+        sizes=static_map(run.metrics["sizes"]),
         comparisons=comparisons(run.evaluation),
         linear_is_used=run.verdict.use == LINEAR_MODEL,
         scores=_scores(run.metrics, run.evaluation),
@@ -125,70 +113,46 @@ def page(template: str, images: Mapping[str, bytes], **values: Any) -> str:
 
 
 def comparisons(evaluation: Evaluation) -> list[str]:
-    """How far the NL-LFR came, beside the linear model: a line for each output of a few tests.
-
-    Without tests the lines are on the validation records, or else on the training records.
-    """
+    """How far the NL-LFR came, beside the linear model: a line for each output of a few tests."""
+    # Without tests the lines are on the validation records, or else on the training records.
     responses = evaluation.simulations
     uses = ("test", "validation", "train")
     use = next(use for use in uses if any(response.use == use for response in responses))
     shown = []
     for response in (response for response in responses if response.use == use):
-        errors = [each for each in _errors(response.score) if each.output != _ALL]
-        for each in errors:
-            name = response.record.name + (f", {each.output}" if len(errors) > 1 else "")
-            shown.append((name, each))
+        rows = [r for r in rows_of(response.record.name, response.score) if r.output != ALL]
+        shown += [(r.record + f", {r.output}" * (len(rows) > 1), r) for r in rows]
     scored = sorted((item for item in shown if item[1].ratio > 0), key=lambda item: item[1].ratio)
     if len(shown) <= _FEW or not scored:
         return [_line(*item) for item in shown]
     least, most = (f"{percent(1 / e.ratio)} ({name})" for name, e in (scored[-1], scored[0]))
-    relative = [errors.relative for _, errors in scored]
+    relative = sorted(row.relative(row.error) or 0.0 for _, row in scored)
     line = (
         f"{len(scored)} {use} errors: {least} to {most} of the linear model's, "
-        f"NRMSE {percent(min(relative))} to {percent(max(relative))}"
+        f"NRMSE {percent(relative[0])} to {percent(relative[-1])}"
     )
     return [line, *(_line(*item) for item in shown if item not in scored)]
 
 
-def _line(name: str, errors: _Errors) -> str:
-    if not math.isfinite(errors.error):
+def _line(name: str, row: Row) -> str:
+    if row.error is None or not math.isfinite(row.error):
         return f"{name}: the NL-LFR diverges"
-    error, linear = quantities([errors.error, errors.linear], errors.unit)
-    relative = percent(errors.relative)
-    beside = of_linear(errors.error / errors.linear) if errors.linear > 0 else "not comparable"
+    error, linear = quantities([row.error, row.linear], row.unit)
+    beside = of_linear(row.error / row.linear) if row.linear else "not comparable"
+    relative = percent(row.relative(row.error))
     return f"{name}: error {beside} ({error} against {linear}), NRMSE {relative}"
-
-
-def _sizes(sizes: Mapping[str, int]) -> str:
-    """The sizes of the model in words."""
-    degree = sizes.get("degree")
-    static = neurons(sizes) if degree is None else f"polynomial of degree {degree}"
-    return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {static}"
 
 
 def _scores(metrics: Mapping[str, Any], evaluation: Evaluation) -> dict[str, Any]:
     sizes = metrics["sizes"]["nz"], metrics["sizes"]["nw"]
     published = [p for p in evaluation.dataset.published if p.sizes in (None, sizes)]
-    compared = {key: _errors(score) for key, score in evaluation.scores.items()}
-    in_unit = _units(compared.values(), published_unit(published))
-    outputs = evaluation.dataset.train[0].outputs
-    several, units = len(outputs) > 1, any(channel.unit for channel in outputs)
-    what = [*["output"] * several, *["unit"] * (several and units)]
-    errors = [linear_name(metrics), "NL-LFR", "ratio", "linear NRMSE", "NRMSE"]
-    tests, others = [], []
-    for (use, name), each in compared.items():
-        for row, found in enumerate(each):
-            factor, shown = in_unit[found.unit]
-            cells = [*[found.output, shown][: len(what)], *_cells(found, factor)]
-            if use == "test":
-                key = name if row == 0 else f"{name} {found.output}"
-                values = [times(factor, p.scores.get(key)) for p in published]
-                known = values if row == 0 else ["" if v is None else v for v in values]
-                tests.append([name if row == 0 else "", *cells, *known])
-            else:
-                others.append([*([name, _USES[use]] if row == 0 else ["", ""]), *cells])
+    found = evaluation.scores.items()
+    rows = in_units([r for (_, name), s in found for r in rows_of(name, s)], published)
+    of_tests = [row for row in rows if row.score["use"] == "test"]
+    others = [row for row in rows if row.score["use"] != "test"]
+    linear = linear_name(metrics)
     references = [own_linear(metrics)] if metrics["linear"] else []
-    references += [f"{p.label}: {p.reference}" for p in published if tests]
+    references += [f"{p.label}: {p.reference}" for p in published if of_tests]
     references += [
         f"{name}: the uncertainty of its start state adds {quantity(s['start_error'], s['unit'])} "
         f"to the NL-LFR's error of {quantity(s['rmse'], s['unit'])}"
@@ -196,52 +160,11 @@ def _scores(metrics: Mapping[str, Any], evaluation: Evaluation) -> dict[str, Any
         if start_matters(s)
     ]
     return {
-        "unit": "" if several else in_unit[outputs[0].unit][1],
-        "words": 1 + len(what),
-        "head": ["record", *what, *errors, *(p.label for p in published)],
-        "tests": tests,
+        "unit": "" if len(evaluation.dataset.train[0].outputs) > 1 else rows[0].unit,
+        "tests": columns("tests", of_tests, linear=linear, published=published),
         "references": references,
-        "others_head": ["record", "use", *what, *errors],
-        "others": others,
+        "others": columns("others", others, linear=linear),
     }
-
-
-def _errors(score: Score) -> list[_Errors]:
-    """The errors of each output; before several of one unit those of all together."""
-    columns = zip(
-        score.channels,
-        score.lti_rmse_by_output,
-        score.rmse_by_output,
-        score.std_by_output,
-        strict=True,
-    )
-    single = [_compared(c.name, c.unit, *errors) for c, *errors in columns]
-    units = {channel.unit for channel in score.channels}
-    if len(single) == 1 or len(units) > 1:
-        return single
-    assert score.lti_rmse is not None
-    assert score.rmse is not None
-    return [_compared(_ALL, units.pop(), score.lti_rmse, score.rmse, score.std), *single]
-
-
-def _compared(output: str, unit: str, linear: float, error: float, std: float) -> _Errors:
-    std = std or math.nan
-    ratio = linear / error if error > 0 else math.nan
-    return _Errors(output, unit, linear, error, ratio, linear / std, error / std)
-
-
-def _units(compared: Iterable[Sequence[_Errors]], shown: str = "") -> dict[str, tuple[float, str]]:
-    """Of each unit of the outputs a factor and the unit with a prefix, for all of their errors."""
-    values: dict[str, list[float]] = {}
-    for errors in (errors for each in compared for errors in each):
-        values.setdefault(errors.unit, []).extend([errors.linear, errors.error])
-    return {unit: engineering(own, unit, shown) for unit, own in values.items()}
-
-
-def _cells(errors: _Errors, factor: float) -> list[Cell]:
-    shown = factor * errors.error if math.isfinite(errors.error) else "diverges"
-    relative = percent(errors.linear_relative), percent(errors.relative)
-    return [factor * errors.linear, shown, errors.ratio, *relative]
 
 
 def _data(evaluation: Evaluation) -> dict[str, Any]:
@@ -261,7 +184,7 @@ def _data(evaluation: Evaluation) -> dict[str, Any]:
             factor, unit = engineering([moments[1]], channel.unit)
             channels.append([channel.name, side, unit, *(factor * moment for moment in moments)])
     records = [
-        [r.name, _USES.get(one.use, one.use), r.source, r.start, of_samples(one.score.entry()),
+        [r.name, USES.get(one.use, one.use), r.source, r.start, of_samples(one.score.entry()),
          r.period]
         for one, r in ((response, response.record) for response in evaluation.simulations)
     ]  # fmt: skip

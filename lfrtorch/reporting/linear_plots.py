@@ -37,22 +37,10 @@ STRETCHES = 200
 dots of a record of 50000 samples."""
 
 _FAR = 2.0  # half width of the z plane that is drawn: sampling puts zeros far out that say little
-_MANY = 2000  # dots from which on they are drawn small
-_TURNS = (1, 1.8, 4.5, 9, 10)  # ticks of a phase: 45, 90, 180 degrees
 
 
 def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
-    """Magnitude and phase of the model, and the nonparametric response with its uncertainty.
-
-    Two panels a channel. The model's band is ± 2 standard deviations from the covariance of its
-    parameters, if that is known. Without ``frf`` the model is drawn alone.
-
-    Example:
-        >>> from lfrtorch.reporting import linear_plots
-        >>> figure = linear_plots.frequency_response(bla, lfrtorch.estimate_frf(record))
-        >>> [ax.get_ylabel() for ax in figure.axes]
-        ['magnitude (dB)', 'phase (deg)']
-    """
+    """Draw magnitude and phase of the model ± 2 std, over the measured response if given."""
     ny, nu = len(model.outputs), len(model.inputs)
     figure = Figure(figsize=(2.5 + 5.5 * nu, 5.5 * ny), layout="constrained")
     grid = figure.subplots(
@@ -98,21 +86,15 @@ def frequency_response(model: LinearModel, frf: FRF | None = None) -> Figure:
             title = f"{output.name} / {source.name}"
             magnitude.set(title=title, ylabel=unit_label("magnitude", output.unit, source.unit))
             phase.set(ylabel="phase (deg)")
-            phase.yaxis.set_major_locator(MaxNLocator(5, steps=_TURNS))
+            # Ticks of a phase: 45, 90, 180 degrees.
+            phase.yaxis.set_major_locator(MaxNLocator(5, steps=(1, 1.8, 4.5, 9, 10)))
     frequency_axis(grid, f[0], f[-1])
     _legend(figure, grid[0, 0])
     return figure
 
 
 def poles_and_zeros(model: LinearModel) -> Figure:
-    """Poles and zeros in the z plane, as ``zeros`` names them, with the unit circle.
-
-    Example:
-        >>> from lfrtorch.reporting import linear_plots
-        >>> figure = linear_plots.poles_and_zeros(bla)
-        >>> figure.axes[0].get_xlabel()
-        'real part'
-    """
+    """Draw poles and zeros in the z plane, as ``zeros`` names them, with the unit circle."""
     figure = Figure(figsize=(7.5, 5.5), layout="compressed")
     ax = figure.subplots()
     angle = np.linspace(0, 2 * np.pi, 361)
@@ -137,24 +119,8 @@ def poles_and_zeros(model: LinearModel) -> Figure:
 
 
 def distortion(frf: FRF) -> Figure:
-    """Levels at the output of the fast method: signal, odd and even distortion, noise.
-
-    The distortions are drawn as they were measured, noise included: what stands out of the noise is
-    nonlinear. One panel an output.
-
-    Raises:
-        ValueError: a response that was estimated by another method.
-
-    Example:
-        >>> from lfrtorch.reporting import linear_plots
-        >>> signals = lfrtorch.multisine(1024, fs=100.0, band=(0.1, 30.0), grid="random_odd")
-        >>> u = np.tile(signals.u[0, :, 0], 3)
-        >>> y = signal.lfilter([0, 0.3], [1, -0.7], np.tanh(u))
-        >>> periods = lfrtorch.Record(u[1024:], y[1024:], fs=100.0, start="periodic", period=1024)
-        >>> figure = linear_plots.distortion(lfrtorch.estimate_frf(periods, method="fast"))
-        >>> len(figure.axes)  # one output
-        1
-    """
+    """Draw levels at the output of the fast method: signal, odd and even distortion, noise."""
+    # Distortions are drawn as measured, noise included: what stands out of the noise is nonlinear.
     levels = frf.distortion
     if levels is None:
         raise InputError(
@@ -182,14 +148,7 @@ def distortion(frf: FRF) -> Figure:
 
 
 def order_scan(scan: OrderScan) -> Figure:
-    """Scores and errors of the fit against order, the order chosen marked; singular values.
-
-    Example:
-        >>> from lfrtorch.reporting import linear_plots
-        >>> figure = linear_plots.order_scan(lfrtorch.scan_orders(record, [1, 2]))
-        >>> figure.axes[0].get_xlabel()
-        'order nx'
-    """
+    """Draw scores and errors of the fit against order, and singular values."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     errors, carried = figure.subplots(1, 2)
     score = "validation" if scan.validated else "score (MDL)"
@@ -211,13 +170,7 @@ def order_scan(scan: OrderScan) -> Figure:
 
 
 def zeros(model: LinearModel) -> dict[str, Complex]:
-    """Transmission zeros of a square model under the name ``""``, else the zeros by channel.
-
-    Example:
-        >>> from lfrtorch.reporting import linear_plots
-        >>> list(linear_plots.zeros(bla))
-        ['']
-    """
+    """Transmission zeros of a square model under the name ``""``, else zeros by channel."""
     if len(model.inputs) == len(model.outputs):
         return {"": model.zeros()}
     return {
@@ -228,14 +181,7 @@ def zeros(model: LinearModel) -> dict[str, Complex]:
 
 
 def frequencies(model: LinearModel, frf: FRF | None = None) -> Array:
-    """Hz at which a model is drawn: a grid over the band of the response, and the resonances.
-
-    Example:
-        >>> from lfrtorch.reporting import linear_plots
-        >>> f = linear_plots.frequencies(bla)
-        >>> bool(f[0] > 0), round(float(f[-1]))  # to half the sampling frequency
-        (True, 50)
-    """
+    """Frequencies (Hz) a model is drawn at: a grid in the band, and its resonances."""
     lines = np.array([_LOWEST, 1.0]) * model.fs / 2 if frf is None else frf.frequencies
     first, last = float(lines[0]), float(lines[-1])
     spaced = np.geomspace if is_wide(first, last) else np.linspace
@@ -245,7 +191,7 @@ def frequencies(model: LinearModel, frf: FRF | None = None) -> Array:
 
 
 def _dots(ax: Axes, f: Array, level: Array, label: str, colour: str, marker: str = ".") -> None:
-    ax.plot(f, level, marker, ms=2.5 if len(f) < _MANY else 1.0, color=colour, label=label)
+    ax.plot(f, level, marker, ms=2.5 if len(f) < 2000 else 1.0, color=colour, label=label)
 
 
 def _mean(f: Array, variance: Array) -> tuple[Array, Array]:

@@ -17,7 +17,8 @@ from lfrtorch.linear.order_scan import OrderScan
 from lfrtorch.reporting import figures as run_figures
 from lfrtorch.reporting import linear_plots
 from lfrtorch.reporting.evaluation import Evaluation, Response
-from lfrtorch.reporting.scores import finite, of_samples
+from lfrtorch.reporting.score_columns import ALL, columns, in_units, rows_of
+from lfrtorch.reporting.scores import finite
 from lfrtorch.reporting.verdict import judge_linear
 
 
@@ -129,30 +130,14 @@ def _uncertainty(model: LinearModel, frf: FRF | None) -> list[dict[str, Any]]:
     return listed
 
 
-def table(found: Mapping[str, Any]) -> str:
+def table(found: Mapping[str, Any], evaluation: Evaluation) -> str:
     """The numbers of a run for people."""
     fit = found["fit"]
     parts = [f"Linear model of order {found['nx']}, {fit['criterion']} error"]
-    sources = any(s["source"] != "file" for s in found["scores"])
-    about = ["record", "use", *["source"] * sources]
-    errors: dict[str, list[float | None]] = {}
-    for o in (o for s in found["scores"] for o in s["outputs"]):
-        errors.setdefault(o["unit"], []).append(o["rmse"])
-    prefixed = {unit: tables.engineering(own, unit) for unit, own in errors.items()}
-    scores = [
-        [
-            *(s[key] for key in about),
-            of_samples(s),
-            o["output"],
-            tables.times(prefixed[o["unit"]][0], o["rmse"]),
-            prefixed[o["unit"]][1],
-            in_percent(o["nrmse"]),
-        ]
-        for s in found["scores"]
-        for o in s["outputs"]
-    ]
-    head = [*about, "scored", "output", "RMSE", "unit", "% of std"]
-    parts.append(tables.table(head, scores, digits=4))
+    scores = [(name, s) for (use, name), s in evaluation.scores.items() if use != "selection"]
+    scored = in_units([row for name, s in scores for row in rows_of(name, s) if row.output != ALL])
+    head, rows, _ = columns("linear", scored)
+    parts.append(tables.table(head, rows, digits=4))
     listed = [["pole", p] for p in found["poles"]]
     listed += [[f"zero {n}".strip(), z] for n, zeros in found["zeros"].items() for z in zeros]
     rows = [

@@ -150,11 +150,9 @@ class TensorBoard:
 
 
 def _wait_for_a_later_name(folder: Path) -> None:
-    """Let the second pass in which the last file was made.
-
-    TensorBoard reads the files of a folder in the order of their names, which begin with the
-    second. Within one, file 10 of a process comes before its file 9.
-    """
+    """Let the second pass in which the last file was made."""
+    # TensorBoard reads files in the order of their names, which begin with the second: within one,
+    # file 10 of a process comes before its file 9.
     end = monotonic() + 1.5  # whatever the clock does
     while monotonic() < end and any(folder.glob(f"events.out.tfevents.{int(time())}.*")):
         sleep(0.02)

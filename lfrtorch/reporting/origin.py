@@ -14,18 +14,9 @@ import torch
 from lfrtorch.dataset import Dataset
 from lfrtorch.records import Record
 
-_LONGEST = 10  # seconds that git may take
-
 
 def origin(dataset: Dataset) -> dict[str, Any]:
-    """What ``metrics.json`` says of the origin of a run: machine, git, checksums of the records.
-
-    Example:
-        >>> from lfrtorch.reporting.origin import origin
-        >>> dataset = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[])
-        >>> sorted(origin(dataset))
-        ['checksums', 'git', 'machine']
-    """
+    """Machine, git state and checksums of the records, for ``metrics.json``."""
     records = (*dataset.train, *dataset.validation, *dataset.selection, *dataset.tests)
     return {
         "machine": {
@@ -40,13 +31,7 @@ def origin(dataset: Dataset) -> dict[str, Any]:
 
 
 def checksum(record: Record) -> str:
-    """SHA-256 of a record: its shapes and rate, and all its signals as float64.
-
-    Example:
-        >>> from lfrtorch.reporting.origin import checksum
-        >>> checksum(record) == checksum(record[:]), checksum(record) == checksum(record[1:])
-        (True, False)
-    """
+    """SHA-256 of a record: its shapes and rate, and all its signals as float64."""
     found = sha256(f"{record.u.shape} {record.y.shape} {record.fs!r}".encode())
     signals = [record.u, record.y]
     if record.reference is not None:
@@ -69,7 +54,7 @@ def _git(*words: str) -> str | None:
     """What git says, None if it cannot."""
     try:
         done = subprocess.run(
-            ["git", *words], capture_output=True, text=True, check=True, timeout=_LONGEST
+            ["git", *words], capture_output=True, text=True, check=True, timeout=10
         )
     except (OSError, subprocess.SubprocessError):
         return None

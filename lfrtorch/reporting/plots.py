@@ -32,8 +32,6 @@ from lfrtorch.records import Record
 
 _DPI = 150  # of a figure that is written
 _MOST_POINTS = 20_000  # samples drawn of a long signal
-_SWINGS = 8  # periods of the output that a close-up shows
-_CLOSE_UP, _LARGEST_PART = (50, 2000), 0.25  # its samples, and its part of a longer record
 _FAR = 10.0  # deviations of the output up to which errors are counted in their distribution
 _TAIL = 0.95  # part of the samples whose errors are no larger than the number in the legend
 _BEYOND = 1.0  # ranges of the measured output that are drawn beyond it, if a model runs away
@@ -49,40 +47,17 @@ _WIDE, _NARROW = 6.4, 4.4  # of figures that stand side by side on a wide page
 
 
 def errors(record: Record, simulated: Simulated) -> Figure:
-    """The spectrum of whole periods in steady state, and else the response against time.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> figure = plots.errors(record, {"linear": bla.simulate(record)})
-        >>> figure.axes[0].get_xlabel()  # the record is a whole period: its spectrum
-        'frequency (Hz)'
-    """
+    """Draw the spectrum of whole periods in steady state, and else the response against time."""
     return (spectrum if is_whole(record) else response)(record, simulated)
 
 
 def is_whole(record: Record) -> bool:
-    """Whether the scored samples are whole periods in steady state, whose spectrum has no leakage.
-
-    Periods with a skip window are no whole periods.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> plots.is_whole(record), plots.is_whole(record[:100])
-        (True, False)
-    """
+    """Whether the scored samples are whole periods in steady state, without leakage."""
     return record.start == "periodic" and not record.skip
 
 
 def spectrum(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
-    """Magnitude of the measured output and of the errors against frequency, one panel an output.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> simulated = {"linear": bla.simulate(record), "NL-LFR": model.simulate(record)}
-        >>> figure = plots.spectrum(record, simulated)
-        >>> [line.get_label() for line in figure.axes[0].lines]
-        ['output', 'linear error', 'NL-LFR error']
-    """
+    """Draw magnitudes of the measured output and of the errors, one panel an output."""
     figure, axes = _panels(record, outputs)
     y = record.y[record.skip :]
     f = np.fft.rfftfreq(len(y), 1.0 / record.fs)
@@ -97,15 +72,7 @@ def spectrum(record: Record, simulated: Simulated, outputs: Sequence[int] | None
 
 
 def density(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
-    """Power spectral density of the measured output and of the errors, one panel an output.
-
-    By Welch's method: for records that are no whole periods.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> figure = plots.density(record[:300], {"linear": bla.simulate(record[:300])})
-        >>> figure.savefig("density.png")
-    """
+    """Draw spectral densities by Welch of output and errors, if periods are not whole."""
     figure, axes = _panels(record, outputs)
     for i, ax in axes.items():
         for signal, label, colour, style in _signals(record, simulated, i):
@@ -121,18 +88,7 @@ def density(record: Record, simulated: Simulated, outputs: Sequence[int] | None 
 
 
 def response(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
-    """Measured and simulated output against time, and below them the errors; two panels an output.
-
-    The legend has the fit of each model, 100 % - NRMSE. The grey stretch is that of the close-up.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> figure = plots.response(record, {"linear": bla.simulate(record)})
-        >>> [ax.get_ylabel() for ax in figure.axes]
-        ['y', 'error']
-        >>> figure.axes[-1].get_xlabel()
-        'time in the record (s)'
-    """
+    """Draw outputs and below them errors against time; the stretch of the close-up is grey."""
     whole = slice(0, record.samples - record.skip)
     figure = _overlay(record, simulated, outputs, whole, _WIDE, fits=True)
     near = _worst_stretch(record, simulated, outputs)
@@ -145,16 +101,7 @@ def response(record: Record, simulated: Simulated, outputs: Sequence[int] | None
 
 
 def close_up(record: Record, simulated: Simulated, outputs: Sequence[int] | None = None) -> Figure:
-    """The response about the largest error of the first model that is not linear.
-
-    If all are, the first one counts.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> figure = plots.close_up(record, {"NL-LFR": model.simulate(record)})
-        >>> len(figure.axes)  # the outputs, and their errors
-        2
-    """
+    """Draw the response about the largest error of the first model that is not linear."""
     near = _worst_stretch(record, simulated, outputs)
     figure = _overlay(record, simulated, outputs, near, _NARROW)
     figure.suptitle(f"{record.name}: about the largest error", fontsize="medium")
@@ -164,12 +111,9 @@ def close_up(record: Record, simulated: Simulated, outputs: Sequence[int] | None
 def _worst_stretch(
     record: Record, simulated: Simulated, outputs: Sequence[int] | None = None
 ) -> slice:
-    """Some periods of the output about the largest error, counted from the first scored sample.
-
-    Of the first model that is not linear, or else of the first one. Errors of several outputs are
-    compared relative to the deviation of each. If the model runs away, this is about where it
-    begins.
-    """
+    """Some periods of the output about the largest error, from the first scored sample on."""
+    # Errors are those of the first model that is not linear, over the deviation of each output. If
+    # it runs away, this is about where it begins.
     columns = list(range(record.y.shape[1]) if outputs is None else outputs)
     y = record.y[record.skip :, columns]
     first = next((name for name in simulated if not _is_linear(name)), next(iter(simulated)))
@@ -180,8 +124,9 @@ def _worst_stretch(
     row, column = np.unravel_index(int(np.argmax(error)), error.shape)
     above = y[:, column] > np.mean(y[:, column])
     swings = max(1, np.count_nonzero(above[1:] != above[:-1])) / 2
-    least, most = _CLOSE_UP
-    length = min(_SWINGS * len(y) / swings, most, _LARGEST_PART * len(y))
+    least, most = (50, 2000)
+    # Eight periods, and no more than a quarter of a longer record.
+    length = min(8 * len(y) / swings, most, 0.25 * len(y))
     length = min(len(y), max(least, int(length)))
     begin = max(0, min(int(row) - length // 2, len(y) - length))
     return slice(begin, begin + length)
@@ -190,16 +135,7 @@ def _worst_stretch(
 def distribution(
     record: Record, simulated: Simulated, outputs: Sequence[int] | None = None
 ) -> Figure:
-    """How often which error occurs: density of the errors, logarithmic; one panel an output.
-
-    The legend says in which range the errors of 95 % of the samples are.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> figure = plots.distribution(record, {"NL-LFR": model.simulate(record)})
-        >>> figure.axes[0].get_xlabel()
-        'error of y'
-    """
+    """Draw densities of the errors; the legend has the range of 95 % of the samples."""
     figure, axes = _panels(record, outputs, _NARROW, sharex=False)
     figure.suptitle(f"{record.name}: errors", fontsize="medium")
     for i, ax in axes.items():
@@ -226,15 +162,7 @@ def distribution(
 
 
 def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Figure:
-    """Errors on training and validation records against iteration, the kept iterate marked.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> result = lfrtorch.fit(model, record, trainer=lfrtorch.LevenbergMarquardt(max_iter=3))
-        >>> figure = plots.convergence(result.history, result.chosen_iteration, unit="V")
-        >>> figure.axes[0].get_ylabel()
-        'simulation RMSE (mV)'
-    """
+    """Draw errors on training and validation against iteration, the kept iterate marked."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     ax = figure.subplots()
     iterations = [p.iteration for p in history]
@@ -252,13 +180,7 @@ def convergence(history: Sequence[Progress], chosen: int, unit: str = "") -> Fig
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG file.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> plots.png(plots.response(record, {"linear": bla.simulate(record)}))[1:4]
-        b'PNG'
-    """
+    """The figure as a PNG file."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=_DPI)
     return stream.getvalue()
@@ -357,15 +279,7 @@ def _drawn(simulated: Simulated) -> list[tuple[str, str, str]]:
 
 
 def envelope(t: Array, signal: Array) -> tuple[Array, Array]:
-    """A long signal as the smallest and largest sample of each of many short stretches.
-
-    Example:
-        >>> from lfrtorch.reporting import plots
-        >>> t = np.arange(100_000) / 1000
-        >>> short_t, short = plots.envelope(t, np.sin(t))
-        >>> len(short), bool(short.max() == np.sin(t).max())
-        (20000, True)
-    """
+    """A long signal as the smallest and largest sample of each of many short stretches."""
     stretch = len(signal) // (_MOST_POINTS // 2)
     if stretch < 2:
         return t, signal

@@ -18,12 +18,11 @@ from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.evaluation import HORIZONS, Evaluation
+from lfrtorch.reporting.score_columns import Row, columns, in_units
 from lfrtorch.reporting.verdict import Verdict
 
 ERRORS = "rmse", "lti_rmse"
 """Entries of a score in the unit of the outputs: of the NL-LFR and of the linear model."""
-
-_SEEN = 0.2  # part of an RMSE that an error must have to be told: it makes 2 % of it
 
 
 def metrics(
@@ -36,10 +35,8 @@ def metrics(
     refit: FitResult | None = None,
     residuals: Residuals | None = None,
 ) -> dict[str, Any]:
-    """What ``metrics.json`` holds of a fit, but for its origin; None if a number is not finite.
-
-    A model that was fitted again is scored on the tests; validation errors are those before it.
-    """
+    """What ``metrics.json`` holds of a fit, but for its origin; None for what is not finite."""
+    # A model fitted again is scored on the tests; validation errors are those before it.
     model, dataset = (refit or result).model, evaluation.dataset
     entries = scored(evaluation)
     entries["data"] |= {
@@ -150,46 +147,35 @@ def prediction_table(result: Mapping[str, Any]) -> str:
 
 def table(result: Mapping[str, Any], published: Sequence[Published]) -> str:
     """Our linear model and NL-LFR beside the published ones, in one unit; tests come first."""
-    sizes = result["sizes"]
-    mine = (sizes["nz"], sizes["nw"])
-    others = [p for p in published if p.sizes in (None, mine)]
-    listed = [*result["scores"].items(), *result["validation"]["records"].items()]
-    sources = any(s["source"] != "file" for _, s in listed)
-    models = ["lti_rmse", "rmse"] if sizes["nz"] else ["rmse"]
-    shown = [(line, s, of) for name, s in listed for line, of in lines(name, s, others)]
-    tested = {line for line, s, _ in shown if s["use"] == "test"}
-    factor, unit = tables.engineering(
-        [s[model] for _, s in listed for model in models], unit_of(result), published_unit(others)
-    )
-    others = [p for p in others if tested & p.scores.keys()]
-    ours = [linear_name(result), "NL-LFR"] if sizes["nz"] else ["linear"]
-    uncertain = any(map(start_matters, (s for _, s, _ in shown)))
-    head = ["record", "use", *["source"] * sources, "scored", *ours]
-    head += ["from the start"] * uncertain + [p.label for p in others]
+    sizes, shown = result["sizes"], f"nx {result['sizes']['nx']}, a linear model"
+    others = [p for p in published if p.sizes in (None, (sizes["nz"], sizes["nw"]))]
     rows = [
-        [
-            *(line, s["use"], *[s["source"]] * sources, of_samples(s)),
-            *(tables.times(factor, of[model]) for model in models),
-            *[tables.times(factor, s["start_error"])] * uncertain,
-            *(tables.times(factor, p.scores.get(line) if line in tested else None) for p in others),
-        ]
-        for line, s, of in shown
+        Row(line, name, s, "", s["unit"], of["lti_rmse"], math.nan if e is None else e)
+        for part in (result["scores"], result["validation"]["records"])
+        for name, s in part.items()
+        for line, of in lines(name, s, others)
+        for e in (of["rmse"],)
     ]
-    title = f"Simulation RMSE{f' ({unit})' if unit else ''}"
-    static = f"degree {sizes['degree']}" if "degree" in sizes else neurons(sizes)
-    title += f", nx {sizes['nx']}, "
-    title += f"nz {sizes['nz']}, nw {sizes['nw']}, {static}" if sizes["nz"] else "a linear model"
+    linear = linear_name(result)
+    if sizes["nz"]:
+        shown = static_map(sizes)
+    else:
+        linear, rows = "linear", [row._replace(linear=row.error, error=None) for row in rows]
+    rows = in_units(rows, others)
+    head, cells, _ = columns("terminal", rows, linear=linear, published=others)
+    units = {row.unit for row in rows}
+    title = f"Simulation RMSE{f' ({unit})' if len(units) == 1 and (unit := units.pop()) else ''}"
     if not rows:
-        return f"{title}: nothing is scored, as there is no test and no validation record"
-    predicted = prediction_table(result)
+        return f"{title}, {shown}: nothing is scored, as there is no test and no validation record"
     references = [
         "from the start: what the uncertainty of the estimated start state adds to the NL-LFR's "
         "error"
-    ] * uncertain
+    ] * ("from the start" in head)
     references += [own_linear(result)] if result["linear"] else []
-    references += [f"{p.label}: {p.reference}" for p in others]
-    simulated = [title, "", tables.table(head, rows), *[""] * bool(references), *references]
-    return "\n".join(simulated) + predicted
+    references += [f"{p.label}: {p.reference}" for p in others if p.label in head]
+    table = tables.table(head, cells)
+    simulated = [f"{title}, {shown}", "", table, *[""] * bool(references), *references]
+    return "\n".join(simulated) + prediction_table(result)
 
 
 def lines(
@@ -221,11 +207,6 @@ def own_linear(result: Mapping[str, Any]) -> str:
     return f"linear: a model for each of these: {', '.join(models)}"
 
 
-def published_unit(published: Sequence[Published]) -> str:
-    """The unit of tables, with a prefix, that publications give; none if they leave it open."""
-    return next((p.unit for p in published if p.unit), "")
-
-
 def unit_of(result: Mapping[str, Any]) -> str:
     """The unit of all errors in what :func:`metrics` returns; none if there are several."""
     listed = [*result["scores"].values(), *result["validation"]["records"].values()]
@@ -233,24 +214,13 @@ def unit_of(result: Mapping[str, Any]) -> str:
     return units.pop() if len(units) == 1 else ""
 
 
-def of_samples(score: Mapping[str, Any]) -> str:
-    """Which samples count, in words: the last ones of a record."""
-    scored, samples, skip = (score[name] for name in ("scored", "samples", "skip"))
-    if not scored:
-        return "not scored"
-    last = skip and scored == samples - skip and score.get("records", 1) == 1
-    return f"{'last ' * bool(last)}{scored} of {samples}"
-
-
-def start_matters(score: Mapping[str, Any]) -> bool:
-    """Whether the uncertainty of the start state makes a part of the error that is seen."""
-    added, error = score["start_error"], score["rmse"]
-    return added is not None and error is not None and added > _SEEN * error
-
-
-def neurons(sizes: Mapping[str, int]) -> str:
-    """The neurons in words; maps that are not networks have none."""
-    return f"{sizes['nn']} neurons" if sizes["nn"] else "a map of one's own"
+def static_map(sizes: Mapping[str, int]) -> str:
+    """The sizes in words."""
+    if "degree" in sizes:
+        kind = f"polynomial of degree {sizes['degree']}"
+    else:
+        kind = f"{sizes['nn']} neurons" if sizes["nn"] else "a map of one's own"
+    return f"nx {sizes['nx']}, nz {sizes['nz']}, nw {sizes['nw']}, {kind}"
 
 
 def starts_table(result: Mapping[str, Any], unit: str = "") -> str:

@@ -13,49 +13,26 @@ from lfrtorch.reporting.plots import envelope
 from lfrtorch.survey.measurement import Survey
 from lfrtorch.survey.signal import LEAST, SignalSurvey, longest_run
 
-INPUT, OUTPUT, BAND, CLIPPED = "#0072b2", "0.15", "0.9", "#d55e00"
-
-_RANGE = 120.0  # most dB that a spectrum shows
-_STRETCHES = 3000  # parts of the frequency axis: the largest line of each is drawn
-_BELOW = 3.0  # the frequency axis begins at the lowest end of a band divided by this
-
-BINS = 60
+OUTPUT = "0.15"
 
 
 def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
-    """A row a signal: against time, how often which value, amplitude spectrum with the band.
-
-    Args:
-        found: the survey.
-        signals: the inputs, then the outputs; NaN leaves a gap.
-        title: above all.
-
-    Shape:
-        signals: (T, nu + ny).
-
-    Example:
-        >>> from lfrtorch.reporting.survey_plots import survey_figure
-        >>> from lfrtorch.survey.measurement import survey_measurement
-        >>> found = survey_measurement(record.u, record.y, fs=record.fs)
-        >>> figure = survey_figure(found, np.hstack([record.u, record.y]))
-        >>> len(figure.axes)  # three of the input, three of the output
-        6
-    """
+    """Draw each of the signals (T, nu + ny), its values, and its spectrum with the band."""
     rows = len(found.signals)
     figure = Figure(figsize=(13, 1.2 + 2.0 * rows), layout="constrained")
     grid = figure.subplots(rows, 3, squeeze=False, sharex="col", width_ratios=[3.2, 0.8, 2.6])
     fs = 1.0 if found.fs is None else found.fs
     t = np.arange(len(signals)) / fs
     for one, signal, (time, values, lines) in zip(found.signals, signals.T, grid, strict=True):
-        colour = INPUT if one in found.inputs else OUTPUT
+        colour = "#0072b2" if one in found.inputs else OUTPUT
         time.plot(*envelope(t, signal), lw=0.6, color=colour)
         for end in one.clipped:
-            time.axhline(end.value, lw=1.0, ls="--", color=CLIPPED)
+            time.axhline(end.value, lw=1.0, ls="--", color="#d55e00")
         time.set_xlim(0, max(t[-1], 1 / fs))
         unit_axis(time.yaxis, time.get_ylim(), one.channel.name, one.channel.unit)
         known = signal[np.isfinite(signal)]
         share = np.full(len(known), 100 / max(len(known), 1))
-        values.hist(known, BINS, weights=share, orientation="horizontal", color=colour)
+        values.hist(known, 60, weights=share, orientation="horizontal", color=colour)
         values.set_ylim(time.get_ylim())
         values.tick_params(labelleft=False)
         _spectrum(lines, one, signal, fs, colour)
@@ -71,7 +48,7 @@ def survey_figure(found: Survey, signals: Array, title: str = "") -> Figure:
     time.set_xlabel("sample" if found.fs is None else "time (s)")
     values.set_xlabel("% of samples")
     lowest = min((one.band[0] for one in found.signals if one.band is not None), default=fs / 100)
-    lines.set(xscale="log", xlim=(lowest / _BELOW, fs / 2))
+    lines.set(xscale="log", xlim=(lowest / 3.0, fs / 2))
     lines.set_xlabel(f"frequency ({'cycles/sample' if found.fs is None else 'Hz'})")
     if title:
         figure.suptitle(title)
@@ -88,10 +65,11 @@ def _spectrum(ax: Axes, one: SignalSurvey, signal: Array, fs: float, colour: str
         return
     part = signal[first : first + length]
     f, power = scipy.signal.periodogram(part, fs, window="hann", scaling="spectrum")
-    edges = np.geomspace(f[1], f[-1], _STRETCHES)
+    # The largest line of each stretch is drawn.
+    edges = np.geomspace(f[1], f[-1], 3000)
     starts = np.unique(np.searchsorted(f, edges[edges <= f[-1]]))
     level = 10 * np.log10(np.maximum(2 * np.maximum.reduceat(power, starts), 1e-300))
     ax.plot(f[starts], level, lw=0.6, color=colour)
-    ax.axvspan(*one.band, color=BAND, zorder=0, lw=0)
+    ax.axvspan(*one.band, color="0.9", zorder=0, lw=0)
     top = float(level.max())
-    ax.set_ylim(max(float(level.min()) - 5, top - _RANGE), top + 5)
+    ax.set_ylim(max(float(level.min()) - 5, top - 120.0), top + 5)

@@ -33,7 +33,6 @@ NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
 SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
-_EQUAL = 5e-4  # difference that three digits do not show, its standard error included
 _CLEAR = 2.0  # ratio of two errors that is no chance, whatever its standard error
 
 CONFIDENCE = 0.975
@@ -47,13 +46,7 @@ _LONGEST_NAME = 28  # characters of a record's name in a sentence
 
 
 class Kind(StrEnum):
-    """What a verdict comes to.
-
-    Example:
-        >>> from lfrtorch.reporting.verdict import Kind
-        >>> Kind("worse") is Kind.WORSE
-        True
-    """
+    """What a verdict comes to."""
 
     BETTER = "better"
     """The NL-LFR is clearly better than the linear model on records that were not fitted."""
@@ -189,7 +182,8 @@ def judge(
             f"Better than {linear}: on {whole.name} the NL-LFR's {error} is "
             f"{of_linear(whole.ratio)}"
         )
-    elif abs(whole.ratio - 1.0) + whole.ratio_std < _EQUAL:
+    # Difference that three digits do not show, its standard error included.
+    elif abs(whole.ratio - 1.0) + whole.ratio_std < 5e-4:
         kind, use = Kind.LINEAR, LINEAR_MODEL
         kept = "the fit kept its start, and " * (result.chosen_iteration == 0)
         text = f"As {linear}: {kept}on {whole.name} the errors are the same"
@@ -220,12 +214,9 @@ def reconsidered(
     *,
     linear_nx: int,
 ) -> Verdict:
-    """The verdict on predictions one sample ahead, in view of others and of simulations.
-
-    Sensor noise may be all that both models leave one sample ahead. If they do alike there, the
-    NL-LFR is better where it is so in one of the views and worse in none. ``views`` has the records
-    farther ahead and simulated, by what their errors are called.
-    """
+    """The verdict on predictions one sample ahead, in view of others and of simulations."""
+    # Sensor noise may be all that both models leave one sample ahead. If they do alike there, the
+    # NL-LFR is better where it is so in one of the views, named by their errors, and worse in none.
     if verdict.kind != Kind.LINEAR or verdict.use == NEITHER:
         return verdict
     others = [
@@ -241,10 +232,7 @@ def reconsidered(
 
 
 def judge_linear(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Whether a linear model explains what was not fitted: its worst output on the tests.
-
-    Without tests that are scored it is judged on validation, and else on training.
-    """
+    """Judge a linear model by its worst output on the tests, else validation, else training."""
     errors = {use: _relative_errors(scores, use) for use in ("test", "validation", "train")}
     judged = next((use for use, found in errors.items() if found), None)
     if judged is None:
@@ -282,13 +270,7 @@ def _relative_errors(scores: Sequence[Mapping[str, Any]], use: str) -> dict[str,
 
 
 def of_linear(ratio: float) -> str:
-    """An error over the linear model's in words.
-
-    Example:
-        >>> from lfrtorch.reporting.verdict import of_linear
-        >>> of_linear(0.1234), of_linear(2.0)
-        ("12.3 % of the linear model's", "2.00 times the linear model's")
-    """
+    """An error over the linear model's in words."""
     if ratio < 1.005:  # 1.00 in three digits
         return f"{percent(ratio)} of the linear model's"
     return f"{number(ratio)} times the linear model's"

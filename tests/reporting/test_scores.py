@@ -13,6 +13,7 @@ from lfrtorch.dataset import Dataset, Published
 from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import scores as report
 from lfrtorch.reporting.evaluation import Evaluation, Response
+from lfrtorch.reporting.score_columns import of_samples
 
 pytestmark = pytest.mark.numeric
 
@@ -147,11 +148,11 @@ def test_table_shows_published_results_of_these_sizes_only(result):
 
 def test_the_table_says_which_samples_are_scored():
     counts = {"samples": 300, "skip": 5, "scored": 295}
-    assert report.of_samples(counts) == "last 295 of 300"
-    assert report.of_samples(counts | {"scored": 290}) == "290 of 300"  # some are not valid
-    assert report.of_samples(counts | {"records": 2}) == "295 of 300"
-    assert report.of_samples(counts | {"skip": 0, "scored": 300}) == "300 of 300"
-    assert report.of_samples(counts | {"skip": 300, "scored": 0}) == "not scored"
+    assert of_samples(counts) == "last 295 of 300"
+    assert of_samples(counts | {"scored": 290}) == "290 of 300"  # some are not valid
+    assert of_samples(counts | {"records": 2}) == "295 of 300"
+    assert of_samples(counts | {"skip": 0, "scored": 300}) == "300 of 300"
+    assert of_samples(counts | {"skip": 300, "scored": 0}) == "not scored"
 
 
 def test_what_is_not_finite_becomes_null():
@@ -164,4 +165,5 @@ def test_what_is_not_finite_becomes_null():
 
 
 def test_neurons_in_words():
-    assert report.neurons({"nn": 0}) == "a map of one's own"
+    sizes = {"nx": 2, "nz": 1, "nw": 1, "nn": 0}
+    assert report.static_map(sizes) == "nx 2, nz 1, nw 1, a map of one's own"

@@ -1,0 +1,139 @@
+"""Columns of the tables of scores: each is declared once, for a terminal and for the report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+from lfrtorch._support import tables
+from lfrtorch.dataset import Published
+from lfrtorch.reporting.evaluation import Score
+
+ALL = "all"
+"""Name of several outputs together."""
+
+USES = {"train": "fitted", "validation": "chooses the iterate", "selection": "chooses the start"}
+"""What the report says of a record's use."""
+
+
+class Row(NamedTuple):
+    """Errors on a record or a group of records, of one output or of all together."""
+
+    key: str  # by which publications name it; the record's own in the first of its rows
+    record: str
+    score: Mapping[str, Any]  # its entry in metrics.json
+    output: str
+    unit: str
+    linear: float | None
+    error: float | None = None  # of the NL-LFR; nan if it diverges
+    std: float = math.nan  # of the measured output
+    factor: float = 1.0  # of the errors, for the unit
+
+    @property
+    def ratio(self) -> float:
+        """The linear model's error over the NL-LFR's."""
+        return self.linear / self.error if self.linear is not None and self.error else math.nan
+
+    def relative(self, error: float | None) -> float | None:
+        """An error over the standard deviation of the output."""
+        return None if error is None else error / (self.std or math.nan)
+
+
+class _Column(NamedTuple):
+    """A column of scores: the tables that have it, and its cell, None or empty if it has none."""
+
+    head: str
+    where: str
+    cell: Callable[[Row], tables.Cell]
+
+
+def _error(row: Row) -> tables.Cell:
+    """The NL-LFR's error, or that it diverges."""
+    known = row.error is None or not row.score["scored"] or math.isfinite(row.error)
+    return tables.times(row.factor, row.error) if known else "diverges"
+
+
+def _start(row: Row) -> tables.Cell:
+    """What the uncertainty of the start adds, if that matters."""
+    return tables.times(row.factor, row.score["start_error"]) if start_matters(row.score) else None
+
+
+def _published(of: Published, row: Row) -> tables.Cell:
+    """What was published of a test."""
+    known = of.scores.get(row.key) if row.score["use"] == "test" else None
+    return tables.times(row.factor, known)
+
+
+_COLUMNS = (
+    _Column("record", "terminal", lambda r: r.key),
+    _Column("record", "tests others", lambda r: r.record if r.key == r.record else ""),
+    _Column("record", "linear", lambda r: r.record),
+    _Column("use", "terminal linear", lambda r: r.score["use"]),
+    _Column("use", "others", lambda r: USES[r.score["use"]] if r.key == r.record else ""),
+    _Column("source", "terminal linear", lambda r: r.score["source"].replace("file", "")),
+    _Column("scored", "terminal linear", lambda r: of_samples(r.score)),
+    _Column("output", "tests others", lambda r: r.output if "outputs" in r.score else ""),
+    _Column("output", "linear", lambda r: r.output),
+    _Column("unit", "tests others", lambda r: r.unit if "outputs" in r.score else ""),
+    _Column("unit", "linear", lambda r: r.unit),
+    _Column("{linear}", "terminal tests others linear", lambda r: tables.times(r.factor, r.linear)),
+    _Column("NL-LFR", "terminal tests others", _error),
+    _Column("from the start", "terminal", _start),
+    _Column("ratio", "tests others", lambda r: r.ratio),
+    _Column("linear NRMSE", "tests others", lambda r: tables.percent(r.relative(r.linear))),
+    _Column("% of std", "linear", lambda r: tables.in_percent(r.relative(r.linear))),
+    _Column("NRMSE", "tests others", lambda r: tables.percent(r.relative(r.error))),
+)
+
+
+def columns(
+    where: str, rows: Sequence[Row], *, linear: str = "linear", published: Sequence[Published] = ()
+) -> tuple[list[str], list[list[tables.Cell]], int]:
+    """Head and cells of the columns that have some, and how many of words come first."""
+    found = [column for column in _COLUMNS if where in column.where.split()]
+    found += [_Column(p.label, where, partial(_published, p)) for p in published]
+    found = [c for c in found if any(c.cell(row) not in ("", None) for row in rows)]
+    head = [column.head.format(linear=linear) for column in found]
+    words = sum(column.head in ("record", "use", "output", "unit") for column in found)
+    return head, [[column.cell(row) for column in found] for row in rows], words
+
+
+def rows_of(record: str, score: Score) -> list[Row]:
+    """Errors of all outputs together, if they have one unit, and of each if there are several."""
+    entry, unknown = score.entry(), [None] * len(score.channels)
+    columns = score.lti_rmse_by_output or unknown, score.rmse_by_output or unknown
+    rows = [
+        Row(f"{record} {c.name}", record, entry, c.name, c.unit, linear, error, std)
+        for c, linear, error, std in zip(score.channels, *columns, score.std_by_output, strict=True)
+    ]
+    if len(rows) > 1 and len({row.unit for row in rows}) == 1:
+        unit = rows[0].unit
+        rows.insert(0, Row("", record, entry, ALL, unit, score.lti_rmse, score.rmse, score.std))
+    return [rows[0]._replace(key=record), *rows[1:]]
+
+
+def in_units(rows: Sequence[Row], published: Sequence[Published] = ()) -> list[Row]:
+    """The rows of each unit with its prefix and factor; publications may ask for a prefix."""
+    values: dict[str, list[float | None]] = {}
+    for row in rows:
+        values.setdefault(row.unit, []).extend([row.linear, row.error])
+    asked = next((p.unit for p in published if p.unit), "")
+    found = {unit: tables.engineering(own, unit, asked) for unit, own in values.items()}
+    return [row._replace(factor=found[row.unit][0], unit=found[row.unit][1]) for row in rows]
+
+
+def of_samples(score: Mapping[str, Any]) -> str:
+    """Which samples count, in words: the last ones of a record."""
+    scored, samples, skip = (score[name] for name in ("scored", "samples", "skip"))
+    if not scored:
+        return "not scored"
+    last = skip and scored == samples - skip and score.get("records", 1) == 1
+    return f"{'last ' * bool(last)}{scored} of {samples}"
+
+
+def start_matters(score: Mapping[str, Any]) -> bool:
+    """Whether the uncertainty of the start state makes a part of the error that is seen."""
+    added, error = score["start_error"], score["rmse"]
+    return added is not None and error is not None and added > 0.2 * error  # 2 % of its power
