@@ -32,7 +32,6 @@ SWEEPS = {"-m", "--multirun"}
 """Options that make several runs of several values."""
 
 _SETTING = re.compile(r"[+~]*[a-z_.]+=")  # what a word NAME=VALUE begins with
-_WITHOUT_DATA = ("export",)  # commands that read no data
 
 
 def take_words(command: str, whole: Callable[[Sequence[str]], list[str]] = list) -> None:
@@ -180,7 +179,7 @@ def unknown(command: str, word: Override, cfg: DictConfig) -> str:
     """What to write for a setting that there is not."""
     key = word.key_or_group
     _, value = str(word.input_line).split("=", 1)
-    if command not in _WITHOUT_DATA and cfg.get("data") is None:
+    if command != "export" and cfg.get("data") is None:
         if key.startswith("data."):
             return f"{key} is of no use before data are chosen: add data=file, or +bench=NAME."
         cfg = DictConfig({**cfg, "data": OmegaConf.load(CONF / "data" / "file.yaml")})

@@ -62,11 +62,6 @@ from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.run_files import write
 from lfrtorch.reporting.verdict import LINEAR_MODEL
 
-_PRINTED = 5  # most lines of advice that are printed; the report has all
-
-WITHOUT_FILES = ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
-"""Settings of Hydra for all processes but the first."""
-
 
 def run(
     cfg: DictConfig,
@@ -105,7 +100,8 @@ def run(
             write(
                 found, folder, command=command, config=config, draw=cfg.figures, board=files.board
             )
-            for item in found.advice[:_PRINTED]:
+            # Most lines of advice that are printed; the report has all.
+            for item in found.advice[:5]:
                 print(f"next: {item.text}\n      ({item.evidence})")
             if found.verdict.use == LINEAR_MODEL:
                 checkpoint = shlex.quote(f"checkpoint={folder / 'linear'}")
@@ -230,7 +226,8 @@ def launch() -> None:
         several = study.is_study(sys.argv)
         take_words("config", study.study_words if several else arguments)
     if WORLD > 1 and os.environ["RANK"] != "0":
-        sys.argv += WITHOUT_FILES
+        # Settings of Hydra for all processes but the first.
+        sys.argv += ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none"]
     if several:
         with user_errors():  # Ctrl-C and SIGTERM reach the runs
             study.went_on(main)

@@ -21,10 +21,6 @@ class TerminatedError(LfrtorchError):
         self.number = number
 
 
-AGAIN = 0.05
-"""Seconds after which a signal comes again that a library took for an error of its own."""
-
-
 @contextmanager
 def handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
     """Inside, ``handler`` takes SIGTERM, and Ctrl-C unless it is ignored.
@@ -38,7 +34,8 @@ def handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
         if not isinstance(failed.exc_value, TerminatedError | KeyboardInterrupt):
             hook(failed)
         elif handler is as_error:
-            again = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
+            # It comes again once the library is done.
+            again = threading.Timer(0.05, os.kill, (os.getpid(), number))
             again.daemon = True
             again.start()
 

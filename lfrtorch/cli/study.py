@@ -43,17 +43,19 @@ from lfrtorch.cli.interrupts import TerminatedError
 from lfrtorch.cli.quotes import register_resolver
 from lfrtorch.cli.run_folder import SNAPSHOTS
 
-LOG, FAILED, LOCK = "log.txt", "failed.txt", ".lock"
+LOG, FAILED = "log.txt", "failed.txt"
 """In the folder of a run: what it printed, why it failed, and what says that a process is at it."""
 
-_NOT_COMPARED = ("overwrite", "resume")  # words that are not about what a run computes
 _LONGEST = 120  # characters of a folder's name; file systems take 255 bytes
 
 ATTEMPTS = 3
 """How often the runs that are left are begun if processes are killed that many runs share."""
 
-KILLED = {"BrokenProcessPool", "UncompletedJobError", "WorkerCrashedError", "NodeDiedError"}
+
+_KILLED = {"BrokenProcessPool", "UncompletedJobError", "WorkerCrashedError", "NodeDiedError"}
 """Errors of joblib, submitit and Ray if one of their processes is."""
+
+LOADED = ("lfrtorch.cli.fit", "lfrtorch._public", "pandas", "scipy.signal")
 
 LAUNCHERS = {
     "joblib": "hydra_plugins.hydra_joblib_launcher",
@@ -63,18 +65,11 @@ LAUNCHERS = {
 }
 """What starts several runs at once, and the package that it needs."""
 
-REQUESTS = 1.0
-"""Seconds after which a worker of Ray looks whether its run is to end: no signal wakes it."""
-
-IN_SEQUENCE = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 
 PROCESSES = get_context("forkserver") if sys.platform == "linux" else get_context("spawn")
 """Runs begin as copies of a process that has loaded what they need and has computed nothing: its
 threads are not copied, and a run would wait for them. Other systems' libraries allow no copies.
 """
-
-LOADED = ("lfrtorch.cli.fit", "lfrtorch._public", "pandas", "scipy.signal")
-"""Modules that runs need, loaded before they begin: some take seconds."""
 
 
 def folder_name(varied: str) -> str:
@@ -134,7 +129,7 @@ def _same_study(folder: Path, common: Sequence[str]) -> None:
 
 def _compared(words: Sequence[str]) -> list[str]:
     """The words that say what a run computes, in an order of their own."""
-    return sorted(word for word in words if word.partition("=")[0] not in _NOT_COMPARED)
+    return sorted(word for word in words if word.partition("=")[0] not in ("overwrite", "resume"))
 
 
 def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, hydra: Any) -> float:
@@ -148,7 +143,8 @@ def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, h
         if known is not None:
             print(f"{folder.name}: done before", flush=True)
             return known
-        if cfg.threads is None and hydra.launcher._target_ != IN_SEQUENCE:
+        one_by_one = hydra.launcher._target_.endswith(".BasicLauncher")
+        if cfg.threads is None and not one_by_one:
             cfg.threads = hydra.launcher.get("cpus_per_task") or 1
         if not cfg.overwrite and cfg.resume is None and (folder / SNAPSHOTS).is_dir():
             cfg.resume = str(folder)
@@ -190,7 +186,7 @@ def alone(folder: Path) -> Iterator[Connection | None]:
     except ImportError:  # not on Windows
         yield None
         return
-    with Connection(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)) as lock:
+    with Connection(os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o666)) as lock:
         fcntl.flock(lock.fileno(), fcntl.LOCK_EX)
         yield lock
 
@@ -201,14 +197,16 @@ def _apart(
     """The value of the work, None if it failed, and how it ended; what it prints is in a file."""
     if get_start_method() not in get_all_start_methods():  # joblib's, which our processes lack
         set_start_method(PROCESSES.get_start_method(), force=True)
-    PROCESSES.set_forkserver_preload([*LOADED])
+    # Modules that runs need are loaded before they begin: some take seconds.
+    PROCESSES.set_forkserver_preload(list(LOADED))
     ours, theirs = PROCESSES.Pipe(duplex=False)
     process = PROCESSES.Process(target=_send, args=(theirs, work, cfg, log, lock))
     process.start()
     theirs.close()
     try:
         while process.exitcode is None:
-            process.join(REQUESTS)
+            # No signal wakes a worker of Ray: it looks whether its run is to end.
+            process.join(1.0)
     except KeyboardInterrupt:  # it was asked to end as well, and keeps what it found
         process.join()
         raise
@@ -299,7 +297,7 @@ def went_on(launched: Callable[[], Any]) -> None:
             print(f"{how}: the same command with that folder goes on", file=sys.stderr)
             sys.exit(128 + number)
         except Exception as error:
-            if not {kind.__name__ for kind in type(error).__mro__} & KILLED:
+            if not {kind.__name__ for kind in type(error).__mro__} & _KILLED:
                 raise
             print("a process was killed: going on with the runs that are left", file=sys.stderr)
     sys.exit(f"processes were killed {ATTEMPTS} times: is there memory enough for so many at once?")

@@ -17,8 +17,6 @@ from lfrtorch.export.equations import Equations, equations, printable, rendered
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
-_COMPILERS = ("gcc", "cc", "clang")
-
 
 def write_fmu(model: Model | LinearModel, path: str | Path, name: str = "model") -> None:
     """Write a model as an FMU 2.0 for co-simulation: a binary for Linux x86_64 and its sources.
@@ -65,7 +63,7 @@ def _compiled(files: dict[str, str], name: str) -> bytes:
             f"this machine is {' '.join(machine)}, and an FMU is compiled on Linux x86_64 alone; "
             "compile what to=c writes for your tool."
         )
-    compiler = next(filter(None, map(shutil.which, _COMPILERS)), None)
+    compiler = next(filter(None, map(shutil.which, ("gcc", "cc", "clang"))), None)
     if compiler is None:
         raise InputError("an FMU needs a C compiler; install gcc, or export with to=c.")
     with tempfile.TemporaryDirectory() as folder:

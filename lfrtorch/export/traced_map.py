@@ -20,12 +20,6 @@ OPSET, IR = 17, 8
 _SAMPLES = (1, 5, 64)
 """Numbers of inputs on which graph and map are compared."""
 
-_LARGEST = 3.0
-"""Standard deviation of the loudest of them; z is of about unit size."""
-
-_ROUNDING = 1e-11
-"""Largest error of the graph, relative to 1 and to the largest w."""
-
 
 def traced(static: Own, nz: int) -> Any:
     """The graph z (n, nz) -> w (n, nw) of a map, an ``onnx.ModelProto``.
@@ -54,14 +48,16 @@ def traced(static: Own, nz: int) -> Any:
         raise _refused(static, "Its forward branches in Python on values; use torch.where.")
     model = onnx.load_from_string(file.getvalue())
     run = imported("onnx.reference", "onnx").ReferenceEvaluator(model).run
-    for scale, count in zip(np.linspace(_LARGEST, 0.0, len(_SAMPLES) + 1), _SAMPLES, strict=False):
+    # Standard deviation of the loudest of them; z is of about unit size.
+    for scale, count in zip(np.linspace(3.0, 0.0, len(_SAMPLES) + 1), _SAMPLES, strict=False):
         point = float(scale) * z[:count]
         with torch.no_grad():
             expected = static.module(point).numpy()
         (found,) = run(None, {"z": point.numpy()})
         size = max(1.0, np.abs(np.nan_to_num(expected)).max())
+        # Largest error of the graph, relative to 1 and to the largest w.
         if found.shape != expected.shape or not np.allclose(
-            found, expected, rtol=0, atol=_ROUNDING * size, equal_nan=True
+            found, expected, rtol=0, atol=1e-11 * size, equal_nan=True
         ):
             raise _refused(
                 static,

@@ -27,7 +27,6 @@ from lfrtorch.files.table import BLOCK, Clock, Table
 
 _REAL, _TIMES = "biuf", "M"
 
-_RECORD = 32  # samples of a vector that tells the axis of time; shorter ones may be gains
 
 _FREQUENCY = re.compile(
     r"f_?s(amp|ampling|ample)?|s_?rate|sampl(e|ing)[ _-]?(rate|freq|frequency)", re.IGNORECASE
@@ -37,7 +36,6 @@ _INTERVAL = re.compile(
     re.IGNORECASE,
 )
 
-_OBJECT = 3  # MATLAB_object_decode of an object: what is stored is where its parts are
 _IS_OBJECT = "is an object (a table, timetable or iddata, for example); store its arrays"
 
 _UNREADABLE = (
@@ -143,7 +141,8 @@ class ArrayTable(Table):
         self.contents = contents = []
         signals = {name: s for name, s in found.items() if isinstance(s, Signal)}
         vectors = {max(s.shape) for s in signals.values() if s.vector and not s.refusal()}
-        vectors = {T for T in vectors if T >= _RECORD}
+        # Shorter vectors may be gains.
+        vectors = {T for T in vectors if T >= 32}
         headers, units, arrays, refused, rates = [], {}, {}, {}, {}
         lengths: list[int] = []
         for name, signal in found.items():
@@ -381,7 +380,8 @@ def _group(
             elif item.attrs.get("MATLAB_class") in (b"char", b"string"):
                 found[name] = "is text; store an array of real numbers"
                 continue
-            elif item.attrs.get("MATLAB_object_decode", 0) == _OBJECT:
+            # MATLAB_object_decode of an object: what is stored is where its parts are.
+            elif item.attrs.get("MATLAB_object_decode", 0) == 3:
                 found[name] = _IS_OBJECT
                 continue
             elif "MATLAB_empty" in item.attrs:

@@ -24,8 +24,8 @@ _HEAD = 1000
 _MOST_ROWS = 2**20
 """Rows that a sheet of Excel may have."""
 
-_PACKED, _LARGE = 100, 1e8
-"""How many times longer a part of that many bytes may be than it is packed: see Apache POI,
+_PACKED = 100
+"""How many times longer a part of 1e8 bytes may be than it is packed: see Apache POI,
 ZipSecureFile, whose limits are 100 times and 1e5 bytes. Sheets of numbers are packed 5 to 20 times.
 """
 
@@ -148,7 +148,7 @@ class ExcelTable(TextTable):
     def _refuse_bombs(self) -> None:
         with zipfile.ZipFile(self._file) as archive:
             for part in archive.infolist():
-                if part.file_size > max(_LARGE, _PACKED * part.compress_size):
+                if part.file_size > max(1e8, _PACKED * part.compress_size):
                     raise InputError(
                         f"'{self._file}': its part {part.filename!r} takes "
                         f"{in_bytes(part.file_size)} unpacked, over {_PACKED} times what it takes "

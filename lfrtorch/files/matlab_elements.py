@@ -8,7 +8,7 @@ import zlib
 from pathlib import Path
 from typing import IO
 
-_HEADER, _ORDER = 128, 126  # bytes: of the header, and before the mark of the byte order
+_HEADER = 128  # bytes
 _PIECE = 1 << 20  # bytes that are in memory at once
 
 _NUMBERS = frozenset((1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18))  # kinds of elements
@@ -28,7 +28,7 @@ def check_elements(path: Path) -> None:
     """
     with path.open("rb") as stream:
         header = stream.read(_HEADER)
-        order = "<" if header[_ORDER:] == b"IM" else ">"
+        order = "<" if header[126:] == b"IM" else ">"
         _walk(stream, path.stat().st_size - _HEADER, order, frozenset((_MATRIX, _PACKED)), 0)
 
 

@@ -22,9 +22,7 @@ from lfrtorch.records import Channel, interpolated
 
 Gaps = Literal["error", "split"]
 
-_GLANCE = 1000  # samples that show of most columns that they are no grid of time
 _SAME = 1e-3  # relative: sampling frequencies that do not contradict one another
-_NEAR = 0.1  # relative: the usual step of stamps that are uneven is of that frequency
 
 
 @dataclass(frozen=True)
@@ -346,7 +344,8 @@ def _beside(
     ]
     reasons: dict[int, UnevenError] = {}
     grids: dict[int, Sampling] = {}
-    for samples in (BLOCK,) if named else (_GLANCE, BLOCK):
+    # A few samples show of most columns that they are no grid of time.
+    for samples in (BLOCK,) if named else (1000, BLOCK):
         grids.clear()
         for column, t in _first(table, left, samples).items():
             try:
@@ -399,10 +398,11 @@ def _beside_rate(
     ]
     if agree:
         return (agree[0],), notes
+    # The usual step of stamps that are uneven is of that frequency.
     return (), notes + [
         _lost(table, column, error)
         for column, error in reasons
-        if error.fs and _agrees(fs / error.fs, _NEAR)
+        if error.fs and _agrees(fs / error.fs, 0.1)
     ]
 
 

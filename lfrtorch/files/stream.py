@@ -17,7 +17,6 @@ from lfrtorch.files.time_stamps import UnevenError, sampling, time_unit
 from lfrtorch.records import Channel
 
 _SAME = 1e-3  # relative difference of sampling frequencies that counts as none: clocks differ
-_OVERLAP = 1000  # time stamps of the last block that are looked at with those of a short one
 
 
 class Block(NamedTuple):
@@ -89,7 +88,8 @@ class FileStream:
             times, u, y = np.split(block, ends, axis=1)
             if self.times:
                 times = times * (seconds := seconds or self._seconds(times[:, 0]))
-                seen = np.concatenate([seen[-_OVERLAP:], times[:, 0]])
+                # Those of the last block are looked at with those of a short one.
+                seen = np.concatenate([seen[-1000:], times[:, 0]])
                 self._check(seen, first + len(block) - len(seen))
             yield Block(times, u, y)
             first += len(block)

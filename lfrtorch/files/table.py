@@ -27,14 +27,11 @@ BLOCK = 65536
 LEAST = 10
 """Samples that tell a header of numbers above them, and words below, and rows of words at most."""
 
-_COPIES = 3  # of the samples in memory: as they were read, as a record, and normalised
-_CLOSE = 0.75  # similarity of names from which on one may be meant for the other
 _SCALED = "m|g|s|A|K|mol|cd|Hz|N|Nm|Pa|J|W|VA|V|F|Ω|[Oo]hm|T|H|Wb|S|rad|bar|l|L|eV|C|B"
 _OTHER = "min|h|d|sec|deg|°|°C|°F|deg[CF]|%|rpm|rev|psi|lbf?|in|ft|dB|px|counts?|a\\.u\\.|-|1"
 _ATOM = rf"(?:(?:da|[TGMkhdcmuµμnpf])?(?:{_SCALED})|{_OTHER})(?:\^?-?[0-9²³⁻¹]+)?"
 _UNIT = re.compile(rf"{_ATOM}(?:[/*·. ]{_ATOM})*")
 _BRACKETS = re.compile(r"(.*)[(\[]([^()\[\]]*)[)\]]")
-_LONGEST_UNIT = 16
 _CHANNEL = re.compile(r"(.+)\[(\d+)\]")
 
 _Row = TypeVar("_Row")
@@ -137,8 +134,9 @@ class Table(ABC):
 
     def check_memory(self, numbers: float) -> None:
         """Refuse what has so many numbers that there is no memory for it with a ValueError."""
+        # Samples are in memory as they were read, as a record, and normalised.
         check_memory(
-            _COPIES * 8.0 * numbers,
+            3 * 8.0 * numbers,
             f"'{self.path}', of which {numbers:g} numbers are to be read,",
             "give a part of it",
         )
@@ -205,7 +203,7 @@ class Table(ABC):
         """The name without its unit that a word in small letters may be meant for."""
         spelt = self.headers, [column.name for column in self.columns]
         names = {of[i].lower(): spelt[1][i] for of in spelt for i in range(len(of))}
-        close = difflib.get_close_matches(wanted, names, n=1, cutoff=_CLOSE)
+        close = difflib.get_close_matches(wanted, names, n=1, cutoff=0.75)
         last = [name for name in spelt[1] if re.split(r"\W+", name.lower())[-1] == wanted]
         if close:
             return names[close[0]]
@@ -239,7 +237,7 @@ def _parts(header: str) -> tuple[str, str]:
     """What stands before the brackets at its end and in them; empty if nothing is that short."""
     found = _BRACKETS.fullmatch(header)
     inside = found[2].strip() if found else ""
-    return (found[1], inside) if found and 0 < len(inside) <= _LONGEST_UNIT else (header, "")
+    return (found[1], inside) if found and 0 < len(inside) <= 16 else (header, "")
 
 
 def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel, ...]:

@@ -26,7 +26,6 @@ from lfrtorch.files.table import BLOCK, LEAST, Clock, Table, bracketed, is_unit
 
 _HEAD = 1 << 18  # characters that tell the layout
 _LONGEST = 1 << 25  # characters of a line
-_DELIMITERS = ("\t", ";", ",", "|", " ")  # " ": any blanks; the first of those that do as well
 _MARKS = "#%"  # of comment lines
 _COMMENT = re.compile(r"^[ \t]*[#%](?!N/?A\b|[A-Z]+/?0?[!?]).*(?:\n|$)", re.MULTILINE)  # no #N/A
 _MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-nan", "<na>", "#na", "-")
@@ -315,8 +314,9 @@ def _layout(path: Path) -> Layout:
     if not any(line.strip() for line in text):
         raise InputError(f"'{path}' is empty; give a file with data.")
     try:
+        # A blank stands for any number of them; the first of those that do as well is taken.
         delimiter, lines = max(
-            ((d, list(_split(iter(text), d))) for d in _DELIMITERS),
+            ((d, list(_split(iter(text), d))) for d in ("\t", ";", ",", "|", " ")),
             key=lambda split: _order(split[0], split[1]),
         )
     except csv.Error as error:

@@ -11,12 +11,9 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.records import Channel
 
-_JITTER = 0.1  # of a step: how far a stamp may be from its place in an even grid
 _GAP = 1.5  # steps: from here on samples are missing
 _OFTEN = 0.1  # of the samples: if more steps seem to be gaps, the stamps are rounded
 _ROUNDED = 1.01  # digits: how far a stamp may be from there if the last digit rounds
-_SURE = 1e-3  # relative: a sampling frequency that is known as well needs no word on that
-_SHOWS = 5  # steps that the last digit makes unlike the others, before it is taken to round
 _NAMES = re.compile(
     r"(t|time|zeit|uhrzeit|timestamps?|time[ _-]?stamps?|date[ _-]?time|date|sec|seconds?|x_value)",
     re.IGNORECASE,
@@ -38,10 +35,6 @@ _SECONDS = {
 }
 _KNOWN = "s, ms, us, ns, min, h or d"
 _SINCE_1970 = (1e9, 4e9)  # seconds: the years 2001 to 2096
-_COUNTED = ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds"))
-_LATEST = 1e10  # seconds that a column without a unit may have: 300 years
-_SERIAL = ((36526, 73051), (730486, 767011))  # days of 2000 to 2100 in spreadsheets and in MATLAB
-_ROUND = (1, 2, 5, 10, 15, 20, 30, 60, 120, 180, 300, 600, 900, 1200, 1800, 3600)  # s, of loggers
 
 
 class Sampling(NamedTuple):
@@ -64,7 +57,8 @@ class Sampling(NamedTuple):
     def __str__(self) -> str:
         """What a column is taken for: the unit, the frequency and how far it may be off."""
         unit = f" in {self.unit}" if self.unit else ""
-        off = f" ± {100 * self.uncertainty:.1g} %" if self.uncertainty > _SURE else ""
+        # A frequency that is known as well needs no word on that.
+        off = f" ± {100 * self.uncertainty:.1g} %" if self.uncertainty > 1e-3 else ""
         return f"the time{unit}, {self.fs:.6g} Hz{off}"
 
 
@@ -109,17 +103,26 @@ def time_unit(t: Array, channel: Channel) -> TimeUnit:
         return TimeUnit(seconds)
     known = t[np.isfinite(t)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-    for seconds, name in _COUNTED:
+    for seconds, name in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
         if _SINCE_1970[0] <= seconds * low and seconds * high <= _SINCE_1970[1]:
             return TimeUnit(seconds, f"{name} since 1970")
     remedy = f"write the unit behind the name, {_KNOWN} in brackets"
-    if high > _LATEST:
+    # Three hundred years, in seconds.
+    if high > 1e10:
         raise UnevenError(f"goes up to {high:.6g} and has no unit", int(np.nanargmax(t)), remedy)
-    if known.size > 1 and any(first <= low and high <= last for first, last in _SERIAL):
+    # Days of 2000 to 2100 in spreadsheets and in MATLAB.
+    if known.size > 1 and any(
+        first <= low and high <= last for first, last in ((36526, 73051), (730486, 767011))
+    ):
         step = 86400 * float(np.median(np.diff(known)))
         if 0 < step < 1:
             return TimeUnit(86400.0, "days of a calendar")
-        if np.isclose(step, _ROUND, rtol=2e-3).any():
+        # Steps of loggers in s.
+        if np.isclose(
+            step,
+            (1, 2, 5, 10, 15, 20, 30, 60, 120, 180, 300, 600, 900, 1200, 1800, 3600),
+            rtol=2e-3,
+        ).any():
             raise UnevenError(
                 f"begins at {low:.10g}, which may be seconds or the days of a calendar", 0, remedy
             )
@@ -180,7 +183,8 @@ def _rounded(t: Array, digit: float) -> bool:
     away = t - t.mean()
     away -= k * (k @ away) / (k @ k)  # the line of least squares is off by digit / sqrt(T)
     shows = np.count_nonzero(np.abs(steps - np.median(steps)) > 0.5 * digit)
-    return bool(shows >= _SHOWS and np.ptp(away) <= (1.1 + 3 / np.sqrt(len(t))) * digit)
+    # The last digit is taken to round if it makes some steps unlike the others.
+    return bool(shows >= 5 and np.ptp(away) <= (1.1 + 3 / np.sqrt(len(t))) * digit)
 
 
 def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
@@ -197,7 +201,8 @@ def _grid(t: Array, digit: float, gaps: Integers) -> Sampling:
     place = np.arange(len(t)) - np.repeat(starts, lengths)
     away = t - np.repeat(t[starts], lengths) - place * mean
     away -= np.repeat(np.add.reduceat(away, starts) / lengths, lengths)
-    far = np.abs(away) > _JITTER * mean + _ROUNDED * digit
+    # Jitter: so far, in steps, a stamp may be from its place in an even grid.
+    far = np.abs(away) > 0.1 * mean + _ROUNDED * digit
     if far.any():
         twice = np.flatnonzero(steps == 0) + 1
         if 0 < twice.size < _OFTEN * len(t) and _is_grid(np.delete(t, twice)):

@@ -24,7 +24,6 @@ _MOST = 2**21  # samples of a record that are looked at, the first ones after ``
 # Inputs stand still if all of them stay within REST of their rms for the share STILL of the record,
 # which is looked at in STRETCHES parts.
 _STILL, _STRETCHES, _REST = 0.2, 200, 0.05
-_STUCK = 0.1  # share of the record in which an output does not change at all, while an input does
 
 # A record is oversampled if all power lies below fs / OVERSAMPLED; decimation leaves it below
 # fs / WANTED.
@@ -154,7 +153,7 @@ def _levels(found: Survey, u: Array, y: Array, skipped: int) -> Iterator[Note]:
             )
         first, length = longest_run(np.diff(signal) == 0)
         length += 1
-        stuck = length >= _STUCK * T and one.values > 2 and not one.clipped
+        stuck = length >= 0.1 * T and one.values > 2 and not one.clipped
         if stuck and not (roles and _rests(found.inputs, u[first : first + length])):
             yield Note(
                 f"stuck {name}",
