@@ -24,10 +24,7 @@ _locks: dict[Path, int] = {}
 
 
 class Claim(Callback):
-    """Called by Hydra when it knows the folder of a run and has not made it yet.
-
-    Not of several runs: a study keeps each of its folders to one process itself.
-    """
+    """Hydra calls it before it makes the folder of one run; studies keep theirs themselves."""
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """Claim ``hydra.run.dir``."""

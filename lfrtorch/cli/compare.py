@@ -51,10 +51,7 @@ def _record_of_run(folder: Path) -> Record | None:
 
 
 def run(folders: list[Path], out: str | Path | None = None, record: Record | None = None) -> None:
-    """Print the tables, and write the files.
-
-    By default these go where all folders lie, and the record is one of the best run's data.
-    """
+    """Print the tables, and write the files: by default where all folders lie."""
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"'{folder}' is no folder of runs; give one or several.")

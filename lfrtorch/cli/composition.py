@@ -35,10 +35,7 @@ _SETTING = re.compile(r"[+~]*[a-z_.]+=")  # what a word NAME=VALUE begins with
 
 
 def take_words(command: str, whole: Callable[[Sequence[str]], list[str]] = list) -> None:
-    """Check the command line, and leave it to Hydra with quotes around what it cannot read without.
-
-    ``whole`` adds what the words stand for, as the settings of the run in ``resume=DIR``.
-    """
+    """Check the words, after ``whole`` has completed them, and quote them for Hydra."""
     given = sys.argv[1:]
     sys.argv[1:] = [quoted(word) for word in whole(given)]
     check_words(command, given, sys.argv[1:])
@@ -72,10 +69,8 @@ def name_paths(option: str) -> None:
 
 
 def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> None:
-    """Refuse words that Hydra would not take, or would add where nothing reads them.
-
-    The words that are used may have those of an earlier run before them, which were taken then.
-    """
+    """Refuse words that Hydra would not take, or would add where nothing reads them."""
+    # ``used`` may have words of an earlier run before them, which were taken then.
     if {word for word in given if word.startswith("-")} - SWEEPS:
         return  # an option of Hydra, as --help
     several = not SWEEPS.isdisjoint(given)
@@ -195,10 +190,9 @@ def unknown(command: str, word: Override, cfg: DictConfig) -> str:
 
 
 def spelt(cfg: DictConfig) -> Iterator[tuple[str, str]]:
-    """What a user may write for a setting, and the word of the command line.
-
-    Of a name in several groups the last of ``GROUPS`` is meant, and above all groups that without.
-    """
+    """What a user may write for a setting, and the word of the command line."""
+    # Of a name in several groups the last of ``GROUPS`` is meant, above all groups that without
+    # one.
     groups = [name for name, node in cfg.items() if isinstance(node, DictConfig)]
     for group in sorted(map(str, groups), key=lambda name: (name in GROUPS, name)):
         for name in cfg[group]:

@@ -19,11 +19,9 @@ from lfrtorch.cli.words import translated
 
 @contextmanager
 def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None]:
-    """Errors of users end the program with one message and exit code 1; bugs keep their traceback.
-
-    A message names the group of the configuration, which a function's argument belongs to:
-    ``data: seed is -1``. With ``cfg`` it speaks in words of the command line.
-    """
+    """Errors of users end the program with one message and exit code 1; bugs keep theirs."""
+    # A message names the group of the configuration, ``data: seed is -1``; with ``cfg`` it is in
+    # words of the command line.
     error = "error" if rank == "0" else f"error on rank {rank}"
 
     def show(message: str) -> None:

@@ -69,10 +69,8 @@ def run(
     command: str = "",
     ranks: Ranks | None = None,
 ) -> float:
-    """One run, its files written into ``folder`` by the first process; returns the validation RMSE.
-
-    A fit that ended early has its files written before the error of that.
-    """
+    """One run, its files written by the first process; returns the validation RMSE."""
+    # A fit that ended early has its files written before the error of that.
     ranks = Ranks() if ranks is None else ranks
     asked, cfg = cfg, chosen_before(cfg, folder)
     settings = configured(cfg)

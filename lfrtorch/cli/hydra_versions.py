@@ -25,10 +25,7 @@ MAIN: dict[str, Any] = COMPOSED if _TRUSTED is None else {"execution_whitelist":
 
 
 def instantiate(node: Any, *args: Any, **options: Any) -> Any:
-    """What a node of the settings describes.
-
-    What its target raises comes with a note that says which node it was, ``full_key: data``.
-    """
+    """What a node of the settings describes; errors get a note, ``full_key: data``."""
     if _TRUSTED is not None:
         options["_execution_whitelist_"] = _TRUSTED
     try:

@@ -23,10 +23,8 @@ class TerminatedError(LfrtorchError):
 
 @contextmanager
 def handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Inside, ``handler`` takes SIGTERM, and Ctrl-C unless it is ignored.
-
-    What it raises while compiled code calls Python, as numba's compiler does, is lost there.
-    """
+    """Inside, ``handler`` takes SIGTERM, and Ctrl-C unless it is ignored."""
+    # What it raises while compiled code calls Python, as numba's compiler does, is lost there.
     hook = sys.unraisablehook
 
     def lost(failed: sys.UnraisableHookArgs) -> None:
@@ -67,12 +65,11 @@ def as_error(number: int, _: Any = None) -> None:
 
 
 class Termination:
-    """Ctrl-C and SIGTERM as a request that a fit asks for before each iteration, its ``stop``.
+    """Ctrl-C and SIGTERM as a request that a fit asks for before each iteration, its ``stop``."""
 
-    So no write is torn. A second Ctrl-C ends the program at once, and before a fit has begun to ask
-    the first one does. A batch system sends SIGTERM before it kills, and torchrun sends it to the
-    processes that are left.
-    """
+    # So no write is torn. A second Ctrl-C ends the program at once, and before a fit has begun the
+    # first one does. A batch system sends SIGTERM before it kills, and torchrun to processes that
+    # are left.
 
     def __init__(self) -> None:
         self.asked = 0

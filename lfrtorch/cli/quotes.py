@@ -40,15 +40,8 @@ register_resolver(
 
 
 def quoted(word: str) -> str:
-    """The word with quotes around the names in its value that Hydra could not read without.
-
-    A word that Hydra can read, or that quotes would not help, comes back as it is.
-
-    Example:
-        >>> from lfrtorch.cli.quotes import quoted
-        >>> quoted("data.outputs=[Füllstand, Force (N), acc[0], y]")
-        "data.outputs=['Füllstand', 'Force (N)', 'acc[0]', y]"
-    """
+    """The word with quotes around names in its value that Hydra could not read without."""
+    # A word that Hydra can read, or that quotes would not help, comes back as it is.
     name, equals, value = word.partition("=")
     if not equals or is_read(word):
         return word

@@ -73,13 +73,7 @@ threads are not copied, and a run would wait for them. Other systems' libraries 
 
 
 def folder_name(varied: str) -> str:
-    """The name of a run's folder, from its own words: ``nn=5,seed=0``.
-
-    Example:
-        >>> from lfrtorch.cli.study import folder_name
-        >>> folder_name("data.path=a/b.csv,nn=5")
-        'data.path=a%2Fb.csv,nn=5'
-    """
+    """The name of a run's folder, from its own words: ``nn=5,seed=0``."""
     name = quote(varied, safe="=,+[]{}:() ") or "run"
     if len(name) <= _LONGEST:
         return name
@@ -133,11 +127,9 @@ def _compared(words: Sequence[str]) -> list[str]:
 
 
 def job(work: Callable[[DictConfig], float], cfg: DictConfig, folder: Path, *, hydra: Any) -> float:
-    """One of several runs, unless it is done; returns its validation RMSE, nan if it failed.
-
-    Its outcome is a line on the terminal. A run that fails, or is killed, is noted in its folder
-    and stops no other. One that was killed goes on, on as many threads as its place has.
-    """
+    """One of several runs, unless it is done; returns its validation RMSE, nan if it failed."""
+    # Its outcome is a line on the terminal. A run that fails, or is killed, is noted in its folder
+    # and stops no other. One that was killed goes on, on as many threads as its place has.
     with alone(folder) as lock:
         known = None if cfg.overwrite else done(folder, list(hydra.overrides.task))
         if known is not None:
@@ -176,11 +168,9 @@ def done(folder: Path, words: Sequence[str]) -> float | None:
 
 @contextmanager
 def alone(folder: Path) -> Iterator[Connection | None]:
-    """No other process is at this run: one that is left of a study that was killed ends first.
-
-    The open file is locked until all processes that have it close it. It is a connection, since
-    these may be handed to another process.
-    """
+    """No other process is at this run: one left of a study that was killed ends first."""
+    # The open file is locked until all processes that have it close it. It is a connection, since
+    # these may be handed to another process.
     try:
         import fcntl
     except ImportError:  # not on Windows

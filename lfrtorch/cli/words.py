@@ -14,17 +14,7 @@ GROUPS = ("bla", "frf", "data", "trainer")
 
 
 def translated(text: str, cfg: DictConfig) -> str:
-    """A message with Python's arguments as words of the command line.
-
-    Example:
-        >>> from omegaconf import OmegaConf
-        >>> from lfrtorch.cli.words import translated
-        >>> cfg = OmegaConf.create({"data": {"start": "zero"}, "trainer": {"max_iter": 5}})
-        >>> translated("estimate their starts (start='estimated'), or give max_iter=20.", cfg)
-        'estimate their starts (data.start=estimated), or give trainer.max_iter=20.'
-        >>> translated("use estimate_bla(max_iter=400).", cfg)
-        'use bla.max_iter=400.'
-    """
+    """A message with Python's arguments as words of the command line."""
     text = text.replace("init_from=run.model", "init_from=RUN")
     text = re.sub(r"estimate_bla\((\w+=\w+)\)", r"bla.\1", text)
     words = {name: f"{group}.{name}" for group in GROUPS for name in cfg.get(group) or {}}

@@ -82,11 +82,9 @@ class Equations:
         return {"nx": nx, "nu": len(self.u_offset), "ny": ny, "nz": nz, "nw": nw}
 
     def about(self, name: str, place: str = "{0}[{1}]") -> list[str]:
-        """What a reader of the export should know: equations, channels, units, offsets, rate.
-
-        ``place`` is how its language writes a channel, with its letter {0} and its number, which
-        counts from 0 as {1} and from 1 as {2}.
-        """
+        """What a reader of the export should know: equations, channels, units, offsets, rate."""
+        # ``place`` is how its language writes a channel: letter {0}, number from 0 {1} and from 1
+        # {2}.
         match self.static:
             case Network(activation=name_of_sigma, sigma=sigma):
                 meaning = f", {sigma.meaning}" if sigma.meaning else ""

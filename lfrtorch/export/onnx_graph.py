@@ -106,11 +106,7 @@ def _polynomial(graph: Graph, e: Equations, growth: Sequence[tuple[int, int]], z
 
 
 class Graph:
-    """Nodes and constants that become a model of ONNX.
-
-    Args:
-        onnx: the package.
-    """
+    """Nodes and constants that become a model of ONNX."""
 
     def __init__(self, onnx: Any) -> None:
         self.onnx = onnx

@@ -22,12 +22,7 @@ _SAMPLES = (1, 5, 64)
 
 
 def traced(static: Own, nz: int) -> Any:
-    """The graph z (n, nz) -> w (n, nw) of a map, an ``onnx.ModelProto``.
-
-    Raises:
-        ValueError: onnx is not installed, or a map whose graph cannot be made, or is another map: a
-            ``forward`` that branches in Python on values, or computes in float32.
-    """
+    """The graph z (n, nz) -> w (n, nw) of a map; refuse a map that it does not compute."""
     onnx = imported("onnx", "onnx")
     generator = torch.Generator().manual_seed(0)
     file: Any = io.BytesIO()  # which it takes, whatever its types say

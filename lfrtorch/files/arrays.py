@@ -58,10 +58,7 @@ Stored = Callable[[Path], AbstractContextManager[Any]]
 
 
 class _Packing(NamedTuple):
-    """Numbers that are stored as (number - offset) / scale, a missing one as ``fill``.
-
-    See the NetCDF Climate and Forecast Metadata Conventions 1.11, 2.5.1 and 8.1.
-    """
+    """Numbers stored as (number - offset) / scale, see NetCDF CF Conventions 1.11, 8.1."""
 
     scale: float
     offset: float
@@ -76,23 +73,14 @@ class _Packing(NamedTuple):
 
 @dataclass(frozen=True)
 class Signal:
-    """An array of the file.
+    """An array of the file."""
 
-    Args:
-        shape: as it is in the file.
-        dtype: of its numbers.
-        unit: empty if the file does not say it.
-        reverse: the file has the axes in the order that is not the user's.
-        values: the array, if it is in memory; a lone number always is.
-        packing: how its numbers are stored, if not as they are.
-    """
-
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # as it is in the file
     dtype: np.dtype
     unit: str = ""
-    reverse: bool = False
-    values: NDArray[Any] | None = None
-    packing: _Packing | None = None
+    reverse: bool = False  # the file has the axes in the order that is not the user's
+    values: NDArray[Any] | None = None  # if it is in memory; a lone number always is
+    packing: _Packing | None = None  # how numbers are stored, if not as they are
 
     @property
     def shown(self) -> str:

@@ -36,15 +36,7 @@ EXTENSIONS = (".xlsx", ".xlsm")
 
 
 def workbook(path: Path) -> tuple[Path, str]:
-    """The file of a path and the sheet behind it, empty if it names none.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from lfrtorch.files.excel import workbook
-        >>> file, sheet = workbook(Path("rig.xlsx#Run 2"))
-        >>> file.name, sheet
-        ('rig.xlsx', 'Run 2')
-    """
+    """The file of a path and the sheet behind it, ``rig.xlsx#Run 2``, empty if none."""
     name, mark, sheet = str(path).rpartition("#")
     file = Path(name)
     named = mark and file.suffix.lower() in EXTENSIONS and not path.is_file()
@@ -52,11 +44,9 @@ def workbook(path: Path) -> tuple[Path, str]:
 
 
 class ExcelTable(TextTable):
-    """A sheet, a row a sample, read as lines of text; above may be names, units and what else.
+    """A sheet read as lines of text: that behind the path, or the first with samples."""
 
-    It is the first sheet that has samples, or that named behind the path: ``x.xlsx#Run 2``.
-    openpyxl reads row by row; calamine ends the process on a cell whose reference is damaged.
-    """
+    # openpyxl reads row by row; calamine ends the process on a cell whose reference is damaged.
 
     def __init__(self, path: Path) -> None:
         self._file, sheet = workbook(path)

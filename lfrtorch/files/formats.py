@@ -38,15 +38,7 @@ _INSTEAD = {
 
 
 def open_table(path: str | Path) -> Table:
-    """Open the table of a file; what it holds is read as far as its columns ask for.
-
-    The sheet of a workbook may stand behind its name: ``rig.xlsx#Run 2``.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: a folder, an unknown extension, a file without samples or a damaged one, or a
-            package that is missing.
-    """
+    """Open the table of a file, or of the sheet behind its name: ``rig.xlsx#Run 2``."""
     path = expanded(path)
     if path.is_dir():
         inside = sorted(p.name for p in path.iterdir() if extension(p) in FORMATS)

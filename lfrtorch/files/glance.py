@@ -50,11 +50,9 @@ def look_at(
     time: str | int | None = None,
     fs: float | None = None,
 ) -> Glance:
-    """Read the first samples of a file; without inputs and outputs, of all signals.
-
-    If one side is given, the other columns are the other side. Without ``time`` a column that looks
-    like time is taken, without ``fs`` the sampling frequency that the file says.
-    """
+    """Read the first samples of a file; without inputs and outputs, of all signals."""
+    # If one side is given, the other columns are the other side. Without ``time`` a column that
+    # looks like time is taken, without ``fs`` the sampling frequency that the file says.
     (u, y, stamps), remarks = _roles(table, inputs, outputs, time)
     wanted = [*u, *y]
     signals, more = _read(table, [*wanted, *stamps])

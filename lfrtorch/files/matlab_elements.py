@@ -18,14 +18,8 @@ _DEEPEST = 32
 
 
 def check_elements(path: Path) -> None:
-    """Refuse a MATLAB 5 file whose elements do not lie within one another as the format says.
-
-    Source: MATLAB, "MAT-File Format", version 5.
-
-    Raises:
-        ValueError: a kind of element that does not exist or is not allowed there, or an element
-            that is longer than what holds it.
-    """
+    """Refuse a MATLAB 5 file whose elements do not lie in one another as the format says."""
+    # Source: MATLAB, "MAT-File Format", version 5.
     with path.open("rb") as stream:
         header = stream.read(_HEADER)
         order = "<" if header[126:] == b"IM" else ">"

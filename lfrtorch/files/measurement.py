@@ -43,17 +43,13 @@ class Wanted:
 
 
 class Stretch(NamedTuple):
-    """Consecutive samples: u (T, nu), y (T, ny), and which sample of the file is the first.
+    """Consecutive samples without a gap."""
 
-    ``reference`` (T, nr) is that of the inputs, if one was asked for; ``valid`` (T, ny) says which
-    outputs have a value, if some have none: they are interpolated.
-    """
-
-    u: Array
-    y: Array
-    first: int
-    reference: Array | None = None
-    valid: Booleans | None = None
+    u: Array  # (T, nu)
+    y: Array  # (T, ny)
+    first: int  # sample of the file
+    reference: Array | None = None  # (T, nr), if one was asked for
+    valid: Booleans | None = None  # (T, ny): False for outputs without a value, interpolated
 
 
 @dataclass(frozen=True)
@@ -290,11 +286,9 @@ class Rate(NamedTuple):
 
 
 def find_rate(table: Table, used: Sequence[int]) -> Rate | None:
-    """Return what a file says of its sampling frequency, None if nothing.
-
-    It is a column that is named as time is and runs evenly, or else a lone number like ``Fs``.
-    Columns ``used`` are something else. Two that contradict one another are refused.
-    """
+    """Return what a file says of its sampling frequency, None if nothing."""
+    # It is a column that is named as time is and runs evenly, or else a lone number like ``Fs``.
+    # Columns ``used`` are something else. Two that contradict one another are refused.
     times, _ = _beside(table, used, named=True)
     said = [(_called(table, c), g.fs, g.uncertainty) for c, g in times]
     said += [(repr(name), fs, 0.0) for name, fs in table.rates.items()]

@@ -14,12 +14,10 @@ class TooShortError(InputError):
 
 
 def cut(record: Record, validation: float, test: float) -> dict[str, Record]:
-    """Cut a record into parts by use; one whose fraction is 0 is left out.
-
-    Every part begins where the record begins and is simulated from there: only its own samples are
-    scored, so that the transient of the start reaches neither validation nor test. A record in
-    steady state is cut into whole periods, at least one each, which are in steady state themselves.
-    """
+    """Cut a record into parts by use; one whose fraction is 0 is left out."""
+    # Every part begins where the record begins and is simulated from there: only its own samples
+    # are scored, so the transient of the start reaches neither validation nor test. A record in
+    # steady state is cut into whole periods, which are in steady state themselves.
     names = ["train", *["validation"] * bool(validation), *["test"] * bool(test)]
     steady = record.start == "periodic"
     unit = (record.period or record.samples) if steady else 1

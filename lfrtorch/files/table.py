@@ -99,10 +99,8 @@ class Table(ABC):
         """
 
     def without_footer(self, rows: Iterable[_Row], said: Callable[[_Row], str]) -> Iterator[_Row]:
-        """Yield rows without those of words at the end; a note says that they are left out.
-
-        ``said`` returns what a row says that is no sample, nothing of one that is.
-        """
+        """Yield rows without those of words at the end, which a note tells."""
+        # ``said`` returns what a row says that is no sample, nothing of one that is.
         held, words, count = [], "", 0
         for row in rows:
             text = said(row) if count >= LEAST and len(held) < LEAST else ""
@@ -142,11 +140,9 @@ class Table(ABC):
         )
 
     def find(self, wanted: str | int | Sequence[str | int] | None, option: str) -> tuple[int, ...]:
-        """Return the numbers of columns given by name, header or number.
-
-        The name u of an array of several channels stands for all of them, u[0] for the first.
-        Messages call the argument by the name ``option``.
-        """
+        """Return the numbers of columns given by name, header or number."""
+        # The name u of an array of several channels stands for all of them, u[0] for the first.
+        # Messages call the argument by the name ``option``.
         listed = [wanted] if isinstance(wanted, str | int) else wanted
         if (
             not isinstance(listed, Sequence)
@@ -241,11 +237,9 @@ def _parts(header: str) -> tuple[str, str]:
 
 
 def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel, ...]:
-    """Split headers as "force (N)", "force [N]" or "force/N" into names and units.
-
-    What is in the brackets stays in the name if names would be equal without, and if it
-    follows the name at once and is no unit, as in "y(t)".
-    """
+    """Split headers as "force (N)", "force [N]" or "force/N" into names and units."""
+    # Brackets stay in the name if names would be equal without, and in "y(t)": no unit at once
+    # behind.
     found = [
         Channel(header, units[header]) if units.get(header) else _channel(header)
         for header in headers

@@ -434,17 +434,9 @@ def _decimal_comma(whole: list[list[str]]) -> bool:
 def named_by_numbers(
     cells: Sequence[str], below: Sequence[Sequence[str]], *, comma: bool = False
 ) -> bool | None:
-    """Whether a line is a header in which numbers are names; None if it may be a sample, too.
-
-    It is if these are unlike all samples below, or 0, 1, 2 ... as pandas writes them. It is none
-    if a column runs on from it, as a time does.
-
-    Example:
-        >>> from lfrtorch.files.text import named_by_numbers
-        >>> rows = [[str(0.1 * k), str(1.5 + k % 3)] for k in range(1, 20)]
-        >>> [named_by_numbers(line, rows) for line in (["2023", "2024"], ["2", "1"], ["0", "2"])]
-        [True, None, False]
-    """
+    """Whether a line is a header in which numbers are names; None if it may be a sample."""
+    # It is if these are unlike all samples below, or 0, 1, 2 ... as pandas writes them. It is none
+    # if a column runs on from it, as a time does.
     numbers = {i: int(cell) for i, cell in enumerate(cells) if _WHOLE.fullmatch(cell)}
     words = [cell for i, cell in enumerate(cells) if i not in numbers and (cell or i)]
     if any(_is_missing(word) or not word[0].isalpha() for word in words):

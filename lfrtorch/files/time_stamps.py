@@ -38,21 +38,13 @@ _SINCE_1970 = (1e9, 4e9)  # seconds: the years 2001 to 2096
 
 
 class Sampling(NamedTuple):
-    """An even grid of samples.
+    """An even grid of samples."""
 
-    Args:
-        fs: sampling frequency in Hz.
-        uncertainty: of ``fs``, relative, from the digits of the stamps.
-        gaps: the samples that follow a gap.
-        missing: how many samples each gap has.
-        unit: what the stamps are taken to be in, if their column does not say it.
-    """
-
-    fs: float
-    uncertainty: float
-    gaps: Integers
-    missing: Integers
-    unit: str = ""
+    fs: float  # Hz
+    uncertainty: float  # of fs, relative, from the digits of the stamps
+    gaps: Integers  # samples that follow a gap
+    missing: Integers  # how many samples each gap has
+    unit: str = ""  # what the stamps are taken to be in, if their column does not say it
 
     def __str__(self) -> str:
         """What a column is taken for: the unit, the frequency and how far it may be off."""

@@ -16,11 +16,7 @@ Write = Callable[[Mapping[str, NDArray]], None]
 
 
 def table_writer(path: Path) -> AbstractContextManager[Write]:
-    """Open a file for a function that appends arrays (n,) by the names of their columns.
-
-    The same columns each time. CSV has every digit and an empty cell for NaN; a block is a row
-    group of a Parquet file; arrays of .npz are kept in memory until the end.
-    """
+    """Open a file for a function that appends arrays (n,) by the names of their columns."""
     return FORMATS[path.suffix.lower()](path)
 
 

@@ -28,27 +28,17 @@ _ONSET, _CLEAR, _UNCLEAR = 0.1, 4.0, 0.5
 
 
 class TwoSidedResponse(NamedTuple):
-    """What the impulse response at negative and positive lags says of an input and an output.
+    """What the two-sided impulse response says of an input and an output."""
 
-    Args:
-        coherence: share of the output's power that follows from the input, linearly.
-        chance: coherence that unrelated signals would show.
-        causality: (E₊ - E₋) / (E₊ + E₋) of the energies at positive and negative lags: 1 for a
-            system with memory, 0 for one without, -1 for a response that comes first.
-        reverse: the same from output to input.
-        rise: gain of the reverse response at the upper third of the output's frequencies, relative
-            to that at the lower third.
-        delay: samples until the response begins; 0 if that is not clear.
-        peak: lag of its largest value.
-    """
-
-    coherence: float
-    chance: float
+    coherence: float  # share of the output's power that follows from the input, linearly
+    chance: float  # coherence that unrelated signals would show
+    # (E₊ - E₋) / (E₊ + E₋) of the energies at positive and negative lags: 1 for a system with
+    # memory, 0 for one without, -1 for a response that comes first.
     causality: float
-    reverse: float
-    rise: float
-    delay: int
-    peak: int
+    reverse: float  # the same from output to input
+    rise: float  # gain of the reverse response in the upper third of y's frequencies over the lower
+    delay: int  # samples until the response begins; 0 if that is not clear
+    peak: int  # lag of its largest value
 
 
 def two_sided_response(u: Array, y: Array) -> TwoSidedResponse | None:

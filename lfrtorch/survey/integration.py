@@ -34,13 +34,8 @@ _LINES, _FITTED, _FORGETS, _GAIN, _LAG = 12, 0.75, 3.0, 0.5, 0.3
 
 
 def integrators(u: Array, y: Array) -> int:
-    """Return how many integrators, 0, 1 or 2, lie between the inputs and an output.
-
-    A system that forgets more slowly than in a third of the record counts as one that integrates.
-
-    Shape:
-        u: (T, nu), y: (T,).
-    """
+    """Return how many integrators, 0, 1 or 2, lie between inputs (T, nu) and an output (T,)."""
+    # A system that forgets more slowly than in a third of the record counts as one that integrates.
     T, u = len(y), u[:, np.ptp(u, axis=0) > 0]
     if T < _SHORTEST or np.ptp(y) == 0 or not u.size:
         return 0

@@ -19,18 +19,12 @@ from lfrtorch.survey.signal import SignalSurvey, longest_run, survey_signal
 
 @dataclass(frozen=True)
 class Survey:
-    """What a measurement is like.
-
-    Args:
-        inputs, outputs: numbers of each signal.
-        fs: sampling frequency in Hz. If it is ``None``, frequencies are in cycles per sample.
-        whole: the longest part without missing samples.
-    """
+    """The numbers of each signal of a measurement."""
 
     inputs: tuple[SignalSurvey, ...]
     outputs: tuple[SignalSurvey, ...]
-    fs: float | None
-    whole: slice
+    fs: float | None  # Hz; without it frequencies are in cycles per sample
+    whole: slice  # the longest part without missing samples
 
     @property
     def signals(self) -> tuple[SignalSurvey, ...]:
@@ -90,11 +84,9 @@ def survey_measurement(
     outputs: Sequence[Channel] = (),
     period: int | None = None,
 ) -> Survey:
-    """Return the numbers of each signal (T,) or (T, channels), NaN for missing samples.
-
-    ``u`` has no channel if it is not known which signals are inputs. Without ``fs`` frequencies are
-    in cycles per sample; without ``period`` that of the inputs is searched for.
-    """
+    """Return the numbers of each signal (T,) or (T, channels), NaN for missing samples."""
+    # ``u`` has no channel if it is not known which signals are inputs. Without ``fs`` frequencies
+    # are in cycles per sample; without ``period`` that of the inputs is searched for.
     u, y = _columns("u", u), _columns("y", y)
     if len(u) != len(y):
         raise InputError(

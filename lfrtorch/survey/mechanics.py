@@ -54,10 +54,8 @@ def reacting(u: Array, y: Array, *, feedthrough: bool = True) -> Array:
 
 
 def rubs(u: Array, y: Array) -> bool:
-    """Return whether a force (T,) that moves a position (T,) changes with the direction of motion.
-
-    The signals are averaged over windows of several lengths, as differences enlarge noise.
-    """
+    """Return whether a force (T,) that moves a position (T,) changes with its direction."""
+    # The signals are averaged over windows of several lengths, as differences enlarge noise.
     T = len(u)
     if len(np.unique(u)) <= _LEVELS or np.ptp(y) == 0:
         return False

@@ -86,11 +86,9 @@ def survey_signal(
     period: int | None = None,
     inputs: Array | None = None,
 ) -> SignalSurvey:
-    """Return the numbers of a signal (T,), NaN where a sample is missing.
-
-    ``whole`` is its longest part without gaps, for the spectrum, and ``inputs`` (N, nu) what that
-    part (N,) follows, if it is an output.
-    """
+    """Return the numbers of a signal (T,), NaN where a sample is missing."""
+    # ``whole`` is its longest part without gaps, for the spectrum, and ``inputs`` (N, nu) what that
+    # part (N,) follows, if it is an output.
     missing = ~np.isfinite(signal)
     known = signal[~missing] if missing.any() else signal
     values, counts = np.unique(known, return_counts=True)
