@@ -88,17 +88,14 @@ def c_source(
 
 def _arrays(e: Equations) -> Iterator[str]:
     """All constants, in the order in which the equations name them."""
-    for name, size in (
-        ("u_offset", "NU"), ("y_offset", "NY"), ("A", "NX * NX"), ("Bu", "NX * NU"),
-        ("Cy", "NY * NX"), ("Dyu", "NY * NU"), ("Cz", "NZ * NX"), ("Dzu", "NZ * NU"),
-        ("Bw", "NX * NW"), ("Dyw", "NY * NW"), ("x_rest", "NX"),
-    ):  # fmt: skip
-        value = getattr(e, name)
+    sizes = {
+        "u_offset": "NU", "y_offset": "NY", "x_rest": "NX", "A": "NX * NX", "Bu": "NX * NU",
+        "Bw": "NX * NW", "Cz": "NZ * NX", "Dzu": "NZ * NU", "Cy": "NY * NX", "Dyu": "NY * NU",
+        "Dyw": "NY * NW", "Wz": "NN * NZ", "bz": "NN", "Ww": "NW * NN", "bw": "NW", "C": "NW * NM",
+    }  # fmt: skip
+    for name, value in e.arrays.items():
         if value.size:
-            yield _constant(name, size, value)
-    sizes = {"Wz": "NN * NZ", "bz": "NN", "Ww": "NW * NN", "bw": "NW", "C": "NW * NM"}
-    for name, weight in e.weights.items():
-        yield _constant(name, sizes[name], weight)
+            yield _constant(name, sizes[name], value)
     if isinstance(e.static, Polynomial):
         growth, slopes = (
             _braces([[f"{{{', '.join(map(str, row))}}}" for row in rows]])

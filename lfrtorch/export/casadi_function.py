@@ -52,10 +52,11 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
     x = ca.SX.sym("x", e.sizes["nx"])
     u = ca.vertcat(*(ca.SX.sym(channel.name) for channel in e.inputs))
     v = u - e.u_offset
-    x_next, y = ca.mtimes(e.A, x) + ca.mtimes(e.Bu, v), ca.mtimes(e.Cy, x) + ca.mtimes(e.Dyu, v)
+    M = e.matrices
+    x_next, y = ca.mtimes(M.A, x) + ca.mtimes(M.Bu, v), ca.mtimes(M.Cy, x) + ca.mtimes(M.Dyu, v)
     if e.static is not None:
-        w = _static(ca, e, ca.mtimes(e.Cz, x) + ca.mtimes(e.Dzu, v))
-        x_next, y = x_next + ca.mtimes(e.Bw, w), y + ca.mtimes(e.Dyw, w)
+        w = _static(ca, e, ca.mtimes(M.Cz, x) + ca.mtimes(M.Dzu, v))
+        x_next, y = x_next + ca.mtimes(M.Bw, w), y + ca.mtimes(M.Dyw, w)
     return ca.Function(name, [x, u], [x_next, y + e.y_offset], ["x", "u"], ["x_next", "y"])
 
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 from lfrtorch._support.optional import imported
-from lfrtorch.engine.cell import Matrices
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.export.equations import Equations, check_name, equations, rendered
 from lfrtorch.linear.model import LinearModel, control_labels
@@ -78,8 +77,7 @@ def python_source(model: Model | LinearModel, name: str = "model") -> str:
 
 def _arrays(e: Equations) -> Iterator[tuple[str, str | list[str]]]:
     """Names and rows of all constants."""
-    names = ("u_offset", "y_offset", "x_rest", *Matrices._fields)
-    for name, value in ({name: getattr(e, name) for name in names} | dict(e.weights)).items():
+    for name, value in e.arrays.items():
         if value.size:
             yield name, str(value.tolist()) if value.ndim == 1 else [*map(str, value.tolist())]
     if isinstance(e.static, Polynomial):

@@ -17,6 +17,7 @@ from torch.nn import Module
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.engine.cell import Matrices
 from lfrtorch.engine.nonlinearity import Network, Polynomial, known
 from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.engine.simulation import folded
@@ -49,7 +50,7 @@ class Equations:
         y  = Cy x + Dyu v + Dyw w + y_offset
 
     Args:
-        A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw: matrices; nz = nw = 0 of a linear model.
+        matrices: A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw; nz = nw = 0 of a linear model.
         u_offset, y_offset: operating point.
         x_rest: state at rest under u_offset, (nx,); empty if none was found. x = 0 is near it.
         static: f; None for a linear model.
@@ -58,14 +59,7 @@ class Equations:
         inputs, outputs: channel names and units.
     """
 
-    A: Array
-    Bu: Array
-    Bw: Array
-    Cz: Array
-    Dzu: Array
-    Cy: Array
-    Dyu: Array
-    Dyw: Array
+    matrices: Matrices
     u_offset: Array
     y_offset: Array
     x_rest: Array
@@ -76,9 +70,15 @@ class Equations:
     outputs: tuple[Channel, ...]
 
     @property
+    def arrays(self) -> dict[str, Array]:
+        """All numbers of the model by name, in the order in which the equations have them."""
+        offsets = {"u_offset": self.u_offset, "y_offset": self.y_offset, "x_rest": self.x_rest}
+        return offsets | self.matrices._asdict() | dict(self.weights)
+
+    @property
     def sizes(self) -> dict[str, int]:
         """nx, nu, ny, nz and nw."""
-        (nz, nx), (ny, nw) = self.Cz.shape, self.Dyw.shape
+        (nz, nx), (ny, nw) = self.matrices.Cz.shape, self.matrices.Dyw.shape
         return {"nx": nx, "nu": len(self.u_offset), "ny": ny, "nz": nz, "nw": nw}
 
     def about(self, name: str, place: str = "{0}[{1}]") -> list[str]:
@@ -144,11 +144,12 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
     model = model.to_model() if isinstance(model, LinearModel) else model
     cell, s = folded(model.lfr.cell), model.scaler
     weights = {} if cell.static is None else cell.static.state_dict()
-    A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
-    y_scale = s.y_scale[:, None]
+    M, y_scale = cell.matrices(), s.y_scale[:, None]
     found = Equations(
-        A=A, Bu=Bu / s.u_scale, Bw=Bw, Cz=Cz, Dzu=Dzu / s.u_scale,
-        Cy=Cy * y_scale, Dyu=Dyu * y_scale / s.u_scale, Dyw=Dyw * y_scale,
+        matrices=M._replace(
+            Bu=M.Bu / s.u_scale, Dzu=M.Dzu / s.u_scale,
+            Cy=M.Cy * y_scale, Dyu=M.Dyu * y_scale / s.u_scale, Dyw=M.Dyw * y_scale,
+        ),
         u_offset=np.asarray(s.u_offset, dtype=np.float64),
         y_offset=np.asarray(s.y_offset, dtype=np.float64),
         x_rest=np.empty(0),
@@ -158,8 +159,8 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         inputs=model.inputs,
         outputs=model.outputs,
     )  # fmt: skip
-    parts = [*vars(found).values(), *found.weights.values()]
-    if not all(np.isfinite(part).all() for part in parts if isinstance(part, np.ndarray)):
+    parts = [*found.matrices, found.u_offset, found.y_offset, *found.weights.values()]
+    if not all(np.isfinite(part).all() for part in parts):
         raise InputError("the model has weights that are not finite; nothing can be exported.")
     rest = equilibrium(double(cell), torch.zeros(cell.nu, dtype=torch.float64))
     return found if rest is None else replace(found, x_rest=numbers(rest))

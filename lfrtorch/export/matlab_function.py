@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from lfrtorch.analysis.lpv_form import gauss_legendre, lpv
-from lfrtorch.engine.cell import Matrices
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.export.equations import check_name, equations, rendered
 from lfrtorch.linear.model import LinearModel
@@ -48,10 +47,8 @@ def matlab_function(
     check_name(name)
     model = model.to_model() if isinstance(model, LinearModel) else model
     e, form = equations(model), lpv(model)
-    found: dict[str, Any] = {letters: getattr(e, letters) for letters in Matrices._fields}
-    found |= {n: w if w.ndim == 2 else w[:, None] for n, w in e.weights.items()}
-    offsets = {name: getattr(e, name)[:, None] for name in ("u_offset", "y_offset", "x_rest")}
-    found |= offsets | {"fs": e.fs}
+    found: dict[str, Any] = {n: w if w.ndim == 2 else w[:, None] for n, w in e.arrays.items()}
+    found["fs"] = e.fs
     for side, channels in (("input", e.inputs), ("output", e.outputs)):
         found[f"{side}_names"] = np.array([c.name for c in channels], dtype=object)[:, None]
         found[f"{side}_units"] = np.array([c.unit for c in channels], dtype=object)[:, None]

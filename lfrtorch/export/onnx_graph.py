@@ -64,7 +64,7 @@ def _sample(e: Equations, graph: Graph) -> None:
     def combined(to: str, matrices: dict[str, str], *offset: str) -> str:
         """Sum of matrices times signals, which are rows, and perhaps an offset."""
         terms = [
-            graph.node("MatMul", signal, graph.constant(letters, getattr(e, letters).T))
+            graph.node("MatMul", signal, graph.constant(letters, e.arrays[letters].T))
             for letters, signal in matrices.items()
         ]
         return graph.node("Sum", *terms, *offset, to=to)

@@ -37,7 +37,7 @@ class Target(NamedTuple):
     """
 
     endings: tuple[str, ...]
-    write: Callable[..., None]
+    write: Callable[..., object]
     use: str
     observer: tuple[str, ...] | None = None
     follow: str = ""
@@ -82,14 +82,6 @@ def _matlab(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
         path.write_text(text, encoding="utf-8")
 
 
-def _control(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
-    paths[0].write_text(python_source(model, name), encoding="utf-8")
-
-
-def _fmu(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
-    write_fmu(model, paths[0], name)
-
-
 TARGETS = {
     "c": Target(
         (".h", ".c"),
@@ -111,8 +103,16 @@ TARGETS = {
         "x_next, y = onnxruntime.InferenceSession('{path}').run(None, {{'x': x, 'u': u}})",
     ),
     "matlab": Target((".m", ".mat", "_lpv.m"), _matlab, "[x_next, y] = {name}(x, u)"),
-    "control": Target((".py",), _control, "from {name} import system"),
-    "fmu": Target((".fmu",), _fmu, "found = fmpy.simulate_fmu('{path}')"),
+    "control": Target(
+        (".py",),
+        lambda model, name, paths: paths[0].write_text(python_source(model, name), "utf-8"),
+        "from {name} import system",
+    ),
+    "fmu": Target(
+        (".fmu",),
+        lambda model, name, paths: write_fmu(model, paths[0], name),
+        "found = fmpy.simulate_fmu('{path}')",
+    ),
 }
 """All kinds of export."""
 
