@@ -111,13 +111,18 @@ def cell(value: Cell, digits: int = _DIGITS) -> str:
     return str(value) if isinstance(value, str | int) else number(value, digits)
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], digits: int = _DIGITS) -> str:
+def table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[Cell]],
+    digits: int = _DIGITS,
+    layout: str = "simple",
+) -> str:
     """Write a head, a rule and rows; columns of words to the left, others to the right."""
     words = [all(isinstance(row[i], str) for row in rows) for i in range(len(head))]
     return tabulate(
         [[cell(value, digits) for value in row] for row in rows],
         head,
-        tablefmt="simple",
+        tablefmt=layout,
         disable_numparse=True,
         colalign=["left" if word else "right" for word in words] if rows else None,
     )

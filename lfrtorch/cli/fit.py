@@ -63,12 +63,7 @@ from lfrtorch.reporting.run_files import write
 from lfrtorch.reporting.verdict import LINEAR_MODEL
 
 
-def run(
-    cfg: DictConfig,
-    folder: Path,
-    command: str = "",
-    ranks: Ranks | None = None,
-) -> float:
+def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = None) -> float:
     """One run, its files written by the first process; returns the validation RMSE."""
     # A fit that ended early has its files written before the error of that.
     ranks = Ranks() if ranks is None else ranks
@@ -143,13 +138,7 @@ def in_words(found: Run, cfg: DictConfig) -> Run:
 class _Folder(Terminal):
     """The first process: prints, and keeps the folder of the run up to date during the fit."""
 
-    def __init__(
-        self,
-        cfg: DictConfig,
-        folder: Path,
-        *,
-        least: float,
-    ) -> None:
+    def __init__(self, cfg: DictConfig, folder: Path, *, least: float) -> None:
         super().__init__(cfg)
         self.folder, self._least = folder, least
 
@@ -160,13 +149,9 @@ class _Folder(Terminal):
         self.cfg = cast(DictConfig, OmegaConf.merge(self.cfg, chosen))
         with whole_file(self.folder / CONFIG) as fresh:
             OmegaConf.save(self.cfg, fresh, resolve=True)
-        shown = (dataset.validation or dataset.train)[0]
-        self.board = TensorBoard(
-            self.folder,
-            shown if self.cfg.figures else None,
-            linear.simulate(shown),
-            say=self.note,
-        )
+        shown = (dataset.validation or dataset.train)[0] if self.cfg.figures else None
+        y_linear = None if shown is None else linear.simulate(shown)
+        self.board = TensorBoard(self.folder, shown, y_linear, say=self.note)
         keep = Checkpoint(self.folder / "model", least=self._least)
         printing, watch = super().begin(dataset, settings, linear, models)
         if len(models) == 1:

@@ -30,33 +30,19 @@ _FEW = 3  # most records or outputs that are named
 
 
 class Advice(NamedTuple):
-    """A sentence that says what to do or to know.
+    """A sentence that says what to do or to know."""
 
-    Args:
-        text: the sentence, in at most 160 characters.
-        evidence: the numbers that it rests on.
-        change: fields of the settings that follow it, for ``dataclasses.replace(settings,
-            **change)``; None if a program cannot follow it.
-
-    Example:
-        >>> from lfrtorch.reporting.advice import Advice
-        >>> print(Advice("Try several starts: starts=8.", "one start", {"starts": 8}))
-        Try several starts: starts=8. (one start)
-    """
-
-    text: str
-    evidence: str
-    change: Mapping[str, Any] | None = None
+    text: str  # the sentence, in at most 160 characters
+    evidence: str  # the numbers that it rests on
+    change: Mapping[str, Any] | None = None  # fields of the settings, if a program can follow it
 
     def __str__(self) -> str:
         return f"{self.text} ({self.evidence})"
 
 
 def advise(evidence: Evidence) -> list[Advice]:
-    """All that the numbers suggest, the most useful first.
-
-    At the noise, and where the inputs explain little, there is no advice on sizes and search.
-    """
+    """All that the numbers suggest, the most useful first."""
+    # At the noise, and where the inputs explain little, there is no advice on sizes and search.
     return [
         found
         for rule, on_the_model in _RULES

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.drawing import NL_LFR, OUTPUT, plain_ticks
 from lfrtorch._support.errors import InputError, brief
-from lfrtorch._support.tables import Cell, cell, engineering, table, times
+from lfrtorch._support.tables import Cell, engineering, table, times
 from lfrtorch._support.types import Array
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import check_channels, load
@@ -28,18 +28,15 @@ from lfrtorch.reporting.scores import unit_of
 from lfrtorch.score_window import with_window
 
 _SEEDS = ("seed", "data.seed")  # words that differ between repetitions of one setting
-_SHOWN = 20  # most runs that a terminal gets; the files have all
-_LONGEST = 40  # characters of a setting in a figure
 
-CAPTIONS = {
+_CAPTIONS = {
     "parameters": "Validation error by parameters",
     "seeds": "Validation error over seeds",
     "close_up": "Best models on one record, about the largest error of the best one",
     "density": "Spectra of their errors",
 }
-"""Of the figures."""
 
-LEGEND = (
+_LEGEND = (
     "*: no run with as few parameters has a smaller validation error. Median: over the seeds of a "
     "setting; runs that diverge are the worst."
 )
@@ -60,6 +57,11 @@ class Compared:
     unit: str  # of the errors, empty if they have several
     seconds: float  # that the fit took
     outcome: str
+
+    @property
+    def badness(self) -> float:
+        """What runs are sorted by: the error, infinite of those that diverged."""
+        return self.error if math.isfinite(self.error) else math.inf
 
 
 @dataclass(frozen=True)
@@ -98,20 +100,26 @@ class Comparison:
             return {}
         return dict(sorted(groups.items(), key=lambda one: _median(one[1])))
 
-    def rows(self) -> tuple[list[str], list[list[Cell]]]:
-        """Head and rows of the table; the median is that of a setting over its seeds."""
-        tests = list(dict.fromkeys(name for run in self.runs for name in run.tests))
+    def rows(self, *, whole: bool = False) -> tuple[list[str], list[list[Cell]]]:
+        """Head and rows of the table; the whole one has words too, and no prefixes of units."""
+        tests = dict.fromkeys(name for run in self.runs for name in run.tests)
         medians = {run.folder: _median(runs) for runs in self.settings.values() for run in runs}
-        factor, unit = self._scale
-        head = ["run", "", "parameters", f"validation{unit}", *["median"] * bool(medians)]
-        rows: list[list[Cell]] = []
-        for run in self.runs:
-            errors = [run.error, *[medians.get(run.folder)] * bool(medians)]
-            errors += [run.tests.get(name) for name in tests]
-            front = "*" if run in self.front else ""
-            shown = (times(factor, error) for error in errors)
-            rows.append([self._name(run), front, run.parameters, *shown, run.seconds, run.outcome])
-        return [*head, *(f"{name}{unit}" for name in tests), "time (s)", "outcome"], rows
+        factor, unit = (1.0, "") if whole else self._scale
+        columns: dict[str, Callable[[Compared], Cell]] = {"run": self._name}
+        if whole:
+            columns |= {"dataset": lambda _: self.name, "unit": lambda run: run.unit}
+            columns |= {n: lambda run, n=n: run.words.get(n, "") for n in self.varied}
+        columns["front" if whole else ""] = lambda run: "*" if run in self.front else ""
+        columns["parameters"] = lambda run: run.parameters
+        columns[f"validation{unit}"] = lambda run: factor * run.error
+        if medians:
+            columns["median"] = lambda run: times(factor, medians.get(run.folder))
+        for name in tests:
+            columns[f"{name}{unit}"] = lambda run, name=name: times(factor, run.tests.get(name))
+        if whole:
+            columns |= {"linear": lambda run: run.linear, "linear nx": lambda run: run.linear_nx}
+        columns |= {"time (s)": lambda run: run.seconds, "outcome": lambda run: run.outcome}
+        return list(columns), [[cell(run) for cell in columns.values()] for run in self.runs]
 
     def simulations(self, record: Record) -> dict[str, Array]:
         """Simulations of a record by the best runs, one of each setting, and by a linear model."""
@@ -119,7 +127,7 @@ class Comparison:
         best = best or {self._name(run): run for run in self.runs}
         found: dict[str, Array] = {}
         linear: dict[str, Array] = {}
-        for label, run in sorted(best.items(), key=lambda one: _worst_last(one[1].error)):
+        for label, run in sorted(best.items(), key=lambda one: one[1].badness):
             if len(found) == len(plots.COLOURS):
                 break
             shown = _short(label)
@@ -149,9 +157,9 @@ class Comparison:
     def __str__(self) -> str:
         head, rows = self.rows()
         parts = [f"{self.name}: RMSE of {len(rows)} run{'s' * (len(rows) > 1)}"]
-        parts.append(table(head, rows[:_SHOWN]))
-        more = len(rows) - _SHOWN
-        parts.append(LEGEND + f" {more} more runs are in the files." * (more > 0))
+        parts.append(table(head, rows[:20]))
+        more = len(rows) - 20
+        parts.append(_LEGEND + f" {more} more runs are in the files." * (more > 0))
         return "\n\n".join(parts)
 
     def _name(self, run: Compared) -> str:
@@ -213,7 +221,7 @@ def compare(folders: Sequence[str | Path]) -> list[Comparison]:
         listed = ", ".join(f"'{folder}'" for folder in folders)
         raise InputError(f"no run came to its end in {listed}; give folders with metrics.json.")
     groups: dict[str, list[Compared]] = {}
-    for run in sorted(map(_read, files), key=lambda run: _worst_last(run.error)):
+    for run in sorted(map(_read, files), key=lambda run: run.badness):
         groups.setdefault(run.dataset, []).append(run)
     return [Comparison(name, runs) for name, runs in groups.items()]
 
@@ -223,38 +231,20 @@ def write(
     folder: str | Path,
     records: Mapping[str, Record | None] | None = None,
 ) -> None:
-    """Write ``comparison.html``, ``comparison.md`` and ``comparison.csv`` with all runs.
-
-    The page shows simulations of ``records``, which are named as the data.
-
-    Example:
-        >>> from lfrtorch.reporting import comparison
-        >>> dataset = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[record[200:]])
-        >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=1)
-        >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(nx=1, nz=1, nn=4, trainer=trainer))
-        >>> for seed in (0, 1):
-        ...     words = f"lfrtorch fit nn=4 seed={seed}"
-        ...     lfrtorch.reporting.write(run, f"study/seed {seed}", command=words, draw=False)
-        >>> (found,) = comparison.compare(["study"])
-        >>> found.varied, len(found.runs), list(found.settings)
-        (['seed'], 2, ['all runs'])
-        >>> comparison.write([found], "study", {"mine": record[200:]})
-    """
-    images, parts, records = {}, [], records or {}
+    """Write ``comparison.html``, ``.md`` and ``.csv``; records are named as the data."""
+    images, parts, markdown, frames = {}, [], [], []
     for number, one in enumerate(comparisons):
-        figures = one.figures(records.get(one.name))
+        figures = one.figures((records or {}).get(one.name))
         images |= {f"{number}_{name}": plots.png(figure) for name, figure in figures.items()}
-        parts.append(
-            {
-                "name": one.name,
-                "runs": one.rows(),
-                "figures": [(f"{number}_{name}", CAPTIONS[name]) for name in figures],
-            }
-        )
+        captions = [(f"{number}_{name}", _CAPTIONS[name]) for name in figures]
+        parts.append({"name": one.name, "runs": one.rows(), "figures": captions})
+        markdown.append(f"## {one.name}\n\n{table(*one.rows(), layout='github')}\n")
+        head, rows = one.rows(whole=True)
+        frames.append(pd.DataFrame(rows, columns=pd.Index(head)))
     texts = {
-        "html": html.page("comparison.html", images, parts=parts, legend=LEGEND),
-        "md": "\n\n".join(f"## {one.name}\n\n{_markdown(*one.rows())}" for one in comparisons),
-        "csv": _csv(comparisons),
+        "html": html.page("comparison.html", images, parts=parts, legend=_LEGEND),
+        "md": "\n\n".join(markdown),
+        "csv": pd.concat(frames).to_csv(index=False, lineterminator="\n"),
     }
     for ending, text in texts.items():
         with whole_file(Path(folder) / f"comparison.{ending}") as fresh:
@@ -291,42 +281,16 @@ def _read(path: Path) -> Compared:
     return run
 
 
-def _worst_last(error: float) -> tuple[bool, float]:
-    """By which runs are sorted; those that diverged are the worst."""
-    return math.isnan(error), error
-
-
 def _float(value: float | None) -> float:
     return math.nan if value is None else 1.0 * value
 
 
 def _median(runs: Sequence[Compared]) -> float:
     """Of the validation errors; runs that diverged are the worst."""
-    errors = sorted(run.error if math.isfinite(run.error) else math.inf for run in runs)
+    errors = sorted(run.badness for run in runs)
     return errors[(len(errors) - 1) // 2]
 
 
 def _short(label: str) -> str:
     """Beginning and end of a setting, for a figure."""
-    half = _LONGEST // 2
-    return label if len(label) <= _LONGEST else f"{label[:half]}…{label[-half:]}"
-
-
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    lines = [head, ["---"] * len(head), *([cell(value) for value in row] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
-
-
-def _csv(comparisons: Sequence[Comparison]) -> str:
-    """All runs with the words that differ, errors in the units of their records."""
-    names = list(dict.fromkeys(name for one in comparisons for name in one.varied))
-    fields = ["parameters", "error", "linear", "linear_nx", "unit", "seconds", "outcome"]
-    rows = [
-        {"folder": run.folder, "dataset": run.dataset}
-        | {name: run.words.get(name, "") for name in names}
-        | {field: getattr(run, field) for field in fields}
-        | {f"test {name}": error for name, error in run.tests.items()}
-        for one in comparisons
-        for run in one.runs
-    ]
-    return pd.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    return label if len(label) <= 40 else f"{label[:20]}…{label[-20:]}"

@@ -17,13 +17,7 @@ from lfrtorch.records import common_unit
 
 
 class Console(Observer):
-    """Prints what :func:`lfrtorch.identify` finds, step by step.
-
-    Example:
-        >>> from lfrtorch.reporting.console import Console
-        >>> Console().say("note: the input is constant")
-        note: the input is constant
-    """
+    """Prints what :func:`lfrtorch.identify` finds, step by step."""
 
     def __init__(self) -> None:
         self._line: ProgressLine | StartsLine | None = None

@@ -130,21 +130,13 @@ class Response:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evaluation:
-    """An NL-LFR and linear models on all records of a dataset, each simulated once.
-
-    Args:
-        dataset: the records.
-        linear: best linear approximation of all training records, if there is one.
-        model: the NL-LFR, if there is one.
-        refitted: that was fitted again to all estimation records, which the tests are simulated by.
-        own: linear models of single tests, by name (see ``Dataset.linear``).
-    """
+    """An NL-LFR and linear models on all records of a dataset, each simulated once."""
 
     dataset: Dataset
-    linear: LinearModel | None = None
+    linear: LinearModel | None = None  # of all training records
     model: Model | None = None
-    refitted: Model | None = None
-    own: Mapping[str, LinearModel] = field(default_factory=dict)
+    refitted: Model | None = None  # to all estimation records: it simulates the tests
+    own: Mapping[str, LinearModel] = field(default_factory=dict)  # of single tests, by name
 
     @cached_property
     def simulations(self) -> list[Response]:

@@ -34,7 +34,7 @@ def of_run(run: Run) -> tuple[dict[str, Figure], Views]:
         drawn["static_map"] = static_figure(model, dataset.train[0])
     unit = common_unit(model.outputs)
     drawn["convergence"] = plots.convergence(run.fit.history, run.fit.chosen_iteration, unit)
-    drawn["frequency_response"] = linear_plots.frequency_response(bla, measured(dataset.train))
+    drawn["frequency_response"] = linear_plots.frequency_response(bla, _measured(dataset.train))
     drawn["poles_and_zeros"] = linear_plots.poles_and_zeros(bla)
     if run.residuals is not None:
         drawn["residuals"] = run.residuals.plot()
@@ -56,8 +56,10 @@ def of_records(simulated: Sequence[Response], dataset: Dataset) -> tuple[dict[st
     for response in shown[MOST_RECORDS:]:
         if response.use == "test":
             record = response.record
-            drawn[record.name] = plots.errors(record, response.simulated)
-            if not plots.is_whole(record):
+            if plots.is_whole(record):
+                drawn[record.name] = plots.spectrum(record, response.simulated)
+            else:
+                drawn[record.name] = plots.response(record, response.simulated)
                 drawn[f"{record.name}_density"] = plots.density(record, response.simulated)
     return drawn, views
 
@@ -88,7 +90,7 @@ def of_record(
     return drawn, captions
 
 
-def measured(records: Sequence[Record]) -> FRF | None:
+def _measured(records: Sequence[Record]) -> FRF | None:
     """The nonparametric frequency response, if the records give one in seconds."""
     # It takes 3 s up to there.
     if sum(record.samples for record in records) > 500_000:

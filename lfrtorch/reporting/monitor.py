@@ -30,38 +30,20 @@ from lfrtorch.reporting import plots
 
 
 class TensorBoard:
-    """Scalars of every iteration, and figures of the validation record now and then.
+    """Scalars of every iteration, and figures of the validation record now and then."""
 
-    The file is made at the first iteration that is written. It replaces what earlier files in the
-    folder have of this and later iterations: a fit that goes on has each of them once.
-
-    Args:
-        folder: of the event file.
-        record: record whose output and static map are drawn, usually the validation record.
-            Default: scalars alone.
-        y_linear: output of the linear model on it, (T, ny), for the error beside ours.
-        every: iterations between figures; they cost about half a second.
-        finalist: whether nothing is written before the last round of a fit from several starts, so
-            that starts that others end leave no run.
-        say: told once if the file cannot be written, for example because the disk is full. The fit
-            goes on without it. Default: a warning.
-
-    Example:
-        >>> from lfrtorch.reporting.monitor import TensorBoard
-        >>> board, trainer = TensorBoard("board"), lfrtorch.LevenbergMarquardt(max_iter=2)
-        >>> result = lfrtorch.fit(model, record, trainer=trainer, monitors=[board])
-        >>> board.close()  # tensorboard --logdir board
-    """
+    # The file is made at the first iteration that is written. It replaces what earlier files in the
+    # folder have of this and later iterations: a fit that goes on has each of them once.
 
     def __init__(
         self,
         folder: str | Path,
-        record: Record | None = None,
-        y_linear: plots.Array | None = None,
-        every: int = 50,
+        record: Record | None = None,  # whose output and static map are drawn
+        y_linear: plots.Array | None = None,  # output of the linear model on it, (T, ny)
+        every: int = 50,  # iterations between figures, which cost about half a second
         *,
-        finalist: bool = False,
-        say: Callable[[str], None] = warnings.warn,
+        finalist: bool = False,  # write nothing before the last round of several starts
+        say: Callable[[str], None] = warnings.warn,  # told once if the file cannot be written
     ) -> None:
         self.folder, self.finalist, self._say = Path(folder), finalist, say
         self.record, self.y_linear, self.every = record, y_linear, every
@@ -191,24 +173,14 @@ def quiet_writers() -> Iterator[None]:
 
 
 class Checkpoint:
-    """The best iterate so far as a checkpoint on disk: what is left of a run that is killed.
+    """The best iterate so far on disk, of all starts that call it: what a killed run leaves."""
 
-    One may be called by several starts of a fit: it keeps the best of all.
-
-    Args:
-        folder: of the checkpoint.
-        every: least seconds between two of them, the first is that of the start.
-        least: score that an iterate must beat, that of the checkpoint there.
-
-    Example:
-        >>> from lfrtorch.reporting.monitor import Checkpoint
-        >>> keep, trainer = Checkpoint("best", every=0), lfrtorch.LevenbergMarquardt(max_iter=5)
-        >>> result = lfrtorch.fit(model, record, trainer=trainer, monitors=[keep])
-        >>> np.allclose(lfrtorch.load("best").simulate(record), model.simulate(record))
-        True
-    """
-
-    def __init__(self, folder: str | Path, every: float = 5.0, least: float = math.inf) -> None:
+    def __init__(
+        self,
+        folder: str | Path,
+        every: float = 5.0,  # least seconds between two
+        least: float = math.inf,  # score that an iterate must beat
+    ) -> None:
         self.folder, self.every = Path(folder), every
         self._due, self._least = -math.inf, least
         self._unwritten: Model | None = None

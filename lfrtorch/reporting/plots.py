@@ -46,11 +46,6 @@ _HEIGHT = 4.2  # of an output in a figure, in inches
 _WIDE, _NARROW = 6.4, 4.4  # of figures that stand side by side on a wide page
 
 
-def errors(record: Record, simulated: Simulated) -> Figure:
-    """Draw the spectrum of whole periods in steady state, and else the response against time."""
-    return (spectrum if is_whole(record) else response)(record, simulated)
-
-
 def is_whole(record: Record) -> bool:
     """Whether the scored samples are whole periods in steady state, without leakage."""
     return record.start == "periodic" and not record.skip

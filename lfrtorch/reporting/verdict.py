@@ -62,27 +62,13 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the NL-LFR is worth more than the linear model.
+    """Whether the NL-LFR is worth more than the linear model."""
 
-    Args:
-        kind: what it comes to.
-        text: in a sentence of 160 characters at most.
-        use: ``"NL-LFR"``, ``"linear model"`` or ``"neither"``.
-        evidence: numbers that it rests on: the NL-LFR's error over the linear model's (``ratio``,
-            and its standard error ``ratio_std``), both errors over the output's standard deviation
-            (``nrmse``, ``linear_nrmse``), and the same of each record in ``records``.
-
-    Example:
-        >>> dataset = lfrtorch.Dataset("mine", train=[record], validation=[], tests=[])
-        >>> trainer = lfrtorch.LevenbergMarquardt(max_iter=1)
-        >>> run = lfrtorch.identify(dataset, lfrtorch.Settings(nx=1, nz=1, nn=4, trainer=trainer))
-        >>> run.verdict.kind
-        <Kind.UNJUDGED: 'unjudged'>
-    """
-
-    kind: Kind
-    text: str
-    use: str
+    kind: Kind  # what it comes to
+    text: str  # in a sentence of 160 characters at most
+    use: str  # "NL-LFR", "linear model" or "neither"
+    # The NL-LFR's error over the linear model's (ratio, ratio_std), both errors over the output's
+    # standard deviation (nrmse, linear_nrmse), and the same of each record in records.
     evidence: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -139,10 +125,6 @@ def judge(
     enough. It is better if it is so on the tests together, or without tests on validation.
     Records of fewer than ten scored samples say nothing.
 
-    Args:
-        result, responses: the fit, and its model on all records.
-        linear_nx: order of the linear model, which the sentence names.
-        error: what it is called, for example ``"prediction error"``.
     """
     lost = [r for r in responses if not np.isfinite(rms(r.error))]
     failed = result.reason in (Reason.GRADIENT_DIVERGED, Reason.JACOBIAN_VANISHES)

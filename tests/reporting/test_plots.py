@@ -53,12 +53,13 @@ def test_spectrum_shows_amplitudes_in_decibel():
 def test_figures_of_a_linear_model_have_its_lines_alone():
     periodic = Record(T, Y, 100.0, start="periodic")
     skipped = Record(T, Y, 100.0, start="periodic", skip=1)
-    for record, unit, lines in (
-        (periodic, "Hz", ["output", "linear error"]),
-        (skipped, "s", ["measured", "linear, fit 90.0 %"]),
-        (RECORD, "s", ["measured", "linear, fit 90.0 %"]),
+    for draw, record, unit, lines in (
+        (plots.spectrum, periodic, "Hz", ["output", "linear error"]),
+        (plots.response, skipped, "s", ["measured", "linear, fit 90.0 %"]),
+        (plots.response, RECORD, "s", ["measured", "linear, fit 90.0 %"]),
     ):
-        figure = plots.errors(record, both(0.9 * Y))
+        assert plots.is_whole(record) == (draw is plots.spectrum)
+        figure = draw(record, both(0.9 * Y))
         assert labels(figure.axes[0]) == lines
         assert f"({unit})" in figure.axes[-1].get_xlabel()
     assert labels(plots.close_up(RECORD, both(0.9 * Y)).axes[0]) == ["measured", "linear"]
