@@ -29,7 +29,7 @@ class Claim(Callback):
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """Claim ``hydra.run.dir``."""
         if os.environ.get("RANK", "0") == "0":
-            with user_errors(cfg=config):
+            with user_errors():
                 claim(Path(config.hydra.run.dir), config)
 
 

@@ -24,7 +24,9 @@ from lfrtorch.cli import CONF, declared
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import COMPOSED, MAIN
 from lfrtorch.cli.quotes import in_quotes, quoted
-from lfrtorch.cli.words import GROUPS
+
+GROUPS = ("bla", "frf", "data", "trainer")
+"""Groups whose words are arguments of functions. Of a name in several, the last one is meant."""
 
 declared.register()
 
@@ -36,9 +38,25 @@ _SETTING = re.compile(r"[+~]*[a-z_.]+=")  # what a word NAME=VALUE begins with
 
 def take_words(command: str, whole: Callable[[Sequence[str]], list[str]] = list) -> None:
     """Check the words, after ``whole`` has completed them, and quote them for Hydra."""
-    given = sys.argv[1:]
+    given = in_groups(command, sys.argv[1:])
     sys.argv[1:] = [quoted(word) for word in whole(given)]
     check_words(command, given, sys.argv[1:])
+
+
+def in_groups(command: str, given: Sequence[str]) -> list[str]:
+    """The words, with their group before the names that messages have: ``start=estimated``."""
+    own = {str(name) for name in OmegaConf.load(CONF / f"{command}.yaml")}
+    named = [word.partition("=")[0] if "=" in word else "" for word in given]
+    bare = {name for name in named if name.isidentifier()} - own
+    bare = {name for name in bare if not (CONF / name).is_dir()}
+    if not bare:
+        return list(given)
+    words = [parsed(word) for word, name in zip(given, named, strict=True) if name]
+    names = dict(spelt(composed(command, [first_run(w) for w in words if is_choice(w)])))
+    return [
+        names.get(name, name) + word[len(name) :] if name in bare else word
+        for word, name in zip(given, named, strict=True)
+    ]
 
 
 def started(
@@ -49,7 +67,7 @@ def started(
     """Start a command of one run; errors of users end it with a line."""
 
     def job(cfg: DictConfig) -> None:
-        with user_errors(cfg=cfg):
+        with user_errors():
             work(cfg)
 
     with user_errors():

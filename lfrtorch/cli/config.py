@@ -17,7 +17,6 @@ from lfrtorch._support.checks import integer, true_or_false
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.hydra_versions import instantiate
-from lfrtorch.cli.words import translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.fitting.plain_settings import PlainSettings, SizesSearch
 from lfrtorch.fitting.settings import Settings
@@ -90,7 +89,6 @@ def loaded(cfg: DictConfig) -> Dataset:
     if cfg.get("noise", "output") != "output":
         given["refine"] = given.get("refine") or "prediction"
     notes = (*dataset.notes, *(notes_on(measured, given=given) if measured else ()))
-    notes = tuple(translated(note, cfg) for note in notes)
     for note in notes:
         print(in_lines(f"note: {note}"))
     return replace(dataset, notes=notes)

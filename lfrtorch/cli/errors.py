@@ -8,25 +8,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hydra.errors import InstantiationException
-from omegaconf import DictConfig
 
 from lfrtorch._support.errors import LfrtorchError
 from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.hydra_versions import NODE, notes_of
 from lfrtorch.cli.interrupts import TerminatedError, as_error, handled
-from lfrtorch.cli.words import translated
 
 
 @contextmanager
-def user_errors(rank: str = "0", cfg: DictConfig | None = None) -> Iterator[None]:
+def user_errors(rank: str = "0") -> Iterator[None]:
     """Errors of users end the program with one message and exit code 1; bugs keep theirs."""
-    # A message names the group of the configuration, ``data: seed is -1``; with ``cfg`` it is in
-    # words of the command line.
+    # A message names the group of the configuration, which a function's argument belongs to:
+    # ``data: seed is -1``.
     error = "error" if rank == "0" else f"error on rank {rank}"
 
     def show(message: str) -> None:
-        text = message if cfg is None else translated(message, cfg)
-        print(in_lines(f"{error}: {text}"), file=sys.stderr)
+        print(in_lines(f"{error}: {message}"), file=sys.stderr)
 
     try:
         with handled(as_error):

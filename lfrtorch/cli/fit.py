@@ -46,7 +46,6 @@ from lfrtorch.cli.run_folder import (
     program,
     resumable,
 )
-from lfrtorch.cli.words import Terminal, translated
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import ProcessLostError, Ranks, connect
 from lfrtorch.fitting.observer import Watching
@@ -57,8 +56,8 @@ from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 from lfrtorch.reporting.advice import Advice
+from lfrtorch.reporting.console import Console
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard, quiet_writers
-from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.run_files import write
 from lfrtorch.reporting.verdict import LINEAR_MODEL
 
@@ -87,7 +86,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             number = stop.asked or signal.SIGINT
             raise TerminatedError(f"{stopped}: nothing to keep", number) from None
         if files is not None:
-            found = in_words(replace(found, advice=unsearched(found.advice, asked)), cfg)
+            found = replace(found, advice=unsearched(found.advice, asked))
             print(found)
             config = OmegaConf.to_yaml(files.cfg, resolve=True)
             write(
@@ -125,22 +124,12 @@ def unsearched(advice: Sequence[Advice], asked: DictConfig) -> list[Advice]:
     return [item for item in advice if is_open(item)]
 
 
-def in_words(found: Run, cfg: DictConfig) -> Run:
-    """A run whose advice and notes name the words of the command line."""
-    advice = [a._replace(text=translated(a.text, cfg)) for a in found.advice]
-    linear = found.linear
-    if linear.fit is not None:
-        notes = tuple(translated(note, cfg) for note in linear.fit.notes)
-        linear = replace(linear, fit=replace(linear.fit, notes=notes))
-    return replace(found, advice=advice, linear=linear)
-
-
-class _Folder(Terminal):
+class _Folder(Console):
     """The first process: prints, and keeps the folder of the run up to date during the fit."""
 
     def __init__(self, cfg: DictConfig, folder: Path, *, least: float) -> None:
-        super().__init__(cfg)
-        self.folder, self._least = folder, least
+        super().__init__()
+        self.cfg, self.folder, self._least = cfg, folder, least
 
     def begin(
         self, dataset: Dataset, settings: Settings, linear: LinearModel, models: Sequence[Model]
@@ -190,7 +179,7 @@ def launched(cfg: DictConfig, folder: Path, command: str) -> float:
     """One run, by all processes that torchrun started; errors of users end the program."""
     rank = os.environ.get("RANK", "0")
     with ExitStack() as stack:
-        stack.enter_context(user_errors(rank, cfg))
+        stack.enter_context(user_errors(rank))
         stack.enter_context(quiet_writers())
         if rank == "0":
             stack.enter_context(no_empty_folder(folder))

@@ -22,11 +22,11 @@ from lfrtorch.cli.composition import started
 from lfrtorch.cli.config import configured, limit_threads, loaded
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.cli.run_folder import CONFIG, arguments, no_empty_folder, program
-from lfrtorch.cli.words import Terminal
 from lfrtorch.distributed import Ranks
 from lfrtorch.job import linear_model, linear_records
 from lfrtorch.linear.requirements import of_response
 from lfrtorch.reporting import linear_report
+from lfrtorch.reporting.console import Console
 from lfrtorch.reporting.evaluation import Evaluation
 
 
@@ -38,7 +38,7 @@ def identify(cfg: DictConfig, folder: Path, command: str = "") -> None:
     print(f"{dataset.name}: {sum(r.samples for r in dataset.train)} training samples")
     frf, notes = response(cfg, dataset.train)
     # A fit to the response takes the one that the figures show.
-    terminal = Terminal(cfg)
+    terminal = Console()
     data = frf if frf and wants_response(cfg, dataset.train) else None
     data = data or linear_records(dataset.train, settings, terminal)
     model, scan = linear_model(data, settings, dataset.validation, observer=terminal, ranks=Ranks())

@@ -5,15 +5,13 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
-from lfrtorch.cli import CONF
 from lfrtorch.cli.composition import name_paths, started
-from lfrtorch.cli.words import translated
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.glance import look_at
 from lfrtorch.files.load import listed_files, stem_of
@@ -21,9 +19,6 @@ from lfrtorch.records import check_rate
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import survey_measurement
 from lfrtorch.survey.notes import examine
-
-BLA, FILE = (CONF / name for name in ("bla/state_space.yaml", "data/file.yaml"))
-"""Settings whose names the notes use."""
 
 FIGURES = (".png", ".pdf", ".svg")
 
@@ -69,9 +64,7 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
     table = open_table(path)
     seen = look_at(table, data.inputs, data.outputs, time=data.time, fs=data.fs)
     found = survey_measurement(seen.u, seen.y, seen.fs, inputs=seen.inputs, outputs=seen.outputs)
-    words = OmegaConf.create({"bla": OmegaConf.load(BLA), "data": OmegaConf.load(FILE)})
-    sentences = [*seen.doubts]
-    sentences += [translated(note.text, words) for note in examine(found, seen.u, seen.y)]
+    sentences = [*seen.doubts, *(note.text for note in examine(found, seen.u, seen.y))]
     remarks = [*seen.remarks]
     if seen.fs is None:
         remarks.append("no sampling frequency: give data.fs=HZ; frequencies are in cycles/sample")

@@ -20,7 +20,6 @@ from lfrtorch._support.checks import integer, number
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import expanded, real
 from lfrtorch.cli.composition import started
-from lfrtorch.cli.words import translated
 from lfrtorch.file_simulation import (
     Simulated,
     Start,
@@ -53,7 +52,7 @@ def simulate(cfg: DictConfig) -> None:
                 time=cfg.data.time, find_time=cfg.data.fs is None,
             )  # fmt: skip
             for note in filter(None, (*stream.table.notes, stream.note)):
-                print(f"note: '{path}': {translated(note, cfg)}")
+                print(f"note: '{path}': {note}")
             if not stream.y:
                 missing = ", ".join(stream.missing)
                 print(f"note: '{path}' has no column {missing}, so nothing is scored")

@@ -149,7 +149,7 @@ def still_falling(e: Evidence) -> Advice | None:
         return None
     limit = 4 * max(e.iterations, 1)
     return Advice(
-        f"Still falling: max_iter={limit}; init_from=run.model goes on from here.",
+        f"Still falling: max_iter={limit}; init_from=MODEL goes on from here.",
         f"at the pace of the last iterations the validation error falls by {percent(e.falling)} "
         f"in a tenth of the {e.iterations}",
         {"trainer": replace(e.trainer, max_iter=limit)},

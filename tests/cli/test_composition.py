@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lfrtorch import InputError
-from lfrtorch.cli.composition import check_words
+from lfrtorch.cli.composition import check_words, in_groups
 
 FILE = ["data=file", "data.path=x.csv"]
 
@@ -92,3 +92,24 @@ def test_words_of_an_earlier_run_are_taken_as_they_are():
     check_words("config", ["resume=x", "data.seed=2"], [*saved, "resume=x", "data.seed=2"])
     with pytest.raises(InputError, match=r"no setting 'data\.seeed'"):
         check_words("config", ["resume=x", "data.seeed=2"], [*saved, "resume=x", "data.seeed=2"])
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "taken"),
+    [
+        (
+            "config",
+            ["start=estimated", *FILE, "max_iter=9"],
+            ["data.start", *FILE, "trainer.max_iter"],
+        ),
+        ("config", ["-m", *FILE, "tolerance=0,1"], ["-m", *FILE, "trainer.tolerance"]),
+        ("config", [*FILE, "seed=1", "nx=auto"], [*FILE, "seed", "nx"]),  # not data.seed
+        ("config", [*FILE, "zzzz=1", "offset=False"], [*FILE, "zzzz", "bla.offset"]),
+        ("linear", ["method=fast"], ["frf.method"]),
+        ("simulate", ["path=x.csv", "start=zero"], ["data.path", "start"]),
+    ],
+)
+def test_names_as_messages_have_them_are_taken(command: str, words: list[str], taken: list[str]):
+    found = in_groups(command, words)
+    for word, given, name in zip(found, words, taken, strict=True):
+        assert word == (name if name in (*FILE, "-m") else f"{name}={given.partition('=')[2]}")

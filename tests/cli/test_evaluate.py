@@ -115,7 +115,7 @@ def test_the_model_folder_of_a_run_will_do(run_folder: Path, monkeypatch, capsys
     assert "no linear model is scored" not in capsys.readouterr().out
 
 
-def test_without_a_linear_model_its_column_is_empty(tmp_path: Path, monkeypatch, capsys):
+def test_without_a_linear_model_it_has_no_column(tmp_path: Path, monkeypatch, capsys):
     MODEL.save(tmp_path / "alone")
     run(monkeypatch, f"checkpoint={tmp_path / 'alone'}", DATA, f"out={tmp_path / 'a.json'}")
     found = json.loads((tmp_path / "a.json").read_text())
@@ -124,7 +124,8 @@ def test_without_a_linear_model_its_column_is_empty(tmp_path: Path, monkeypatch,
     printed = capsys.readouterr().out
     assert "has no folder linear/, so no linear model is scored" in printed
     rest = next(line for line in printed.splitlines() if line.startswith("rest "))
-    assert rest.split()[-3:] == ["–", "0.250", "0.125"]
+    assert rest.split()[-4:] == ["of", "80", "0.250", "0.125"]
+    assert "linear" not in printed.split("record")[1]
 
 
 @pytest.mark.numeric

@@ -211,7 +211,11 @@ def usual() -> DictConfig:
         ("a", ["nx=auto", "bla.speed=3"], "speed"),
         ("a", ["nx=2", "bla.refine=magic"], "refine is 'magic'"),
         ("a", ["nx=2", "frf.method=magic"], "method is 'magic'"),
-        ("a", ["nx=2", "frf.method=fast"], "no period; give data.period=N, or use frf.method=loc"),
+        (
+            "a",
+            ["nx=2", "frf.method=fast"],
+            "no period; give period=N, or use method='local_",
+        ),
         ("rest", ["nx=2"], "signal 'rest' is constant"),
         ("rest", ["nx=auto"], "signal 'rest' is constant"),
     ],
@@ -222,7 +226,7 @@ def test_settings_that_cannot_be_are_one_message(
     cfg = copy.deepcopy(usual())
     OmegaConf.set_struct(cfg, False)  # as + does on the command line
     cfg.merge_with_dotlist(overrides(csv, inputs, "x", *more)[1:])
-    with pytest.raises(SystemExit) as stop, errors.user_errors(cfg=cfg):
+    with pytest.raises(SystemExit) as stop, errors.user_errors():
         linear.identify(cfg, tmp_path)
     assert stop.value.code == 1
     assert message in capsys.readouterr().err

@@ -60,7 +60,7 @@ def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
     monkeypatch.chdir(folder)
     cfg = copy.deepcopy(usual())
     cfg.merge_with_dotlist(["checkpoint=model", *words])
-    with user_errors(cfg=cfg):
+    with user_errors():
         simulate.simulate(cfg)
 
 
@@ -391,4 +391,4 @@ def test_columns_of_other_names_are_asked_for_in_words_of_the_command_line(
     csv(folder / "other.csv", a=U[:, 0], b=U[:, 1])
     with pytest.raises(SystemExit):
         launched(monkeypatch, folder, "data.path=other.csv", "out=x.csv", "data.fs=50")
-    assert "say which columns these are with data.inputs=[...]" in capsys.readouterr().err
+    assert "say which columns these are with inputs=[...]" in capsys.readouterr().err

@@ -15,7 +15,7 @@ Y = np.random.default_rng(0).standard_normal((200, 1))
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """A figure is what it was asked to show."""
-    for name in ("response", "close_up", "spectrum", "density", "distribution", "errors"):
+    for name in ("response", "close_up", "spectrum", "density", "distribution"):
         monkeypatch.setattr(plots, name, lambda *asked, name=name: (name, *asked[2:]))
 
 
