@@ -353,44 +353,15 @@ def _group(
         if matlab and key.startswith("#"):
             continue
         name = f"{prefix}{key}"
-        item = _linked(group, key)
+        item: Any = _linked(group, key)
+        if matlab and _is_cell(item) and item.size == 1:
+            item = item.file[item[()].reshape(-1)[0]]
         if isinstance(item, str):
             found[name] = item
-            continue
-        if matlab and isinstance(item, h5py.Dataset):
-            cells = item.dtype.kind == "O" and item.attrs.get("MATLAB_class") == b"cell"
-            if cells and item.size == 1:
-                item = item.file[item[()].reshape(-1)[0]]
-            elif item.dtype.kind == "O":
-                what = "cells" if cells else "structs"
-                found[name] = f"is an array of {item.size} {what}; store the arrays of one"
-                continue
-            elif item.attrs.get("MATLAB_class") in (b"char", b"string"):
-                found[name] = "is text; store an array of real numbers"
-                continue
-            # MATLAB_object_decode of an object: what is stored is where its parts are.
-            elif item.attrs.get("MATLAB_object_decode", 0) == 3:
-                found[name] = _IS_OBJECT
-                continue
-            elif "MATLAB_empty" in item.attrs:
-                found[name] = "is empty"
-                continue
-        if isinstance(item, h5py.Group):
-            if "MATLAB_sparse" in item.attrs:
-                found[name] = "is sparse; store full(x)"
-            elif h5py.h5o.get_info(item.id).addr in above:
-                found[name] = "is a group that it lies in itself; leave it out"
-            else:
-                _group(item, f"{name}{'.' if matlab else '/'}", matlab, found, names, above)
-        elif item.dtype.names:
-            complex_ = set(item.dtype.names) == {"real", "imag"}
-            found[name] = (
-                "is complex; store real and imaginary part apart"
-                if complex_
-                else f"is compound ({', '.join(item.dtype.names)}); store one array a field"
-            )
-        elif item.shape is None:
-            found[name] = "is empty"
+        elif reason := _refusal(item, above, matlab):
+            found[name] = reason
+        elif isinstance(item, h5py.Group):
+            _group(item, f"{name}{'.' if matlab else '/'}", matlab, found, names, above)
         else:
             unit = item.attrs.get("units", item.attrs.get("unit", ""))
             unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
@@ -398,6 +369,36 @@ def _group(
             number = np.asarray(item[()]) if item.size == 1 else None
             found[name] = Signal(item.shape, item.dtype, unit, matlab, number, _packing(item))
             names[name] = item.name
+
+
+def _is_cell(item: Any) -> bool:
+    kind = getattr(getattr(item, "dtype", None), "kind", "")
+    return kind == "O" and item.attrs.get("MATLAB_class") == b"cell"
+
+
+def _refusal(item: Any, above: frozenset[int], matlab: bool) -> str:
+    """Why an HDF5 object holds no signals; nothing if it may hold some."""
+    h5py = optional("h5py")
+    if isinstance(item, h5py.Group):
+        if "MATLAB_sparse" in item.attrs:
+            return "is sparse; store full(x)"
+        inside = h5py.h5o.get_info(item.id).addr in above
+        return "is a group that it lies in itself; leave it out" if inside else ""
+    if matlab and item.dtype.kind == "O":
+        what = "cells" if _is_cell(item) else "structs"
+        return f"is an array of {item.size} {what}; store the arrays of one"
+    if matlab and item.attrs.get("MATLAB_class") in (b"char", b"string"):
+        return "is text; store an array of real numbers"
+    # MATLAB_object_decode of an object: what is stored is where its parts are.
+    if matlab and item.attrs.get("MATLAB_object_decode", 0) == 3:
+        return _IS_OBJECT
+    if item.shape is None or (matlab and "MATLAB_empty" in item.attrs):
+        return "is empty"
+    if item.dtype.names and set(item.dtype.names) == {"real", "imag"}:
+        return "is complex; store real and imaginary part apart"
+    if item.dtype.names:
+        return f"is compound ({', '.join(item.dtype.names)}); store one array a field"
+    return ""
 
 
 def _packing(item: Any) -> _Packing | None:

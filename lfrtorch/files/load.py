@@ -213,9 +213,10 @@ class _Reader:
         self._first: Measurement | None = None
         self._notes: dict[str, list[str]] = {}
 
-    def note(self, name: str, text: str) -> None:
+    def note(self, name: str, *texts: str) -> None:
         """Keep what is to be known of a record, or of all if the name is empty."""
-        self._notes.setdefault(text, []).append(name)
+        for text in texts:
+            self._notes.setdefault(text, []).append(name)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -232,7 +233,7 @@ class _Reader:
         for path, stem in zip(paths, stems, strict=True):
             measured = self._measured(path)
             several = len(measured.stretches) > 1
-            self._note_all(stem, measured.notes)
+            self.note(stem, *measured.notes)
             if several:
                 self.note(stem, f"{len(measured.stretches)} stretches between gaps, a record each")
             before = len(found)
@@ -245,16 +246,12 @@ class _Reader:
                         raise InputError(f"'{path}': {error}") from error
                     self.note(name, _LEFT_OUT)
                 else:
-                    self._note_all(name, notes)
+                    self.note(name, *notes)
                     found.append(_Whole(record, path, stem, several))
             if len(found) == before:
                 raise InputError(f"'{path}': no stretch between its gaps is long enough to score.")
         self.all += found
         return found
-
-    def _note_all(self, name: str, texts: Iterable[str]) -> None:
-        for text in texts:
-            self.note(name, text)
 
     def _measured(self, path: Path) -> Measurement:
         """What a file measured, checked to be of a kind with the first."""

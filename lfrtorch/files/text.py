@@ -11,11 +11,11 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,7 +152,7 @@ class TextTable(Table):
     @contextmanager
     def _stream(self) -> Iterator[Iterable[str]]:
         """Open the file as lines of text."""
-        with _opened(self.path, self.layout.encoding) as stream:
+        with _Text(self.path, self.layout.encoding) as stream:
             yield stream
 
     def _texts(self, count: int) -> Iterator[str]:
@@ -243,10 +243,6 @@ class _Text(io.TextIOWrapper):
         return line
 
 
-def _opened(path: Path, encoding: str) -> IO[str]:
-    return _Text(path, encoding)
-
-
 def _bytes(path: Path) -> gzip.GzipFile | io.BufferedReader:
     return gzip.open(path) if path.suffix.lower() == ".gz" else path.open("rb")
 
@@ -265,19 +261,11 @@ def _encoding(path: Path) -> str:
             f"'{path}' is not text, as its zero bytes show; give it the extension of its format, "
             "or save it as text."
         )
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(start)
-    except UnicodeDecodeError:
-        return "cp1252" if _decodes(start, "cp1252") else "latin-1"
-    return "utf-8-sig"
-
-
-def _decodes(text: bytes, encoding: str) -> bool:
-    try:
-        text.decode(encoding)
-    except UnicodeDecodeError:
-        return False
-    return True
+    for encoding in ("utf-8-sig", "cp1252"):
+        with suppress(UnicodeDecodeError):
+            codecs.getincrementaldecoder(encoding)().decode(start)
+            return encoding
+    return "latin-1"
 
 
 def _split(lines: Iterable[str], delimiter: str) -> Iterator[Line]:
@@ -305,7 +293,7 @@ def _cells(text: str, delimiter: str) -> list[str]:
 def _layout(path: Path) -> Layout:
     try:
         encoding = _encoding(path)
-        with _opened(path, encoding) as stream:
+        with _Text(path, encoding) as stream:
             head = stream.read(_HEAD)
             head += stream.readline()
     except _DAMAGED as error:
@@ -382,9 +370,10 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> L
             f"{shown[:80]!r}; give a file with data."
         )
     # A number that cannot be read makes no header of its line.
-    while (
-        start and not lines[start - 1].comment and _similar(lines[start - 1].cells, width, numeric)
-    ):
+    while start:
+        _, cells, comment = lines[start - 1]
+        if comment or len(cells) != width or not any(map(numeric, cells)):
+            break
         start -= 1
 
     above = [
@@ -401,7 +390,8 @@ def layout_of(path: Path, encoding: str, delimiter: str, lines: list[Line]) -> L
             notes = (f"line {lines[start].number}, {shown}, {_HEADERS[named]}",)
         if named:
             above, start = [lines[start].cells], start + 1
-    if width > 1 and not any(cells[-1] for cells in whole) and _short(above, width):
+    unnamed = not above or not above[-1][width - 1]  # the last column
+    if width > 1 and unnamed and not any(cells[-1] for cells in whole):
         width -= 1  # every sample ends with a delimiter
         above = [line.cells for line in lines[:start] if len(line.cells) >= width]
     headers, units = _names(above, width)
@@ -481,15 +471,6 @@ def _finite(cells: Iterable[str], comma: bool) -> list[float]:
     """The finite numbers among cells."""
     numbers = (float(cell.replace(",", ".")) for cell in cells if _is_number(cell, comma))
     return [number for number in numbers if abs(number) < np.inf]
-
-
-def _similar(cells: list[str], width: int, numeric) -> bool:
-    return len(cells) == width and any(map(numeric, cells))
-
-
-def _short(above: list[list[str]], width: int) -> bool:
-    """Whether no name is above the last column."""
-    return not above or not above[-1][width - 1]
 
 
 def _names(above: list[list[str]], width: int) -> tuple[tuple[str, ...], dict[str, str]]:
