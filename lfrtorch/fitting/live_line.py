@@ -16,7 +16,7 @@ from lfrtorch.fitting.trainer import Progress, Round
 from lfrtorch.model import Model
 from lfrtorch.records import common_unit
 
-_DIGITS = 4  # of errors: an iteration often moves the fourth alone
+_DIGITS = 4  # significant digits of errors: an iteration often moves the fourth alone
 
 
 class LiveLine:
@@ -82,17 +82,16 @@ class ProgressLine:
     """
 
     def __init__(self, every: int | None = 10, stream: TextIO | None = None) -> None:
-        self.every, self._line, self._unseen = every, LiveLine(stream), ""
+        self._every, self._line, self._unseen = every, LiveLine(stream), ""
 
     def __call__(self, model: Model, progress: Progress) -> None:
         """Show the progress."""
-        text = progress_text(progress, common_unit(model.outputs))
+        text = _progress_text(progress, common_unit(model.outputs))
         self._line.show(text)
-        if self._line.live or self.every is None:
-            return
-        self._unseen = text
-        if progress.iteration % self.every == 0:
-            self.close()
+        if not self._line.live and self._every is not None:
+            self._unseen = text
+            if progress.iteration % self._every == 0:
+                self.close()
 
     def close(self) -> None:
         """End the line; if the stream cannot rewrite one, show the last iteration."""
@@ -102,12 +101,12 @@ class ProgressLine:
         self._unseen = ""
 
 
-def progress_text(progress: Progress, unit: str) -> str:
-    """Iteration, errors (a star marks the best so far), time left, optimiser's scalars."""
-    parts = [
-        f"{progress.iteration:>{len(str(progress.limit))}}/{progress.limit}",
-        *_errors(progress, unit, best=progress.best),
-    ]
+def _progress_text(progress: Progress, unit: str) -> str:
+    """Write iteration, errors, time left and scalars of the trainer."""
+    limit = str(progress.limit)
+    parts = [f"{progress.iteration:>{len(limit)}}/{limit}", *_errors(progress, unit)]
+    if progress.best and not math.isnan(progress.validation):
+        parts[-1] += "*"
     if progress.iteration:
         parts.append(f"{_duration(progress.seconds_left)} left")
     shown = {"damping": "damping", "gain_ratio": "gain", "gradient_norm": "|gradient|"}
@@ -117,16 +116,16 @@ def progress_text(progress: Progress, unit: str) -> str:
     return "  ".join(parts)
 
 
-def _errors(progress: Progress, unit: str, *, best: bool = False) -> list[str]:
-    """Errors on training and, if there is one, validation; a star marks the best so far."""
+def _errors(progress: Progress, unit: str) -> list[str]:
+    """Write the errors on training and, if there is one, validation."""
     train, validation = quantities([progress.train, progress.validation], unit, _DIGITS)
     if math.isnan(progress.validation):
         return [f"train {train}"]
-    return [f"train {train}", f"validation {validation}" + ("*" if best else "")]
+    return [f"train {train}", f"validation {validation}"]
 
 
 def _duration(seconds: float) -> str:
-    """45 s, 5 min or 2 h 05 min."""
+    """Write 45 s, 5 min or 2 h 05 min."""
     minutes = round(seconds / 60)
     if seconds < 120:
         return f"{seconds:.0f} s"
@@ -141,12 +140,11 @@ class StartsLine:
         unit: of the errors.
         stream: where to write. Default: standard output.
         iterations: of all starts together, for the time left.
-        rounds: whether a round gets a line that stays.
 
     Example:
         >>> from lfrtorch.fitting.live_line import StartsLine
         >>> models = [lfrtorch.initialise(bla, record, nz=1, nw=1, nn=4, seed=i) for i in range(4)]
-        >>> line, trainer = StartsLine(4), lfrtorch.LevenbergMarquardt(max_iter=16)
+        >>> line, trainer = StartsLine(4, iterations=36), lfrtorch.LevenbergMarquardt(max_iter=16)
         >>> result = lfrtorch.fit(
         ...     models, record, trainer=trainer, monitors=[[line]] * 4, watch=line.round
         ... )
@@ -156,15 +154,9 @@ class StartsLine:
     """
 
     def __init__(
-        self,
-        starts: int,
-        unit: str = "",
-        stream: TextIO | None = None,
-        *,
-        iterations: int | None = None,
-        rounds: bool = True,
+        self, starts: int, unit: str = "", stream: TextIO | None = None, *, iterations: int
     ) -> None:
-        self.starts, self.unit, self.iterations, self.rounds = starts, unit, iterations, rounds
+        self._starts, self._unit, self._all = starts, unit, iterations
         self._line, self._clock = LiveLine(stream), monotonic()
         self._iterations: dict[int, int] = {}
         self._best: Progress | None = None
@@ -175,28 +167,24 @@ class StartsLine:
         count = sum(self._iterations.values())
         if self._best is None or progress.score < self._best.score:
             self._best = progress
-        total = "" if self.iterations is None else f"/{self.iterations}"
-        parts = [f"{count}{total} iterations of {self.starts} starts"]
-        parts += _errors(self._best, self.unit)
-        if self.iterations is not None and 0 < count < self.iterations:
+        parts = [f"{count}/{self._all} iterations of {self._starts} starts"]
+        parts += _errors(self._best, self._unit)
+        if 0 < count < self._all:
             each = (monotonic() - self._clock) / count
-            parts.append(f"{_duration(each * (self.iterations - count))} left")
+            parts.append(f"{_duration(each * (self._all - count))} left")
         self._line.show("  ".join(parts))
 
     def round(self, ended: Round) -> None:
         """Show a round that has ended."""
-        if not self.rounds:
-            return
         judged = [(s.selection, s.validation, s.train) for s in ended.starts]
         found = [next(e for e in each if not math.isnan(e)) for each in judged]
         names = ["best", *["median"] * (len(found) > 2), *["worst"] * (len(found) > 1)]
         numbers = {"best": found[0], "median": median(found), "worst": max(found)}
-        shown = quantities([numbers[name] for name in names], self.unit, _DIGITS)
+        shown = quantities([numbers[name] for name in names], self._unit, _DIGITS)
+        errors = ", ".join(f"{name} {value}" for name, value in zip(names, shown, strict=True))
         self._line.say(
             f"round {ended.number} of {ended.count}: {len(found)} start(s) to iteration "
-            f"{max(s.iterations for s in ended.starts)}, "
-            + ", ".join(f"{name} {value}" for name, value in zip(names, shown, strict=True))
-            + f", {ended.seconds:.0f} s"
+            f"{max(s.iterations for s in ended.starts)}, {errors}, {ended.seconds:.0f} s"
         )
 
     def close(self) -> None:

@@ -28,6 +28,7 @@ from threading import Event
 from typing import Any, cast
 
 import torch
+from torch import Tensor
 
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer
@@ -71,10 +72,6 @@ from lfrtorch.score_window import with_window
 
 ROUNDS = (1 / 16, 1 / 8)
 """Parts of the iterations after which the worse half is left."""
-
-FINALISTS = 2
-"""Least number of starts that go to the end: of four on the parallel Wiener-Hammerstein stand-in
-the best one after 25 iterations ended in a poor minimum at one of five realisations."""
 
 AS_GOOD = 1.01
 """Ratio of errors up to which a mean of more starts is as good: the best of many iterates of some
@@ -123,27 +120,20 @@ def fit(
         train: records that are fitted.
         validation: records that choose among the iterates. Of an estimated start as many samples
             as determine it are not scored; a record that has too few does not choose.
-        selection: more records to judge starts on, and not the iterates of one. They should have
-            amplitudes that are not fitted: starts that fit alike differ there. (On the Bouc-Wen
-            benchmark the sweep's error has a rank correlation of 0.45 with that at the training's
-            level, of 0.7 and 0.8 with those at a half and a fifth of it. Iterates that are chosen
-            there are among the first if the model is too small, and worse at the training's level
-            by up to 6 %.)
+        selection: more records to judge starts on, and not the iterates of one, best at amplitudes
+            that are not fitted: starts that fit alike differ there (``benchmarks/starts.md``).
             Starts are judged on validation and selection, and without both on training.
         trainer: the search. Default: Levenberg-Marquardt.
         ridge: weight of |θ - θ_start|², see ``lfrtorch.least_squares.problem``.
         noise: where it acts. ``"output"``: on the outputs, and the simulation error is minimised.
             ``"innovation"``: inside the system, too, and the error of the prediction one sample
             ahead is minimised; all errors are those of predictions, and the model of the result
-            has K. ``"both"``: that of the simulation is minimised beside it, with three times the
+            has K. ``"both"``: the simulation error is minimised as well, with three times the
             weight, which keeps the model from running away. The models need a K, as ``initialise``
-            writes it from a linear model of ``estimate_bla(..., refine="prediction")``; records in
-            steady state are taken as others.
+            writes it from a linear model of ``estimate_bla(..., refine="prediction")``.
         horizon: samples of the windows that training records are cut into, each simulated from a
-            start state of its own that is fitted with the parameters
-            (``lfrtorch.fitting.windows``). Errors of training and validation are then those in
-            windows, of validation from states that are fitted to samples before them. Default:
-            whole records.
+            start state that is fitted with the parameters (``lfrtorch.fitting.windows``). Errors
+            are then those in windows. Default: whole records.
         average: most starts that the model of the result is the mean of
             (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
             averaged as bring the mean within 1 % of the least error on validation and selection,
@@ -158,8 +148,8 @@ def fit(
             calls this function with the same arguments, starts from the first one's weights and
             returns the same fit. Of starts that others fit, monitors see the best and the last
             iterate of a round.
-        snapshots: where the starts are kept as far as they came. If some are, they go on from
-            there, to the same end as if they had not been interrupted (on the same machine).
+        snapshots: where the starts are kept as far as they came. They go on from there, to the
+            same end as if they had not been interrupted (on the same machine).
         stop: asked before each iteration; the fit ends there if it returns True, for example
             ``lambda: time.monotonic() > deadline``. Of several processes one ends all.
 
@@ -270,10 +260,9 @@ def _fitted(
             f"{which} on the training records at the start; start from a stable model, or use "
             "the linear model alone (lfrtorch linear)."
         )
-    here = sum(fit.seconds for fit in fits)
     snapshots.restore(fits)
-    clock -= sum(fit.seconds for fit in fits) - here
-    unseen = [r for some in (validation, selection) if some for r in as_records(some)]
+    clock -= sum(fit.seconds for fit in fits)  # of iterations before an interruption
+    unseen = [*validation, *selection]
     field, cut = fits, None
     with ExitStack() as ending:
         if monitors is None and ranks.rank == 0:
@@ -282,9 +271,8 @@ def _fitted(
             ending.callback(line.close)
         watching = watching or [()] * len(fits)
         if spread:
-            asked = any_of(halt, stop)
             together: Together = OverProcesses(
-                fits, watching, halt, ranks=ranks, stop=asked, take=snapshots.take
+                fits, watching, halt, ranks=ranks, stop=any_of(halt, stop), take=snapshots.take
             )
         else:
             together = Together(fits, watching, halt)
@@ -307,7 +295,7 @@ def _fitted(
                 break
             if number < len(planned):
                 kept, _ = planned[number]
-                snapshots.decided([judge.number(fit) for fit in field[:kept]])
+                snapshots.decided([judge.numbers[id(fit)] for fit in field[:kept]])
                 field = _drop_others(field, field[:kept])
     ranked = judge.ranked(fits)
     result = ranked[0].result()
@@ -351,7 +339,9 @@ def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]
     planned = []
     for until in sorted({ceil(part * limit) for part in parts} | {limit}):
         planned.append((starts, until))
-        starts = min(starts, max(FINALISTS, average, ceil(starts / 2)))
+        # Two go to the end at least: the best of four after 25 iterations ended in a poor minimum
+        # at one of five realisations of the parallel Wiener-Hammerstein stand-in.
+        starts = min(starts, max(2, average, ceil(starts / 2)))
     return planned
 
 
@@ -368,7 +358,7 @@ def line_of(
     if len(models) == 1:
         return ProgressLine(every=None)
     unit = common_unit(models[0].outputs)
-    return StartsLine(len(models), unit, iterations=iterations_of(planned), rounds=False)
+    return StartsLine(len(models), unit, iterations=iterations_of(planned))
 
 
 class _Judge:
@@ -378,75 +368,64 @@ class _Judge:
     # judge, which say nothing of a mean.
 
     def __init__(self, fits: Sequence[Fit], records: Sequence[Record], together: Together) -> None:
-        self.fits, self._records, self._together = fits, records, together
-        self._errors = [self._error(fit.model) if records else None for fit in fits]
+        self._fits, self._records, self._together = fits, records, together
+        self.numbers = {id(fit): number for number, fit in enumerate(fits)}
+        self._errors = {id(fit): self._error(fit.model) for fit in fits} if records else {}
 
     def ranked(self, fits: Sequence[Fit]) -> list[Fit]:
-        """The fits that have begun, the best first."""
+        """Sort the fits that have begun, the best first."""
         return sorted((fit for fit in fits if fit.history), key=self._score)
 
     def summaries(self, fits: Sequence[Fit]) -> tuple[RestartSummary, ...]:
-        """How far each came."""
+        """Say how far each came."""
         found = []
         for fit in fits:
-            number = self.number(fit)
-            error = self._errors[number]
+            error, best = self._errors.get(id(fit)), fit.kept
+            selection = math.nan if error is None else error.rmse(error.theta)
+            number, last, why = self.numbers[id(fit)], fit.history[-1], told(fit.reason, fit.detail)
             found.append(
-                RestartSummary(
-                    number,
-                    fit.history[-1].iteration,
-                    fit.kept.train,
-                    fit.kept.validation,
-                    math.nan if error is None else error.rmse(error.theta),
-                    told(fit.reason, fit.detail),
-                )
+                RestartSummary(number, last.iteration, best.train, best.validation, selection, why)
             )
         return tuple(found)
 
     def stable(self, fits: Sequence[Fit], train: Sequence[Record]) -> list[Model]:
-        """The models that stay stable on louder inputs, the best first."""
+        """Return the models that stay stable on louder inputs, the best first."""
         # With one that does not, a mean runs away. Rounding may differ between processes, and the
         # choice must not.
         models = [fit.model for fit in self.ranked(fits)]
-        reach = torch.tensor(
-            [largest_stable_amplitude(model, train) for model in models], dtype=torch.float64
-        )
-        reach = self._together.ranks.first(reach).tolist()
+        reach = self._same([largest_stable_amplitude(model, train) for model in models])
         return [model for model, to in zip(models, reach, strict=True) if to >= max(LOUDER)]
 
     def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
-        """The mean of as many models as do about as well as the best, and of how many."""
+        """Return the mean of as many models as do about as well as the best, and of how many."""
         # None if a single start is better than all means. Without records to judge on, the mean of
         # all.
         if not self._records:
             return (mean_model(best), len(best)) if len(best) > 1 else (None, 1)
         means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]
-        scores = [min(map(self._score, self.fits))]
-        for mean in means:
-            error = self._error(mean)
-            scores.append(error.cost(error.residual(error.theta)))
-        scores = self._together.ranks.first(torch.tensor(scores, dtype=torch.float64))
+        scores = [_cost(self._error(mean)) for mean in means]
+        scores = self._same([min(map(self._score, self._fits)), *scores])
         count = 1 + int((scores <= AS_GOOD**2 * scores.nan_to_num(math.inf).min()).nonzero().max())
         return (means[count - 2], count) if count > 1 else (None, 1)
 
     def _error(self, model: Model) -> Problem:
-        """The same error for starts and means."""
-        one = next(fit for fit in self.fits if not fit.diverges)
+        """Return the same error for starts and means."""
+        one = next(fit for fit in self._fits if not fit.diverges)
         return one.judge_of(model, self._records)
 
     def _score(self, fit: Fit) -> float:
-        if not math.isfinite(fit.best):
-            return math.inf
-        error = self._errors[self.number(fit)]
-        if error is None:
+        if not math.isfinite(fit.best) or not self._records:
             return fit.best
-        score = error.cost(error.residual(error.theta))
-        score = float(self._together.ranks.first(torch.tensor(score, dtype=torch.float64)))
+        score = float(self._same([_cost(self._errors[id(fit)])]))
         return score if math.isfinite(score) else math.inf
 
-    def number(self, fit: Fit) -> int:
-        """The place of a fit among all."""
-        return next(number for number, other in enumerate(self.fits) if other is fit)
+    def _same(self, numbers: list[float]) -> Tensor:
+        """Return the numbers of the first process."""
+        return self._together.ranks.first(torch.tensor(numbers, dtype=torch.float64))
+
+
+def _cost(error: Problem) -> float:
+    return error.cost(error.residual(error.theta))
 
 
 def _drop_others(field: list[Fit], kept: list[Fit]) -> list[Fit]:

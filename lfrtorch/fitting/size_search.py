@@ -360,7 +360,7 @@ def search_sizes(
     with ExitStack() as ending:
         if monitor is None and ranks.rank == 0:
             unit, steps = field[0].fit.model.outputs[0].unit, iterations_of(planned)
-            monitor = StartsLine(len(field), unit, iterations=steps, rounds=False)
+            monitor = StartsLine(len(field), unit, iterations=steps)
             ending.callback(monitor.close)
         watching = [] if monitor is None else [monitor]
         together = Together([r.fit for r in field], [watching] * len(field), halt)

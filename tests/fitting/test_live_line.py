@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lfrtorch
-from lfrtorch.fitting.live_line import ProgressLine, StartsLine, progress_text
+from lfrtorch.fitting.live_line import ProgressLine, StartsLine, _progress_text
 from lfrtorch.fitting.observer import LineObserver
 from lfrtorch.fitting.trainer import Progress, RestartSummary, Round
 from lfrtorch.records import Channel, Record
@@ -57,11 +57,11 @@ def step(iteration: int, **report: float) -> Progress:
 
 
 def test_text_names_every_number():
-    text = progress_text(step(4, damping=0.125, gain_ratio=0.75, rank=9), "m")
+    text = _progress_text(step(4, damping=0.125, gain_ratio=0.75, rank=9), "m")
     assert text == (
         " 4/40  train 1.500 mm  validation 2.500 mm*  72 s left  damping 0.12  gain 0.75"
     )
-    assert "left" not in progress_text(step(0), "m")
+    assert "left" not in _progress_text(step(0), "m")
 
 
 def test_a_file_gets_a_line_now_and_then_and_the_last(bla: lfrtorch.LinearModel):
@@ -88,7 +88,7 @@ def test_a_terminal_gets_one_live_line_that_fits(
     line(model, step(4))
     line.close()
     line.close()
-    whole = progress_text(step(4), "m")
+    whole = _progress_text(step(4), "m")
     (seen, after) = stream.screen()
     assert whole.startswith(seen)
     assert len(seen) < width
