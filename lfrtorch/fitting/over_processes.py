@@ -24,8 +24,8 @@ from lfrtorch.fitting.trainer import Fit, Monitor, Stop
 from lfrtorch.model import Model
 
 SHORT, LONG = 10.0, 60.0
-"""Seconds of a leg: shorter ones get twice the iterations, longer ones half of them. A process that
-waits for the others longer than its timeout takes them for lost."""
+"""Seconds of a leg: shorter ones get twice the iterations, longer ones half of them, as a process
+that waits longer than its timeout takes the others for lost."""
 
 Take = Callable[[int, bytes], None]
 """Called with the number of a start and the state of its fit, as ``Fit.save`` writes it."""
@@ -75,10 +75,9 @@ class OverProcesses(Together):
                 raise
             for fit in fits:
                 fit.note_end(Reason.PROCESS_LOST, lost.detail)
-            return
-        self._take_over(others)
-        if asked:
-            for fit in fits:
+        else:
+            self._take_over(others)
+            for fit in fits if asked else ():
                 fit.note_end(Reason.INTERRUPTED)
 
     def _legs(self, own: Sequence[Fit], until: int, at: int) -> bool:
@@ -107,7 +106,12 @@ class OverProcesses(Together):
 
     def _hand_on(self, own: Sequence[Fit]) -> None:
         """All processes get the states of each one's fits."""
-        mine = {self._numbers[id(fit)]: state_of(fit) for fit in own if fit.state is not None}
+        mine: dict[int, bytes] = {}
+        for fit in own:
+            if fit.state is not None:
+                with TemporaryDirectory() as folder:
+                    fit.save(path := Path(folder) / "fit")
+                    mine[self._numbers[id(fit)]] = path.read_bytes()
         sizes = [[number, len(state)] for number, state in mine.items()]
         listed = self.ranks.stack(torch.tensor(sizes, dtype=torch.int64).reshape(-1, 2))
         if not len(listed):
@@ -137,11 +141,3 @@ class OverProcesses(Together):
                 monitor(fit.model, fit.kept)
             if monitors and fit.history[-1] is not fit.kept:
                 fit.show_last(monitors)
-
-
-def state_of(fit: Fit) -> bytes:
-    """As ``Fit.save`` writes it."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "fit"
-        fit.save(path)
-        return path.read_bytes()

@@ -12,7 +12,7 @@ from lfrtorch.model import Model
 
 
 def any_of(halt: Event, stop: Stop | None) -> Stop:
-    """Stop if one of the two says so."""
+    """Return what stops if one of the two says so."""
     return lambda: halt.is_set() or (stop is not None and stop())
 
 

@@ -11,12 +11,9 @@ from time import monotonic
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch.fitting import state_file
-from lfrtorch.fitting.trainer import Fit, Keep, nothing
+from lfrtorch.fitting.trainer import Fit, Keep
 
-EVERY = 10.0
-"""Least seconds between two files of one start."""
-
-ROUNDS = "rounds.json"
+_ROUNDS = "rounds.json"
 
 
 class Snapshots:
@@ -44,38 +41,34 @@ class Snapshots:
     """
 
     def __init__(
-        self, folder: Path | None = None, every: float = EVERY, *, writes: bool = True
+        self, folder: Path | None = None, every: float = 10.0, *, writes: bool = True
     ) -> None:
         self.folder, self.every = folder, every
         self._writes = writes and folder is not None
         self.rounds: list[list[int]] = []
         """Numbers of the starts that went on after each round that has ended."""
         self._count: int | None = None
-        if folder is not None and (folder / ROUNDS).is_file():
+        if folder is not None and (file := folder / _ROUNDS).is_file():
             try:
-                found = json.loads((folder / ROUNDS).read_text())
+                found = json.loads(file.read_text())
                 self._count, self.rounds = int(found["starts"]), found["rounds"]
                 if any(type(start) is not int for decided in self.rounds for start in decided):
                     raise ValueError("starts that are no numbers")
             except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
                 raise InputError(
-                    f"'{folder / ROUNDS}' is damaged ({brief(error)}); start from the "
-                    "best model of the run instead: init_from=DIR."
+                    f"'{file}' is damaged ({brief(error)}); start from the best model of the run "
+                    "instead: init_from=DIR."
                 ) from None
 
     @property
     def least(self) -> float:
-        """Normalised squared error of the best iterate of all; infinite if there is none."""
+        """Least normalised squared error of all iterates; infinite if there is none."""
         files = [self._file(number) for number in range(self._count or 0)]
         found = [state_file.read(file)[0]["best"] for file in files if file.is_file()]
         return min(found, default=math.inf)
 
     def restore(self, fits: Sequence[Fit]) -> None:
-        """Restore the fits that had begun.
-
-        Raises:
-            ValueError: another number of starts, or other fits.
-        """
+        """Restore the fits that had begun; refuse other fits with a ValueError."""
         if self.folder is None:
             return
         if self._count is None:
@@ -91,14 +84,12 @@ class Snapshots:
                 fit.restore(self._file(number))
 
     def keeper(self, number: int) -> Keep:
-        """What writes the file of a start when it is due."""
-        if not self._writes:
-            return nothing
+        """Return what writes the file of a start when it is due."""
         due = monotonic() + self.every
 
         def keep(fit: Fit, paused: bool) -> None:
             nonlocal due
-            if fit.history and (paused or monotonic() >= due):
+            if self._writes and fit.history and (paused or monotonic() >= due):
                 fit.save(self._file(number))
                 due = monotonic() + self.every
 
@@ -120,8 +111,7 @@ class Snapshots:
         return self.folder / f"{number}.safetensors"
 
     def _write(self) -> None:
-        if not self._writes:
-            return
-        assert self.folder is not None
-        with whole_file(self.folder / ROUNDS) as fresh:
-            fresh.write_text(json.dumps({"starts": self._count, "rounds": self.rounds}) + "\n")
+        if self._writes:
+            assert self.folder is not None
+            with whole_file(self.folder / _ROUNDS) as fresh:
+                fresh.write_text(json.dumps({"starts": self._count, "rounds": self.rounds}) + "\n")

@@ -144,7 +144,6 @@ class RestartSummary:
 
     Args:
         number: its place in the order given, from 0.
-        iterations: it had.
         train, validation: errors of its best iterate, output unit.
         selection: its error on all records that choose among starts; NaN if there are none.
         reason: why it ended, a :class:`lfrtorch.Reason` or, if a process was lost, a text with the
@@ -230,15 +229,10 @@ class StoppedError(LfrtorchError):
     """A fit or a search was stopped before there was anything to keep."""
 
 
-def nothing(fit: Fit, paused: bool) -> None:
-    """Keep no fit."""
-
-
 class Fit:
     """A fit that goes on for as many iterations as it is asked for, and keeps the best iterate."""
 
-    # ``keep`` is called after every iteration, when the fit may be saved, and with True when it
-    # pauses. Each process has its own ``stop``, and one that says so ends all.
+    # Each process has its own ``stop``, and one that says so ends all.
 
     def __init__(
         self,
@@ -251,7 +245,7 @@ class Fit:
         simulation: float = 0.0,
         horizon: int | None = None,
         ranks: Ranks | None = None,
-        keep: Keep = nothing,
+        keep: Keep = lambda fit, paused: None,
         stop: Stop | None = None,
     ) -> None:
         self.model, self.keep, self._stop = model, keep, stop
@@ -297,17 +291,17 @@ class Fit:
             )
 
     def judge_of(self, model: Model, records: Record | Sequence[Record]) -> Problem:
-        """The errors of any model on records that are not fitted, as those of validation."""
+        """Return the problem of a model's errors on records that are not fitted."""
         return Problem.judge(model, records, like=self.problem)
 
     @property
     def seconds(self) -> float:
-        """That its iterations took, those before it went on included."""
+        """Time of all iterations, those before it went on included."""
         return self._seconds
 
     @property
     def diverges(self) -> bool:
-        """Whether the model diverges on the training records at the start: there is no search."""
+        """Whether the model diverges on the training records at the start."""
         return self.reason == Reason.START_DIVERGES
 
     @property
@@ -321,6 +315,10 @@ class Fit:
         if not self.history or self.diverges:
             return self.diverges
         return bool(self.state.reason) or self.state.iteration >= self.trainer.limit
+
+    def short_of(self, until: int) -> bool:
+        """Return whether it goes on to an iteration, and is not asked to stop."""
+        return not self.over and self.state.iteration < until and not self.stopped()
 
     def note_end(self, reason: str, detail: str = "") -> None:
         """Note why the fit is over."""
@@ -340,7 +338,7 @@ class Fit:
         try:
             if not self.history:
                 self.begin(monitors)
-            while not self.over and self.state.iteration < until and not self.stopped():
+            while self.short_of(until):
                 clock = time.perf_counter()
                 after = self.trainer.step(self.problem, self.state)
                 self.take(after, time.perf_counter() - clock, monitors)
@@ -367,7 +365,6 @@ class Fit:
         """Write the state of the fit to a file, from which ``restore`` goes on to the same bits."""
         state, tensors = state_file.packed(self.state)
         problem = self.problem.state_dict()
-        tensors = {f"state.{name}": tensor for name, tensor in tensors.items()}
         tensors |= {f"problem.{name}": tensor for name, tensor in problem.items()}
         numbers = {
             "state": state,
@@ -382,13 +379,13 @@ class Fit:
         device = self.problem.theta.device
         like = self.trainer.init(self.problem, self.problem.theta)
         # After init, which may evaluate gradients and leave guesses of periodic orbits behind.
-        kept = state_file.within("problem.", tensors, device)
+        tensors = {name: tensor.to(device) for name, tensor in tensors.items()}
+        kept = state_file.within("problem.", tensors)
         if self.ranks.world > 1:  # what was kept of the terms is the first process's part
             kept = {name: part for name, part in kept.items() if "." not in name}
         self.problem.load_state_dict(kept)
         try:
-            state = state_file.within("state.", tensors, device)
-            state = state_file.unpacked(like, numbers["state"], state)
+            state = state_file.unpacked(like, numbers["state"], tensors)
         except TypeError:
             raise InputError(
                 f"'{path}' was left by another trainer than {type(self.trainer).__name__}; go "
@@ -404,7 +401,7 @@ class Fit:
         self.state = self.trainer.prolonged(state)
         self.reason = self.state.reason
         self.history = [Progress(**entry) for entry in numbers["history"]]
-        self._theta_best = tensors["best"].to(device)
+        self._theta_best = tensors["best"]
         for name in _KEPT:
             setattr(self, name, numbers[name])
         self.problem.write(self._theta_best)
@@ -471,11 +468,8 @@ class Fit:
     def _enter(self, state: TrainerState, progress: Progress) -> None:
         """Note an iterate, and keep it if it is the best."""
         if progress.best:
-            self._theta_best, self.best, self._chosen = (
-                state.theta,
-                progress.score,
-                len(self.history),
-            )
+            self._theta_best, self.best = state.theta, progress.score
+            self._chosen = len(self.history)
         self.state, self._score, self._seconds = state, progress.score, progress.seconds
         self.history.append(progress)
 

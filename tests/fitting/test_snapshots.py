@@ -368,7 +368,7 @@ def test_numbers_that_were_not_written(tmp_path: Path, name: str, old: bytes, ne
 
 def test_a_file_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with monkeypatch.context() as changed:
-        changed.setattr(state_file, "FORMAT", "lfrtorch snapshot 3")
+        changed.setattr(state_file, "_FORMAT", "lfrtorch snapshot 3")
         run(starts(1), records(), tmp_path, trainer=LevenbergMarquardt(max_iter=1))
     with pytest.raises(ValueError, match="another version"):
         run(starts(1), records(), tmp_path)
