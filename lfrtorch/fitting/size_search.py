@@ -65,20 +65,8 @@ from lfrtorch.score_window import with_window
 
 Sizes = dict[str, Any]
 
-NZ, NW, NN = (1, 2, 3), (1, 2, 3), (5, 10, 15, 25)
-"""What is tried."""
-
-SEEDS = (0, 1000, 2000, 3000)
-"""Seeds of the starts of each model."""
-
-ROUNDS = ((8, 1 / 6), (4, 1 / 3), (1, 1.0))
+_ROUNDS = ((8, 1 / 6), (4, 1 / 3), (1, 1.0))
 """Models that take part, over those of the last, and the part of the iterations they reach."""
-
-FINALISTS = 6
-"""Models of the last round."""
-
-ITERATIONS = 75
-"""Iterations of the last round: three eighths of those of a fit."""
 
 LEGEND = """\
 validation: rms error over that of the output. It compares sizes, and is smaller than on new data:
@@ -94,10 +82,8 @@ class Candidate:
 
     Args:
         sizes: nz, nw, and nn or degree; nx if it was searched, too.
-        seed: of its start.
         rounds, iterations: that it took part in; no iteration if it diverges at the start.
         parameters, parameters_net: all, and without the gauge directions.
-        seconds: they took.
         error, error_std: rms of the simulation error over the validation records, each output
             relative to its rms, and its standard error; infinite if the model diverges.
         ratio: of this error to the linear model's; NaN if there is none to compare with.
@@ -121,8 +107,8 @@ class Candidate:
         if not isfinite(self.error):
             return f"{text}: diverges"
         text += f": validation {number(self.error)} ± {number(self.error_std)}"
-        return text + (
-            "" if np.isnan(self.ratio) else f", {number(self.ratio)} of the linear model's"
+        return (
+            text if np.isnan(self.ratio) else f"{text}, {number(self.ratio)} of the linear model's"
         )
 
 
@@ -175,17 +161,8 @@ class SizeSearch:
     counts: Integers = field(repr=False)
 
     @property
-    def above(self) -> Array:
-        """How far each is above the best, in standard errors of the difference, (candidates,)."""
-        return standard_errors_above([c.squares for c in self.candidates], self.counts)
-
-    @property
     def chosen(self) -> Candidate:
-        """The one with the fewest net parameters whose error is near the best.
-
-        That is within one standard error of the difference, 5 % at most, or within 1 %. Or one that
-        has fewer parameters than that one, and a smaller error.
-        """
+        """The one with the fewest net parameters whose error is near the best, see ``LEGEND``."""
         good = as_good([c.squares for c in self.candidates], self.counts)
         near = [c for c, enough in zip(self.candidates, good, strict=True) if enough]
         limit = min(near, key=lambda c: (c.parameters_net, c.error)).error
@@ -212,22 +189,16 @@ class SizeSearch:
 
     def entries(self) -> list[dict[str, Any]]:
         """Numbers of each, by name."""
+        chosen = self.chosen
+        above = standard_errors_above([c.squares for c in self.candidates], self.counts)
         return [
             {
                 **c.sizes,
-                "seed": c.seed,
-                "rounds": c.rounds,
-                "iterations": c.iterations,
-                "parameters": c.parameters,
-                "parameters_net": c.parameters_net,
-                "seconds": c.seconds,
-                "error": c.error,
-                "error_std": c.error_std,
-                "ratio": c.ratio,
-                "standard_errors_above": float(above),
-                "chosen": c is self.chosen,
+                **{name: n for name, n in vars(c).items() if name not in ("sizes", "squares")},
+                "standard_errors_above": float(far),
+                "chosen": c is chosen,
             }
-            for c, above in zip(self.candidates, self.above, strict=True)
+            for c, far in zip(self.candidates, above, strict=True)
         ]
 
     def table(self) -> str:
@@ -236,7 +207,7 @@ class SizeSearch:
 
 
 def size_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
-    """Head and rows of a table of the chosen model and those of the last round."""
+    """Return head and rows of a table of the chosen model and those of the last round."""
     sizes = [name for name in ("nx", "nz", "nw", "nn", "degree") if entries and name in entries[0]]
     numbers = ["iterations", "parameters", "parameters_net", "seconds"]
     numbers += ["error", "error_std", "ratio", "standard_errors_above"]
@@ -244,14 +215,11 @@ def size_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[li
     rows = []
     for e in sorted(entries, key=lambda e: e["parameters_net"]):
         if e["chosen"] or e["rounds"] == last:
-            mark = "chosen" if e["chosen"] else "" if _known(e["error"]) else "diverges"
+            finite = e["error"] is not None and isfinite(e["error"])
+            mark = "chosen" if e["chosen"] else "" if finite else "diverges"
             rows.append([*(e[name] for name in (*sizes, *numbers)), mark])
     head = ["iterations", "parameters", "net", "seconds", "validation", "±", "/ linear"]
     return [*sizes, *head, "above best", ""], rows
-
-
-def _known(error: float | None) -> bool:
-    return error is not None and isfinite(error)
 
 
 @typed()
@@ -262,13 +230,13 @@ def search_sizes(
     validation: Record | Sequence[Record],
     *,
     nx: int | Sequence[int] | None = None,
-    nz: int | Sequence[int] = NZ,
-    nw: int | Sequence[int] = NW,
-    nn: int | Sequence[int] = NN,
+    nz: int | Sequence[int] = (1, 2, 3),
+    nw: int | Sequence[int] = (1, 2, 3),
+    nn: int | Sequence[int] = (5, 10, 15, 25),
     degree: int | Sequence[int] | None = None,
     linear: LinearModel | None = None,
-    seeds: Sequence[int] = SEEDS,
-    finalists: int = FINALISTS,
+    seeds: Sequence[int] = (0, 1000, 2000, 3000),
+    finalists: int = 6,
     folds: int = 0,
     trainer: Trainer | None = None,
     ridge: Ridge = 0.0,
@@ -294,7 +262,6 @@ def search_sizes(
         nz, nw, nn: sizes to try; one number is a size that is known.
         degree: of a polynomial, in the place of nn.
         linear: the model that errors are compared with.
-        seeds: of the starts of each size.
         finalists: models that get all iterations.
         folds: if not 0, the finalists are fitted again, to all but one of so many stretches of the
             training and validation records in turn (:func:`lfrtorch.fitting.folds.folds`), and the
@@ -325,7 +292,7 @@ def search_sizes(
     """
     given = {} if nx is None else {"nx": nx}
     given |= {"nz": nz, "nw": nw} | ({"nn": nn} if degree is None else {"degree": degree})
-    tried = {name: sizes_to_try(name, values) for name, values in given.items()}
+    tried = {name: _sizes_to_try(name, values) for name, values in given.items()}
     integer("finalists", finalists, 1)
     integer("folds", folds, 0)
     if not len(seeds):
@@ -341,19 +308,24 @@ def search_sizes(
         _, train, validation = predicting([], train, validation)
     given_records = all_records(as_records(train), as_records(validation)) if folds else []
     ranks = Ranks() if ranks is None else ranks
-    trainer = LevenbergMarquardt(max_iter=ITERATIONS) if trainer is None else trainer
+    trainer = LevenbergMarquardt(max_iter=75) if trainer is None else trainer
     refuse_together(noise=noise, horizon=horizon, guarantee=trainer.guarantee)
     validation = [*map(with_window, as_records(validation))]
     scale = Scaler.of(validation).y_scale
-    judge, clock = Judge(validation, linear, ranks, scale), time.perf_counter()
-    drawn = _drawn(tried, seeds, ROUNDS[0][0] * finalists)
+    judge, clock = _Judge(validation, linear, ranks, scale), time.perf_counter()
+    drawn = _drawn(tried, seeds, _ROUNDS[0][0] * finalists)
     planned = race(len(drawn), finalists, trainer.limit)
     halt = Event()
-    options: dict[str, Any] = {"trainer": trainer, "ridge": ridge, "ranks": ranks}
-    options["simulation"], options["horizon"] = SIMULATION.get(noise, 0.0), horizon
-    options["stop"] = any_of(halt, stop) if ranks.world == 1 else stop
+    options: dict[str, Any] = {
+        "trainer": trainer,
+        "ridge": ridge,
+        "ranks": ranks,
+        "simulation": SIMULATION.get(noise, 0.0),
+        "horizon": horizon,
+        "stop": any_of(halt, stop) if ranks.world == 1 else stop,
+    }
     field = [
-        _Runner(sizes, seed, Fit(begun(start, sizes, seed), train, validation, **options))
+        _Runner(sizes, seed, Fit(_begun(start, sizes, seed), train, validation, **options))
         for sizes, seed in drawn
     ]
     left: list[Candidate] = []
@@ -369,7 +341,7 @@ def search_sizes(
             left = [judge.candidate(runner, number - 1) for runner in field[count:]] + left
             field = field[:count]
             together.advance([runner.fit for runner in field], until)
-            check_whole([runner.fit for runner in field])
+            _check_whole([runner.fit for runner in field])
             best = judge.candidate(min(field, key=lambda runner: runner.fit.best), number)
             seconds = time.perf_counter() - clock
             watch(SizeRound(number, len(planned), len(field), until, best, seconds))
@@ -380,17 +352,17 @@ def search_sizes(
                 part._replace(left_out=[*map(with_window, part.left_out)])
                 for part in folds_of(given_records, folds)
             ]
-            judges = [Judge(part.left_out, linear, ranks, scale) for part in parts]
+            judges = [_Judge(part.left_out, linear, ranks, scale) for part in parts]
             fits = [
                 [
-                    Fit(begun(start, r.sizes, r.seed), part.train, part.left_out, **options)
+                    Fit(_begun(start, r.sizes, r.seed), part.train, part.left_out, **options)
                     for part in parts
                 ]
                 for r in field
             ]
             each = [fit for own in fits for fit in own]
             Together(each, [watching] * len(each), halt).advance(each, trainer.limit)
-            check_whole(each)
+            _check_whole(each)
             counts = np.concatenate([judge.counts for judge in judges])
             left = []
             last = [_crossed(c, own, judges) for c, own in zip(last, fits, strict=True)]
@@ -403,7 +375,7 @@ def search_sizes(
     return search
 
 
-def _crossed(candidate: Candidate, fits: Sequence[Fit], judges: Sequence[Judge]) -> Candidate:
+def _crossed(candidate: Candidate, fits: Sequence[Fit], judges: Sequence[_Judge]) -> Candidate:
     """A model of the last round with the errors of its fits in what was left out of each."""
     results = [fit.result() for fit in fits]
     pairs = zip(judges, results, strict=True)
@@ -421,9 +393,9 @@ def _crossed(candidate: Candidate, fits: Sequence[Fit], judges: Sequence[Judge])
 
 
 def race(models: int, finalists: int, limit: int) -> list[tuple[int, int]]:
-    """How many models take part in each round, and the iteration at which it ends."""
+    """Plan how many models take part in each round, and the iteration at which it ends."""
     planned: list[tuple[int, int]] = []
-    for part, to in ROUNDS:
+    for part, to in _ROUNDS:
         count, until = min(models, part * finalists), ceil(to * limit)
         if planned and until == planned[-1][1]:
             continue
@@ -442,7 +414,7 @@ def _drawn(
     return [(every[i], seed) for seed in seeds for i in rng.permutation(len(every))][:count]
 
 
-def check_whole(fits: Sequence[Fit]) -> None:
+def _check_whole(fits: Sequence[Fit]) -> None:
     """Refuse to go on with fits that were interrupted, or lost a process."""
     for fit in fits:
         if fit.reason == Reason.INTERRUPTED:
@@ -459,8 +431,8 @@ class _Runner(NamedTuple):
     fit: Fit
 
 
-class Judge:
-    """Scores models on records that are not fitted; those of the first process count."""
+class _Judge:
+    """Scores models on records that are not fitted; the scores of the first process count."""
 
     def __init__(
         self, records: list[Record], linear: LinearModel | None, ranks: Ranks, scale: Array
@@ -489,7 +461,7 @@ class Judge:
 
 
 def _relative(squares: Array, counts: Integers) -> tuple[float, float]:
-    """Root of the mean square and its standard error."""
+    """Return the root of the mean square and its standard error."""
     if not np.isfinite(squares).all():
         return inf, inf
     mean, error = blocked_mean(squares, counts)
@@ -498,14 +470,12 @@ def _relative(squares: Array, counts: Integers) -> tuple[float, float]:
 
 
 def _ratio(error: float, linear: Array, counts: Integers) -> float:
-    """An error over the linear model's; NaN if there is none, or if it is 0."""
-    if np.isnan(linear).any():
-        return nan
-    least = _relative(linear, counts)[0]
+    """Return an error over the linear model's; NaN if there is none, or if it is 0."""
+    least = 0.0 if np.isnan(linear).any() else _relative(linear, counts)[0]
     return error / least if least else nan
 
 
-def begun(start: Callable[[Sizes, int], Model], sizes: Sizes, seed: int) -> Model:
+def _begun(start: Callable[[Sizes, int], Model], sizes: Sizes, seed: int) -> Model:
     """A model of some sizes to start from."""
     model = start(sizes, seed)
     if not isinstance(model, Model):
@@ -513,8 +483,8 @@ def begun(start: Callable[[Sizes, int], Model], sizes: Sizes, seed: int) -> Mode
     return model
 
 
-def sizes_to_try(name: str, given: int | Sequence[int]) -> list[int]:
-    """The numbers of one size, rising."""
+def _sizes_to_try(name: str, given: int | Sequence[int]) -> list[int]:
+    """Return the numbers of one size, rising."""
     values = [given] if isinstance(given, int | str) else sorted(set(given))
     if not values:
         raise InputError(f"{name} is empty; give the numbers to try, for example [1, 2].")
