@@ -14,7 +14,6 @@ import os
 import re
 from collections.abc import Callable
 from datetime import timedelta
-from types import TracebackType
 from typing import Self, TypeVar
 
 import torch
@@ -27,16 +26,11 @@ from lfrtorch._support.reasons import Reason, told
 
 Shared = TypeVar("Shared")
 
-
-TIMEOUT = 600.0
-"""Seconds that a process waits for the others: the slowest share of an iteration, amply."""
-
-AXES = 8
-"""Most axes of a tensor that is handed on."""
+_AXES = 8  # most axes of a tensor that is handed on
 
 
 class ProcessLostError(LfrtorchError, RuntimeError):
-    """Another process ended, or did not answer in time: which, and what else is known of it."""
+    """Another process ended, or did not answer in time."""
 
     def __init__(self, detail: str) -> None:
         super().__init__(told(Reason.PROCESS_LOST, detail))
@@ -59,11 +53,7 @@ class Ranks:
         return items[self.rank :: self.world]
 
     def sharing_records(self, starts: int) -> Ranks:
-        """The processes that share the records of each start.
-
-        If there are as many starts as processes, these share the starts: each start then has all
-        records, and one process alone.
-        """
+        """The processes that share the records of each start: one, if they share the starts."""
         return Ranks() if 1 < self.world <= starts else self
 
     def enough_for(self, items: int) -> Ranks:
@@ -88,21 +78,17 @@ class Ranks:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
-def connect(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Ranks:
+def connect(device: str | torch.device = "cpu", timeout: float = 600.0) -> Ranks:
     """The processes that torchrun started, or the one that is alone; use it in a ``with``.
 
     Args:
         device: where the model is: ``"cpu"``, or ``"cuda"`` for each process its own GPU.
-        timeout: seconds after which a process that does not answer counts as lost.
+        timeout: seconds after which a process that does not answer counts as lost: amply more than
+            the slowest share of an iteration.
 
     Raises:
         ValueError: a timeout that is not positive.
@@ -149,13 +135,13 @@ class ProcessGroup(Ranks):
         self._device = torch.device(device)  # that of the backend
 
     def sum(self, part: Tensor) -> Tensor:
-        """The sum of all processes' parts, on each of them."""
+        """The sum of all parts."""
         total = self._sent(part).clone()
         self._call(lambda: dist.all_reduce(total))
         return total.to(part.device)
 
     def stack(self, part: Tensor) -> Tensor:
-        """The rows of all processes' parts, which may differ in number, on each of them."""
+        """The rows of all parts."""
         count = torch.tensor([len(part)], device=self._device)
         counts = [torch.empty_like(count) for _ in range(self.world)]
         self._call(lambda: dist.all_gather(counts, count))
@@ -169,8 +155,8 @@ class ProcessGroup(Ranks):
         return torch.cat(cut).to(part.device)
 
     def first(self, part: Tensor) -> Tensor:
-        """The part of the first process, whatever its shape, on each of them."""
-        shape = [part.ndim, *part.shape, *[0] * (AXES - part.ndim)]
+        """The part of the first process."""
+        shape = [part.ndim, *part.shape, *[0] * (_AXES - part.ndim)]
         known = torch.tensor(shape, device=self._device)
         self._call(lambda: dist.broadcast(known, 0))
         axes, *sizes = known.tolist()
@@ -181,7 +167,7 @@ class ProcessGroup(Ranks):
         return sent.to(part.device)
 
     def close(self) -> None:
-        """Leave the other processes: what they share from now on ends in a ``ProcessLostError``."""
+        """Leave the other processes."""
         if dist.is_initialized():
             dist.destroy_process_group()
 

@@ -57,8 +57,7 @@ class NoiseCovariance:
         """G with G Gᵀ = [R Sᵀ; S Q] in the same units, lower triangular in blocks.
 
         Raises:
-            ValueError: a covariance of another size, one that is not finite, symmetric and
-                positive, or an S that is too large for Q and R.
+            ValueError: covariances that are none, or of other sizes.
         """
         Q, R = _covariance("Q", self.Q, nx), _covariance("R", self.R, ny)
         S = np.zeros((nx, ny)) if self.S is None else reals("S", self.S)
@@ -105,16 +104,6 @@ class ExtendedKalmanFilter(StateObserver):
 
     References:
         Anderson and Moore, "Optimal Filtering", 1979, section 8.2.
-
-    Example:
-        >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
-        >>> observer = model.observer(noise=noise)
-        >>> before = observer.covariance
-        >>> for u, y in zip(record.u[:50], record.y[:50]):
-        ...     y_hat = observer.predict(u)
-        ...     e = observer.update(y)
-        >>> bool(observer.covariance[0, 0] < 0.01 * before[0, 0])
-        True
     """
 
     def __init__(
@@ -146,7 +135,7 @@ class ExtendedKalmanFilter(StateObserver):
 
     @property
     def covariance(self) -> Float[Array, "nx nx"]:
-        """Of the error of ``state``, in the model's coordinates."""
+        """Covariance of the error of ``state``, in the model's coordinates."""
         return self._U @ self._U.T
 
     def follow(self, u: Float[Array, "T nu"], y: Float[Array, "T ny"]) -> float:
@@ -189,20 +178,20 @@ class ExtendedKalmanFilter(StateObserver):
 
 
 def data_root(cell: LFRCell) -> Float[Array, "nx nx"]:
-    """U with U Uᵀ = the covariance of the states over the training data."""
+    """Return U with U Uᵀ = the covariance of the states over the training data."""
     U = _root(cell.state_covariance.detach().double().cpu().numpy(), np.inf)
     assert U is not None
     return U
 
 
 def inside_limits(record: Record) -> Float[Array, "T ny"]:
-    """The outputs of a record, NaN where they may be beyond its limits or are not valid."""
+    """Return the outputs of a record, NaN where they may be beyond its limits or are not valid."""
     y = np.where(record.beyond, np.nan, record.y)
     return y if record.valid is None else np.where(record.valid, y, np.nan)
 
 
 def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
-    """A covariance from itself, its variances, or one variance."""
+    """Return a covariance from itself, its variances, or one variance."""
     value = reals(name, given)
     if value.ndim < 2 and value.size in (1, size):
         value = np.diag(np.broadcast_to(value, size))
@@ -217,7 +206,7 @@ def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
 
 
 def _root(P: Float[Array, "n n"], size: float) -> Float[Array, "n n"] | None:
-    """U with U Uᵀ = P; None if P has a negative eigenvalue, relative to a size."""
+    """Return U with U Uᵀ = P; None if P has a negative eigenvalue, relative to a size."""
     values, vectors = np.linalg.eigh(P)
     if values[0] < -_ROUNDING * size:
         return None

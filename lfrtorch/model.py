@@ -49,19 +49,16 @@ from lfrtorch.records import (
 )
 from lfrtorch.state_observer import StateObserver, SteadyGainObserver
 
-NO_GAIN = (
-    "this model has no innovation gain K: fit it with noise='innovation', from a start with the "
-    "linear model of estimate_bla(..., refine='prediction')."
-)
-
 NO_OBSERVER = (
     "this model has no innovation gain K: give noise=lfrtorch.NoiseCovariance(Q, R) for a Kalman "
     "filter, or fit it with noise='innovation'."
 )
 
+_SCALING = ("u_offset", "u_scale", "y_offset", "y_scale")  # fields of a Scaler, in a checkpoint
+
 
 def simulate_record(lfr: LFR, normalised: NormalisedRecord, start: Start) -> Trajectory:
-    """All signals of a record from a start other than ``"given"``, with R = 1."""
+    """Return all signals of a record from a start other than ``"given"``, with R = 1."""
     like, record = lfr.cell.A, normalised.record
     signals = normalised.u, normalised.y, record.start_factors
     u, y, weight = (torch.tensor(signal).to(like).unsqueeze(0) for signal in signals)
@@ -229,11 +226,10 @@ class Model:
 
         Args:
             data: a record, or an input in physical units.
-            start: ``"zero"`` (x = 0: at rest at the input's offset, exactly so for the linear model
-                and the start of a fit, later up to the network's bias), ``"given"`` (x0),
-                ``"periodic"``, or ``"estimated"``: from the most probable state, given the record's
-                output in the samples it skips, or in all if it skips none. Default: the record's
-                own, and ``"zero"`` for a bare input.
+            start: ``"zero"`` (x = 0: at rest at the input's offset, up to the network's bias),
+                ``"given"`` (x0), ``"periodic"``, or ``"estimated"``: from the most probable state,
+                given the record's output in the samples it skips, or in all if it skips none.
+                Default: the record's own, and ``"zero"`` for a bare input.
             x0: initial state in the model's coordinates, for ``start="given"``.
 
         Shape:
@@ -348,7 +344,7 @@ class Model:
         x0: ArrayLike | None = None,
         P0: ArrayLike | None = None,
     ) -> StateObserver:
-        """What follows the states of the running system, sample by sample.
+        """Return what follows the states of the running system, sample by sample.
 
         With the covariances of the noise it is an extended Kalman filter, of any model. Otherwise
         it has the constant gain K of a model in innovation form.
@@ -371,27 +367,23 @@ class Model:
             >>> observer = started.observer(after=record[:100])
             >>> np.allclose(observer.predict(record.u[100]), started.predict(record[:101])[100])
             True
-            >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
-            >>> x0 = model.observer(noise=noise, after=record[:100]).state
-            >>> model.simulate(record.u[100:], start="given", x0=x0).shape
-            (300, 1)
         """
         if after is not None:
             if x0 is not None:
                 raise InputError("after and x0 both say where the states begin; give one of them.")
             self.check(after)
         known = self.lfr.cell, self.scaler, self.inputs, self.outputs
-        zero = np.zeros(self.lfr.cell.nx)
+        begin = np.zeros(self.lfr.cell.nx) if x0 is None else x0
         if noise is not None:
-            found = ExtendedKalmanFilter(*known, zero if x0 is None else x0, noise, P0)
+            found = ExtendedKalmanFilter(*known, begin, noise, P0)
             if after is not None:
                 found.follow(after.u, inside_limits(after))
             return found
         if self.K is None:
             raise InputError(NO_OBSERVER)
         if after is not None:
-            x0 = self.predictor().signals(with_past_outputs(after)).x[0, -1].double().numpy()
-        return SteadyGainObserver(*known, zero if x0 is None else x0, self.K)
+            begin = self.predictor().signals(with_past_outputs(after)).x[0, -1].double().numpy()
+        return SteadyGainObserver(*known, begin, self.K)
 
     def predictor(self) -> Model:
         """The model of the output one sample ahead; its inputs are u, then y.
@@ -406,14 +398,14 @@ class Model:
             Model(u, y -> y, 100 Hz, nx=1, nz=1, nw=1, nn=4)
         """
         if self.K is None:
-            raise InputError(NO_GAIN)
+            raise InputError(
+                "this model has no innovation gain K: fit it with noise='innovation', from a start "
+                "with the linear model of estimate_bla(..., refine='prediction')."
+            )
         s = self.scaler
-        scaler = Scaler(
-            np.concatenate([s.u_offset, s.y_offset]),
-            np.concatenate([s.u_scale, s.y_scale]),
-            s.y_offset,
-            s.y_scale,
-        )
+        offset = np.concatenate([s.u_offset, s.y_offset])
+        scale = np.concatenate([s.u_scale, s.y_scale])
+        scaler = Scaler(offset, scale, s.y_offset, s.y_scale)
         cell = predictor_cell(self.lfr.cell, self.K)
         inputs = (*self.inputs, *self.outputs)
         return replace(self, lfr=LFR(cell), scaler=scaler, inputs=inputs, K=None)
@@ -434,7 +426,7 @@ class Model:
         return replace(self, lfr=LFR(cell), scaler=scaler, inputs=self.inputs[:nu], K=K)
 
     def check(self, record: Record) -> None:
-        """Refuse a record of other channels or another sampling frequency with a ValueError.
+        """Refuse a record of other channels or another rate with a ValueError.
 
         Example:
             >>> try:
@@ -482,17 +474,15 @@ class Model:
             "inputs": [c._asdict() for c in self.inputs],
             "outputs": [c._asdict() for c in self.outputs],
         }
-        if _zero(cell.Dzu):
-            description["z_feedthrough"] = False
-        if _zero(cell.Dyu):
-            description["feedthrough"] = False
-        if cell.structure != "free":
-            description["structure"] = cell.structure
-        if self.fitted_to:
-            description["fitted_to"] = self.fitted_to
+        unless_usual = (
+            ("z_feedthrough", not _zero(cell.Dzu), True),
+            ("feedthrough", not _zero(cell.Dyu), True),
+            ("structure", cell.structure, "free"),
+            ("fitted_to", self.fitted_to, ""),
+        )
+        description |= {name: value for name, value, usual in unless_usual if value != usual}
         weights = dict(self.lfr.cell.state_dict())
-        scaling = ("u_offset", "u_scale", "y_offset", "y_scale")
-        weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in scaling}
+        weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in _SCALING}
         if self.K is not None:
             weights["K"] = self.K
         return checkpoint.write(folder, description, weights)
@@ -504,9 +494,8 @@ def simulate_blocks(
 ) -> Iterator[Array]:
     """Simulated output of an input that comes in blocks, as if it were simulated in one go.
 
-    Each block begins with the state at the end of the one before. The numbers are the same to the
-    bit if the CPU has the model compiled (linear, a ``Network`` or a ``Polynomial``), otherwise to
-    rounding. Only one block is in memory.
+    The numbers are the same to the bit if the CPU has the model compiled (linear, a ``Network`` or
+    a ``Polynomial``), otherwise to rounding. Only one block is in memory.
 
     Args:
         model: what is simulated; ``LinearModel.to_model`` gives that of a linear one.
@@ -543,13 +532,7 @@ def simulate_blocks(
 
 
 def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tensor, "nx nx"]:
-    """E x xᵀ of the simulated states over all samples of records, about 0, in float64.
-
-    Example:
-        >>> from lfrtorch.model import state_moment
-        >>> state_moment(model, record).shape
-        torch.Size([1, 1])
-    """
+    """Return E x xᵀ of the simulated states over all samples of records, about 0, in float64."""
     nx, samples = model.lfr.cell.nx, 0
     total = torch.zeros(nx, nx, dtype=torch.float64)
     for record in as_records(records):
@@ -559,7 +542,7 @@ def state_moment(model: Model, records: Record | Sequence[Record]) -> Float[Tens
 
 
 def _described(static: Module | None) -> dict[str, Any] | None:
-    """A static map in a checkpoint's description."""
+    """Describe a static map for a checkpoint."""
     if static is None:
         return None
     if isinstance(static, Beyond):
@@ -575,7 +558,7 @@ def _described(static: Module | None) -> dict[str, Any] | None:
 def _made(
     description: Any, nz: int, nw: int, dtype: torch.dtype, own: Module | None
 ) -> Module | None:
-    """The static map of a description, its weights yet to be loaded."""
+    """Return the static map of a description, its weights yet to be loaded."""
     match description:
         case {"type": "Beyond", "base": base}:
             if (found := _made(base, nz, nw, dtype, own)) is None:
@@ -634,12 +617,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         lost = [name for name, tensor in weights.items() if not tensor.isfinite().all()]
         if lost:
             raise InputError(f"{', '.join(lost)} have numbers that are not finite")
-        scaler = Scaler(
-            *(
-                weights.pop(f"scaler.{name}").numpy()
-                for name in ("u_offset", "u_scale", "y_offset", "y_scale")
-            )
-        )
+        scaler = Scaler(*(weights.pop(f"scaler.{name}").numpy() for name in _SCALING))
         if weights["A"].shape != (sizes["nx"],) * 2:
             raise InputError("they are of other sizes")
         static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
@@ -653,11 +631,9 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         cell.structure = description.get("structure", "free")
         if cell.structure not in STRUCTURES:
             raise InputError(f"structure is {cell.structure!r}")
-        channels = [described_channels(description[side]) for side in ("inputs", "outputs")]
-        fs = float(description["fs"])
-        inputs, outputs = channels
+        inputs, outputs = (described_channels(description[side]) for side in ("inputs", "outputs"))
         fitted_to = str(description.get("fitted_to", ""))
-        return Model(LFR(cell), scaler, fs, inputs, outputs, fitted_to, K)
+        return Model(LFR(cell), scaler, float(description["fs"]), inputs, outputs, fitted_to, K)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise InputError(
             f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."
@@ -665,7 +641,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
 
 
 def _zero(weight: Tensor) -> bool:
-    """Whether a fit holds the weight at 0."""
+    """Return whether a fit holds the weight at 0."""
     return not (weight.requires_grad or weight.any())
 
 

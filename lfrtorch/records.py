@@ -1,22 +1,7 @@
 """Records of input and output signals, and the scaling between physical and normalised units.
 
-Axes, for the whole package (upper case: a length, lower case: a size of the model):
-
-====  =====================================================================
-R     records
-T     samples of a record
-nu    inputs ``u``
-ny    outputs ``y``
-nx    states ``x``
-nz    inputs ``z`` of the static nonlinearity
-nw    outputs ``w`` of the static nonlinearity
-nn    neurons
-P     parameters
-M     residuals (all records, scored samples and outputs together)
-====  =====================================================================
-
-A :class:`Record` is a numpy array in physical units; inside the engine signals are torch tensors
-in normalised units. A :class:`Scaler` stands at the two ends.
+A :class:`Record` has numpy arrays in physical units; inside the engine signals are torch tensors in
+normalised units. ``_support/types.py`` has the letters of all axes.
 """
 
 from __future__ import annotations
@@ -34,18 +19,10 @@ from lfrtorch._support.types import Array, Booleans
 
 Start = Literal["zero", "given", "estimated", "periodic"]
 
-_LISTED = 4
-"""Most channels of a side that a printed record names."""
-
 _SMALLEST, _LARGEST = 1e-100, 1e100
-"""Levels of a signal, and sampling frequencies, beyond which squares may leave the range of numbers
-(1e-308 to 1e308)."""
+"""Levels of a signal, and sampling frequencies, whose squares neither overflow nor vanish."""
 
-PAST_OUTPUTS = "a prediction from past outputs (noise=innovation or both)"
-"""What messages call it."""
-
-_MANY_CHANNELS = 16
-"""An array of more channels than this and fewer samples is taken for a transposed one."""
+PAST_OUTPUTS = "a prediction from past outputs (noise=innovation or both)"  # in messages
 
 
 class Channel(NamedTuple):
@@ -82,14 +59,12 @@ class Record:
     """One measurement: input, output, and how it is to be simulated and scored.
 
     Args:
-        u: input, physical units. A one-dimensional array is one channel.
-        y: output, physical units. A one-dimensional array is one channel.
+        u, y: input and output, physical units. A one-dimensional array is one channel.
         fs: sampling frequency in Hz.
         start: ``"zero"`` simulates from x = 0 (near rest at the input's offset), ``"given"`` from
-            ``x0``; ``"estimated"`` fits the start state to the record, too: in a fit together with
-            the parameters; in a simulation to the skipped samples alone, or to all if none is
-            skipped; ``"periodic"`` says that the record is a whole number of periods in steady
-            state.
+            ``x0``; ``"estimated"`` fits the start state, too: in a fit together with the
+            parameters; in a simulation to the skipped samples alone, or to all if none is skipped;
+            ``"periodic"``: the record is a whole number of periods in steady state.
         skip: samples at the beginning that are left out of cost and score. Of an estimated start
             without it, a score leaves out the first 50, or the first fifth of a shorter record.
         x0: the given start state, in the coordinates of the model.
@@ -97,11 +72,10 @@ class Record:
         line_weight: of the squared errors in a fit by spectral line, for whole periods without
             ``skip``: line f is that of ``numpy.fft.rfft``. 1 for all lines is plain least squares;
             1 / noise variance is maximum likelihood (Pintelon and Schoukens, 2012, chapter 9).
-        limits: least and greatest output that the sensors show, each the same for all outputs or a
-            number for each of them, or ``None`` if there is none. A sample at a limit says that the
-            output is there or beyond: a fit counts its error on the inner side alone, an estimated
-            start state of a given model leaves it out, and a simulation of the record ends there.
-        name: what tables and messages call it.
+        limits: least and greatest output that the sensors show, each a number for all outputs or
+            one for each, or ``None``. At a limit the output is there or beyond: a fit counts the
+            error on the inner side alone, an estimated start state leaves the sample out, and a
+            simulation of the record ends there.
         source: where it comes from: ``"official"``, ``"simulated"``, ``"stand-in"`` or ``"file"``.
         inputs, outputs: channel names and units, one a column of ``u`` and ``y``.
         period: samples of one period of the input, if it repeats; a ``"periodic"`` record holds
@@ -109,10 +83,9 @@ class Record:
         reference: what the experimenter sets if a controller makes the input, or what a generator
             plays if the input is measured with noise: a channel for each input, without noise. Best
             linear approximations are estimated from it, see :func:`lfrtorch.estimate_frf`.
-        valid: which output samples are measurements: False for outliers, dropouts and samples that
-            were never taken. The model is simulated through them; they are neither fitted nor
-            scored. ``y`` may be NaN there, and is interpolated, for figures and for first guesses.
-            Default: all.
+        valid: which output samples are measurements: False for outliers and dropouts. The model is
+            simulated through them; they are neither fitted nor scored. ``y`` may be NaN there, and
+            is interpolated, for figures and for first guesses. Default: all.
 
     Shape:
         u: (T, nu), y: (T, ny), reference: (T, nu), x0: (nx,), weight: () or (ny,),
@@ -221,13 +194,11 @@ class Record:
             return
         integer(f"record '{self.name}': period", self.period, 1)
         if self.period > T or (self.start == "periodic" and T % self.period):
+            wanted = "it must hold at least one."
+            if self.start == "periodic":
+                wanted = "a steady-state record holds a whole number of periods: cut it to one."
             raise InputError(
-                f"record '{self.name}' has {T} samples and a period of {self.period}; "
-                + (
-                    "a steady-state record holds a whole number of periods: cut it to one."
-                    if self.start == "periodic"
-                    else "it must hold at least one."
-                )
+                f"record '{self.name}' has {T} samples and a period of {self.period}; {wanted}"
             )
 
     def _check_weights(self, T: int, ny: int) -> None:
@@ -254,13 +225,12 @@ class Record:
                 )
             lines = np.broadcast_to(lines, (F, ny))
         for name, values in (("weight", weight), ("line_weight", lines)):
-            if values is None:
-                continue
-            if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
-                raise InputError(
-                    f"record '{self.name}': {name} must be finite, at least 0 and not all 0."
-                )
-            object.__setattr__(self, name, values)
+            if values is not None:
+                if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
+                    raise InputError(
+                        f"record '{self.name}': {name} must be finite, at least 0 and not all 0."
+                    )
+                object.__setattr__(self, name, values)
 
     def _check_limits(self, ny: int) -> None:
         if self.limits is None:
@@ -361,14 +331,7 @@ class Record:
         return len(self.u)
 
     def __getitem__(self, window: slice) -> Record:
-        """The part of the record in ``window``: a record from zero state with nothing skipped.
-
-        It keeps its period if it is as long as that.
-
-        Raises:
-            ValueError: not a slice, one with a step (it would change the rate), or a record with
-                weights by spectral line, as a part has other lines.
-        """
+        """Return the part of the record in ``window``, from zero state with nothing skipped."""
         if not isinstance(window, slice) or window.step not in (None, 1):
             raise InputError(f"a record is cut by record[first:last], not by {window!r}.")
         if self.line_weight is not None:
@@ -381,13 +344,10 @@ class Record:
         return replace(self, **part, start="zero", skip=0, period=period, x0=None)
 
     def mean_period(self) -> Record:
-        """One period, the mean of all of a record in steady state, that weighs as much as they do.
+        """Return one period, the mean of all P of a record in steady state, with their weight.
 
-        A fit of simulations is the same if the input has no noise, and faster. If it has, what P
-        periods average to has 1 / P of its power, and so has the bias that it leaves in a model.
-
-        Raises:
-            ValueError: the record is not in steady state.
+        A fit of simulations is the same if the input has no noise, and faster. If it has, the mean
+        has 1 / P of its power, and a model 1 / P of the bias.
 
         Example:
             >>> from dataclasses import replace
@@ -402,20 +362,13 @@ class Record:
             )
         N = self.period or self.samples
         P = self.samples // N
-        whole = self.signals_in(slice(None))
         means = {
             name: None if signal is None else signal.reshape(P, N, -1).mean(axis=0)
-            for name, signal in whole.items()
+            for name, signal in self.signals_in(slice(None)).items()
         }
         lines = None if self.line_weight is None else self.line_weight[::P]
-        return replace(
-            self,
-            **means,
-            skip=0,
-            weight=P * np.asarray(self.weight),
-            line_weight=lines,
-            limits=None,
-        )
+        weight = P * np.asarray(self.weight)
+        return replace(self, **means, skip=0, weight=weight, line_weight=lines, limits=None)
 
     def signals_in(self, window: slice | NDArray[np.integer]) -> dict[str, Any]:
         """Return the signals in ``window`` by name, for ``dataclasses.replace``."""
@@ -436,8 +389,7 @@ def signals(record: Record) -> str:
     """Write the channels of a record: u -> y."""
 
     def listed(channels: Sequence[Channel]) -> str:
-        names = [str(channel) for channel in channels[:_LISTED]]
-        return ", ".join(names + ["..."] * (len(channels) > _LISTED))
+        return ", ".join([*map(str, channels[:4]), *["..."] * (len(channels) > 4)])
 
     return f"{listed(record.inputs)} -> {listed(record.outputs)}"
 
@@ -494,7 +446,7 @@ def _no_record(given: object) -> ValueError:
 
 
 def without_coordinates(record: Record) -> Record:
-    """The record with a given start state, which is in the coordinates of one model, estimated."""
+    """Return a record whose given start state, in the coordinates of one model, is estimated."""
     return replace(record, start="estimated", x0=None) if record.start == "given" else record
 
 
@@ -646,7 +598,7 @@ def as_signal(x: ArrayLike, channels: tuple[Channel, ...], what: str, *, first: 
         )
     if array.size == 0:
         raise InputError(f"{what} is empty (shape {array.shape}); give at least one sample.")
-    if array.shape[0] < array.shape[1] and array.shape[1] > _MANY_CHANNELS:
+    if array.shape[0] < array.shape[1] and array.shape[1] > 16:  # most likely transposed
         raise InputError(
             f"{what} has shape {array.shape}: more channels than samples. "
             "Time runs along the first axis; transpose the array."

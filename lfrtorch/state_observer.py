@@ -140,8 +140,6 @@ class SteadyGainObserver(StateObserver):
         >>> observer = started.observer(after=record[:100])
         >>> y_hat = observer.predict(record.u[100])
         >>> e = observer.update(record.y[100])
-        >>> np.allclose(y_hat + e, record.y[100])
-        True
     """
 
     def __init__(
@@ -163,7 +161,7 @@ class SteadyGainObserver(StateObserver):
 
 
 def _sample(values: ArrayLike, channels: tuple[Channel, ...], name: str) -> Array:
-    """One sample of some channels."""
+    """Return one sample of some channels."""
     found = np.array(values, np.float64, ndmin=1)
     if found.size != len(channels) or found.ndim > 1:
         names = ", ".join(channel.name for channel in channels)
