@@ -39,13 +39,8 @@ class Start(NamedTuple):
 def estimated_start(
     model: Model, stream: FileStream, *, samples: int | None = None, skip: int | None = None
 ) -> Start:
-    """The most probable start state, given the first measured outputs, which are not scored.
-
-    Args:
-        model, stream: what is simulated.
-        samples: how many are looked at. Default: those skipped, or else as many as of a record.
-        skip: samples that the user wants to be skipped.
-    """
+    """Return the most probable start state, given the first measured outputs, not scored then."""
+    # ``samples``: how many are looked at; those that the user skips, or as many as of a record.
     if not stream.y:
         raise InputError(
             "start=estimated needs measured outputs; name their columns with data.outputs=[...], "
@@ -115,13 +110,7 @@ class Simulated(NamedTuple):
 def simulate_file(
     model: Model, stream: FileStream, out: Path, start: Start, *, asked: int = 0
 ) -> Simulated:
-    """Simulate a file block by block into another.
-
-    Args:
-        model, stream, out: what is simulated, on what and to where.
-        start: the state before the first sample, and how many samples are not scored.
-        asked: samples that the user wants to be skipped.
-    """
+    """Simulate a file block by block into another; ``asked``: samples that the user skips."""
     names = [channel.name for channel in model.outputs]
     scores, settled = (BlockScores(len(names), start.skip + more) for more in (0, BEGINNING))
     first, peaks = 0, np.zeros(len(model.inputs))
@@ -158,12 +147,7 @@ def simulate_file(
 
 
 def notes_on(result: Simulated, model: Model, *, estimated: bool) -> list[str]:
-    """What a user should know before the outputs are used.
-
-    Args:
-        result, model: what was simulated.
-        estimated: whether the start state was.
-    """
+    """Say what a user should know before the outputs are used."""
     notes = [
         f"the input {channel.name} goes {number(peak)} standard deviations of the training "
         "input away from its mean: the model extrapolates there"

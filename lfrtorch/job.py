@@ -46,9 +46,6 @@ from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
 from lfrtorch.reporting.verdict import judge, reconsidered
 
-SEARCHED_STARTS = 2
-"""Least number of starts of a model whose sizes were searched: the first is the search's."""
-
 SLOW_SAMPLES = 5000
 """Training samples from which a static map that is not compiled is worth a note."""
 
@@ -125,7 +122,7 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     settings, asked = replace(settings, nx=linear.nx), settings
     sizes = choose_sizes(stage, linear)
     if sizes is not None:
-        chosen, starts = sizes.chosen, max(SEARCHED_STARTS, asked.starts)
+        chosen, starts = sizes.chosen, max(2, asked.starts)  # the first is the search's
         settings = replace(settings, seed=chosen.seed, starts=starts, **chosen.sizes)
         if settings.nx != linear.nx:
             more = "more" if cast(int, settings.nx) > linear.nx else "fewer"
@@ -191,12 +188,7 @@ def scored_run(
     size_search: SizeSearch | None,
     again: FitResult | None = None,
 ) -> Run:
-    """All records simulated and scored, with verdict and advice; the tests by a model fitted again.
-
-    Args:
-        dataset, settings, linear, result, order_scan, size_search: what was found.
-        again: the fit to all estimation records.
-    """
+    """Score all records, the tests by the model fitted again; add verdict and advice."""
     samples = sum(record.samples for record in dataset.train)
     fitted_to = f"{dataset.name}: {len(dataset.train)} record(s), {samples} samples"
     result = replace(result, model=replace(result.model, fitted_to=fitted_to))
@@ -305,11 +297,9 @@ def tell(linear: LinearModel, observer: Observer) -> None:
 def linear_records(
     train: Sequence[Record], settings: Settings, observer: Observer
 ) -> Sequence[Record]:
-    """The records that the linear model is estimated from: those in steady state, or all.
-
-    A best linear approximation is that of one kind of signal, and takes a fraction of the work in
-    steady state. If those records excite too little for the order, all are taken.
-    """
+    """Return the records that the linear model is estimated from: those in steady state, or all."""
+    # A best linear approximation is that of one kind of signal, and takes a fraction of the work in
+    # steady state. If those records excite too little for the order, all are taken.
     steady = [record for record in train if record.start == "periodic"]
     if len(steady) in (0, len(train)):
         return train
@@ -322,12 +312,9 @@ def linear_records(
 
 
 def choose_sizes(stage: Stage, linear: LinearModel) -> SizeSearch | None:
-    """The search for the sizes that are ``"auto"``; None if none but nx is.
-
-    If nx is one of them, the order of the linear model is the least: an NL-LFR may make use of
-    states that a linear model does not. Models are fitted to the part of the training records that
-    the first iterations have.
-    """
+    """Return the search for the sizes that are ``"auto"``; None if none but nx is."""
+    # The order of the linear model is the least nx: an NL-LFR may make use of more states. Models
+    # are fitted to the part of the training records that the first iterations have.
     dataset, settings, observer = stage.dataset, stage.settings, stage.observer
     if not settings.searched:
         return None

@@ -36,25 +36,20 @@ from lfrtorch._support.types import Array, Booleans, Integers
 MARGIN = 0.01
 """A model does as well as the best if its rms error exceeds that one's by at most this part."""
 
-_CEILING = 0.05  # a model does not do as well if it exceeds that one's by more than this part
-
 BLOCKS = 10
 """Least number of blocks of time, over all records."""
 
 
 def as_good(squares: Sequence[Array] | Array, counts: Integers) -> Booleans:
-    """Return which models are within one standard error of the best, or ``MARGIN``.
-
-    None is that is worse by more than 5 %. Arguments as in ``standard_errors_above``.
-    """
+    """Return which models are within one standard error of the best and 5 %, or ``MARGIN``."""
     means = np.asarray(squares).sum(axis=1)
     near = standard_errors_above(squares, counts) <= 1.0
-    near &= means <= (1.0 + _CEILING) ** 2 * means.min()
+    near &= means <= 1.05**2 * means.min()
     return near | (means <= (1.0 + MARGIN) ** 2 * means.min())
 
 
 def no_progress(errors: Sequence[float], last: int) -> bool:
-    """Whether none of the last few rms errors is below the earlier ones by ``MARGIN``."""
+    """Return whether none of the last few rms errors is below the earlier ones by ``MARGIN``."""
     earlier = errors[:-last]
     return bool(earlier) and min(errors[-last:]) > min(earlier) / (1.0 + MARGIN)
 
@@ -75,11 +70,7 @@ def standard_errors_above(squares: Sequence[Array] | Array, counts: Integers) ->
 
 
 def blocked_mean(sums: Array, counts: Integers) -> tuple[Array, Array]:
-    """The mean of a signal that has these sums over blocks of time, and its standard error.
-
-    Shape:
-        sums: (..., B), counts: (B,) -> (...), (...).
-    """
+    """Return the mean of a signal from its sums (..., B) over blocks, and its standard error."""
     B, samples = len(counts), counts.sum()
     mean = sums.sum(axis=-1) / samples
     rest = sums - mean[..., None] * counts

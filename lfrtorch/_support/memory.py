@@ -49,15 +49,9 @@ def _own_limit() -> float:
 
 
 def limit_of(listed: Path, mounted: Path) -> float:
-    """Return the least memory limit of the control groups of a process, inf if there is none.
-
-    Args:
-        listed: file of the groups, a line each.
-        mounted: folder of what the groups may take; groups above limit those in them.
-
-    References:
-        Linux kernel documentation, "Control Group v2", and its v1 with "memory.limit_in_bytes".
-    """
+    """Return the least memory limit of the control groups of a process, inf if there is none."""
+    # ``listed`` has a line a group, ``mounted`` what each may take; groups limit those in them.
+    # Linux kernel documentation, "Control Group v2", and its v1 with "memory.limit_in_bytes".
     try:
         groups = [line.split(":", 2)[1:] for line in listed.read_text().splitlines()]
     except OSError:

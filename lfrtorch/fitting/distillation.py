@@ -30,12 +30,6 @@ from lfrtorch.fitting.trainer import FitResult, Monitor, Stop, Trainer
 from lfrtorch.least_squares.simulation_errors import Ridge
 from lfrtorch.records import Record, as_records
 
-COPIES = 5
-"""Records at other inputs, for each record of the data."""
-
-PASSES = 30
-"""Passes that give a shuffled input the spectrum of the data's."""
-
 
 @typed()
 def distil(
@@ -79,7 +73,7 @@ def distil(
         raise InputError("the model is no mean of several; fit several starts with average=4.")
     train, rng = as_records(train), np.random.default_rng(seed)
     copies = []
-    for record in (record for record in train for _ in range(COPIES)):
+    for record in (record for record in train for _ in range(5)):  # inputs for each
         start = "periodic" if record.start == "periodic" else "zero"
         u = shuffled(record.u, rng)
         y = result.model.simulate(u, start=start)
@@ -104,7 +98,7 @@ def shuffled(u: Array, rng: np.random.Generator) -> Array:
     """An input (T, nu) of the same amplitudes and nearly the same spectrum, in another order."""
     amplitudes, spectrum = np.sort(u, axis=0), np.abs(np.fft.rfft(u, axis=0))
     found = u[rng.permutation(len(u))]
-    for _ in range(PASSES):
+    for _ in range(30):  # passes, after which the spectrum is nearly that of u
         phases = np.exp(1j * np.angle(np.fft.rfft(found, axis=0)))
         order = np.fft.irfft(spectrum * phases, len(u), axis=0).argsort(axis=0).argsort(axis=0)
         found = np.take_along_axis(amplitudes, order, axis=0)

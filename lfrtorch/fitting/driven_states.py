@@ -19,20 +19,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.survey.signal import band
 
-GRID = 4096
-"""Frequencies at which the spectra of records are put together."""
-
-LAST = 0.95
-"""Part of the frequencies up to fs / 2 from which on inputs are said to excite all of them."""
-
-DAMPING = 0.03
-"""Damping ratio of the modes."""
-
-RANGE = 0.3
-"""Entries of Bw, Cy and Cz are in -RANGE .. RANGE."""
-
-DECADES = 100.0
-"""Range of the corner frequencies of relaxations, the highest over the lowest."""
+_DAMPING = 0.03  # damping ratio of the modes
 
 
 def distortion_frequencies(
@@ -42,14 +29,14 @@ def distortion_frequencies(
     # Above the band of the inputs a linear model has no output, and all of its error, normalised,
     # is distortion.
     edge = _edge(inputs)
-    grid = np.linspace(edge, np.pi, GRID)
-    power = np.zeros(GRID)  # of all frequencies from the edge up to each
+    grid = np.linspace(edge, np.pi, 4096)  # on which spectra of all records are added
+    power = np.zeros_like(grid)  # of all frequencies from the edge up to each
     for error in errors:
         spectrum = np.fft.rfft(np.hanning(len(error) + 1)[:-1, None] * error, axis=0)
         below = np.cumsum((np.abs(spectrum) ** 2).sum(axis=1)) / len(error)
         power += np.interp(grid, np.linspace(0.0, np.pi, len(below)), below)
     power -= power[0]
-    if edge >= LAST * np.pi or not power[-1] > 0:
+    if edge >= 0.95 * np.pi or not power[-1] > 0:
         raise InputError(
             f"modes is {count}, and the linear model leaves no errors above the band that the "
             "inputs excite; give modes=0."
@@ -61,7 +48,7 @@ def relaxation_frequencies(
     inputs: Sequence[Float[Array, "T nu"]], count: int
 ) -> Float[Array, " count"]:
     """Corner frequencies, rad per sample: two decades below half the band in equal ratios."""
-    return 0.5 * _edge(inputs) * DECADES ** -((np.arange(count) + 0.5) / count)
+    return 0.5 * _edge(inputs) * 100.0 ** -((np.arange(count) + 0.5) / count)
 
 
 @torch.no_grad()
@@ -76,7 +63,7 @@ def with_driven_states(
     # w is 0. z sees the relaxations, a state each, and not the modes, two states each. Frequencies
     # are in rad per sample.
     like = {"dtype": cell.A.dtype, "device": cell.A.device}
-    decay = np.exp(-np.concatenate([relaxations, np.repeat(DAMPING * modes, 2)]))
+    decay = np.exp(-np.concatenate([relaxations, np.repeat(_DAMPING * modes, 2)]))
     nx, states = cell.nx, len(decay)
     larger = LFRCell(cell.nu, cell.ny, nx + states, cell.nz, cell.nw, deepcopy(cell.static), **like)
     for name in ("A", "Bu", "Bw", "Cy", "Cz"):
@@ -85,7 +72,7 @@ def with_driven_states(
     for name in ("Dyu", "Dyw", "Dzu"):
         larger.get_parameter(name).copy_(cell.get_parameter(name))
     A = np.diag(decay)
-    for i, angle in enumerate(np.sqrt(1.0 - DAMPING**2) * modes):
+    for i, angle in enumerate(np.sqrt(1.0 - _DAMPING**2) * modes):
         at = slice(len(relaxations) + 2 * i, len(relaxations) + 2 * i + 2)
         A[at, at] @= [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
     larger.A[nx:, nx:] = torch.as_tensor(A)
@@ -93,12 +80,12 @@ def with_driven_states(
     gain = torch.as_tensor(np.sqrt(1.0 - decay**2)).to(**like)
     seen = slice(nx, nx + len(relaxations))
     for entries in (larger.Bw[nx:], larger.Cy[:, nx:], larger.Cz[:, seen]):
-        entries.uniform_(-RANGE, RANGE, generator=generator)
+        entries.uniform_(-0.3, 0.3, generator=generator)
     larger.Bw[nx:] *= gain[:, None]
     return larger
 
 
 def _edge(inputs: Sequence[Float[Array, "T nu"]]) -> float:
-    """The upper end of the inputs' band, rad per sample."""
+    """Return the upper end of the inputs' band, rad per sample."""
     bands = [band(channel) for u in inputs for channel in u.T]
     return 2.0 * np.pi * max((high for found in bands if found for high in found), default=0.5)

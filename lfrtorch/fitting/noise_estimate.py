@@ -15,16 +15,6 @@ from lfrtorch.fitting.state_scaling import state_moment
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, rms_scale
 
-LEAST, MOST = 1e-12, 1e2
-"""Variances that are tried, of states and outputs over their mean squares in the records."""
-
-STARTS = (1e-4, 1e-2)
-"""Variances of all states and of all outputs, relative to the same: the search begins at the best
-pair, from above, as a variance that is far too small makes no difference to the likelihood."""
-
-DIFFERENCE = 1e-4
-"""Of the logarithm of a variance, for the gradient."""
-
 
 @typed()
 def estimate_noise(model: Model, records: Record | Sequence[Record]) -> NoiseCovariance:
@@ -77,16 +67,19 @@ def estimate_noise(model: Model, records: Record | Sequence[Record]) -> NoiseCov
         log_p = sum(model.observer(noise=noise, P0=P0).follow(u, y) for u, y in signals)
         return -log_p / count - unit if np.isfinite(log_p) else np.inf
 
-    starts = [np.log([q] * nx + [r] * len(y_rms)) for q, r in product(STARTS, STARTS)]
+    # Variances relative to mean squares in the records. The search begins from above, as one that
+    # is far too small makes no difference to the likelihood; eps: of a finite difference.
+    first = (1e-4, 1e-2)
+    starts = [np.log([q] * nx + [r] * len(y_rms)) for q, r in product(first, first)]
     found = scipy.optimize.minimize(
         cost, min(starts, key=cost), method="L-BFGS-B",
-        bounds=[(np.log(LEAST), np.log(MOST))] * (nx + len(y_rms)), options={"eps": DIFFERENCE},
+        bounds=[(np.log(1e-12), np.log(1e2))] * (nx + len(y_rms)), options={"eps": 1e-4},
     )  # fmt: skip
     return noise_of(found.x)
 
 
 def _of_innovations(model: Model, records: Sequence[Record]) -> NoiseCovariance:
-    """The noise of the innovation form."""
+    """Return the noise of the innovation form."""
     assert model.K is not None
     errors = [(record.y - model.predict(record))[record.skip :] for record in records]
     e = np.concatenate(errors)

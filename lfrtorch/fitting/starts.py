@@ -32,10 +32,10 @@ from lfrtorch.linear.modes import without_slow_minor_modes
 from lfrtorch.model import Model
 from lfrtorch.records import Record, Scaler, as_records, rms_scale, without_coordinates
 
-OUTPUT_RANGE = 0.3
+_OUTPUT_RANGE = 0.3
 """Bw, Dyw ~ U(-0.3, 0.3) of the ``"zero_output"`` start."""
 
-OUTPUT_WEIGHTS: dict[type[Module], tuple[str, ...]] = {Network: ("Ww", "bw"), Polynomial: ("C",)}
+_OUTPUT_WEIGHTS: dict[type[Module], tuple[str, ...]] = {Network: ("Ww", "bw"), Polynomial: ("C",)}
 """The weights of a static map that make its output vanish."""
 
 
@@ -215,12 +215,12 @@ def initialise(
         spread = _deviation(z)[:, None]
         cell.Cz.div_(spread)
         cell.Dzu.div_(spread)
-        for name in OUTPUT_WEIGHTS.get(type(static), ()) if method == "zero_output" else ():
+        for name in _OUTPUT_WEIGHTS.get(type(static), ()) if method == "zero_output" else ():
             static.get_parameter(name).zero_()
         if method == "zero_output" and not static((z / spread.mT).unsqueeze(0)).any():
             to_output = feedthrough or not z_feedthrough
-            uniform(cell.Bw, 0.0 if end == "output" and to_output else OUTPUT_RANGE)
-            uniform(cell.Dyw, OUTPUT_RANGE if to_output else 0.0)
+            uniform(cell.Bw, 0.0 if end == "output" and to_output else _OUTPUT_RANGE)
+            uniform(cell.Dyw, _OUTPUT_RANGE if to_output else 0.0)
     if relaxations or modes:
         inputs = [record.u for record in data]
         corners = relaxation_frequencies(inputs, relaxations)

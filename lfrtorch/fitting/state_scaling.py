@@ -9,9 +9,6 @@ import torch
 from lfrtorch.model import Model, state_moment
 from lfrtorch.records import Record
 
-ROUNDING = 1e-9
-"""Distance of an rms from 1 that may be rounding alone."""
-
 
 @torch.no_grad()
 def scale_states(
@@ -31,7 +28,7 @@ def scale_states(
     into, of = (cell.Bu, cell.Bw), (cell.Cz, cell.Cy)
     if keep_coordinates or not all(weight.requires_grad for weight in (cell.A, *into, *of)):
         rms = torch.ones_like(rms)
-    rms = torch.where((rms == 0) | ((rms - 1.0).abs() < ROUNDING), 1.0, rms)
+    rms = torch.where((rms == 0) | ((rms - 1.0).abs() < 1e-9), 1.0, rms)  # what may be rounding
     cell.state_covariance.copy_(moment / torch.outer(rms, rms))
     cell.A.mul_((rms / rms[:, None]).to(cell.A))
     for weight in into:

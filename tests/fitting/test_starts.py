@@ -15,7 +15,7 @@ from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.fitting import nonlinear_end
 from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
-from lfrtorch.fitting.starts import OUTPUT_RANGE, initialise
+from lfrtorch.fitting.starts import initialise
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.linear.bla import estimate_bla
@@ -131,7 +131,7 @@ def test_weights_of_the_zero_output_which_is_the_default(bla: LinearModel):
     assert not static.bw.any()
     for weight in (cell.Bw, cell.Dyw):
         assert weight.all()
-        assert weight.abs().max() <= OUTPUT_RANGE
+        assert weight.abs().max() <= 0.3
     for weight in (static.Wz, static.bz):
         assert weight.all()
         assert weight.abs().max() <= 1
@@ -192,7 +192,7 @@ def test_start_with_a_given_map_is_the_linear_model(bla: LinearModel, name: str,
     cleared = cleared if method == "zero_output" else set()
     for weight in (cell.Bw, cell.Dyw):
         assert bool(weight.all()) == bool(weight.any()) == bool(cleared)
-        assert weight.abs().max() <= OUTPUT_RANGE
+        assert weight.abs().max() <= 0.3
     assert cell.static is not None
     for key, weight in cell.static.state_dict().items():
         expected = torch.zeros_like(weight) if key in cleared else given[key].double()
