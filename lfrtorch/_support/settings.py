@@ -26,7 +26,7 @@ def check_settings(settings: Any, prefix: str = "", without: Container[str] = ()
     from lfrtorch._support.checks import integer, number
 
     for one in fields(settings):
-        value, limits = getattr(settings, one.name), one.metadata["limits"]
+        value, limits = getattr(settings, one.name), one.metadata.get("limits")
         if limits and one.name not in without and not (value is None and one.default is None):
             check = integer if "least" in limits else number
             check(prefix + one.name, value, **limits)

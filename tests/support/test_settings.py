@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any
 
 import pytest
@@ -52,3 +52,13 @@ def test_a_setting_is_taken_up_to_its_limits_alone(kind: Any, one: Field):
 def test_a_setting_has_a_default_and_a_line_in_the_docstring(kind: Any, one: Field):
     assert one.default is not MISSING or one.default_factory is not MISSING
     assert f"\n        {one.name}: {one.metadata['help'][:40]}" in kind.__doc__
+
+
+def test_a_search_of_ones_own_may_have_fields_of_its_own():
+    @dataclass(frozen=True)
+    class Mine(LevenbergMarquardt):
+        every: int = 5
+
+    assert Mine(max_iter=3).every == 5
+    with pytest.raises(InputError, match="max_iter is -1"):
+        Mine(max_iter=-1)
