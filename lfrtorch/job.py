@@ -23,7 +23,7 @@ from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.first_fit import begun_on_part, first_records
 from lfrtorch.fitting.last_fits import distilled, refitted
-from lfrtorch.fitting.multistart import fit
+from lfrtorch.fitting.multistart import fit, starts_worth
 from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
@@ -119,11 +119,13 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     linear, order_scan = linear_model(
         approximated, settings, dataset.validation, observer=observer, ranks=given.ranks
     )
-    settings, asked = replace(settings, nx=linear.nx), settings
+    settings = replace(settings, nx=linear.nx)
     sizes = choose_sizes(stage, linear)
     if sizes is not None:
-        chosen, starts = sizes.chosen, max(2, asked.starts)  # the first is the search's
-        settings = replace(settings, seed=chosen.seed, starts=starts, **chosen.sizes)
+        chosen = sizes.chosen  # the first start is the search's
+        settings = replace(settings, seed=chosen.seed, **chosen.sizes)
+        if settings.starts == 1:
+            settings = replace(settings, starts=2)
         if settings.nx != linear.nx:
             more = "more" if cast(int, settings.nx) > linear.nx else "fewer"
             observer.say(
@@ -131,8 +133,9 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
             )
             linear = estimate_bla(approximated, cast(int, settings.nx), **settings.linear)
             tell(linear, observer)
+    settings = with_starts(replace(stage, settings=settings), linear)
     models = starting_models(dataset.train, settings, linear)
-    if settings.init_from is not None and settings.starts > 1:
+    if settings.init_from is not None and settings.seeds[1:]:
         observer.say("note: starts is 1: the fit starts from the model of init_from alone")
     settings, models = begun_on_part(replace(stage, settings=settings), models)
     average = _most_averaged(models, settings.average, observer)
@@ -369,6 +372,18 @@ def _larger(
         except ValueError:
             break
     return found
+
+
+def with_starts(stage: Stage, linear: LinearModel) -> Settings:
+    """The settings with a number of starts in place of ``"auto"``."""
+    settings, train = stage.settings, stage.dataset.train
+    if settings.starts != "auto":
+        return settings
+    if settings.init_from is not None:
+        return replace(settings, starts=1)
+    samples, limit = sum(record.samples for record in train), settings.trainer.limit
+    first = starting_model(train, settings, linear, settings.seed)
+    return replace(settings, starts=starts_worth(first, samples, limit))
 
 
 def starting_models(

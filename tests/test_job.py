@@ -29,6 +29,7 @@ from lfrtorch import (
 from lfrtorch.cli import config, fit
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.first_fit import part_of
+from lfrtorch.fitting.multistart import starts_worth
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.stage import Stage
@@ -179,6 +180,19 @@ def test_the_seed_draws_the_weights_of_any_map(dataset: Dataset, static: Any):
     assert not all(map(torch.equal, *weights))
     torch.manual_seed(5)
     assert torch.equal(torch.random.get_rng_state(), state)  # which is the user's
+
+
+def test_starts_are_as_many_as_are_cheap(dataset: Dataset, monkeypatch: pytest.MonkeyPatch):
+    given = settings(starts="auto", trainer=LevenbergMarquardt(max_iter=2))
+    run = identify(dataset, given)
+    assert (len(run.fit.starts), run.settings.starts) == (8, 8)
+    again = identify(dataset, replace(given, init_from=run.model))
+    assert again.settings.starts == 1
+    # Four starts of 200 iterations come to 4 * 13 + 2 * 187 of them.
+    first, work = run.model, 20e-9 * 300 * run.model.parameter_count
+    for minute, count in ((427, 4), (425, 2), (390, 1)):
+        monkeypatch.setattr("lfrtorch.fitting.multistart._MINUTE", minute * work)
+        assert starts_worth(first, 300, 200) == count
 
 
 @pytest.mark.parametrize("starts", [1, 3])

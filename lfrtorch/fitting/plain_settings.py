@@ -148,8 +148,13 @@ class PlainSettings:
         most=1,
     )
     first_iterations: int = setting(40, "how many of these there are.", least=1)
-    starts: int = setting(
-        1, "random starts, of which the best is kept; at least 2 if sizes are searched.", least=1
+    starts: Size = setting(
+        1,
+        "random starts, of which the best is kept; at least 2 if sizes are searched. "
+        '``"auto"``: 8, or as many as take about a minute on one core, as a single one may end in '
+        "a poor minimum; the default for files.",
+        least=1,
+        word="auto",
     )
     seed: int = setting(
         0,

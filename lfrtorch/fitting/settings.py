@@ -29,7 +29,7 @@ SEED_STEP = 1000
 """Distance of the seeds of several starts."""
 
 
-@typed("init_from", "trainer", "static", "nx", "nz", "nw", "nn", "degree")
+@typed("init_from", "trainer", "static", "nx", "nz", "nw", "nn", "degree", "starts")
 @documented
 @dataclass(frozen=True, kw_only=True)
 class Settings(PlainSettings):
@@ -150,7 +150,7 @@ class Settings(PlainSettings):
     @property
     def seeds(self) -> tuple[int, ...]:
         """Seeds of the starts; neighbouring values of ``seed`` have none in common."""
-        return self.first_seeds(self.starts)
+        return self.first_seeds(1 if self.starts == "auto" else self.starts)
 
     def first_seeds(self, count: int) -> tuple[int, ...]:
         """Seeds of so many starts."""
