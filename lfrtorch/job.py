@@ -23,7 +23,7 @@ from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.first_fit import begun_on_part, first_records
 from lfrtorch.fitting.last_fits import distilled, refitted
-from lfrtorch.fitting.multistart import fit, starts_worth
+from lfrtorch.fitting.multistart import cheap_starts, fit
 from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
@@ -124,8 +124,6 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     if sizes is not None:
         chosen = sizes.chosen  # the first start is the search's
         settings = replace(settings, seed=chosen.seed, **chosen.sizes)
-        if settings.starts == 1:
-            settings = replace(settings, starts=2)
         if settings.nx != linear.nx:
             more = "more" if cast(int, settings.nx) > linear.nx else "fewer"
             observer.say(
@@ -133,10 +131,9 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
             )
             linear = estimate_bla(approximated, cast(int, settings.nx), **settings.linear)
             tell(linear, observer)
-    settings = with_starts(replace(stage, settings=settings), linear)
-    models = starting_models(dataset.train, settings, linear)
-    if settings.init_from is not None and settings.seeds[1:]:
-        observer.say("note: starts is 1: the fit starts from the model of init_from alone")
+    settings, models = starting_models(
+        dataset.train, settings, linear, observer, least=1 if sizes is None else 2
+    )
     settings, models = begun_on_part(replace(stage, settings=settings), models)
     average = _most_averaged(models, settings.average, observer)
     samples = sum(record.samples for record in dataset.train)
@@ -374,27 +371,29 @@ def _larger(
     return found
 
 
-def with_starts(stage: Stage, linear: LinearModel) -> Settings:
-    """The settings with a number of starts in place of ``"auto"``."""
-    settings, train = stage.settings, stage.dataset.train
-    if settings.starts != "auto":
-        return settings
-    if settings.init_from is not None:
-        return replace(settings, starts=1)
-    samples, limit = sum(record.samples for record in train), settings.trainer.limit
-    first = starting_model(train, settings, linear, settings.seed)
-    return replace(settings, starts=starts_worth(first, samples, limit))
-
-
 def starting_models(
-    train: Sequence[Record], settings: Settings, linear: LinearModel
-) -> list[Model]:
-    """The models that the fit starts from, one a seed; that of ``init_from`` is the only one."""
-    if settings.init_from is None:
-        return [starting_model(train, settings, linear, seed) for seed in settings.seeds]
-    model = deepcopy(settings.init_from)
-    model.lfr.to(device=settings.device, dtype=settings.dtype)
-    return [model]
+    train: Sequence[Record],
+    settings: Settings,
+    linear: LinearModel,
+    observer: Observer,
+    *,
+    least: int,
+) -> tuple[Settings, list[Model]]:
+    """The settings with the number of starts, and their models; that of ``init_from`` alone."""
+    if settings.init_from is not None:
+        if settings.starts not in (1, "auto"):
+            observer.say("note: starts is 1: the fit starts from the model of init_from alone")
+        model = deepcopy(settings.init_from)
+        model.lfr.to(device=settings.device, dtype=settings.dtype)
+        return replace(settings, starts=1), [model]
+    first = starting_model(train, settings, linear, settings.seed)
+    count = settings.starts
+    if count == "auto":
+        rows = sum(record.y.size for record in train)
+        count = cheap_starts(rows, first.parameter_count, settings.trainer.limit)
+    settings = replace(settings, starts=max(least, count))
+    more = [starting_model(train, settings, linear, seed) for seed in settings.seeds[1:]]
+    return settings, [first, *more]
 
 
 def starting_model(

@@ -29,7 +29,7 @@ from lfrtorch import (
 from lfrtorch.cli import config, fit
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.first_fit import part_of
-from lfrtorch.fitting.multistart import starts_worth
+from lfrtorch.fitting.multistart import cheap_starts
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.stage import Stage
@@ -66,7 +66,7 @@ def dataset() -> Dataset:
 
 
 def settings(**given) -> Settings:
-    return Settings(**{"nx": 1, "nz": 1, "nn": 3, "trainer": SHORT} | given)
+    return Settings(**{"nx": 1, "nz": 1, "nn": 3, "starts": 1, "trainer": SHORT} | given)
 
 
 @pytest.mark.numeric
@@ -186,13 +186,11 @@ def test_starts_are_as_many_as_are_cheap(dataset: Dataset, monkeypatch: pytest.M
     given = settings(starts="auto", trainer=LevenbergMarquardt(max_iter=2))
     run = identify(dataset, given)
     assert (len(run.fit.starts), run.settings.starts) == (8, 8)
-    again = identify(dataset, replace(given, init_from=run.model))
-    assert again.settings.starts == 1
+    assert identify(dataset, replace(given, init_from=run.model)).settings.starts == 1
     # Four starts of 200 iterations come to 4 * 13 + 2 * 187 of them.
-    first, work = run.model, 20e-9 * 300 * run.model.parameter_count
     for minute, count in ((427, 4), (425, 2), (390, 1)):
-        monkeypatch.setattr("lfrtorch.fitting.multistart._MINUTE", minute * work)
-        assert starts_worth(first, 300, 200) == count
+        monkeypatch.setattr("lfrtorch.fitting.multistart._MINUTE", 20e-9 * 300 * 40 * minute)
+        assert cheap_starts(300, 40, 200) == count
 
 
 @pytest.mark.parametrize("starts", [1, 3])

@@ -347,11 +347,11 @@ def schedule(starts: int, limit: int, average: int = 1) -> list[tuple[int, int]]
     return planned
 
 
-def starts_worth(model: Model, samples: int, limit: int) -> int:
+def cheap_starts(rows: int, parameters: int, limit: int) -> int:
     """How many starts take about a minute on one core, 8 at most."""
-    # A multiplication for each row and parameter stands for the work of an iteration, which takes
-    # 20 ns for each of them (Bouc-Wen: 8192 samples, 89 parameters, 14 ms).
-    work = 20e-9 * samples * len(model.outputs) * model.parameter_count
+    # An iteration takes 20 ns for each row and parameter (Bouc-Wen: 8192 samples, 89 parameters,
+    # 14 ms). Measured seconds would make the number depend on the machine.
+    work = 20e-9 * rows * parameters
     cheap = (n for n in (8, 4, 2) if work * iterations_of(schedule(n, limit)) <= _MINUTE)
     return next(cheap, 1)
 

@@ -149,10 +149,10 @@ class PlainSettings:
     )
     first_iterations: int = setting(40, "how many of these there are.", least=1)
     starts: Size = setting(
-        1,
+        "auto",
         "random starts, of which the best is kept; at least 2 if sizes are searched. "
-        '``"auto"``: 8, or as many as take about a minute on one core, as a single one may end in '
-        "a poor minimum; the default for files.",
+        '``"auto"``: 8, or fewer if they would take more than about a minute on one core. A single '
+        "one may end in a poor minimum.",
         least=1,
         word="auto",
     )

@@ -15,7 +15,7 @@ from lfrtorch.cli.config import configured
     ("name", "trainer"), [("levenberg_marquardt", LevenbergMarquardt), ("adam", Adam)]
 )
 def test_defaults_are_those_of_the_declarations(name: str, trainer: type):
-    found = configured(configuration(f"trainer={name}", "data=file", "nx=2"))
+    found = configured(configuration(f"trainer={name}", "data=file", "nx=2", "starts=auto"))
     usual = Settings(nx=2, trainer=trainer())
     for one in fields(Settings):
         if one.name not in ("linear", "sizes_search"):

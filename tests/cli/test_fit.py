@@ -176,7 +176,8 @@ def test_the_paper_cases_are_one_override():
 @pytest.mark.numeric
 @pytest.mark.usefixtures("coarse")
 def test_run_writes_its_folder_and_the_checkpoint_simulates(csv, tmp_path, monkeypatch, capsys):
-    words = [f"hydra.run.dir='{tmp_path}'", *file_overrides(csv), "nx=1", "trainer.max_iter=20"]
+    words = [f"hydra.run.dir='{tmp_path}'", *file_overrides(csv), "nx=1"]
+    words += ["starts=1", "trainer.max_iter=20"]
     launched(monkeypatch, *words)
     for name in ("metrics.json", "config.yaml", "model/model.json", "figures/test.png"):
         assert (tmp_path / name).is_file()
