@@ -6,8 +6,10 @@ The numbers, and the thresholds that several rules share, are those of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from lfrtorch._support.tables import number, percent
@@ -93,7 +95,8 @@ def validation_is_unlike(e: Evidence) -> Advice | None:
     if not e.parts_differ:
         return None
     return Advice(
-        "The validation part is unlike the training part: choose other parts, or cross-validate.",
+        "The validation part is unlike the training part: hold out a longer one "
+        "(validation=0.4), or records by name (validation=[NAME]).",
         f"error of the linear model: validation {percent(e.linear_validation)}, "
         f"training {percent(e.linear_train)}",
     )
@@ -126,7 +129,7 @@ def gain_is_lost(e: Evidence) -> Advice | None:
     which = e.judged[2]
     return Advice(
         f"The gain on {which} is lost on the tests: they are unlike, or the model is overfit; "
-        "choose other parts, or measure longer.",
+        "hold out a longer part (validation=0.4), or measure longer.",
         f"error over the linear model's: {which} {percent(e.gain)}, tests {percent(e.tests)}",
     )
 
@@ -174,12 +177,14 @@ def overfits(e: Evidence) -> Advice | None:
     else:
         return None
     change: dict[str, Any] = {}
-    if e.sizes.get("degree"):
-        change = {"degree": max(2, e.sizes["degree"] - 1)}
+    if e.searched or not e.crowded:
+        pass  # validation chose the sizes, or the samples bear them
+    elif e.sizes.get("degree", 0) > 2:
+        change = {"degree": e.sizes["degree"] - 1}
     elif e.sizes.get("nn", 0) > 1:
         change = {"nn": e.sizes["nn"] // 2}
-    smaller = _written(change) or "smaller sizes"
-    return Advice(f"Overfit: {smaller}, or more data.", evidence, change or None)
+    smaller = f"{_written(change)}, or " if change else ""
+    return Advice(f"Overfit: {smaller}more data.", evidence, change or None)
 
 
 def linear_part_incomplete(e: Evidence) -> Advice | None:
@@ -213,29 +218,28 @@ def hardly_better(e: Evidence) -> Advice | None:
             "this level, or the rest is no static map of a few signals.",
             gain,
         )
-    change = _larger(e)
-    if e.linear is None and e.sizes.get("nx"):
-        change = {"nx": e.sizes["nx"] + 1, **change}
+    states = {"nx": e.sizes["nx"] + 1} if e.linear is None and e.sizes.get("nx") else {}
+    change: dict[str, Any] = _larger(e, states)
     if not e.continued and e.started < 8:
         change = {"starts": 8, **change}
+    more = _written(change) or "more data"
     return Advice(
-        f"The gain on {which} is small; a longer search or larger sizes may have more: "
-        f"{_written(change)}."
+        f"The gain on {which} is small; a longer search or larger sizes may have more: {more}."
         if e.better
         else "Hardly better than the linear model: the system is linear at this level, or the "
-        f"search or the sizes are too small: {_written(change)}.",
+        f"search or the sizes are too small: {more}.",
         gain,
-        change,
+        change or None,
     )
 
 
 def outputs_left_out(e: Evidence) -> Advice | None:
     """Outputs without gain, while others have one: the static map has too few outputs."""
     behind = {name: ratio for name, ratio in e.outputs.items() if ratio > USELESS}
-    if not behind or e.gain is None or e.useless or e.lost_on_tests or e.overtrained:
+    change = {name: e.sizes.get(name, 0) + 1 for name in ("nw", "nz")}
+    if not behind or e.gain is None or e.useless or e.lost_on_tests or not _borne(e, change):
         return None
     ratios = _listed([f"{number(ratio)} times on '{name}'" for name, ratio in behind.items()])
-    change: dict[str, Any] = {name: e.sizes.get(name, 0) + 1 for name in ("nw", "nz")}
     return Advice(
         f"Some outputs gain nothing, or are linear: {_written(change)}.",
         f"{e.judged[2]} error {ratios} that of the linear model, and less on the others",
@@ -260,7 +264,11 @@ def nonlinear_part_incomplete(e: Evidence) -> Advice | None:
     else:
         return None
     change = _larger(e)
-    return Advice(f"Nonlinear behaviour is left: {_written(change)}.", evidence, change)
+    larger = _written(change) or "more data would bear a larger map"
+    text = "at any size searched; more data may bear a larger map" if e.searched else larger
+    return Advice(
+        f"Nonlinear behaviour is left: {text}.", evidence, None if e.searched else change or None
+    )
 
 
 def best_start_alone(e: Evidence) -> Advice | None:
@@ -304,12 +312,11 @@ def tests_are_louder(e: Evidence) -> Advice | None:
 
 def largest_sizes(e: Evidence) -> Advice | None:
     """Sizes that validation chose at the edge of what was tried."""
-    if not e.largest:
+    if not e.largest or e.crowded:
         return None
-    sizes = {name: e.sizes[name] for name in e.largest}
+    lists = [f"sizes_search.{name}=[{e.sizes[name]},{2 * e.sizes[name]}]" for name in e.largest]
     return Advice(
-        f"The largest sizes tried were chosen; larger ones may do better: try beyond "
-        f"{_written(sizes)}.",
+        f"The largest sizes tried were chosen; larger ones may do better: {', '.join(lists)}.",
         "sizes_search says what is tried",
     )
 
@@ -362,12 +369,32 @@ _RULES = (  # the most useful first, and whether a rule is on the sizes or the s
 )
 
 
-def _larger(e: Evidence) -> dict[str, int]:
-    """Sizes of a larger static map."""
-    sizes = {name: max(2, e.sizes.get(name, 0) + 1) for name in ("nz", "nw")}
-    if e.sizes.get("degree"):
-        return {"degree": e.sizes["degree"] + 2, **sizes}
-    return {"nn": 2 * e.sizes["nn"], **sizes} if e.sizes.get("nn") else sizes
+def _larger(e: Evidence, states: Mapping[str, int] = MappingProxyType({})) -> dict[str, int]:
+    """Sizes of a larger static map, and of more states; none if the samples do not bear them."""
+    signals = {name: max(2, e.sizes.get(name, 0) + 1) for name in ("nz", "nw")}
+    static = {"degree": e.sizes["degree"] + 2} if e.sizes.get("degree") else {}
+    if e.sizes.get("nn"):
+        static = {"nn": 2 * e.sizes["nn"]}
+    tried = ({**states, **static, **signals}, {**states, **static})
+    return next((change for change in tried if change and _borne(e, change)), {})
+
+
+def _borne(e: Evidence, change: Mapping[str, int]) -> bool:
+    """Whether larger sizes are advised: errors are near each other, and there are samples for it.
+
+    The next fit has at most ``growth`` times the parameters, and is not called overfit for them.
+    """
+    growth = _weights({**e.sizes, **change}) / _weights(e.sizes)
+    return e.close and e.bears(growth)
+
+
+def _weights(sizes: Mapping[str, int]) -> int:
+    """A product of sizes that grows at least as the parameters do."""
+    nz, nw = sizes.get("nz", 0), sizes.get("nw", 0)
+    static = (nz + 1 + nw) * max(1, sizes.get("nn", 0))
+    if sizes.get("degree"):
+        static = nw * math.comb(nz + sizes["degree"], nz)
+    return max(1, static) * max(1, sizes.get("nx", 0))
 
 
 def _written(change: Mapping[str, Any]) -> str:

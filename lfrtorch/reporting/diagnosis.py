@@ -44,6 +44,7 @@ OVERFIT = 1.5
 """Growth from training to validation of the NL-LFR's error over that of the linear model's, which
 sees how the records differ."""
 
+_CLOSE = 1.2  # that growth, up to which a larger map is advised
 
 USELESS = 0.9
 """Error over the linear model's from which on the NL-LFR is hardly better."""
@@ -156,13 +157,27 @@ class Evidence:
     @property
     def overtrained(self) -> bool:
         """Whether validation rose after the kept iterate, as training went on with noise."""
-        # Samples a parameter up to which that is overfitting: with as many, p/M = 0.1, fitted white
-        # noise is √((1 + p/M) / (1 - p/M)) = 1.1 times as large on other samples. If there are
-        # more, the map is too small instead: with 11 and 21 a larger one was the better on the
-        # coupled drives and the tanks.
-        many = self.samples <= 10 * self.parameters
         # Training error falls while validation rises.
-        return many and self.risen >= 1.05 and self.fell <= 0.99 and not self.states_missing
+        crowded = self.crowded and not self.states_missing
+        return crowded and self.risen >= 1.05 and self.fell <= 0.99
+
+    @property
+    def crowded(self) -> bool:
+        """Whether there are so many parameters that a smaller static map is advised."""
+        return not self.bears(1.0)
+
+    def bears(self, growth: float) -> bool:
+        """Whether the samples bear ``growth`` times the parameters."""
+        # With ten samples a parameter, p/M = 0.1, fitted white noise is √((1 + p/M) / (1 - p/M)) =
+        # 1.1 times as large on other samples. If there are more, the map is too small instead: with
+        # 11 and 21 a larger one was the better on the coupled drives and the tanks. A larger map
+        # with more is advised, so that the next fit's advice does not ask for a smaller one.
+        return self.samples > 10 * growth * self.parameters
+
+    @property
+    def close(self) -> bool:
+        """Whether errors on validation and training are so near that a larger map is advised."""
+        return not self.overtrained and (self.overfit or 0.0) <= _CLOSE
 
     @property
     def noise_limited(self) -> bool:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import ast
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import lfrtorch
-from lfrtorch.records import Record
+from lfrtorch.cli.composition import composed, spelt
+from lfrtorch.records import Channel, Record
 from lfrtorch.reporting import advice
 from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import Evidence
@@ -26,6 +31,8 @@ GOOD = Evidence(
     linear=0.01,
     nonlinear=0.01,
     transient=1.0,
+    parameters=60,
+    samples=4000,
     iterations=100,
     starts=(0.021, 0.022, 0.03),
     started=8,
@@ -42,6 +49,10 @@ def verdict(kind: Kind, use: str = "linear model") -> Verdict:
 
 OVERTRAINED = {"risen": 1.3, "fell": 0.7, "samples": 400, "parameters": 80}
 
+GUESSED = {"searched": False}
+
+USELESS = GUESSED | {"train": 0.19, "validation": 0.199}
+
 UNUSABLE = verdict(Kind.LINEAR, NEITHER)
 
 SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
@@ -55,12 +66,14 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
         (advice.diverges, {"diverged": [f"sweep {k}" for k in range(99)]}, "use ridge=1e-3"),
         (advice.starts_in_a_transient, {"transient": 4.0, "free": 0.9}, "skip=N"),
         (advice.nothing_held_out, {"validation": None, "linear_validation": None}, "hold out"),
-        (advice.validation_is_unlike, {"linear_validation": 0.4}, "cross-validate"),
-        (advice.validation_is_unlike, {"linear_validation": 0.1}, "cross-validate"),
+        (advice.validation_is_unlike, {"linear_validation": 0.4}, "(validation=0.4)"),
+        (advice.validation_is_unlike, {"linear_validation": 0.1}, "validation=[NAME]"),
         (advice.still_falling, {"falling": 0.05}, "max_iter=400"),
         (advice.still_falling, {"falling": 0.05, "trainer": lfrtorch.Adam()}, "max_iter=400"),
-        (advice.overfits, {"validation": 0.05}, "nn=5, or more data"),
-        (advice.overfits, OVERTRAINED, "nn=5, or more data"),
+        (advice.overfits, {"validation": 0.05}, "Overfit: more data"),
+        (advice.overfits, {"validation": 0.05, "samples": 400}, "Overfit: more data"),
+        (advice.overfits, GUESSED | {"validation": 0.05, "samples": 400}, "nn=5, or more data"),
+        (advice.overfits, GUESSED | OVERTRAINED, "nn=5, or more data"),
         (advice.linear_part_incomplete, {"linear": 0.5}, "nx=4, nx=5 or nx='auto'"),
         (
             advice.hardly_better,
@@ -73,13 +86,15 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
         (advice.tests_are_louder, {"louder": {"arrow": 1.5}}, "train on inputs as loud"),
         (advice.noise_unknown, {"noise": None}, "in steady state for training."),
         (advice.choose_sizes, {"searched": False}, "nx='auto', nz='auto', nw='auto', nn='auto'"),
-        (advice.largest_sizes, {"largest": ["nn"]}, "nn=10"),
+        (advice.largest_sizes, {"largest": ["nn"]}, "sizes_search.nn=[10,20]"),
         (advice.hardly_better, {"validation": 0.199}, "at any size searched"),
         (
             advice.hardly_better,
-            {"validation": 0.199, "searched": False, "linear": None, "started": 1},
+            USELESS | {"linear": None, "started": 1},
             "starts=8, nx=4, nn=20, nz=2, nw=2",
         ),
+        (advice.hardly_better, USELESS | {"samples": 900, "started": 1}, "starts=8."),
+        (advice.hardly_better, USELESS | {"samples": 900}, "more data."),
         (advice.at_the_noise, {"train": 0.0105, "validation": 0.011}, "nothing to gain"),
         (advice.neither_usable, {"verdict": UNUSABLE}, "hold in training alone"),
         (
@@ -103,10 +118,15 @@ def test_a_rule_speaks_if_its_number_says_so(rule, change, said):
 
 def test_nonlinear_behaviour_is_left_where_the_error_is_neither_noise_nor_linear():
     rule = advice.nonlinear_part_incomplete
-    polynomial = replace(GOOD, sizes={"nx": 3, "nz": 1, "nw": 1, "degree": 3})
+    guessed = replace(GOOD, searched=False)
+    polynomial = replace(guessed, sizes={"nx": 3, "nz": 1, "nw": 1, "degree": 3}, samples=9000)
     seen = replace(GOOD, noise=None, nonlinear=0.3)
     for found, said in (
-        (rule(GOOD), "nn=20, nz=2, nw=2. (training error 2.00 times the noise"),
+        (rule(GOOD), "at any size searched; more data may bear a larger map."),
+        (rule(guessed), "nn=20, nz=2, nw=2. (training error 2.00 times the noise"),
+        (rule(replace(guessed, samples=1300)), "left: nn=20. (training"),
+        (rule(replace(guessed, samples=1100)), "left: more data would bear a larger map."),
+        (rule(replace(guessed, validation=0.025)), "left: more data would bear a larger map."),
         (rule(polynomial), "degree=5"),
         (rule(seen), "30.0 % of the error's power"),
     ):
@@ -147,7 +167,7 @@ def test_what_spoils_the_linear_model_as_much_is_no_overfit():
 
 
 def test_where_training_goes_on_with_noise_nothing_larger_is_advised():
-    useless = {"validation": 0.19, "train": 0.15, "started": 1, "searched": False}
+    useless = {"validation": 0.19, "train": 0.18, "started": 1, "searched": False}
     larger = ("Nonlinear behaviour is left", "Hardly better", "Some outputs gain nothing")
     for fit in (GOOD, replace(GOOD, **useless), replace(GOOD, outputs={"y1": 0.95, "y2": 0.1})):
         assert any(str(item).startswith(larger) for item in advise(fit))
@@ -247,3 +267,52 @@ def test_a_fit_of_few_noisy_samples_is_overfit_and_one_of_many_is_not(samples, n
     run = lfrtorch.identify(lfrtorch.Dataset("noisy", [train], [validation], []), settings)
     assert any(item.text.startswith("Overfit:") for item in run.advice) is is_said
     assert not (is_said and any(item.text.startswith("Hardly better") for item in run.advice))
+
+
+@pytest.mark.parametrize("start", [{"nn": n} for n in (1, 2, 3, 15, 16)] + [{"degree": 3}])
+@pytest.mark.parametrize("nx", [1, 3])
+def test_the_advice_of_one_run_is_not_taken_back_by_the_next(start: dict[str, int], nx: int):
+    """Of larger sizes, whatever validation then says, no smaller ones follow; nor the reverse."""
+
+    def fit(sizes: dict[str, int], **changes: Any) -> Evidence:
+        static = lfrtorch.Polynomial if "degree" in sizes else lfrtorch.Network
+        size = sizes.get("degree") or sizes["nn"]
+        nx, nz, nw = (sizes[name] for name in ("nx", "nz", "nw"))
+        cell = lfrtorch.LFRCell(1, 1, nx, nz, nw, static=static(nz, nw, size))
+        u, y = (Channel(name) for name in "uy")
+        scaler = lfrtorch.Scaler(*np.ones((4, 1)))
+        model = lfrtorch.Model(lfrtorch.LFR(cell), scaler, 1.0, (u,), (y,))
+        count = model.net_parameter_count
+        return replace(GOOD, searched=False, sizes=sizes, parameters=count, **changes)
+
+    both = set()
+    sizes = {"nx": nx, "nz": 1, "nw": 1, **start}
+    for samples in np.unique(np.geomspace(50, 30000, 60).astype(int)):
+        before = fit(sizes, samples=samples)
+        for bad in ({"validation": 0.05}, {"risen": 1.3, "fell": 0.7}):
+            larger = advice.nonlinear_part_incomplete(before)
+            smaller = advice.overfits(replace(before, **bad))
+            if larger and larger.change:
+                both.add("larger")
+                after = advice.overfits(fit({**sizes, **larger.change}, samples=samples, **bad))
+                assert after is None or after.change is None
+            if smaller and smaller.change:
+                both.add("smaller")
+                after = advice.nonlinear_part_incomplete(
+                    fit({**sizes, **smaller.change}, samples=samples)
+                )
+                assert after is not None
+                assert after.change is None
+    assert both == {"larger", "smaller"} or start == {"nn": 1}
+
+
+def test_advice_asks_for_settings_that_there_are():
+    """In every text of the rules each NAME=VALUE is a setting, of the fit or of its files."""
+    known = dict(spelt(composed("config", ["data=file"])))
+    known |= {f"sizes_search.{one.name}": "" for one in fields(lfrtorch.SizesSearch)}
+    source = ast.parse(Path(advice.__file__).read_text(encoding="utf-8"))
+    constants = [n.value for n in ast.walk(source) if isinstance(n, ast.Constant)]
+    texts = [text for text in constants if isinstance(text, str)]
+    asked = re.findall(r"(?<![\w.])([a-z_.]+)=", "\n".join(texts))
+    assert {"validation", "ridge", "starts", "skip", "init_from", "max_iter"} <= set(asked)
+    assert [name for name in asked if name not in known] == []
