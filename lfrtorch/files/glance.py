@@ -93,6 +93,9 @@ def _roles(
     table: Table, inputs: Columns | None, outputs: Columns | None, time: str | int | None
 ) -> tuple[list[tuple[int, ...]], list[str]]:
     """Inputs, outputs and times, and remarks on the choice."""
+    told = list[str]()
+    if inputs is None and outputs is None:
+        inputs, outputs, told = table.by_name(inputs, outputs)
     u = () if inputs is None else table.find(inputs, "data.inputs")
     y = () if outputs is None else table.find(outputs, "data.outputs")
     stamps = () if time is None else table.find(time, "data.time")
@@ -103,7 +106,7 @@ def _roles(
             f"'{table.path}': {', '.join(map(repr, twice)) or 'data.time'} stands for several; "
             "give every column one use, and one column of times."
         )
-    heads, remarks = {}, list[str]()
+    heads, remarks = {}, told
     if not table.contents:
         remarks += [f"left out: {name!r} {reason}" for name, reason in table.refused.items()]
     rest = sorted(set(range(len(table.columns))) - set(named))

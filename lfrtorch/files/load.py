@@ -90,7 +90,8 @@ def load_records(
             sheet of a workbook. Default: its first that has samples.
         inputs: one or several names of columns or arrays, or column numbers from 0. An array of
             several channels is several inputs, and ``"acc[0]"`` is the first channel of ``acc``.
-        outputs: likewise.
+            Default: those whose names leave no doubt, as ``u``, or ``u1`` and ``u2``.
+        outputs: likewise; by name ``y``, or ``y1`` and ``y2``.
         fs: sampling frequency in Hz. Default: from ``time``.
         time: the column of time stamps, in seconds or as ISO date-times, evenly spaced. Default:
             one that is named as time is, or a lone number like ``Fs`` in a file of arrays.

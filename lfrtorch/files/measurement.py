@@ -67,8 +67,9 @@ class Measurement:
 def read_measurement(path: Path, wanted: Wanted) -> Measurement:
     """Read inputs, outputs and sampling frequency of a file; refuse gaps, unless to be split."""
     table = open_table(path)
-    u = table.find(wanted.inputs, "inputs")
-    y = table.find(wanted.outputs, "outputs")
+    inputs, outputs, told = table.by_name(wanted.inputs, wanted.outputs)
+    u = table.find(inputs, "inputs")
+    y = table.find(outputs, "outputs")
     r = () if wanted.reference is None else table.find(wanted.reference, "reference")
     if r and len(r) != len(u):
         raise InputError(
@@ -161,7 +162,7 @@ def read_measurement(path: Path, wanted: Wanted) -> Measurement:
             )
             for a, b in stretches
         ],
-        [*table.notes, *notes],
+        [*table.notes, *told, *notes],
     )
 
 

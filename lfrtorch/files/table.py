@@ -33,6 +33,11 @@ _ATOM = rf"(?:(?:da|[TGMkhdcmuµμnpf])?(?:{_SCALED})|{_OTHER})(?:\^?-?[0-9²³�
 _UNIT = re.compile(rf"{_ATOM}(?:[/*·. ]{_ATOM})*")
 _BRACKETS = re.compile(r"(.*)[(\[]([^()\[\]]*)[)\]]")
 _CHANNEL = re.compile(r"(.+)\[(\d+)\]")
+_SIDES = {
+    "inputs": re.compile(r"(u|uest|in|input)_?(\d*)", re.IGNORECASE),
+    "outputs": re.compile(r"(y|yest|out|output)_?(\d*)", re.IGNORECASE),
+}
+"""Names of columns that leave no doubt of their use, with a number if there are several."""
 
 _Row = TypeVar("_Row")
 
@@ -154,6 +159,29 @@ class Table(ABC):
                 f"from 0. '{self.path}' has {self.listed}."
             )
         return tuple(column for one in listed for column in self._find(one, option))
+
+    def by_name(
+        self, inputs: Columns | None, outputs: Columns | None
+    ) -> tuple[Columns | None, Columns | None, list[str]]:
+        """Inputs and outputs, those that are not given by the names of columns; and a note."""
+        told = {side: self._told(side) for side in _SIDES}
+        if inputs is not None:
+            del told["inputs"]
+        if outputs is not None:
+            del told["outputs"]
+        if not told or not all(told.values()):
+            return inputs, outputs, []
+        said = ", ".join(f"{side}={','.join(names)}" for side, names in told.items())
+        note = f"{said}, by the names of the columns"
+        return told.get("inputs", inputs), told.get("outputs", outputs), [note]
+
+    def _told(self, side: str) -> list[str]:
+        """The columns called as those of a side are: one, or several with a number each."""
+        found = [match for c in self.columns if (match := _SIDES[side].fullmatch(c.name))]
+        alike = len({match[1].lower() for match in found}) == 1
+        numbers = {match[2] for match in found}
+        clear = len(found) == 1 or (len(numbers) == len(found) and "" not in numbers)
+        return [match[0] for match in found] if alike and clear else []
 
     def _find(self, wanted: str | int, option: str) -> tuple[int, ...]:
         if isinstance(wanted, int):

@@ -139,6 +139,42 @@ def test_column_order_is_the_users(tmp_path, signals):
     assert np.array_equal(joined(data.tests[0]), signals[:, [2, 0, 1]])
 
 
+@pytest.mark.parametrize(
+    ("header", "told"),
+    [
+        ("t,u,y", "inputs=u, outputs=y"),
+        ("y2,y1,U (V)", "inputs=U, outputs=y2,y1"),
+        ("input_1,input_2,output", "inputs=input_1,input_2, outputs=output"),
+        ("uEst,yEst,uVal", "inputs=uEst, outputs=yEst"),
+        ("IN,OUT,temperature", "inputs=IN, outputs=OUT"),
+    ],
+)
+def test_names_that_leave_no_doubt_are_taken(tmp_path, signals, header, told):
+    path = write(tmp_path / "a.csv", signals, header)
+    data = load_records(path, fs=50)
+    assert f"{told}, by the names of the columns" in data.notes
+    u, y = (",".join(c.name for c in getattr(data.train[0], s)) for s in ("inputs", "outputs"))
+    assert f"inputs={u}, outputs={y}" == told
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["t,force,disp", "u,u1,y", "u,input,y", "u,y,y1", "u,disp,acc", "u,u,y", "u1,u2,u3", "v,w,y"],
+)
+def test_names_that_leave_a_doubt_are_not(tmp_path, signals, header):
+    path = write(tmp_path / "a.csv", signals, header)
+    refused(r"inputs is None; give inputs=\[", path, use={"fs": 50.0})
+
+
+def test_a_side_that_is_given_leaves_the_other_to_the_names(tmp_path, signals):
+    path = write(tmp_path / "a.csv", signals, "u,force,y")
+    data = load_records(path, inputs="force", fs=50)
+    assert "outputs=y, by the names of the columns" in data.notes
+    assert [channel.name for channel in data.train[0].inputs] == ["force"]
+    assert not any("by the names" in note for note in load_records(path, **BARE, fs=50).notes)
+    refused("outputs is None", write(path, signals, "u,force,disp"), use={"inputs": "u", "fs": 50})
+
+
 def test_columns_without_a_header(tmp_path, signals):
     bare = write(tmp_path / "b.csv", signals, header=None)
     data = load_records(bare, inputs=[0, 1], outputs=2, fs=1.0)
@@ -646,7 +682,8 @@ def test_refused_periods(tmp_path, signals):
 
 def test_refused_arguments(tmp_path, signals):
     path = write(tmp_path / "a.csv", signals)
-    refused(r"inputs is None.*'u1', 'u2', 'y'", path, inputs=None)
+    other = write(tmp_path / "b.csv", signals, "v1,v2,y")
+    refused(r"inputs is None.*'v1', 'v2', 'y'", other, inputs=None)
     refused(r"outputs is \[\]", path, outputs=[])
     refused(r"names of columns or their numbers", path, inputs=[1.5])
     refused("fs is 0; give a positive number", path, fs=0)
