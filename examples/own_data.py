@@ -7,9 +7,9 @@ y the level, every 0.5 s.
 
 On the command line the same is
 
-    lfrtorch preview tank.csv data.inputs=[pump] data.outputs=[level]
-    lfrtorch fit data=file data.path=tank.csv data.inputs=[pump] data.outputs=[level] \\
-        data.fs=2 data.start=estimated nx=1 nz=1 nw=1 nn=5 starts=4
+    lfrtorch preview tank.csv inputs=pump outputs=level
+    lfrtorch fit tank.csv inputs=pump outputs=level fs=2 \\
+        start=estimated nx=1 nz=1 nw=1 nn=5 starts=4
 """
 
 from pathlib import Path

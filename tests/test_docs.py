@@ -9,14 +9,15 @@ import pytest
 from matplotlib import pyplot
 
 import lfrtorch
-from lfrtorch.cli.composition import composed, first_run, parsed
+from lfrtorch.cli.composition import composed, first_run, in_full, parsed
+from lfrtorch.cli.quotes import quoted
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 
 COMMAND = re.compile(
-    r"^    lfrtorch (fit|linear|simulate|evaluate|export) (.+?)(?: +#.*)?$", re.MULTILINE
+    r"^    lfrtorch (preview|fit|linear|simulate|evaluate|export) (.+?)(?: +#.*)?$", re.MULTILINE
 )
 COMMANDS = sorted(
     {
@@ -55,11 +56,13 @@ def test_reference_has_all_that_is_exported():
 
 @pytest.mark.parametrize(("name", "words"), COMMANDS, ids=[" ".join(each) for each in COMMANDS])
 def test_command_of_the_guide_has_settings_that_exist(name: str, words: str):
-    overrides = [word for word in shlex.split(words) if word not in ("-m", "--help")]
-    if "-m" in words.split():
+    command = "config" if name == "fit" else name
+    given = in_full(command, [word for word in shlex.split(words) if word != "--help"])
+    overrides = [word for word in given if word != "-m"]
+    if "-m" in given:
         read = [parsed(word) for word in overrides]
         overrides = [first_run(word) for word in read if not word.is_hydra_override()]
-    composed("config" if name == "fit" else name, overrides)
+    composed(command, [quoted(word) for word in overrides])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -54,4 +54,5 @@ def start(command: str) -> None:
 def usage() -> str:
     """All commands, a line each."""
     lines = [f"  lfrtorch {name:10}{what}" for name, what in COMMANDS.items()]
-    return "\n".join(["usage: lfrtorch COMMAND --help", *lines])
+    example = "for example: lfrtorch fit x.csv inputs=force outputs=disp fs=750 nx=3"
+    return "\n".join(["usage: lfrtorch COMMAND --help", *lines, example])

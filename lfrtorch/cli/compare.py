@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from lfrtorch._support.errors import InputError, LfrtorchError, brief
 from lfrtorch._support.paths import real
-from lfrtorch.cli.composition import composed, name_paths, started
+from lfrtorch.cli.composition import composed, started
 from lfrtorch.cli.config import one_record
 from lfrtorch.cli.quotes import quoted
 from lfrtorch.cli.run_folder import OVERRIDES, words_of
@@ -23,8 +23,7 @@ from lfrtorch.reporting import comparison
 
 def launch() -> None:
     """The command; a word without a name is a folder."""
-    name_paths("folders")
-    started("compare", chosen)
+    started("compare", chosen, unnamed="folders")
 
 
 def chosen(cfg: DictConfig) -> None:
@@ -33,7 +32,8 @@ def chosen(cfg: DictConfig) -> None:
         raise InputError("no folder of runs is named; give one or several.")
     out = [] if cfg.out is None else [str(cfg.out)]
     record = None if cfg.get("data") is None else one_record(cfg)
-    run([Path(folder) for folder in cfg.folders], *out, record=record)
+    folders = [cfg.folders] if isinstance(cfg.folders, str) else cfg.folders
+    run([Path(folder) for folder in folders], *out, record=record)
 
 
 def _record_of_run(folder: Path) -> Record | None:
@@ -45,7 +45,7 @@ def _record_of_run(folder: Path) -> Record | None:
     except (LfrtorchError, OSError) as error:
         print(
             f"note: the data of '{folder}' cannot be read ({brief(error)}), so the page shows no "
-            "record; words of lfrtorch fit choose other data: data=file data.path=FILE\n"
+            "record; words of lfrtorch fit choose other data: data.path=FILE\n"
         )
         return None
 

@@ -14,16 +14,19 @@ import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Glob, Override
+from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.paths import expanded
 from lfrtorch.cli import CONF, declared
 from lfrtorch.cli.errors import user_errors
 from lfrtorch.cli.hydra_versions import COMPOSED, MAIN
-from lfrtorch.cli.quotes import in_quotes, quoted
+from lfrtorch.cli.quotes import in_quotes, is_read, quoted
+from lfrtorch.files.excel import workbook
+from lfrtorch.files.formats import FORMATS, extension, similar
 
 GROUPS = ("bla", "frf", "data", "trainer")
 """Groups whose words are arguments of functions. Of a name in several, the last one is meant."""
@@ -33,14 +36,83 @@ declared.register()
 SWEEPS = {"-m", "--multirun"}
 """Options that make several runs of several values."""
 
-_SETTING = re.compile(r"[+~]*[a-z_.]+=")  # what a word NAME=VALUE begins with
+_SETTING = re.compile(r"[+~]*(?:hydra/)?[\w.]+=")  # what a word NAME=VALUE begins with
+_DATA_CHOSEN = {"config", "linear", "evaluate", "compare"}  # commands whose data are a group
+_LISTS = {"data.inputs", "data.outputs", "data.reference"}
 
 
-def take_words(command: str, whole: Callable[[Sequence[str]], list[str]] = list) -> None:
+def take_words(
+    command: str,
+    whole: Callable[[Sequence[str]], list[str]] = list,
+    unnamed: str = "data.path",
+) -> None:
     """Check the words, after ``whole`` has completed them, and quote them for Hydra."""
-    given = in_groups(command, sys.argv[1:])
+    given = in_full(command, sys.argv[1:], unnamed)
     sys.argv[1:] = [quoted(word) for word in whole(given)]
     check_words(command, given, sys.argv[1:])
+
+
+def in_full(command: str, given: Sequence[str], unnamed: str = "data.path") -> list[str]:
+    """The words with all that follows from them: ``x.csv inputs=u`` are a file and its columns."""
+    words = with_names(given, unnamed)
+    names = {word.partition("=")[0].lstrip("+") for word in words}
+    chosen = not names.isdisjoint({"data", "bench", "resume"})
+    if command in _DATA_CHOSEN and not chosen and not names.isdisjoint({"path", "data.path"}):
+        words = ["data=file", *words]
+    several = not SWEEPS.isdisjoint(words)
+    return [_listed(word, several=several) for word in in_groups(command, words)]
+
+
+def with_names(given: Sequence[str], option: str) -> list[str]:
+    """The words, those without a name as values of ``option``; of data only what may be a file."""
+    other = [
+        word
+        for word in given
+        if not word
+        or word[0] == "-"
+        or (word[0] == "~" and "/" not in word)
+        or (_SETTING.match(word) and not os.path.exists(word))
+        or (option == "data.path" and not _may_be_file(word))
+    ]
+    paths = [_plain_or_quoted(option, word) for word in given if word not in other]
+    if not paths:
+        return other
+    short = option.rpartition(".")[2]
+    if any(word.startswith((f"{option}=", f"{short}=")) for word in other):
+        raise InputError(f"{option} is given twice; a path alone is {option}, too.")
+    value = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
+    return [f"{option}={value}", *other]
+
+
+def _may_be_file(word: str) -> bool:
+    """Whether a word is a file, a pattern of files, or called as a file of measurements is."""
+    path, _ = workbook(expanded(word))
+    if path.is_dir() or ("=" in word and not path.exists()):
+        return False
+    if path.is_file() or not {"*", "?"}.isdisjoint(word) or extension(path) in FORMATS:
+        return True
+    if path.suffix[1:].isalpha():
+        raise InputError(f"there is no file '{path}'{similar(path)}.")
+    return False
+
+
+def _plain_or_quoted(option: str, path: str) -> str:
+    """A path as a value, in quotes where Hydra would read it as something else."""
+    word = f"{option}={path}"
+    return path if is_read(word) and parsed(word).value() == path else in_quotes(path)
+
+
+def _listed(word: str, *, several: bool) -> str:
+    """Names of columns without brackets as a list; several of them are runs if there are some."""
+    name, _, value = quoted(word).partition("=")
+    if name not in _LISTS or not is_read(f"{name}={value}"):
+        return word
+    read = parsed(word).value()
+    if isinstance(read, ChoiceSweep):
+        single = read.simple_form and not several
+    else:
+        single = isinstance(read, str | int | QuotedString)
+    return f"{name}=[{value}]" if single else word
 
 
 def in_groups(command: str, given: Sequence[str]) -> list[str]:
@@ -52,7 +124,8 @@ def in_groups(command: str, given: Sequence[str]) -> list[str]:
     if not bare:
         return list(given)
     words = [parsed(word) for word, name in zip(given, named, strict=True) if name]
-    names = dict(spelt(composed(command, [first_run(w) for w in words if is_choice(w)])))
+    cfg = composed(command, [first_run(w) for w in words if is_choice(w)])
+    names = dict(spelt(_with_data(command, cfg)))
     return [
         names.get(name, name) + word[len(name) :] if name in bare else word
         for word, name in zip(given, named, strict=True)
@@ -63,6 +136,7 @@ def started(
     command: str,
     work: Callable[[DictConfig], object],
     whole: Callable[[Sequence[str]], list[str]] = list,
+    unnamed: str = "data.path",
 ) -> None:
     """Start a command of one run; errors of users end it with a line."""
 
@@ -71,19 +145,8 @@ def started(
             work(cfg)
 
     with user_errors():
-        take_words(command, whole)
+        take_words(command, whole, unnamed)
     hydra.main(**MAIN, config_path=str(CONF), config_name=command)(job)()
-
-
-def name_paths(option: str) -> None:
-    """Let an option have the words of the command line that are paths and have no name."""
-    given = sys.argv[1:]
-    named = [w for w in given if w[:1] == "-" or (_SETTING.match(w) and not os.path.exists(w))]
-    paths = [in_quotes(word) for word in given if word not in named]
-    with user_errors():
-        if paths and any(word.startswith(f"{option}=") for word in named):
-            raise InputError(f"{option} is given twice; a path alone is {option}, too.")
-    sys.argv[1:] = [*named, *[f"{option}=[{','.join(paths)}]"] * bool(paths)]
 
 
 def check_words(command: str, given: Sequence[str], used: Sequence[str] = ()) -> None:
@@ -127,10 +190,14 @@ def parsed(word: str) -> Override:
             raise HydraException("no name")
         return found
     except HydraException:
-        path = Path(word)
-        if path.is_dir() or path.is_file():
-            name = "checkpoint=" if path.is_dir() else "data=file data.path="
-            raise InputError(f"'{word}' has no name; did you mean {name}{word}?") from None
+        if Path(word).is_dir():
+            raise InputError(
+                f"'{word}' is a folder: give its files, or checkpoint={word} if it has a model."
+            ) from None
+        if re.fullmatch(r"[\w./-]+", word):
+            raise InputError(
+                f"'{word}' is neither a setting, NAME=VALUE, nor a file{similar(expanded(word))}."
+            ) from None
         raise InputError(
             f"'{word}' is not understood; write NAME=VALUE, and quotes around the word if a space, "
             "a comma or a bracket stands in its value: \"NAME='VALUE'\"."
@@ -192,11 +259,9 @@ def unknown(command: str, word: Override, cfg: DictConfig) -> str:
     """What to write for a setting that there is not."""
     key = word.key_or_group
     _, value = str(word.input_line).split("=", 1)
-    if command != "export" and cfg.get("data") is None:
-        if key.startswith("data."):
-            return f"{key} is of no use before data are chosen: add data=file, or +bench=NAME."
-        cfg = DictConfig({**cfg, "data": OmegaConf.load(CONF / "data" / "file.yaml")})
-    names = dict(spelt(cfg))
+    if command in _DATA_CHOSEN and cfg.get("data") is None and key.startswith("data."):
+        return f"{key} is of no use before data are chosen: add a file, or +bench=NAME."
+    names = dict(spelt(_with_data(command, cfg)))
     close = get_close_matches(key, names, n=1, cutoff=0.75)
     if close:
         meant = f"did you mean {names[close[0]]}={value}?"
@@ -205,6 +270,13 @@ def unknown(command: str, word: Override, cfg: DictConfig) -> str:
     else:
         meant = "--help lists them all."
     return f"there is no setting '{key}'; {meant}"
+
+
+def _with_data(command: str, cfg: DictConfig) -> DictConfig:
+    """The configuration; if no data are chosen, with the settings of files."""
+    if command not in _DATA_CHOSEN or cfg.get("data") is not None:
+        return cfg
+    return DictConfig({**cfg, "data": OmegaConf.load(CONF / "data" / "file.yaml")})
 
 
 def spelt(cfg: DictConfig) -> Iterator[tuple[str, str]]:

@@ -105,6 +105,6 @@ def require_data(cfg: DictConfig) -> None:
     """Say how data are chosen if none are."""
     if cfg.get("data") is None:
         raise InputError(
-            "no data chosen: add +bench=boucwen, or data=file data.path=FILE "
-            "data.inputs=[...] data.outputs=[...] data.fs=HZ nx=ORDER (or nx=auto)."
+            "no data chosen: add +bench=boucwen, or a file and its columns, "
+            "x.csv inputs=force outputs=disp fs=HZ nx=ORDER (or nx=auto)."
         )

@@ -3,7 +3,7 @@
 lfrtorch fit +bench=boucwen
 lfrtorch fit -m +bench=boucwen 'seed=range(20)' nn=5,10 hydra.sweep.dir=DIR
 lfrtorch fit resume=runs/boucwen/DATE
-lfrtorch fit data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750 nx=3
+lfrtorch fit x.csv inputs=force outputs=disp fs=750 nx=3
 torchrun --nproc-per-node 2 -m lfrtorch.cli fit ...
 """
 
@@ -98,8 +98,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             if found.verdict.use == LINEAR_MODEL:
                 checkpoint = shlex.quote(f"checkpoint={folder / 'linear'}")
                 print(
-                    f"\nThe linear model: lfrtorch simulate {checkpoint} data.path=NEW.csv "
-                    "out=PREDICTED.csv"
+                    f"\nThe linear model: lfrtorch simulate {checkpoint} NEW.csv out=PREDICTED.csv"
                 )
             print(f"\nRun in {folder}" + f", its report in {folder / 'report.html'}" * cfg.figures)
             print(f"TensorBoard: tensorboard --logdir {folder}")

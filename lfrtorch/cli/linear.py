@@ -1,7 +1,7 @@
 """The linear model alone: records -> frequency response -> BLA -> table, figures, checkpoint.
 
 lfrtorch linear +bench=boucwen
-lfrtorch linear data=file data.path=x.csv data.inputs=[u] data.outputs=[y] data.fs=750 nx=auto
+lfrtorch linear x.csv inputs=force outputs=disp fs=750 nx=auto
 """
 
 from __future__ import annotations

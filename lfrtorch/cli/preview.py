@@ -11,7 +11,7 @@ from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
-from lfrtorch.cli.composition import name_paths, started
+from lfrtorch.cli.composition import started
 from lfrtorch.files.formats import open_table
 from lfrtorch.files.glance import look_at
 from lfrtorch.files.load import listed_files, stem_of
@@ -24,8 +24,7 @@ FIGURES = (".png", ".pdf", ".svg")
 
 
 def launch() -> None:
-    """The command; a word without a name is the path of a file."""
-    name_paths("data.path")
+    """The command."""
     started("preview", preview)
 
 

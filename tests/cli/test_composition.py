@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 
 from lfrtorch import InputError
-from lfrtorch.cli.composition import check_words, in_groups
+from lfrtorch.cli.composition import check_words, composed, in_full, in_groups, parsed
+from lfrtorch.cli.quotes import quoted
 
 FILE = ["data=file", "data.path=x.csv"]
+PATTERN = ["data=file", "data.path='runs/*.mat'"]
+INPUTS = ["data.inputs=[0]"]
 
 
 @pytest.mark.parametrize(
@@ -25,7 +28,7 @@ FILE = ["data=file", "data.path=x.csv"]
         ("config", ["bench=boucwen"], "a benchmark is added to the settings: +bench=boucwen."),
         ("config", [*FILE, "data.zzzz=1"], "'data.zzzz'; if the function takes it, write +data.zz"),
         ("config", [*FILE, "zzzz=1"], "no setting 'zzzz'; --help lists them all."),
-        ("config", ["data.path=x.csv"], "add data=file, or +bench=NAME"),
+        ("config", ["data.path=x.csv"], "add a file, or +bench=NAME"),
         ("config", [*FILE, "data.inputs=a,b"], "for a list write data.inputs=[a,b], for a run"),
         ("config", [*FILE, "nx=1,2"], "nx=1,2 has several values: for a run of each of them add"),
         ("config", ["static=poly"], "no static=poly; give network, own, polynomial."),
@@ -38,7 +41,8 @@ FILE = ["data=file", "data.path=x.csv"]
         ("config", ["+bench=tanks"], "no bench=tanks; give boucwen, "),
         ("config", ["-m", *FILE, "seed=interval(0,9)", "zzzz=1"], "no setting 'zzzz'"),
         ("config", ["-m", *FILE, "trainer=glob(*)", "data.input=[u]"], "did you mean data.inputs"),
-        ("config", ["x.csv"], "'x.csv' is not understood; write NAME=VALUE"),
+        ("config", ["zzzz"], "'zzzz' is neither a setting, NAME=VALUE, nor a file"),
+        ("config", ["two words"], "'two words' is not understood; write NAME=VALUE"),
         ("config", ["data.inputs=[u,"], "write NAME=VALUE, and quotes"),
         ("config", ["hydra/launcher=nowhere"], "Could not find 'hydra/launcher/nowhere'"),
         ("linear", [*FILE, "frf.metod=fast"], "'frf.metod'; did you mean frf.method=fast?"),
@@ -58,12 +62,11 @@ def test_an_unknown_word_is_refused_in_one_line(command: str, words: list[str], 
     assert "HYDRA_FULL_ERROR" not in text
 
 
-def test_a_path_without_a_name_gets_one(tmp_path: Path):
-    file = tmp_path / "x.csv"
-    file.touch()
-    for path, meant in ((file, "data=file data.path="), (tmp_path, "checkpoint=")):
-        with pytest.raises(InputError, match=re.escape(f"did you mean {meant}{path}?")):
-            check_words("evaluate", [str(path)])
+def test_a_folder_is_no_file(tmp_path: Path):
+    for folder in (tmp_path, tmp_path / "a=b.csv"):
+        folder.mkdir(exist_ok=True)
+        with pytest.raises(InputError, match=re.escape(f"give its files, or checkpoint={folder}")):
+            check_words("evaluate", in_full("evaluate", [str(folder)]))
 
 
 @pytest.mark.parametrize(
@@ -113,3 +116,76 @@ def test_names_as_messages_have_them_are_taken(command: str, words: list[str], t
     found = in_groups(command, words)
     for word, given, name in zip(found, words, taken, strict=True):
         assert word == (name if name in (*FILE, "-m") else f"{name}={given.partition('=')[2]}")
+
+
+WHOLE = [*FILE, "data.inputs=[force]", "data.outputs=[disp]", "data.fs=750", "nx=3"]
+
+
+@pytest.mark.parametrize(
+    ("command", "short", "long"),
+    [
+        ("config", "x.csv inputs=force outputs=disp fs=750 nx=3", WHOLE),
+        ("linear", "inputs=force nx=3 x.csv fs=750 outputs=disp", WHOLE),
+        ("config", "path=x.csv data.inputs=force data.outputs=[disp] data.fs=750 nx=3", WHOLE),
+        ("config", "data=file x.csv inputs=0 outputs=2,1", [*FILE, *INPUTS, "data.outputs=[2,1]"]),
+        ("evaluate", "checkpoint=m x.csv", ["checkpoint=m", *FILE]),
+        ("simulate", "checkpoint=m x.csv inputs=0", ["checkpoint=m", FILE[1], *INPUTS]),
+        ("preview", "x.csv y.mat.csv", ["data.path=[x.csv,y.mat.csv]"]),
+        ("config", "runs/*.mat test=sweep.csv", [*PATTERN, "data.test=sweep.csv"]),
+        ("compare", "folders=runs/a path=x.csv", ["folders=runs/a", *FILE]),
+        ("config", "x.csv inputs=null", [*FILE, "data.inputs=null"]),
+        ("config", "x.csv reference=r,'s,t'", [*FILE, "data.reference=[r,'s,t']"]),
+        ("config", "+bench=boucwen seed=1", ["+bench=boucwen", "seed=1"]),
+    ],
+)
+def test_few_words_are_a_whole_command_line(command: str, short: str, long: list[str]):
+    words = [quoted(word) for word in in_full(command, short.split())]
+    check_words(command, words)
+    assert composed(command, words) == composed(command, long)
+
+
+def test_names_of_columns_that_need_quotes_are_a_list_too():
+    words = ["x.csv", "inputs=Force (N),acc[0]", "outputs='Weg [mm]'"]
+    cfg = composed("config", [quoted(word) for word in in_full("config", words)])
+    assert (cfg.data.inputs, cfg.data.outputs) == (["Force (N)", "acc[0]"], ["Weg [mm]"])
+
+
+def test_a_comma_is_a_list_of_columns_or_of_runs():
+    words = ["x.csv", "inputs=a,b", "outputs=y", "nn=5,10"]
+    assert in_full("config", words)[2:] == ["data.inputs=[a,b]", "data.outputs=[y]", "nn=5,10"]
+    found = in_full("config", ["-m", *words])
+    assert found[:2] == ["data=file", "data.path=x.csv"]
+    assert found[3:] == ["data.inputs=a,b", "data.outputs=[y]", "nn=5,10"]
+    check_words("config", found)
+    assert in_full("config", ["-m", "x.csv", "inputs=[a],[b]"])[-1] == "data.inputs=[a],[b]"
+
+
+def test_paths_that_hydra_would_read_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    names = ["5", "a,b.csv", "a=1.csv", "{x}.csv", "null", "it's.csv", "Maß 1.csv"]
+    for name in names:
+        (tmp_path / name).touch()
+    path, *other = in_full("simulate", names)
+    assert (parsed(path).value(), other) == (names, [])
+    for name in names:
+        (word,) = in_full("preview", [name])
+        assert composed("preview", [word]).data.path == name
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["x.cvs"], "there is no file 'x.cvs'; there is 'x.csv' in its folder."),
+        (["force"], "'force' is neither a setting, NAME=VALUE, nor a file; its folder has 'x.csv'"),
+        (["x.csv", "data.path=x.csv"], "data.path is given twice"),
+        (["x.csv", "path=x.csv"], "data.path is given twice"),
+        (["x.csv", "input=u"], "no setting 'input'; did you mean data.inputs=u?"),
+        (["inputs=u,v"], "data.inputs is of no use before data are chosen: add a file, or +bench="),
+        (["q" * 300 + ".csv"], "is no path (File name too long)"),
+    ],
+)
+def test_few_words_that_are_wrong(words, message, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "x.csv").touch()
+    with pytest.raises(InputError, match=re.escape(message)):
+        check_words("config", in_full("config", words))

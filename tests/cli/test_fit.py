@@ -349,6 +349,19 @@ def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, t
     assert metrics["scores"]["test"]["rmse"] < metrics["scores"]["test"]["lti_rmse"]
 
 
+@pytest.mark.usefixtures("untraced")
+def test_a_run_of_few_words_is_saved_in_full_and_goes_on(
+    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words = ["nx=1", "nn=2", "figures=false", "max_iter=1", "fs=10"]
+    launched(monkeypatch, str(csv), *words, f"hydra.run.dir={tmp_path}")
+    assert "note: inputs=u, outputs=y, by the names of the columns" in capsys.readouterr().out
+    assert run_folder.words_of(tmp_path)[:2] == ["data=file", f"data.path={csv}"]
+    launched(monkeypatch, f"resume={tmp_path}", "max_iter=2")
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["fit"]["iterations"] == 2
+
+
 @pytest.mark.numeric
 def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "starts=2", "trainer.max_iter=8", "threads=1"]

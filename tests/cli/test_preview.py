@@ -127,6 +127,15 @@ def test_without_roles_all_columns_are_shown(file: Path, run):
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_columns_that_are_called_as_signals_are(file: Path, signals, run):
+    named = written(file, {"u": signals["force"], "y": signals["level"]})
+    out = run(named, "fs=50")
+    assert "inputs=u, outputs=y, by the names of the columns" in out
+    assert "what lies between them is not looked at" not in out
+    assert "outputs: u, all other columns" in run(named, "inputs=y")
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_the_other_columns_are_outputs(file: Path, run):
     assert "outputs: level, all other columns" in run(file, "data.inputs=[1]")
     assert "inputs: force, all other columns" in run(file, "data.outputs=[level]")
@@ -262,7 +271,8 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
     for word, message in (
         ("data.start=zero", "there is no setting 'data.start'"),
         ("nx=2", "there is no setting 'nx'"),
-        ("data.inputs=a,b", "for a list write data.inputs=[a,b]"),
+        ("data.inputs=a,b", "has no column 'a', named in data.inputs"),
+        ("data.fs=1,2", "data.fs=1,2 has several values: for a list write data.fs=[1,2]"),
         (f"data.path={file}", "data.path is given twice"),
         ("data.inputs=[a", "is not understood"),
         ("data.fs=-3", "data.fs is -3; give a positive number"),
