@@ -89,11 +89,7 @@ def _may_be_file(word: str) -> bool:
     path, _ = workbook(expanded(word))
     if path.is_dir() or ("=" in word and not path.exists()):
         return False
-    if path.is_file() or not {"*", "?"}.isdisjoint(word) or extension(path) in FORMATS:
-        return True
-    if path.suffix[1:].isalpha():
-        raise InputError(f"there is no file '{path}'{similar(path)}.")
-    return False
+    return path.is_file() or not {"*", "?"}.isdisjoint(word) or extension(path) in FORMATS
 
 
 def _plain_or_quoted(option: str, path: str) -> str:

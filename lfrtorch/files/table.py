@@ -164,16 +164,13 @@ class Table(ABC):
         self, inputs: Columns | None, outputs: Columns | None
     ) -> tuple[Columns | None, Columns | None, list[str]]:
         """Inputs and outputs, those that are not given by the names of columns; and a note."""
-        told = {side: self._told(side) for side in _SIDES}
-        if inputs is not None:
-            del told["inputs"]
-        if outputs is not None:
-            del told["outputs"]
+        given = {"inputs": inputs, "outputs": outputs}
+        told = {side: self._told(side) for side in given if given[side] is None}
         if not told or not all(told.values()):
             return inputs, outputs, []
         said = ", ".join(f"{side}={','.join(names)}" for side, names in told.items())
-        note = f"{said}, by the names of the columns"
-        return told.get("inputs", inputs), told.get("outputs", outputs), [note]
+        given |= told
+        return given["inputs"], given["outputs"], [f"{said}, by the names of the columns"]
 
     def _told(self, side: str) -> list[str]:
         """The columns called as those of a side are: one, or several with a number each."""

@@ -28,6 +28,7 @@ _TRANSIENT = 3.0  # error in the first twentieth of the scored samples over that
 
 
 _LOUDER = 1.25  # largest test input over the largest in training above which the model extrapolates
+_CLOSE = 1.2  # growth as of OVERFIT, up to which a larger map is advised
 _FEW = 3  # most records or outputs that are named
 
 
@@ -380,12 +381,9 @@ def _larger(e: Evidence, states: Mapping[str, int] = MappingProxyType({})) -> di
 
 
 def _borne(e: Evidence, change: Mapping[str, int]) -> bool:
-    """Whether larger sizes are advised: errors are near each other, and there are samples for it.
-
-    The next fit has at most ``growth`` times the parameters, and is not called overfit for them.
-    """
+    """Whether larger sizes are advised: validation has not grown, and the samples bear them."""
     growth = _weights({**e.sizes, **change}) / _weights(e.sizes)
-    return e.close and e.bears(growth)
+    return (e.overfit or 0.0) <= _CLOSE and e.bears(growth)
 
 
 def _weights(sizes: Mapping[str, int]) -> int:

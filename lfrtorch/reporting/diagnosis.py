@@ -44,8 +44,6 @@ OVERFIT = 1.5
 """Growth from training to validation of the NL-LFR's error over that of the linear model's, which
 sees how the records differ."""
 
-_CLOSE = 1.2  # that growth, up to which a larger map is advised
-
 USELESS = 0.9
 """Error over the linear model's from which on the NL-LFR is hardly better."""
 
@@ -173,11 +171,6 @@ class Evidence:
         # 11 and 21 a larger one was the better on the coupled drives and the tanks. A larger map
         # with more is advised, so that the next fit's advice does not ask for a smaller one.
         return self.samples > 10 * growth * self.parameters
-
-    @property
-    def close(self) -> bool:
-        """Whether errors on validation and training are so near that a larger map is advised."""
-        return not self.overtrained and (self.overfit or 0.0) <= _CLOSE
 
     @property
     def noise_limited(self) -> bool:

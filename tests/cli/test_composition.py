@@ -175,7 +175,8 @@ def test_paths_that_hydra_would_read_otherwise(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["x.cvs"], "there is no file 'x.cvs'; there is 'x.csv' in its folder."),
+        (["x.cvs"], "'x.cvs' is neither a setting, NAME=VALUE, nor a file; there is 'x.csv' in"),
+        (["x.cvs", "fs=750"], "'x.cvs' is neither a setting, NAME=VALUE, nor a file; there is"),
         (["force"], "'force' is neither a setting, NAME=VALUE, nor a file; its folder has 'x.csv'"),
         (["x.csv", "data.path=x.csv"], "data.path is given twice"),
         (["x.csv", "path=x.csv"], "data.path is given twice"),
