@@ -55,10 +55,11 @@ def take_words(
 def in_full(command: str, given: Sequence[str], unnamed: str = "data.path") -> list[str]:
     """The words with all that follows from them: ``x.csv inputs=u`` are a file and its columns."""
     words = with_names(given, unnamed)
-    names = {word.partition("=")[0].lstrip("+") for word in words}
-    chosen = not names.isdisjoint({"data", "bench", "resume"})
-    if command in _DATA_CHOSEN and not chosen and not names.isdisjoint({"path", "data.path"}):
-        words = ["data=file", *words]
+    names = [word.partition("=")[0].lstrip("+") for word in words]
+    at = next((i for i, name in enumerate(names) if name in ("path", "data.path")), None)
+    chosen = not {"data", "bench", "resume"}.isdisjoint(names)
+    if command in _DATA_CHOSEN and not chosen and at is not None:
+        words.insert(at, "data=file")
     several = not SWEEPS.isdisjoint(words)
     return [_listed(word, several=several) for word in in_groups(command, words)]
 
@@ -81,7 +82,8 @@ def with_names(given: Sequence[str], option: str) -> list[str]:
     if any(word.startswith((f"{option}=", f"{short}=")) for word in other):
         raise InputError(f"{option} is given twice; a path alone is {option}, too.")
     value = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
-    return [f"{option}={value}", *other]
+    at = next(i for i, word in enumerate(given) if word not in other)  # options stay where they are
+    return [*other[:at], f"{option}={value}", *other[at:]]
 
 
 def _may_be_file(word: str) -> bool:

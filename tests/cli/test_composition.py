@@ -154,7 +154,7 @@ def test_a_comma_is_a_list_of_columns_or_of_runs():
     words = ["x.csv", "inputs=a,b", "outputs=y", "nn=5,10"]
     assert in_full("config", words)[2:] == ["data.inputs=[a,b]", "data.outputs=[y]", "nn=5,10"]
     found = in_full("config", ["-m", *words])
-    assert found[:2] == ["data=file", "data.path=x.csv"]
+    assert found[:3] == ["-m", "data=file", "data.path=x.csv"]
     assert found[3:] == ["data.inputs=a,b", "data.outputs=[y]", "nn=5,10"]
     check_words("config", found)
     assert in_full("config", ["-m", "x.csv", "inputs=[a],[b]"])[-1] == "data.inputs=[a],[b]"

@@ -155,9 +155,10 @@ def test_processes_that_are_killed_are_replaced(capsys: pytest.CaptureFixture[st
 @pytest.mark.numeric
 @pytest.mark.usefixtures("untraced")
 def test_runs_follow_each_other(csv, tmp_path, monkeypatch, capfd):
+    few = ["-m", str(csv), "inputs=u", "outputs=y", "fs=10"]
     words = ["-m", *file_overrides(csv), *SHORT, "nn=2,0", f"hydra.sweep.dir={tmp_path}"]
     with pytest.raises(SystemExit):
-        launched(monkeypatch, *words)
+        launched(monkeypatch, *few, *SHORT, "nn=2,0", f"hydra.sweep.dir={tmp_path}")
     said = capfd.readouterr().out
     assert "1 of 2 runs" in said
     assert "nn=0: failed: nn is 0" in said
