@@ -59,4 +59,11 @@ def launched(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
 
 
 def file_overrides(csv: Path) -> list[str]:
-    return ["data=file", f"data.path={csv}", "data.inputs=[u]", "data.outputs=[y]", "data.fs=10"]
+    return [
+        "data=file",
+        f"data.path={csv}",
+        "data.inputs=[u]",
+        "data.outputs=[y]",
+        "data.fs=10",
+        "data.start=zero",
+    ]

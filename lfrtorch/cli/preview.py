@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
+import numpy as np
 from omegaconf import DictConfig
 
 from lfrtorch._support import tables
@@ -13,9 +14,11 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.paths import real
 from lfrtorch.cli.composition import started
 from lfrtorch.files.formats import open_table
-from lfrtorch.files.glance import look_at
+from lfrtorch.files.glance import Glance, look_at
 from lfrtorch.files.load import listed_files, stem_of
-from lfrtorch.records import check_rate
+from lfrtorch.linear.record_start import try_starts
+from lfrtorch.periods import find_period
+from lfrtorch.records import Record, check_rate
 from lfrtorch.reporting.survey_plots import survey_figure
 from lfrtorch.survey.measurement import survey_measurement
 from lfrtorch.survey.notes import examine
@@ -71,6 +74,7 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
         remarks.append(
             "without data.inputs and data.outputs what lies between them is not looked at"
         )
+    remarks += beginning(seen)
     print(f"{path}: {len(seen.y)} samples{'' if seen.fs is None else f' at {seen.fs:.6g} Hz'}")
     for remark in remarks:
         print(f"  {remark}")
@@ -85,3 +89,15 @@ def show(path: Path, data: DictConfig, figure: Path) -> None:
     with whole_file(figure) as fresh:
         survey_figure(found, seen.spread(), path.name).savefig(fresh, dpi=110)
     print(f"\nFigure in {figure}\n")
+
+
+def beginning(seen: Glance) -> list[str]:
+    """How a fit would take the record to begin, if its linear models tell that."""
+    T = round(0.8 * len(seen.y))  # by default the rest is the test
+    u, y = seen.u[:T], seen.y[:T]
+    if not seen.inputs or not np.isfinite(u).all() or find_period(u) is not None:
+        return []
+    try:
+        return [str(try_starts(Record(u, y, fs=seen.fs or 1.0, valid=np.isfinite(y))))]
+    except InputError:
+        return []

@@ -29,6 +29,7 @@ from lfrtorch.files.measurement import (
 )
 from lfrtorch.files.split import TooShortError, cut
 from lfrtorch.files.table import Columns, NoColumnError
+from lfrtorch.linear.record_start import try_starts
 from lfrtorch.periods import find_period, find_transient
 from lfrtorch.records import Record
 from lfrtorch.score_window import SHORTEST, warm_up
@@ -39,11 +40,14 @@ __all__ = ["load_records"]
 Paths = str | Path | Sequence[str | Path]
 Use = float | str | Path | Sequence[str | Path] | None
 
-Start = Literal["zero", "estimated", "periodic"]
+Start = Literal["auto", "zero", "estimated", "periodic"]
 Period = int | Literal["auto"] | None
 
 EVERYTHING = "all"
 """Value of ``test`` that takes all records."""
+
+_TRIED = 3
+"""Most training records that tell whether all begin in motion: a trial takes some seconds."""
 
 _LEFT_OUT = "left out, as it is too short"
 _SAME = 1e-4  # relative, of sampling frequencies: what printed time stamps leave open
@@ -70,7 +74,7 @@ def load_records(
     units: Mapping[str | int, str] | None = None,
     validation: Use = 0.2,
     test: Use = 0.2,
-    start: Start = "zero",
+    start: Start = "auto",
     period: Period = "auto",
     skip: int | Literal["auto"] | None = None,
     gaps: Gaps = "error",
@@ -103,7 +107,10 @@ def load_records(
         test: records that are scored, likewise: of a fraction the last part, of a number the last
             records. ``"all"``: every record, for a model that is there; nothing is left to fit.
         start: ``"zero"`` (at rest), ``"estimated"`` (amid the measurement), or ``"periodic"``:
-            every record is cut to whole periods in steady state.
+            every record is cut to whole periods in steady state. Default: a record of whole periods
+            that has settled from its first sample on is periodic. Other records are from rest,
+            unless linear models of most of the first three that train validate clearly better with
+            an estimated start; a note has both errors. With ``test="all"`` all are from rest.
         period: samples of one period of the inputs; ``"auto"`` finds it, ``None`` is none.
         skip: samples at the beginning of every record that are left out of cost and score.
             Default: of records from rest the periods that the output takes to settle, or 5 % if
@@ -140,11 +147,12 @@ def load_records(
     """
     reader = _Reader(
         Wanted(inputs, outputs, fs, time, dict(units or {}), gaps, reference),
-        start,
+        "zero" if start == "auto" and test == EVERYTHING else start,
         period,
         None if skip == "auto" else skip,
         limits,
-        unseen=test if _is_fraction(test) else 0.0,
+        validation=validation if _is_fraction(validation) else 0.0,
+        test=test if _is_fraction(test) else 0.0,
     )
     paths = listed_files(path, "path")
     left = reader.read(paths)
@@ -163,11 +171,14 @@ def load_records(
             f"the fractions are validation={validation} and test={test}; they must leave something "
             "for training, for example 0.2 and 0.2."
         )
+    train = [whole.record for whole in left]
+    if reader.begin_in_motion(train):
+        tests, chosen, train = map(reader.in_motion, (tests, chosen, train))
     parts: dict[str, list[Record]] = {"train": [], "validation": chosen, "test": tests}
     short = None
-    for whole in left:
+    for whole, own in zip(left, train, strict=True):
         try:
-            for use, record in cut(whole.record, validated, tested).items():
+            for use, record in cut(own, validated, tested).items():
                 parts[use].append(record)
         except TooShortError as error:
             if not whole.stretch:
@@ -201,16 +212,18 @@ class _Reader:
         skip: int | None,
         limits: Sequence[ArrayLike | None] | None,
         *,
-        unseen: float,
+        validation: float,
+        test: float,
     ) -> None:
         if period not in (None, "auto"):
             integer("period", period, 1)
         if skip is not None:
             integer("skip", skip, 0)
         self.wanted, self.period, self.skip = wanted, period, skip
-        self.limits, self.unseen = limits, unseen
+        self.limits, self.validation, self.unseen = limits, validation, test
         self.start: Start = start
         self.all: list[_Whole] = []
+        self._open: set[str] = set()  # names of records that may be at rest or in motion
         self._first: Measurement | None = None
         self._notes: dict[str, list[str]] = {}
 
@@ -254,6 +267,33 @@ class _Reader:
         self.all += found
         return found
 
+    def begin_in_motion(self, train: Sequence[Record]) -> bool:
+        """Whether the records that are not decided yet begin in motion, as most that train do."""
+        moving = []
+        for record in [record for record in train if record.name in self._open][:_TRIED]:
+            seen = record[: record.samples - round(record.samples * self.unseen)]
+            try:
+                trial = try_starts(seen)
+            except InputError:
+                self.note(record.name, "start is zero: no linear model tells how it begins")
+                moving.append(False)
+            else:
+                self.note(record.name, str(trial))
+                moving.append(trial.chosen == "estimated")
+        in_motion = 2 * sum(moving) > len(moving)
+        if len(self._open) > 1 and moving:
+            start = "estimated" if in_motion else "zero"
+            self.note("", f"start is {start} for all records, as for most of these {len(moving)}")
+        return in_motion
+
+    def in_motion(self, records: Sequence[Record]) -> list[Record]:
+        """Records with an estimated start where nothing else is decided."""
+        skip = self.skip or 0
+        return [
+            replace(record, start="estimated", skip=skip) if record.name in self._open else record
+            for record in records
+        ]
+
     def _measured(self, path: Path) -> Measurement:
         """What a file measured, checked to be of a kind with the first."""
         try:
@@ -289,9 +329,18 @@ class _Reader:
         automatic = self.period == "auto"
         N = find_period(u if r is None else r) if automatic else cast("int | None", self.period)
         start: Start = "estimated" if stretch.first and self.start != "periodic" else self.start
-        settling = 0
+        settling, settled = 0, False
         if N is not None and self.skip is None and start != "estimated":
             settling = find_transient(seen, N)
+            settled = not settling and not any(
+                integrators(u[: len(seen)], channel) for channel in seen.T
+            )
+        undecided = start == "auto"
+        if start == "auto":
+            start = "zero"
+            whole = N is not None and len(seen) >= 2 * N and self._whole_periods(T, N)
+            if settled and whole and stretch.valid is None:
+                start, undecided = "periodic", False
         if start == "periodic":
             if N is None:
                 raise InputError(
@@ -310,6 +359,7 @@ class _Reader:
             if self.skip is None and start == "zero":
                 skip = warm_up(T, settling)
             settling = settling if skip == settling else 0
+            undecided = undecided and not settling
             if T - skip < SHORTEST:
                 raise TooShortError(
                     f"record '{name}' has {max(T - skip, 0)} scored samples of {T}, with "
@@ -323,14 +373,12 @@ class _Reader:
                 said += "; the first period is the transient and is not fitted"
             elif count:
                 said += f"; the first {count} periods are the transient and are not fitted"
-            elif (
-                start == "zero"
-                and self.skip is None
-                and not find_transient(seen, N)
-                and not any(integrators(u[: len(seen)], channel) for channel in seen.T)
-            ):
-                said += "; the output is settled from the first sample on: use start='periodic'"
+            elif settled and self.start != "periodic":
+                said += "; the output is settled from the first sample on: "
+                said += "start is periodic" if start == "periodic" else "use start='periodic'"
             notes.append(said)
+        if undecided:
+            self._open.add(name)
         record = Record(
             u[kept],
             y[kept],
@@ -347,6 +395,11 @@ class _Reader:
             valid=None if stretch.valid is None else stretch.valid[kept],
         )
         return record, notes
+
+    def _whole_periods(self, T: int, N: int) -> bool:
+        """Whether a record is made of periods, of which each of its parts has one at least."""
+        parts = [max(1, round(T // N * part)) for part in (self.validation, self.unseen) if part]
+        return T % N == 0 and max(1, sum(parts)) < T // N
 
 
 def listed_files(given: Any, option: str) -> list[Path]:

@@ -12,4 +12,5 @@ The files in the order of the work, which is a good one to read them in:
 7. ``bla``: these steps in one, and ``integrators`` behind the outputs
 8. ``order_fits``, ``order_scan``: models of several orders, and the order that is chosen
 9. ``model``, ``modes``: the result, and the modes of it that matter
+10. ``record_start``: whether a record begins at rest, by what its linear models say
 """

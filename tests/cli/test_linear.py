@@ -54,7 +54,15 @@ def csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def overrides(csv: Path, inputs: str, outputs: str, *more: str) -> list[str]:
     columns = [f"data.inputs=[{inputs}]", f"data.outputs=[{outputs}]"]
-    return ["data=file", f"data.path={csv}", *columns, f"data.fs={FS}", f"data.skip={SKIP}", *more]
+    return [
+        "data=file",
+        f"data.path={csv}",
+        *columns,
+        f"data.fs={FS}",
+        f"data.skip={SKIP}",
+        "data.start=zero",
+        *more,
+    ]
 
 
 def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> dict:
@@ -93,7 +101,9 @@ def test_numbers_are_those_of_the_system(csv: Path, tmp_path: Path, monkeypatch)
     assert [(s["use"], s["record"]) for s in found["scores"]] == [
         ("train", "train"), ("validation", "validation"), ("test", "test"),
     ]  # fmt: skip
-    dataset = lfrtorch.load_records(csv, inputs=["a", "b"], outputs=["x", "phi"], fs=FS, skip=SKIP)
+    dataset = lfrtorch.load_records(
+        csv, inputs=["a", "b"], outputs=["x", "phi"], fs=FS, skip=SKIP, start="zero"
+    )
     model = lfrtorch.LinearModel.load(tmp_path / "linear")
     for score, record in zip(
         found["scores"], (*dataset.train, *dataset.validation, *dataset.tests), strict=True

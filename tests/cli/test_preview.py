@@ -65,8 +65,9 @@ def run(tmp_path, capsys, monkeypatch):
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """An empty figure, which is written in no time."""
+    """An empty figure, which is written in no time, and no trial of starts."""
     monkeypatch.setattr(preview, "survey_figure", lambda *_: Figure())
+    monkeypatch.setattr(preview, "beginning", lambda _: [])
 
 
 def refused(capsys, *words: str | Path) -> str:
@@ -83,7 +84,8 @@ def test_one_command_gives_table_notes_and_figure(file: Path, run):
     out = run(file, "data.inputs=[force]", "data.outputs=[level]")
     assert f"{file}: {T} samples at 50 Hz" in out
     assert "'time' is taken for the time, 50 Hz" in out
-    head, rule, force, level = out.splitlines()[3:7]
+    assert "with an estimated start: start is zero" in out
+    head, rule, force, level = out.splitlines()[4:8]
     assert head.split()[:4] == ["signal", "use", "samples", "missing"]
     assert set(rule) == {"-", " "}
     assert force.split()[:5] == ["force", "(N)", "input", str(T), "0"]
@@ -300,6 +302,18 @@ def test_the_words_of_other_commands_are_understood(file: Path, signals, run, ca
 )
 def test_user_errors_are_one_message(words, message, file: Path, capsys):
     assert message in refused(capsys, file, *words)
+
+
+@pytest.mark.numeric
+def test_how_a_fit_would_take_the_record_to_begin(tmp_path: Path, run, monkeypatch):
+    monkeypatch.setattr(preview, "survey_figure", lambda *_: Figure())
+    noise, u = np.random.default_rng(0).standard_normal((2, 1400))
+    y = lfilter([1.0], [1, -1.96, 0.9702], u) + 0.5 * noise
+    y[1010] = np.nan
+    words = ["data.inputs=[u]", "data.outputs=[y]", "data.fs=50"]
+    out = run(written(tmp_path / "motion.csv", {"u": u[1000:], "y": y[1000:]}), *words)
+    assert "with an estimated start: start is estimated" in out
+    assert "start is" not in run(written(tmp_path / "few.csv", {"u": u[:30], "y": y[:30]}), *words)
 
 
 def test_figure_of_signals_that_say_little():

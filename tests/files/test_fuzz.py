@@ -78,7 +78,7 @@ def tried(path: Path, content: bytes) -> None:
     u, y = COLUMNS.get(path.name, ("u", "y"))
     try:
         with np.errstate(over="ignore"):  # a damaged exponent may be 1e300
-            data = load_records(path, inputs=u, outputs=y, fs=100.0)
+            data = load_records(path, inputs=u, outputs=y, fs=100.0, start="zero")
     except InputError as error:
         message = str(error)
     else:

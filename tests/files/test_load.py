@@ -14,14 +14,20 @@ import scipy.signal
 
 from lfrtorch import load_records
 from lfrtorch.excitation import multisine
+from lfrtorch.files import load
 from lfrtorch.files.text import TextTable
+from lfrtorch.linear.record_start import StartTrial
 from lfrtorch.records import Channel
 
 SAMPLES = 200
-USE: dict[str, Any] = {"inputs": ["u1", "u2"], "outputs": "y", "fs": 50.0}
-TIMED: dict[str, Any] = {"inputs": "u", "outputs": "y", "time": "t"}
-BARE: dict[str, Any] = {"inputs": "u", "outputs": "y"}
+USE: dict[str, Any] = {"inputs": ["u1", "u2"], "outputs": "y", "fs": 50.0, "start": "zero"}
+TIMED: dict[str, Any] = {"inputs": "u", "outputs": "y", "time": "t", "start": "zero"}
+BARE: dict[str, Any] = {"inputs": "u", "outputs": "y", "start": "zero"}
 N = 100  # samples of a period
+
+
+def begun(use: dict[str, Any], start: str) -> dict[str, Any]:
+    return use | {"start": start}
 
 
 @pytest.fixture
@@ -87,7 +93,7 @@ def test_five_percent_warm_up_unless_told(tmp_path, signals):
 
 def test_start_and_limits_of_the_sensors_are_those_of_all_records(tmp_path, signals):
     path = write(tmp_path / "a.csv", signals)
-    data = load_records(path, **USE, limits=(None, 1.0), start="estimated")
+    data = load_records(path, **begun(USE, "estimated"), limits=(None, 1.0))
     for record in (*data.train, *data.validation, *data.tests):
         assert np.array_equal(record.shown(record.y), np.minimum(record.y, 1.0))
         assert record.start == "estimated"
@@ -109,7 +115,7 @@ def test_the_period_is_that_of_the_reference(tmp_path):
     u, y = r + rng.standard_normal((2, 200))
     path = write(tmp_path / "a.csv", np.column_stack([u, y, r]), "u,y,r")
     options: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 1.0, "validation": 0, "test": 0}
-    data = load_records(path, **options, reference="r", start="periodic", skip=0)
+    data = load_records(path, **begun(options, "periodic"), reference="r", skip=0)
     assert data.train[0].period == 50
 
 
@@ -135,7 +141,9 @@ def test_parts_may_be_left_out(tmp_path, signals, none):
 
 def test_column_order_is_the_users(tmp_path, signals):
     path = write(tmp_path / "a.csv", signals)  # a Hydra ListConfig is a Sequence and no list
-    data = load_records(path, inputs=UserList(["y", 0]), outputs=UserList(["u2"]), fs=1.0)
+    data = load_records(
+        path, inputs=UserList(["y", 0]), outputs=UserList(["u2"]), fs=1.0, start="zero"
+    )
     assert np.array_equal(joined(data.tests[0]), signals[:, [2, 0, 1]])
 
 
@@ -177,7 +185,7 @@ def test_a_side_that_is_given_leaves_the_other_to_the_names(tmp_path, signals):
 
 def test_columns_without_a_header(tmp_path, signals):
     bare = write(tmp_path / "b.csv", signals, header=None)
-    data = load_records(bare, inputs=[0, 1], outputs=2, fs=1.0)
+    data = load_records(bare, inputs=[0, 1], outputs=2, fs=1.0, start="zero")
     assert np.array_equal(joined(data.tests[0]), signals)
     assert [c.name for c in data.train[0].inputs] == ["column 0", "column 1"]
 
@@ -186,7 +194,7 @@ def test_other_columns_may_hold_text(tmp_path):
     rows = "".join(f"{i},12:00:{i:02d},{2 * i}\r\n" for i in range(60))
     path = tmp_path / "a.csv"
     path.write_bytes(f"\ufeffu,time,y\r\n{rows}\r\n".encode())  # as Excel saves it
-    data = load_records(path, inputs="u", outputs="y", fs=1.0)
+    data = load_records(path, inputs="u", outputs="y", fs=1.0, start="zero")
     assert np.array_equal(joined(data.tests[0]), np.arange(60.0)[:, None] * [1, 2])
     assert data.notes == ()
 
@@ -195,7 +203,9 @@ def test_arrays(tmp_path, signals):
     np.savez(tmp_path / "rig.npz", force=signals[:, :2], y=signals[:, 2])
     scipy.io.savemat(tmp_path / "rig.mat", {"exp": {"force": signals[:, :2], "y": signals[:, 2]}})
     for name, prefix in (("rig.npz", ""), ("rig.mat", "exp.")):
-        data = load_records(tmp_path / name, inputs=f"{prefix}force", outputs=f"{prefix}y", fs=50.0)
+        data = load_records(
+            tmp_path / name, inputs=f"{prefix}force", outputs=f"{prefix}y", fs=50.0, start="zero"
+        )
         assert np.array_equal(joined(data.tests[0]), signals)
         assert [c.name for c in data.train[0].inputs] == [f"{prefix}force1", f"{prefix}force2"]
         assert data.name == "rig"
@@ -330,7 +340,9 @@ def test_dates_and_units_of_time(tmp_path, signals):
     timed = np.hstack([signals, 20 * np.arange(SAMPLES)[:, None]])
     write(tmp_path / "b.csv", timed, "u1,u2,y,t (ms)")
     for name in ("a.csv", "b.csv"):
-        data = load_records(tmp_path / name, inputs=["u1", "u2"], outputs="y", time="t")
+        data = load_records(
+            tmp_path / name, inputs=["u1", "u2"], outputs="y", time="t", start="zero"
+        )
         assert data.train[0].fs == 50.0
         assert np.array_equal(joined(data.tests[0]), signals)
 
@@ -409,7 +421,7 @@ def test_the_aircraft_as_published(benchmark_root):
         ("Acceleration", ["Acceleration1", "Acceleration2", "Acceleration3"]),
         ("Acceleration[1]", ["Acceleration2"]),
     ):
-        data = load_records(file, inputs="Force", outputs=outputs, test=0)
+        data = load_records(file, inputs="Force", outputs=outputs, test=0, start="zero")
         assert [channel.name for channel in data.train[0].outputs] == names
     assert data.train[0].fs == 400.0
     assert data.train[0].period == 8192
@@ -437,7 +449,7 @@ def lost_and_doubled(path):
 
 def test_rows_that_are_lost_are_refused_if_the_rate_is_given_too(tmp_path):
     values = lost_and_doubled(tmp_path)
-    use: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 100.0, "validation": 0, "test": 0}
+    use: dict[str, Any] = BARE | {"fs": 100.0, "validation": 0, "test": 0}
     message = refused(r"6 gap\(s\) of 42 sample\(s\) in all", tmp_path / "lost.csv", use=use)
     assert message.endswith("If 't' is no time, give it another name.")
     data = load_records(tmp_path / "lost.csv", **use, gaps="split")
@@ -454,7 +466,7 @@ def test_rows_that_are_lost_are_refused_if_the_rate_is_given_too(tmp_path):
 
 def test_uneven_time_beside_a_rate_that_is_given_is_noted(tmp_path):
     path, t = tmp_path / "a.csv", np.arange(300) / 100
-    use: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 100.0}
+    use: dict[str, Any] = BARE | {"fs": 100.0}
     timed(path, t + 0.003 * np.sin(np.arange(300.0) ** 2))
     (note,) = load_records(path, **use).notes
     assert note.startswith("the column 't' is not evenly spaced")
@@ -472,7 +484,7 @@ def test_a_unit_of_time_that_is_assumed_is_said(tmp_path):
     path = tmp_path / "a.csv"
     values = timed(path, 1.7e12 + 10 * np.arange(300))
     write(path, np.column_stack([1.7e12 + 10 * np.arange(300), values]), "stamp,u,y")
-    data = load_records(path, inputs="u", outputs="y", time="stamp")
+    data = load_records(path, **BARE, time="stamp")
     assert data.train[0].fs == 100.0
     (note,) = data.notes
     assert note.endswith("'stamp' is taken for the time in milliseconds since 1970, 100 Hz")
@@ -489,7 +501,7 @@ def test_sheets_are_records(tmp_path, signals):
         for row in [["Zeit (s)", "u1", "u2", "y"], *np.c_[np.arange(200) / 50, signals].tolist()]:
             sheet.append(row)
     made.save(path)
-    use = {"inputs": ["u1", "u2"], "outputs": "y"}
+    use: dict[str, Any] = {"inputs": ["u1", "u2"], "outputs": "y", "start": "zero"}
     data = load_records([f"{path}#Run 1", f"{path}#Run 2"], **use, validation=1, test=0)
     assert [record.name for record in (*data.train, *data.validation)] == ["train", "validation"]
     assert np.allclose(joined(data.train[0]), signals, rtol=1e-14)  # 16 digits are in the file
@@ -571,7 +583,7 @@ def periodic(path, periods, *, settled=False, noise=1e-3, more=0):
     return table
 
 
-PERIODIC: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 1.0}
+PERIODIC: dict[str, Any] = {"inputs": "u", "outputs": "y", "fs": 1.0, "start": "zero"}
 SAME_INPUT = "the parts of a record have the same input in every period"
 
 
@@ -604,7 +616,7 @@ def test_outputs_of_the_test_part_move_nothing_before_it(
     table[-tests:, 1] += np.random.default_rng(1).normal(size=tests) * 10.0
     write(tmp_path / "b.csv", table, "u,y")
     one, other = (
-        load_records(tmp_path / name, **PERIODIC, start=start, validation=0.2 * (count > 3))
+        load_records(tmp_path / name, **begun(PERIODIC, start), validation=0.2 * (count > 3))
         for name in ("a.csv", "b.csv")
     )
     for a, b in zip(one.train + one.validation, other.train + other.validation, strict=True):
@@ -648,15 +660,15 @@ def test_no_steady_state_is_advised_for_a_system_that_integrates(tmp_path):
 @pytest.mark.numeric
 def test_steady_state_is_cut_to_whole_periods(tmp_path):
     table = periodic(tmp_path / "a.csv", 7, more=40)
-    data = load_records(tmp_path / "a.csv", **PERIODIC, start="periodic")
+    data = load_records(tmp_path / "a.csv", **begun(PERIODIC, "periodic"))
     records = [*data.train, *data.validation, *data.tests]
     assert [(r.start, r.samples, r.period, r.skip) for r in records] == [
         ("periodic", count * N, N, 0) for count in (4, 1, 1)
     ]
     assert np.array_equal(np.concatenate([joined(r) for r in records]), table[N : 7 * N])
-    data = load_records(tmp_path / "a.csv", **PERIODIC, start="periodic", skip=30, test=0)
+    data = load_records(tmp_path / "a.csv", **begun(PERIODIC, "periodic"), skip=30, test=0)
     assert np.array_equal(joined(data.train[0]), table[30 : 6 * N + 30])
-    given = load_records(tmp_path / "a.csv", **PERIODIC, start="periodic", period=2 * N, skip=0)
+    given = load_records(tmp_path / "a.csv", **begun(PERIODIC, "periodic"), period=2 * N, skip=0)
     assert [r.samples for r in (*given.train, *given.tests)] == [2 * N] * 2 or given.train
 
 
@@ -671,10 +683,119 @@ def test_refused_periods(tmp_path, signals):
     refused("has 300 samples and a period of 301; it must hold at least one", path, use=PERIODIC,
             period=301)  # fmt: skip
     refused("period is 0", path, use=PERIODIC, period=0)
-    refused("start is 'given'; give 'zero', 'estimated' or 'periodic'", path, use=PERIODIC,
+    refused("start is 'given'; give 'auto', 'zero', 'estimated' or 'periodic'", path, use=PERIODIC,
             start="given")  # fmt: skip
     write(path, signals)
     refused("start is 'periodic' and the input of .* does not repeat", path, start="periodic")
+
+
+# --- how records begin ----------------------------------------------------------------------
+
+AUTO: dict[str, Any] = PERIODIC | {"start": "auto"}
+
+
+def cut_out(path, before, samples=400, seed=0):
+    """A file of a slow resonance from rest, without its first samples; u and y."""
+    noise, u = np.random.default_rng(seed).normal(size=(2, samples + before))
+    y = scipy.signal.lfilter([1.0], [1, -1.96, 0.9702], u)
+    table = np.stack([u, y + 0.03 * y.std() * noise], axis=1)[before:]
+    write(path, table, "u,y")
+    return table
+
+
+def starts(data) -> list[tuple[str, int]]:
+    return [(r.start, r.skip) for r in (*data.train, *data.validation, *data.tests)]
+
+
+@pytest.mark.numeric
+def test_a_record_in_motion_has_an_estimated_start(tmp_path):
+    table = cut_out(tmp_path / "a.csv", 1000)
+    data = load_records(tmp_path / "a.csv", **AUTO)
+    assert starts(data) == [("estimated", 0), ("estimated", 240), ("estimated", 320)]
+    (note,) = data.notes
+    assert "from rest and at" in note
+    assert note.endswith("with an estimated start: start is estimated")
+    table[-80:, 1] = 1e3  # outputs of the test choose nothing
+    write(tmp_path / "b.csv", table, "u,y")
+    other = load_records(tmp_path / "b.csv", **AUTO)
+    assert (starts(other), other.notes) == (starts(data), data.notes)
+    skipping = load_records(tmp_path / "a.csv", **AUTO, skip=7, test=0)
+    assert starts(skipping) == [("estimated", 7), ("estimated", 320)]
+    everything = load_records(tmp_path / "a.csv", **AUTO, test="all")
+    assert (starts(everything), everything.notes) == ([("zero", 20)], ())
+
+
+@pytest.mark.numeric
+def test_a_record_from_rest_is_said_to_be(tmp_path):
+    cut_out(tmp_path / "a.csv", 0)
+    data = load_records(tmp_path / "a.csv", **AUTO, test=0)
+    assert starts(data) == [("zero", 20), ("zero", 320)]
+    assert data.notes[0].endswith("start is zero")
+
+
+@pytest.mark.parametrize(
+    ("resting", "start"), [(["run1", "run3"], ("estimated", 0)), (["run0", "run1"], ("zero", 10))]
+)
+def test_records_begin_as_most_of_the_first_that_train(
+    tmp_path, signals, monkeypatch, resting: list[str], start: tuple[str, int]
+):
+    tried = []
+
+    def trial(record):
+        tried.append(record.name)
+        return StartTrial(1.0, 1.0 if record.name in resting else 0.5, 2.0)
+
+    monkeypatch.setattr(load, "try_starts", trial)
+    for name in ("run0", "run1", "run2", "run3", "run4", "test"):
+        write(tmp_path / f"{name}.csv", signals)
+    use = USE | {"start": "auto", "validation": 1, "test": tmp_path / "test.csv"}
+    data = load_records(tmp_path / "run*.csv", **use)
+    assert starts(data) == [start] * 6
+    assert data.notes[-1] == f"start is {start[0]} for all records, as for most of these 3"
+    assert tried == ["run0", "run1", "run2"]
+
+
+@pytest.mark.numeric
+def test_whole_periods_in_steady_state_are_periodic(tmp_path):
+    periodic(tmp_path / "a.csv", 4, settled=True)
+    data = load_records(tmp_path / "a.csv", **AUTO)
+    assert starts(data) == [("periodic", 0)] * 3
+    assert data.notes[0].endswith("settled from the first sample on: start is periodic")
+    # A part without a whole period, a part of a period, a transient, samples without a value:
+    few = load_records(tmp_path / "a.csv", **AUTO, validation=0.5, test=0.4)
+    assert starts(few)[0][0] != "periodic"
+    assert few.notes[0].endswith("use start='periodic'")
+    table = periodic(tmp_path / "a.csv", 5, settled=True, more=30)
+    assert starts(load_records(tmp_path / "a.csv", **AUTO))[0][0] != "periodic"
+    table = table[:500]
+    table[5, 1] = np.nan
+    write(tmp_path / "a.csv", table, "u,y")
+    assert starts(load_records(tmp_path / "a.csv", **AUTO))[0][0] != "periodic"
+    periodic(tmp_path / "a.csv", 5)
+    data = load_records(tmp_path / "a.csv", **AUTO)
+    assert starts(data)[0] == ("zero", N)  # the transient is left out, and tells enough
+    assert not any("from rest and at" in note for note in data.notes)
+
+
+def test_a_record_that_tells_nothing_is_from_rest(tmp_path):
+    cut_out(tmp_path / "a.csv", 1000, samples=30)
+    write(tmp_path / "b.csv", np.ones((100, 2)), "u,y")
+    for name in "ab":
+        data = load_records(tmp_path / f"{name}.csv", **AUTO, validation=0, test=0)
+        assert data.train[0].start == "zero"
+        assert data.notes == ("start is zero: no linear model tells how it begins",)
+
+
+@pytest.mark.numeric
+def test_gaps_and_references_hinder_no_choice(tmp_path):
+    table = cut_out(tmp_path / "a.csv", 1000)
+    table = np.hstack([table, table[:, :1]])
+    table[300, 1] = np.nan
+    write(tmp_path / "a.csv", table, "u,y,r")
+    data = load_records(tmp_path / "a.csv", **AUTO, gaps="split", test=0)
+    assert [r.start for r in data.train] == ["estimated"] * 2
+    data = load_records(tmp_path / "a.csv", **AUTO, reference="r", test=0)
+    assert data.train[0].start == "estimated"
 
 
 # --- what is refused ------------------------------------------------------------------------
@@ -758,7 +879,7 @@ def test_silverbox_in_matlab_and_text(tmp_path, benchmark_root):
     if not path.is_file():
         pytest.skip(f"no file '{path}'")
     found = scipy.io.loadmat(path, squeeze_me=True)
-    use: dict[str, Any] = {"fs": 1e7 / 2**14, "period": None}
+    use: dict[str, Any] = {"fs": 1e7 / 2**14, "period": None, "start": "zero"}
     data = load_records(path, inputs="V1", outputs="V2", **use)
     np.savetxt(
         tmp_path / "a.txt", np.stack([found["V1"], found["V2"]], axis=1)[:2000], header="V1 V2",
@@ -781,7 +902,7 @@ def test_columns_that_are_not_used_are_looked_at_together(tmp_path, monkeypatch)
 
     monkeypatch.setattr(TextTable, "blocks", counted)
     with pytest.raises(ValueError, match="give fs=HZ"):
-        load_records(tmp_path / "a.csv", inputs="c0", outputs="c1")
+        load_records(tmp_path / "a.csv", inputs="c0", outputs="c1", start="zero")
     assert len(passes) == 1
 
 
@@ -797,5 +918,7 @@ def test_a_line_may_have_thousands_of_cells(tmp_path):
     names = ",".join(f"signal {i}" for i in range(len(row)))
     assert len(names) > csv.field_size_limit()
     write(tmp_path / "a.csv", np.tile(row, (60, 1)) + np.arange(60)[:, None] % 3, names)
-    data = load_records(tmp_path / "a.csv", inputs="signal 0", outputs="signal 13999", fs=1.0)
+    data = load_records(
+        tmp_path / "a.csv", inputs="signal 0", outputs="signal 13999", fs=1.0, start="zero"
+    )
     assert data.train[0].y[2] == row[-1] + 2
