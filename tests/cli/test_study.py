@@ -155,7 +155,7 @@ def test_processes_that_are_killed_are_replaced(capsys: pytest.CaptureFixture[st
 @pytest.mark.numeric
 @pytest.mark.usefixtures("untraced")
 def test_runs_follow_each_other(csv, tmp_path, monkeypatch, capfd):
-    few = ["-m", str(csv), "inputs=u", "outputs=y", "fs=10"]
+    few = ["-m", str(csv), "inputs=u", "outputs=y", "fs=10", "start=zero"]
     words = ["-m", *file_overrides(csv), *SHORT, "nn=2,0", f"hydra.sweep.dir={tmp_path}"]
     with pytest.raises(SystemExit):
         launched(monkeypatch, *few, *SHORT, "nn=2,0", f"hydra.sweep.dir={tmp_path}")

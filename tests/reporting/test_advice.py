@@ -263,7 +263,7 @@ def test_a_fit_of_few_noisy_samples_is_overfit_and_one_of_many_is_not(samples, n
     train = Record(u[:samples], y[:samples], name="train")
     validation = Record(u[samples:], y[samples:], name="validation", skip=20)
     trainer = lfrtorch.LevenbergMarquardt(max_iter=25)
-    settings = lfrtorch.Settings(nx=1, nz=1, nw=1, nn=nn, trainer=trainer)
+    settings = lfrtorch.Settings(nx=1, nz=1, nw=1, nn=nn, starts=1, trainer=trainer)
     run = lfrtorch.identify(lfrtorch.Dataset("noisy", [train], [validation], []), settings)
     assert any(item.text.startswith("Overfit:") for item in run.advice) is is_said
     assert not (is_said and any(item.text.startswith("Hardly better") for item in run.advice))
