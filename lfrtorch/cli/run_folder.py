@@ -88,7 +88,9 @@ def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:
         return cfg
     before = read_settings(folder / CONFIG)
     names = [n for n in ("nx", "nz", "nw", "nn", "degree") if cfg[n] == "auto"]
-    names += ["starts", "seed"] if names else []
+    names += ["seed"] if names else []
+    # The number of starts follows from the iterations, too, of which there may be more now.
+    names += ["starts"] if names or cfg.starts == "auto" else []
     if not isinstance(before, dict) or not before.keys() >= set(names):
         raise InputError(f"'{folder / CONFIG}' lacks {', '.join(names)}; begin a new run.")
     chosen = {name: before[name] for name in names}

@@ -501,6 +501,19 @@ def test_resume_with_a_class_of_ones_own(tmp_path: Path):
     assert word in run_folder.arguments([f"resume={tmp_path}", word])
 
 
+@pytest.mark.numeric
+def test_a_run_goes_on_with_the_starts_that_were_cheap_for_its_iterations(
+    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    words = [str(csv), "inputs=u", "outputs=y", "fs=10", "nx=1", "nn=2", "figures=false"]
+    launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words, "trainer.max_iter=2")
+    monkeypatch.setattr("lfrtorch.fitting.multistart._MINUTE", 0.0)  # as of many more iterations
+    launched(monkeypatch, f"resume={tmp_path}", "trainer.max_iter=3")
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["starts"] == 8
+    assert metrics["fit"]["iterations"] == 3
+
+
 @pytest.mark.parametrize("text", ["nx: [", "- 1", "nz: 2", ""])
 def test_damaged_settings_of_a_run_that_goes_on(tmp_path: Path, text: str):
     (tmp_path / "config.yaml").write_text(text)
