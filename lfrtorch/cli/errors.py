@@ -17,7 +17,7 @@ from lfrtorch.cli.interrupts import TerminatedError, as_error, handled
 
 @contextmanager
 def user_errors(rank: str = "0") -> Iterator[None]:
-    """Errors of users end the program with one message and exit code 1; bugs keep theirs."""
+    """Errors of users end the program with a message and exit code 1; bugs keep a traceback."""
     # A message names the group of the configuration, which a function's argument belongs to:
     # ``data: seed is -1``.
     error = "error" if rank == "0" else f"error on rank {rank}"

@@ -263,8 +263,8 @@ def _parts(header: str) -> tuple[str, str]:
 
 def channels(headers: Sequence[str], units: Mapping[str, str]) -> tuple[Channel, ...]:
     """Split headers as "force (N)", "force [N]" or "force/N" into names and units."""
-    # Brackets stay in the name if names would be equal without, and in "y(t)": no unit at once
-    # behind.
+    # Brackets stay in the name if names would be equal without them, or if they follow the name
+    # at once and hold no unit, as in "y(t)".
     found = [
         Channel(header, units[header]) if units.get(header) else _channel(header)
         for header in headers

@@ -25,8 +25,6 @@ from lfrtorch.reporting.diagnosis import (
 )
 
 _TRANSIENT = 3.0  # error in the first twentieth of the scored samples over that in the rest
-
-
 _LOUDER = 1.25  # largest test input over the largest in training above which the model extrapolates
 _CLOSE = 1.2  # growth as of OVERFIT, up to which a larger map is advised
 _FEW = 3  # most records or outputs that are named
