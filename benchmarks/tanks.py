@@ -24,7 +24,7 @@ import numpy as np
 import lfrtorch
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.datasets import cascaded_tanks
-from lfrtorch.fitting.folds import Fold, folds
+from lfrtorch.fitting.folds import Fold, as_folded, folds
 
 PARTS, SKIP = 8, 50
 SIZES = {"nz": 2, "nw": 2, "activation": "softplus"}
@@ -50,7 +50,10 @@ def main() -> int:
     for limit, nn, ridge in TRIED:
         whole = measured if limit else replace(measured, limits=None)
         bla = lfrtorch.estimate_bla(whole, nx=2)
-        parts = [left_out(part, bla, nn, ridge, options.starts) for part in folds(whole, PARTS)]
+        parts = [
+            left_out(whole, part, bla, nn, ridge, options.starts)
+            for part in folds(as_folded(whole), PARTS)
+        ]
         squares, highest = np.array([found for found, _ in parts]), np.array([y for _, y in parts])
         alone, mean = np.sqrt(np.mean(squares, axis=0))
         inside = np.sqrt(np.mean(squares[highest < 10.0, 1]))
@@ -59,14 +62,19 @@ def main() -> int:
     return 0
 
 
+def left_out_of(whole: lfrtorch.Record, part: Fold) -> lfrtorch.Record:
+    """The record up to the end of what was left out, the rest skipped."""
+    ((first, last),) = part.windows
+    return replace(whole[:last], start=whole.start, x0=whole.x0, skip=max(first, SKIP))
+
+
 def distilled(whole: lfrtorch.Record, starts: int) -> None:
     """A row for each eighth."""
     trainer = lfrtorch.LevenbergMarquardt(max_iter=ITERATIONS)
     bla = lfrtorch.estimate_bla(whole, nx=2)
     print("| eighth | best start | mean | one model |\n|---|---|---|---|")
-    for number, part in enumerate(folds(whole, PARTS), 1):
-        (judged,) = part.left_out
-        judged = replace(judged, skip=max(judged.skip, SKIP))
+    for number, part in enumerate(folds(as_folded(whole), PARTS), 1):
+        judged = left_out_of(whole, part)
         models = [
             lfrtorch.initialise(bla, part.train, **SIZES, nn=15, seed=1000 * i)
             for i in range(starts)
@@ -80,11 +88,15 @@ def distilled(whole: lfrtorch.Record, starts: int) -> None:
 
 
 def left_out(
-    part: Fold, bla: lfrtorch.LinearModel, nn: int, ridge: float, starts: int
+    whole: lfrtorch.Record,
+    part: Fold,
+    bla: lfrtorch.LinearModel,
+    nn: int,
+    ridge: float,
+    starts: int,
 ) -> tuple[tuple[float, float], float]:
     """Mean square errors, of the median start and of the mean, and the highest level there."""
-    (judged,) = part.left_out
-    judged = replace(judged, skip=max(judged.skip, SKIP))
+    judged = left_out_of(whole, part)
     trainer = lfrtorch.LevenbergMarquardt(max_iter=ITERATIONS)
     errors, stable = [], []
     for seed in range(starts):

@@ -27,7 +27,7 @@ from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.noise_estimate import estimate_noise
 from lfrtorch.fitting.refit import refit
-from lfrtorch.fitting.size_search import SizeSearch, search_sizes
+from lfrtorch.fitting.choice import Choice
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import FitResult
@@ -36,7 +36,6 @@ from lfrtorch.least_squares.adam import Adam
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 
 # the whole job
-from lfrtorch.fitting.plain_settings import SizesSearch
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.job import identify
@@ -53,6 +52,7 @@ __all__ = [
     "LFR",
     "Adam",
     "Channel",
+    "Choice",
     "Dataset",
     "FitResult",
     "InputError",
@@ -73,8 +73,6 @@ __all__ = [
     "Run",
     "Scaler",
     "Settings",
-    "SizeSearch",
-    "SizesSearch",
     "Snapshots",
     "analysis",
     "datasets",
@@ -96,6 +94,5 @@ __all__ = [
     "reporting",
     "rmse",
     "scan_orders",
-    "search_sizes",
     "simulate_blocks",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import closing
 from copy import deepcopy
@@ -21,13 +20,14 @@ from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
-from lfrtorch.fitting.first_fit import begun_on_part, first_records
+from lfrtorch.fitting.choice import Choice, choose_sizes
+from lfrtorch.fitting.first_fit import begun_on_part, part_of
 from lfrtorch.fitting.last_fits import distilled, refitted
 from lfrtorch.fitting.multistart import cheap_starts, fit
 from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.plain_settings import PlainSettings
+from lfrtorch.fitting.refit import all_records
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.size_search import SizeSearch, search_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.stage import Stage
 from lfrtorch.fitting.starts import initialise
@@ -41,10 +41,24 @@ from lfrtorch.model import Model, check_channels
 from lfrtorch.records import Record
 from lfrtorch.reporting.advice import advise
 from lfrtorch.reporting.diagnosis import evidence
-from lfrtorch.reporting.evaluation import HORIZONS, Evaluation, worst_residuals
+from lfrtorch.reporting.evaluation import (
+    HORIZONS,
+    Evaluation,
+    cross_validated,
+    worst_residuals,
+)
 from lfrtorch.reporting.run import Run
 from lfrtorch.reporting.scores import metrics
 from lfrtorch.reporting.verdict import judge, reconsidered
+
+_CHOOSING = 20_000
+"""Training samples that sizes are chosen with, at most."""
+
+_AVERAGED = 4
+"""Starts that a model of chosen sizes is the mean of, at most."""
+
+_ITERATIONS = 75
+"""Of a fit that no validation record ends: about as many as its ridge was chosen with."""
 
 SLOW_SAMPLES = 5000
 """Training samples from which a static map that is not compiled is worth a note."""
@@ -119,20 +133,23 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     linear, order_scan = linear_model(
         approximated, settings, dataset.validation, observer=observer, ranks=given.ranks
     )
-    settings = replace(settings, nx=linear.nx)
-    sizes = choose_sizes(stage, linear)
-    if sizes is not None:
-        chosen = sizes.chosen  # the first start is the search's
-        settings = replace(settings, seed=chosen.seed, **chosen.sizes)
-        if settings.nx != linear.nx:
-            more = "more" if cast(int, settings.nx) > linear.nx else "fewer"
-            observer.say(
-                f"nx: {settings.nx}, as the NL-LFR makes use of {more} states than the linear model"
-            )
-            linear = estimate_bla(approximated, cast(int, settings.nx), **settings.linear)
-            tell(linear, observer)
+    begun = linear
+    choice = None
+    if settings.searched:
+        dataset = _all_estimation(dataset)
+        stage = replace(stage, dataset=dataset)
+        choice = _choice(stage, linear, order_scan)
+        settings = _of_choice(settings, choice)
+        records = linear_records(dataset.train, settings, Observer())
+        estimate = partial(estimate_bla, records, **settings.linear)
+        linear = estimate(choice.nx)
+        begun = linear if settings.nx == choice.nx else estimate(cast(int, settings.nx))
+        tell(linear, observer)
+    else:
+        settings = replace(settings, nx=linear.nx)
+    stage = replace(stage, settings=settings)
     settings, models = starting_models(
-        dataset.train, settings, linear, observer, least=1 if sizes is None else 2
+        dataset.train, settings, begun, observer, least=1 if choice is None else _AVERAGED
     )
     settings, models = begun_on_part(replace(stage, settings=settings), models)
     average = _most_averaged(models, settings.average, observer)
@@ -166,7 +183,26 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
     if settings.refit:
         result, again = refitted(replace(given, settings=settings), result)
     return scored_run(
-        dataset, settings, linear, result, order_scan=order_scan, size_search=sizes, again=again
+        dataset, settings, linear, result, order_scan=order_scan, choice=choice, again=again
+    )
+
+
+def _all_estimation(dataset: Dataset) -> Dataset:
+    """The dataset with all records but the tests for training."""
+    train = all_records(dataset.train, [*dataset.validation, *dataset.selection])
+    return replace(dataset, train=train, validation=[], selection=[])
+
+
+def _of_choice(settings: Settings, choice: Choice) -> Settings:
+    """The settings with what was chosen; the fit has no validation records."""
+    trainer: Any = settings.trainer
+    return replace(
+        settings,
+        **choice.chosen.sizes,
+        ridge=choice.chosen.ridge,
+        average=max(settings.average, _AVERAGED) if settings.static == "network" else 1,
+        refit=False,
+        trainer=replace(trainer, max_iter=min(trainer.limit, _ITERATIONS)),
     )
 
 
@@ -185,7 +221,7 @@ def scored_run(
     result: FitResult,
     *,
     order_scan: OrderScan | None,
-    size_search: SizeSearch | None,
+    choice: Choice | None,
     again: FitResult | None = None,
 ) -> Run:
     """Score all records, the tests by the model fitted again; add verdict and advice."""
@@ -201,9 +237,10 @@ def scored_run(
         model=result.model,
         refitted=None if again is None else again.model,
         own=linear_models_of_tests(dataset, settings),
+        left_out=() if choice is None else cross_validated(choice.left_out),
     )
     judged = simulations = evaluation.simulations
-    if settings.noise == "output":
+    if settings.noise == "output" or choice is not None:
         verdict = judge(result, simulations, linear_nx=linear.nx)
     else:
         one, some, _ = HORIZONS
@@ -222,7 +259,7 @@ def scored_run(
         noise_rms=dataset.noise_rms,
         continued=settings.init_from is not None,
         ridge=settings.ridge != 0.0,
-        search=size_search,
+        searched=choice is not None,
         trainer=settings.trainer,
         verdict=verdict,
     )
@@ -230,7 +267,7 @@ def scored_run(
         result,
         evaluation,
         seeds=settings.seeds,
-        search=size_search,
+        choice=choice,
         verdict=verdict,
         refit=again,
         residuals=residuals,
@@ -240,7 +277,7 @@ def scored_run(
         settings=settings,
         linear=linear,
         order_scan=order_scan,
-        size_search=size_search,
+        choice=choice,
         fit=result,
         refit=again,
         evaluation=evaluation,
@@ -311,64 +348,41 @@ def linear_records(
     return steady
 
 
-def choose_sizes(stage: Stage, linear: LinearModel) -> SizeSearch | None:
-    """Return the search for the sizes that are ``"auto"``; None if none but nx is."""
-    # The order of the linear model is the least nx: an NL-LFR may make use of more states. Models
-    # are fitted to the part of the training records that the first iterations have.
+def _choice(stage: Stage, linear: LinearModel, scan: OrderScan | None) -> Choice:
+    """Choose the sizes that are ``"auto"``, and the ridge, by cross-validation."""
     dataset, settings, observer = stage.dataset, stage.settings, stage.observer
-    if not settings.searched:
-        return None
-    grid = settings.sizes_search
-    trainer: Any = settings.trainer
-    linears = {linear.nx: linear}
-    if settings.nx == "auto":
-        above = [nx for nx in grid.nx if linear.nx < nx <= settings.nx_max]
-        linears |= _larger(linear_records(dataset.train, settings, Observer()), above, settings)
+    samples = sum(record.samples for record in dataset.train)
+    part = min(1.0, _CHOOSING / samples)
+    records = dataset.train if part == 1.0 else part_of(dataset.train, part)
+    if part < 1.0:
+        some = sum(record.samples for record in records)
+        observer.say(f"sizes are chosen on {some} of {samples} training samples")
+    orders = scan.orders if scan else ()
+    given = {name: size for name, size in settings.sizes.items() if isinstance(size, int)}
 
-    def start(tried: dict[str, Any], seed: int) -> Model:
-        begin = linears[tried.get("nx", linear.nx)]
-        return starting_model(dataset.train, replace(settings, **tried), begin, seed)
+    approximated = linear_records(records, settings, Observer())
 
-    iterations = math.ceil(grid.iterations * trainer.limit)
-    tried = {
-        name: getattr(grid if name in settings.searched else settings, name)
-        for name in settings.size_names
-    }
-    if settings.nx == "auto":
-        tried["nx"] = list(linears)
-    search = search_sizes(
+    def approximation(nx: int) -> LinearModel:
+        return estimate_bla(approximated, nx, **settings.linear)
+
+    def start(bla: LinearModel, train: Sequence[Record], sizes: dict[str, int], seed: int) -> Model:
+        return starting_model(train, replace(settings, nx=bla.nx, **sizes), bla, seed)
+
+    choice = choose_sizes(
+        records,
+        [nx for nx in orders if nx <= linear.nx] if settings.nx == "auto" else [linear.nx],
+        approximation,
         start,
-        first_records(stage),
-        dataset.validation,
-        **tried,
-        linear=linear,
-        seeds=settings.first_seeds(grid.starts),
-        finalists=grid.finalists,
-        folds=grid.folds,
-        monitor=observer.searching(),
-        watch=lambda ended: observer.say(str(ended)),
-        **{**stage.options, "trainer": replace(trainer, max_iter=iterations)},
+        given=given,
+        last=settings.size_names[-1],
+        seed=settings.seed,
+        guarantee=settings.trainer.guarantee,
+        watch=observer.say,
+        ranks=stage.ranks,
+        stop=stage.stop,
     )
-    observer.say(search.table())
-    for note in search.notes:
-        observer.say(f"note: {note}")
-    return search
-
-
-def _larger(
-    train: Sequence[Record], orders: Sequence[int], settings: Settings
-) -> dict[int, LinearModel]:
-    """Linear models of rising orders, as far as the records carry them."""
-    found: dict[int, LinearModel] = {}
-    for nx in orders:
-        try:
-            excited, wanted = excited_directions(train, nx)
-            if excited < wanted:
-                break
-            found[nx] = estimate_bla(train, nx, **settings.linear)
-        except ValueError:
-            break
-    return found
+    observer.say(choice.table())
+    return choice
 
 
 def starting_models(

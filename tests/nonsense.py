@@ -117,8 +117,8 @@ def of_functions(folder: Path) -> list[Case]:
     inside: Any = lfrtorch.initialise(predicting, record, nz=1, nw=1, nn=2)
     inside = lfrtorch.fit(inside, record, noise="innovation", trainer=trainer, monitors=[]).model
     model, flat = one.model, y[:, None]
-    sizes = {"nz": 1, "nw": 1, "nn": [2, 3], "seeds": (0,), "trainer": trainer}
-    start: Any = lambda sizes, seed: begin(seed=seed)  # noqa: E731
+    start: Any = lambda bla, train, sizes, seed: begin(seed=seed)  # noqa: E731
+    choosing = {"orders": [2], "start": start, "given": {"nx": 2, "nz": 1, "nw": 1, "nn": 2}}
     fitted = {"train": record, "trainer": trainer}
     calls: list[tuple[Callable[..., Any], dict[str, Any]]] = [
         (lfrtorch.multisine, {"samples": 64}),
@@ -132,7 +132,7 @@ def of_functions(folder: Path) -> list[Case]:
         (lfrtorch.refit, {"result": one, "held_out": short, **fitted}),
         (lfrtorch.distil, {"result": mean, "validation": short, **fitted}),
         (lfrtorch.mean_model, {"models": several}),
-        (lfrtorch.search_sizes, {"start": start, "train": record, "validation": short, **sizes}),
+        (lfrtorch.choose_sizes, {"records": record, "linear": lambda nx: bla, **choosing}),
         (lfrtorch.rmse, {"record": record, "y_hat": flat}),
         (lfrtorch.nrmse, {"record": record, "y_hat": flat}),
         (lfrtorch.Settings, {"nx": 2}),

@@ -21,21 +21,16 @@ from lfrtorch import (
     Dataset,
     LevenbergMarquardt,
     Record,
-    Scaler,
     Settings,
-    SizesSearch,
     identify,
 )
 from lfrtorch.cli import config, fit
-from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.first_fit import part_of
 from lfrtorch.fitting.multistart import cheap_starts
 from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.snapshots import Snapshots
-from lfrtorch.fitting.stage import Stage
 from lfrtorch.fitting.trainer import StoppedError
-from lfrtorch.job import choose_sizes, linear_records
-from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.job import linear_records
 from lfrtorch.reporting import Console, plots, write
 
 SHORT = LevenbergMarquardt(max_iter=4)
@@ -86,46 +81,53 @@ def test_the_job_scores_every_record_and_advises(dataset: Dataset):
 
 
 @pytest.mark.numeric
-def test_chosen_sizes_are_returned_and_what_was_asked_for_stays(dataset: Dataset):
-    search, observer = SizesSearch(nn=(1, 3), starts=1), Said()
-    asked = settings(nx="auto", nx_max=2, nn="auto", starts=1, sizes_search=search)
+def test_chosen_sizes_are_fitted_to_all_estimation_records(dataset: Dataset):
+    observer = Said()
+    asked = settings(nx="auto", nx_max=2, nn="auto", starts="auto")
     run = identify(dataset, asked, observer=observer)
     assert (asked.nx, asked.nn) == ("auto", "auto")
     assert run.order_scan is not None
-    assert run.size_search is not None
-    assert run.settings.sizes == run.model.sizes
-    assert run.settings.nx == run.linear.nx >= run.order_scan.chosen
-    # All say which linear model is beside it: that of the scan, or of more states.
-    nx = run.linear.nx
-    assert [text for text in observer.texts if "BLA:" in text][-1].startswith(f"BLA: order {nx}")
-    assert f"the linear model (nx {nx}): " in run.verdict.text
-    assert f"  linear (nx {nx})  " in str(run)
-    assert run.metrics["lti_nx"] == nx
-    chosen = run.size_search.chosen
-    assert (run.settings.nn, run.settings.seed) == (chosen.sizes["nn"], chosen.seed)
-    # The fit goes the way of the model that was chosen.
-    first = next(start for start in run.fit.starts if start.number == 0)
-    scale = Scaler.of(dataset.validation).y_scale.item()
-    assert first.validation <= chosen.error * scale * (1.0 + 1e-6)
-    assert len(run.fit.starts) == run.settings.starts == 2
+    assert run.choice is not None
+    chosen = run.choice.chosen
+    assert run.settings.sizes == chosen.sizes
+    assert run.settings.ridge == chosen.ridge
+    assert run.linear.nx == run.choice.nx
+    assert f"the linear model (nx {run.linear.nx}): " in run.verdict.text
+    samples = sum(r.samples for r in (*dataset.train, *dataset.validation))
+    assert run.metrics["data"]["samples"] == samples
+    assert run.dataset.validation == []
+    # Stands for validation: errors in what was left out of fit and choice.
+    (held_out,) = (r for r in run.simulations if r.use == "validation")
+    assert held_out.score.rmse == pytest.approx(run.metrics["validation"]["rmse"])
+    assert run.fit.averaged > 1
+    assert run.model.sizes["nx"] == run.fit.averaged * chosen.sizes["nx"]
 
 
 @pytest.mark.numeric
-def test_sizes_are_searched_as_far_as_short_records_carry():
-    whole = saturation("whole", 0, 120)
-    parts = [Record(whole.u[p], whole.y[p], skip=5) for p in (slice(72), slice(72, 120))]
-    some = SizesSearch(nx=(3, 6), nz=(1,), nw=(1,), nn=(2,), finalists=1)  # 6 needs 84 samples
-    asked = settings(nx="auto", nn="auto", sizes_search=some)
-    k = np.arange(300)
-    tones = np.sin(0.3 * k) + np.cos(1.1 * k)  # which excite five directions, and order 3 has seven
-    slow = np.tanh(np.convolve(tones, [0.0, 0.6, 0.3])[:300])
-    toned = [Record(tones[p], slow[p], skip=5) for p in (slice(200), slice(200, 300))]
-    for (train, validation), orders in ((parts[:2], {1, 3}), (toned, {1})):
-        data = Dataset("mine", [train], [validation], [])
-        linear = estimate_bla(data.train, nx=1)
-        found = choose_sizes(Stage(data, asked, Observer(), Ranks(), None), linear)
-        assert found is not None
-        assert {c.sizes["nx"] for c in found.candidates} == orders
+def test_without_tests_what_was_left_out_judges(dataset: Dataset):
+    alone = replace(dataset, tests=[])
+    run = identify(alone, settings(nx=1, nz="auto", nn=3, starts=1))
+    assert run.verdict.kind == "better"
+    assert "on cross-validation the NL-LFR's error is" in run.verdict.text
+    assert (run.settings.nx, run.settings.nn) == (1, 3)
+
+
+@pytest.mark.parametrize("feature", ["noise", "init", "periodic", "polynomial"])
+@pytest.mark.numeric
+def test_sizes_are_chosen_beside(feature: str, dataset: Dataset):
+    asked: dict[str, Any] = {"nx": 1, "nz": 1, "nw": 1, "nn": "auto"}
+    if feature == "noise":
+        asked |= {"noise": "innovation"}
+    elif feature == "init":
+        asked |= {"init": "paper"}
+    elif feature == "polynomial":
+        asked |= {"static": "polynomial", "nn": 3, "degree": "auto"}
+    else:
+        u, y = dataset.train[0].u, dataset.train[0].y
+        steady = Record(u[-100:], y[-100:], start="periodic", name="steady")
+        dataset = replace(dataset, train=[*dataset.train, steady])
+    run = identify(replace(dataset, tests=[]), settings(**asked))
+    assert run.verdict.kind == "better"
 
 
 def test_a_model_to_go_on_from_is_not_changed(dataset: Dataset):
@@ -400,9 +402,9 @@ def test_a_refit_that_cannot_help_leaves_the_model(dataset: Dataset, monkeypatch
 
 
 def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFixture[str]):
-    identify(dataset, settings(nn="auto", sizes_search=SizesSearch(nn=(1, 3))), observer=Console())
+    identify(dataset, settings(nz="auto", nn=3), observer=Console())
     printed = capsys.readouterr().out
-    for text in ("BLA: order 1", "round 1 of 2: 8 models to iteration 1", "training samples"):
+    for text in ("BLA: order 1", "sizes: nx 1, nz 1, nw 1, nn 3: ", "training samples"):
         assert text in printed
     identify(dataset, settings())
     assert capsys.readouterr().out == ""

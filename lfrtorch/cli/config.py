@@ -18,7 +18,7 @@ from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import in_lines
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.dataset import Dataset
-from lfrtorch.fitting.plain_settings import PlainSettings, SizesSearch
+from lfrtorch.fitting.plain_settings import PlainSettings
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.records import Record
 from lfrtorch.survey.notes import notes_on
@@ -37,7 +37,6 @@ def configured(cfg: DictConfig) -> Settings:
     if cfg.dtype not in ("float32", "float64"):
         raise InputError(f"dtype is {cfg.dtype}; give float64 or float32.")
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
-    plain["sizes_search"] = SizesSearch(**plain["sizes_search"])
     return Settings(
         **{one.name: plain[one.name] for one in fields(PlainSettings)},
         static=partial(own_map, cfg) if cfg.static.kind == "own" else cfg.static.kind,

@@ -16,7 +16,6 @@ import signal
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -55,7 +54,6 @@ from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.job import identify
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
-from lfrtorch.reporting.advice import Advice
 from lfrtorch.reporting.console import Console
 from lfrtorch.reporting.monitor import Checkpoint, TensorBoard, quiet_writers
 from lfrtorch.reporting.run_files import write
@@ -66,7 +64,7 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
     """One run, its files written by the first process; returns the validation RMSE."""
     # A fit that ended early has its files written before the error of that.
     ranks = Ranks() if ranks is None else ranks
-    asked, cfg = cfg, chosen_before(cfg, folder)
+    cfg = chosen_before(cfg, folder)
     settings = configured(cfg)
     limit_threads(cfg)
     dataset = loaded(cfg)
@@ -86,7 +84,6 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
             number = stop.asked or signal.SIGINT
             raise TerminatedError(f"{stopped}: nothing to keep", number) from None
         if files is not None:
-            found = replace(found, advice=unsearched(found.advice, asked))
             print(found)
             config = OmegaConf.to_yaml(files.cfg, resolve=True)
             write(
@@ -111,16 +108,6 @@ def run(cfg: DictConfig, folder: Path, command: str = "", ranks: Ranks | None = 
         raise TerminatedError(f"the fit was {how}; {best}", stop.asked or signal.SIGINT)
     judged = found.metrics["validation"]["rmse"]
     return found.fit.history[found.fit.chosen_iteration].train if judged is None else judged
-
-
-def unsearched(advice: Sequence[Advice], asked: DictConfig) -> list[Advice]:
-    """Without advice to search for sizes that were: a run that goes on has them from before."""
-
-    def is_open(item: Advice) -> bool:
-        sizes = [name for name, value in (item.change or {}).items() if value == "auto"]
-        return not sizes or any(asked[name] != "auto" for name in sizes)
-
-    return [item for item in advice if is_open(item)]
 
 
 class _Folder(Console):

@@ -83,18 +83,17 @@ def read_settings(path: Path) -> Any:
 
 
 def chosen_before(cfg: DictConfig, folder: Path) -> DictConfig:
-    """The configuration with the sizes, starts and seed that the run to go on with chose."""
-    if cfg.resume is None or not (folder / CONFIG).is_file():
+    """The configuration with as many starts as the run to go on with had.
+
+    They follow from the iterations, of which there may be more now. Sizes are chosen again, to the
+    same end.
+    """
+    if cfg.resume is None or cfg.starts != "auto" or not (folder / CONFIG).is_file():
         return cfg
     before = read_settings(folder / CONFIG)
-    names = [n for n in ("nx", "nz", "nw", "nn", "degree") if cfg[n] == "auto"]
-    names += ["seed"] if names else []
-    # The number of starts follows from the iterations, too, of which there may be more now.
-    names += ["starts"] if names or cfg.starts == "auto" else []
-    if not isinstance(before, dict) or not before.keys() >= set(names):
-        raise InputError(f"'{folder / CONFIG}' lacks {', '.join(names)}; begin a new run.")
-    chosen = {name: before[name] for name in names}
-    return cast(DictConfig, OmegaConf.merge(cfg, chosen))
+    if not isinstance(before, dict) or "starts" not in before:
+        raise InputError(f"'{folder / CONFIG}' lacks starts; begin a new run.")
+    return cast(DictConfig, OmegaConf.merge(cfg, {"starts": before["starts"]}))
 
 
 def program(script: str) -> list[str]:

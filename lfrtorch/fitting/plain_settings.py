@@ -5,54 +5,17 @@ Nothing heavy is imported here: the help of the command line reads the declarati
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from lfrtorch._support.settings import check_settings, documented, setting
+from lfrtorch._support.settings import setting
 
 Size = int | Literal["auto"]
 """A number, or one that the data choose."""
 
 Noise = Literal["output", "innovation", "both"]
 """What is fitted: simulations, as if noise were at the outputs alone, predictions, or both."""
-
-
-@documented
-@dataclass(frozen=True, kw_only=True)
-class SizesSearch:
-    """What is tried for the sizes that are ``"auto"``, see :func:`lfrtorch.search_sizes`.
-
-    Example:
-        >>> lfrtorch.SizesSearch(nn=(5, 10), starts=2).nn
-        (5, 10)
-    """
-
-    nx: Sequence[int] = setting(
-        (2, 3, 4, 6, 8, 10, 12),
-        "the numbers of states to try above the linear model's order, up to ``nx_max``, if nx and "
-        'another size are ``"auto"``.',
-    )
-    nz: Sequence[int] = setting((1, 2, 3), "the numbers to try.")
-    nw: Sequence[int] = setting((1, 2, 3), "likewise.")
-    nn: Sequence[int] = setting((5, 10, 15, 25), "likewise.")
-    degree: Sequence[int] = setting((2, 3, 5), "likewise.")
-    starts: int = setting(4, "random starts of each size, at most.", least=1)
-    finalists: int = setting(
-        6, "models that get all iterations of the search; 8 times as many begin it.", least=1
-    )
-    iterations: float = setting(
-        0.375, "part of the iterations of the fit that they get.", positive=True
-    )
-    folds: int = setting(
-        0,
-        "if not 0, the finalists are compared by cross-validation over so many stretches of the "
-        "training and validation records: for short records.",
-        least=0,
-    )
-
-    def __post_init__(self) -> None:
-        check_settings(self, "sizes_search.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,8 +124,5 @@ class PlainSettings:
         "of the first start; the others have seed + 1000, seed + 2000, ... If sizes are searched, "
         "the first start of the fit is the one that brought the sizes chosen.",
         least=0,
-    )
-    sizes_search: SizesSearch = setting(
-        SizesSearch, 'what is tried for the sizes that are ``"auto"``.'
     )
     device: str = setting("cpu", 'of the fit: ``"cpu"`` or ``"cuda"``.')

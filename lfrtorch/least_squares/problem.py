@@ -73,7 +73,7 @@ class Problem(LeastSquares):
         self._terms: list[Term] = [errors, *others]
         self._initial_states = errors.first_initial_states()
         self._theta_0 = self.theta
-        self._ridge = errors.parameters.ridge(ridge).to(self._theta_0)
+        self.weigh(ridge)
         self._guarantee = guarantee
         fixed = fixed_parameters(lfr.cell) if fixed is None else fixed
         self.fixed: Bool[Tensor, " P"] | None = None
@@ -164,6 +164,10 @@ class Problem(LeastSquares):
         theta = theta.detach().to(self._theta_0, copy=True)  # the module's weights are its own
         self.errors.parameters.write(self.lfr.cell, theta)
         self._initial_states = self.errors.parameters.initial_states(theta)
+
+    def weigh(self, ridge: Ridge) -> None:
+        """Give the ridge another weight; it still pulls to θ_0."""
+        self._ridge = self.errors.parameters.ridge(ridge).to(self._theta_0)
 
     def rmse(self, theta: Float[Tensor, " P"]) -> float:
         """RMSE at θ over scored samples and outputs, unweighted, in output units, as in a score."""

@@ -32,7 +32,13 @@ from lfrtorch.linear.integrators import (
     simulation_errors,
     whitening_pole,
 )
-from lfrtorch.linear.minima import Problem, best_minimum, candidates, transformation
+from lfrtorch.linear.minima import (
+    Problem,
+    best_minimum,
+    candidates,
+    search_from,
+    transformation,
+)
 from lfrtorch.linear.model import LinearFit, LinearModel
 from lfrtorch.linear.refinement import Refined
 from lfrtorch.linear.requirements import (
@@ -57,6 +63,8 @@ from lfrtorch.model import state_moment
 from lfrtorch.records import Record, Scaler, as_records, without_coordinates
 
 Criterion = Literal["simulation", "prediction", "frequency"]
+
+_NEAR, _SETTLED = 12, 1e-4  # iterations from a model near the minimum, and what ends them
 
 FILTERS = 4
 """Most filters that the error of a differenced output is whitened by."""
@@ -171,6 +179,32 @@ def estimate_bla(
         moment = state_moment(model.to_model(), data)
         model = replace(model, state_covariance=moment.numpy())
     return replace(model, fit=replace(fit, seconds=time.perf_counter() - clock, notes=notes))
+
+
+@spread_by_hand()
+def refined_near(model: LinearModel, records: Sequence[Record]) -> LinearModel:
+    """Fit a model's order to other records of its kind in simulation error, from that model."""
+    # That is all a fit without some of the samples takes. Exact integrators stay as they are.
+    if model.poles.size and np.abs(model.poles).max() >= 1.0:
+        return model
+    data = [without_coordinates(record) for record in records]
+    scaler = Scaler.of(data, offset=bool(model.y_offset.any() or model.u_offset.any()))
+    problem = SignalFit(
+        [scaler.normalise(record) for record in data],
+        offset=True,
+        prediction=False,
+        feedthrough=bool(model.D.any()),
+    )
+    _, matrices = problem.with_input_matrices(model.A, model.C / scaler.y_scale[:, None])
+    search = search_from(problem, matrices).advance(_NEAR, _SETTLED)
+    found = problem.refined(search)
+    near = physical(found, scaler, data[0])
+    near = near.transformed(*transformation(problem, found.matrices))
+    if found.constant is not None:
+        near = replace(near, y_offset=near.y_offset + scaler.y_scale * found.constant)
+    fit = LinearFit("simulation", found.rmse, found.iterations, found.reason, 0.0)
+    moment = state_moment(near.to_model(), data).numpy()
+    return replace(near, state_covariance=moment, fit=fit)
 
 
 def default_criterion(records: Sequence[Record]) -> Criterion:

@@ -309,17 +309,6 @@ def tests_are_louder(e: Evidence) -> Advice | None:
     )
 
 
-def largest_sizes(e: Evidence) -> Advice | None:
-    """Sizes that validation chose at the edge of what was tried."""
-    if not e.largest or e.crowded:
-        return None
-    lists = [f"sizes_search.{name}=[{e.sizes[name]},{2 * e.sizes[name]}]" for name in e.largest]
-    return Advice(
-        f"The largest sizes tried were chosen; larger ones may do better: {', '.join(lists)}.",
-        "sizes_search says what is tried",
-    )
-
-
 def choose_sizes(e: Evidence) -> Advice | None:
     """Sizes that were guessed, and validation records that can choose them."""
     if e.searched or e.continued or e.validation is None or e.parts_differ:
@@ -363,7 +352,6 @@ _RULES = (  # the most useful first, and whether a rule is on the sizes or the s
     (one_start, True),
     (still_falling, True),
     (tests_are_louder, False),
-    (largest_sizes, True),
     (noise_unknown, False),
 )
 

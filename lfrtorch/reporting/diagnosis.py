@@ -17,7 +17,6 @@ from scipy.special import fdtrc
 from lfrtorch._support.reasons import SPENT, Reason
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.densities import noise_of_periods
-from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.linear.model import LinearModel
@@ -90,7 +89,6 @@ class Evidence:
     continued: bool = False  # from a model, so that there are no other starts
     sizes: Mapping[str, int] = field(default_factory=dict)  # nx is that of the linear model
     searched: bool = False  # whether validation chose them
-    largest: Sequence[str] = ()  # those that are the largest of a search
     trainer: Any = field(default_factory=LevenbergMarquardt)
     ridge: bool = False
     louder: Mapping[str, float] = field(default_factory=dict)  # largest input / training's, by test
@@ -208,7 +206,7 @@ def evidence(
     noise_rms: float | None = None,  # of the training outputs in their unit, if it is known
     continued: bool = False,  # from a model
     ridge: bool = False,
-    search: SizeSearch | None = None,  # for the sizes, if validation chose them
+    searched: bool = False,  # whether the sizes were chosen by the data
     trainer: Trainer | None = None,  # Levenberg-Marquardt if not given
     verdict: Verdict | None = None,
 ) -> Evidence:
@@ -252,8 +250,7 @@ def evidence(
         started=max(1, len(result.starts)),
         continued=continued,
         sizes=result.model.sizes if bla is None else {**result.model.sizes, "nx": bla.nx},
-        searched=search is not None,
-        largest=[] if search is None else search.largest,
+        searched=searched,
         trainer=LevenbergMarquardt() if trainer is None else trainer,
         ridge=ridge,
         louder={

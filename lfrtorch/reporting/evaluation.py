@@ -22,6 +22,9 @@ from lfrtorch.score_window import fitted
 
 _LINEAR, _NL_LFR = "linear", "NL-LFR"  # names of the two models
 
+CROSS = "cross-validation"
+"""Name of what stands for a validation record if all records are fitted."""
+
 HORIZONS = 1, 10, 100
 """Samples ahead that predictions are scored at."""
 
@@ -137,6 +140,7 @@ class Evaluation:
     model: Model | None = None
     refitted: Model | None = None  # to all estimation records: it simulates the tests
     own: Mapping[str, LinearModel] = field(default_factory=dict)  # of single tests, by name
+    left_out: Sequence[Response] = ()  # by models that were fitted and chosen without each sample
 
     @cached_property
     def simulations(self) -> list[Response]:
@@ -151,7 +155,7 @@ class Evaluation:
                 simulated[_NL_LFR] = y_hat = model.simulate(driven)
                 added = None if use == "train" else start_error(model, record, y_hat)
             found.append(Response(record, use, simulated, added))
-        return found
+        return [*found, *self.left_out]
 
     @cached_property
     def predictions(self) -> dict[int, list[Response]]:
@@ -198,6 +202,18 @@ class Evaluation:
             return self.linear, self.model
         own = self.own.get(self.dataset.score_of(record), self.linear)
         return own, self.refitted or self.model
+
+
+def cross_validated(
+    left_out: Sequence[tuple[Record, Array, Array]],
+) -> list[Response]:
+    """Records with the outputs of the linear model and the NL-LFR where they were left out."""
+    found = []
+    for record, linear, y_hat in left_out:
+        name = CROSS if len(left_out) == 1 else f"{record.name}, {CROSS}"
+        simulated = {_LINEAR: linear, _NL_LFR: y_hat}
+        found.append(Response(replace(record, name=name), "validation", simulated))
+    return found
 
 
 def ranked(responses: Sequence[Response]) -> list[Response]:

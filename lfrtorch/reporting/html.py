@@ -29,7 +29,7 @@ from lfrtorch._support.tables import (
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.linearisation import poles_at_rest
 from lfrtorch.analysis.residual_analysis import LEGEND as RESIDUALS_LEGEND
-from lfrtorch.fitting.size_search import LEGEND, size_table
+from lfrtorch.fitting.choice import LEGEND, choice_table
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.records import common_unit
@@ -86,7 +86,7 @@ def render(
         residuals_legend=RESIDUALS_LEGEND,
         linear=_linear(run.linear, run.fit),
         fit=_fit(run),
-        search=(len(tried), size_table(tried), LEGEND.splitlines()),
+        search=(len(tried), choice_table(tried), LEGEND.splitlines()),
         parameters=[
             [name, " × ".join(map(str, w.shape)), w.numel()] for name, w in groups if w.numel()
         ],

@@ -10,8 +10,8 @@ from lfrtorch._support.tables import quantity
 from lfrtorch.analysis.amplitude_margin import LOUDER
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import Dataset
+from lfrtorch.fitting.choice import Choice
 from lfrtorch.fitting.settings import Settings
-from lfrtorch.fitting.size_search import SizeSearch
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.order_scan import OrderScan
@@ -31,7 +31,7 @@ class Run:
         dataset: the records.
         settings: with the sizes that were chosen in the place of ``"auto"``.
         linear: the best linear approximation of all training records.
-        order_scan, size_search: how nx and the other sizes were chosen; None if they were given.
+        order_scan, choice: how nx and the other sizes were chosen; None if they were given.
         fit: the nonlinear fit, of the best start or of the mean of several.
         refit: the fit to all estimation records, if one was asked for. Its model is the run's, and
             is scored on the tests; training and validation errors are those of ``fit.model``.
@@ -55,7 +55,7 @@ class Run:
     settings: Settings
     linear: LinearModel
     order_scan: OrderScan | None
-    size_search: SizeSearch | None
+    choice: Choice | None
     fit: FitResult
     refit: FitResult | None = None
     evaluation: Evaluation

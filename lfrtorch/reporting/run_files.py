@@ -51,7 +51,7 @@ def write(
         "report": "\n\n".join(map(str, [run.verdict, *run.advice])),
         "scores": scores.table(metrics, dataset.published),
         "settings": config,
-        "sizes": "" if run.size_search is None else run.size_search.table(),
+        "sizes": "" if run.choice is None else run.choice.table(),
     }
     for name, text in texts.items():
         if text:

@@ -14,7 +14,7 @@ from lfrtorch._support.reasons import Reason
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.analysis.residual_analysis import Residuals
 from lfrtorch.dataset import LISTED, Published
-from lfrtorch.fitting.size_search import SizeSearch
+from lfrtorch.fitting.choice import Choice
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.records import common_unit
 from lfrtorch.reporting.evaluation import HORIZONS, Evaluation
@@ -30,7 +30,7 @@ def metrics(
     evaluation: Evaluation,
     *,
     seeds: Sequence[int],
-    search: SizeSearch | None = None,
+    choice: Choice | None = None,
     verdict: Verdict | None = None,
     refit: FitResult | None = None,
     residuals: Residuals | None = None,
@@ -45,7 +45,7 @@ def metrics(
     }
     entries |= {
         "verdict": None if verdict is None else asdict(verdict),
-        "sizes_search": [] if search is None else search.entries(),
+        "sizes_search": [] if choice is None else choice.entries(),
         "fit": {
             "iterations": result.iterations,
             "seconds": result.seconds,

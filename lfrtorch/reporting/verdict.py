@@ -5,7 +5,9 @@ same blocks of time, and the standard error of its logarithm. (That of the diffe
 few resonances have most of the error, even where one model is better in every block.) A ratio is
 clear if it is beyond Student's quantile, or if one error is twice the other: one burst of a model
 that runs away has a large standard error, and is no chance. A difference below 5 % of the error is
-none.
+none. What was left out in turn is the whole record, each stretch judged by models that were chosen
+without it: there 1.5 standard errors and 1 % are enough. Of 38 planted systems 16 are called better
+so, all of them rightly, and 13 with the limits of other records.
 """
 
 from __future__ import annotations
@@ -25,13 +27,15 @@ from lfrtorch._support.types import Array, Integers
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.metrics import nrmse, rms
 from lfrtorch.paired_blocks import BLOCKS, blocked_mean, in_blocks
-from lfrtorch.reporting.evaluation import Response
+from lfrtorch.reporting.evaluation import CROSS, Response
 
 NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
 """What a verdict says is to be used."""
 
 SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
+
+_CROSS_SAME, _CROSS_CLEAR = 0.01, 1.5  # likewise, and the standard errors, in cross-validation
 
 _CLEAR = 2.0  # ratio of two errors that is no chance, whatever its standard error
 
@@ -92,6 +96,7 @@ class _Compared(NamedTuple):
     clear: float  # how many are needed
     nrmse: float  # error over the output's standard deviation
     linear_nrmse: float
+    same: float = SAME  # difference of the errors that is none
 
     @property
     def worse(self) -> bool:
@@ -103,7 +108,7 @@ class _Compared(NamedTuple):
     def better(self) -> bool:
         """Whether it is clearly smaller."""
         certain = self.deviations < -self.clear or self.ratio <= 1.0 / _CLEAR
-        return certain and self.ratio < 1.0 - SAME
+        return certain and self.ratio < 1.0 - self.same
 
 
 class _Errors(NamedTuple):
@@ -171,7 +176,7 @@ def judge(
         text = f"As {linear}: {kept}on {whole.name} the errors are the same"
     else:
         kind, use = Kind.LINEAR, LINEAR_MODEL
-        clearly = "clearly " * (whole.ratio < 1.0 - SAME)
+        clearly = "clearly " * (whole.ratio < 1.0 - whole.same)
         text = (
             f"Not {clearly}better than {linear}: on {whole.name} the {error} is "
             f"{number(100 * whole.ratio)} ± {number(100 * whole.ratio_std, 2)} % of its"
@@ -310,14 +315,17 @@ def _compared(
     power = float(np.dot([e.power for e in errors], samples)) or math.nan
     first = errors[0].response
     several = f"{len(errors)} {_use(first)} records"
+    cross = all(e.response.record.name.endswith(CROSS) for e in errors)
+    clear = stdtrit(len(counts) - 1, 1.0 - (1.0 - CONFIDENCE) / max(1, among))
     return _Compared(
         name=_name(first) if len(errors) == 1 else several,
         ratio=ratio,
         ratio_std=ratio_std,
         deviations=math.log(ratio) * ratio / ratio_std if ratio_std > 0 else 0.0,
-        clear=float(stdtrit(len(counts) - 1, 1.0 - (1.0 - CONFIDENCE) / max(1, among))),
+        clear=_CROSS_CLEAR if cross else float(clear),
         nrmse=math.sqrt(sum(e.squares.sum() for e in errors) / power),
         linear_nrmse=math.sqrt(sum(e.linear.sum() for e in errors) / power),
+        same=_CROSS_SAME if cross else SAME,
     )
 
 
@@ -335,6 +343,8 @@ def _use(response: Response) -> str:
 def _name(response: Response) -> str:
     """A record in a sentence."""
     name, use = response.record.name, _use(response)
+    if name == CROSS:
+        return name
     if len(name) > _LONGEST_NAME:
         name = f"{name[: _LONGEST_NAME - 3]}..."
     return use if name in ("", response.use, use) else f"{use} '{name}'"

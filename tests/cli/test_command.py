@@ -55,7 +55,6 @@ def test_help_says_how_to_use_it_and_leaves_nothing_behind(
             names.remove("reference")  # of use to the linear fit alone
         group = file.split("/")[0]
         assert [name for name in names if f"{group}.{name}" not in printed] == []
-        assert "sizes_search" not in printed
         assert "init_from" not in printed
     assert list(tmp_path.iterdir()) == []
 

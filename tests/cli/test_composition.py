@@ -72,7 +72,7 @@ def test_a_folder_is_no_file(tmp_path: Path):
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        ("config", ["+bench=boucwen", "seed=1", "bla.offset=true", "sizes_search.nz=[1,2]"]),
+        ("config", ["+bench=boucwen", "seed=1", "bla.offset=true"]),
         ("config", [*FILE, "+data.x=1", "+trainer.x=1", "+bla.weight=x", "++trainer.max_iter=5"]),
         ("config", ["+data._target_=my.loader", "+data.path=x", "trainer._target_=my.Trainer"]),
         ("config", [*FILE, "static=own", "static._target_=my.Map", "+static.width=3"]),

@@ -5,17 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lfrtorch.fitting.folds import folds
+from lfrtorch.fitting.folds import as_folded, folds
 from lfrtorch.records import Record, Start
 
 
 def record(samples: int, start: Start = "zero", skip: int = 0, period: int | None = None) -> Record:
     time = np.arange(samples, dtype=float)
     return Record(time, 1000.0 * samples + time, start=start, skip=skip, period=period)
-
-
-def scored(records: list[Record]) -> list[float]:
-    return [y for each in records for y in each.y[each.skip :, 0]]
 
 
 def some(kind: str) -> list[Record]:
@@ -31,36 +27,32 @@ def some(kind: str) -> list[Record]:
 
 @pytest.mark.parametrize("kind", ["one", "amid", "several", "periods", "realisations"])
 @pytest.mark.parametrize("count", [2, 4])
-def test_every_sample_is_left_out_once_and_trains_in_the_others(kind: str, count: int):
-    records = some(kind)
+def test_every_scored_sample_is_left_out_once_and_trains_in_the_others(kind: str, count: int):
+    records = as_folded(some(kind))
+    every = sorted(y for r in records for y in r.y[r.skip :, 0])
     found = folds(records, count)
-    assert len(found) == count
-    every = sorted(scored(records))
-    assert sorted(y for fold in found for y in scored(fold.left_out)) == every
-    for fold in found:
-        assert sorted(scored(fold.train) + scored(fold.left_out)) == every
-    sizes = [len(scored(fold.left_out)) for fold in found]
-    assert max(sizes) - min(sizes) <= (60 if records[0].start == "periodic" else 2)
+    left_out = [fold.left_out([r.y for r in records])[:, 0] for fold in found]
+    assert sorted(np.concatenate(left_out)) == every
+    assert max(map(len, left_out)) - min(map(len, left_out)) <= 2
+    for fold, own in zip(found, left_out, strict=True):
+        trains = [y for r in fold.train for y in r.y[r.scored[:, 0], 0]]
+        assert not {*trains} & {*own}
+        assert {*every} <= {*trains, *own}
 
 
-def test_what_was_left_out_is_simulated_from_the_start_of_its_record():
-    whole = replace(record(200, skip=20), start="given", x0=np.ones(1))
-    for fold in folds(whole, 3):
-        (left_out,) = fold.left_out
-        assert np.array_equal(left_out.u, whole.u[: left_out.samples])
-        assert left_out.start == "given"
-        for part in fold.train:
-            assert part.start == ("given" if part.u[0] == 0 else "estimated")
-    steady = folds(record(60, "periodic", period=20), 3)[1]
-    assert [(r.samples, r.start, r.period) for r in steady.train] == 2 * [(20, "periodic", 20)]
+def test_a_masked_sample_stays_so_and_none_is_periodic():
+    valid = np.arange(200) % 7 > 0
+    whole = replace(record(200, skip=20), start="given", x0=np.ones(1), valid=valid)
+    (steady, own) = as_folded([record(60, "periodic", period=20), whole])
+    assert (steady.start, steady.period, own.start) == ("estimated", None, "estimated")
+    for fold in folds([own], 3):
+        (train,) = fold.train
+        assert not train.scored[~valid].any()
+        assert not train.scored[slice(*fold.windows[0])].any()
 
 
 def test_folds_that_cannot_be_say_so():
     with pytest.raises(ValueError, match="folds is 1"):
-        folds(record(200), 1)
-    weighted = replace(record(60, "periodic", period=20), line_weight=np.ones(31))
-    with pytest.raises(ValueError, match="has line_weight"):
-        folds(weighted, 3)
-    for records in (record(200, "periodic", period=200), record(15)):
-        with pytest.raises(ValueError, match="folds is 2, and one of these stretches"):
-            folds(records, 2)
+        folds([record(200)], 1)
+    with pytest.raises(ValueError, match=r"15 scored samples, of which 2 stretches.*longer rec"):
+        folds([record(15)], 2)

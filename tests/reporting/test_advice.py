@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,6 @@ SETTINGS = lfrtorch.Settings(nx=3, nz=1, nw=1, nn=10)
         (advice.tests_are_louder, {"louder": {"arrow": 1.5}}, "train on inputs as loud"),
         (advice.noise_unknown, {"noise": None}, "in steady state for training."),
         (advice.choose_sizes, {"searched": False}, "nx='auto', nz='auto', nw='auto', nn='auto'"),
-        (advice.largest_sizes, {"largest": ["nn"]}, "sizes_search.nn=[10,20]"),
         (advice.hardly_better, {"validation": 0.199}, "at any size searched"),
         (
             advice.hardly_better,
@@ -309,7 +308,6 @@ def test_the_advice_of_one_run_is_not_taken_back_by_the_next(start: dict[str, in
 def test_advice_asks_for_settings_that_there_are():
     """In every text of the rules each NAME=VALUE is a setting, of the fit or of its files."""
     known = dict(spelt(composed("config", ["data=file"])))
-    known |= {f"sizes_search.{one.name}": "" for one in fields(lfrtorch.SizesSearch)}
     source = ast.parse(Path(advice.__file__).read_text(encoding="utf-8"))
     constants = [n.value for n in ast.walk(source) if isinstance(n, ast.Constant)]
     texts = [text for text in constants if isinstance(text, str)]

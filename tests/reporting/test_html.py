@@ -83,7 +83,7 @@ class Run:
             settings=lfrtorch.Settings(nx=2),
             linear=self.bla,
             order_scan=None,
-            size_search=None,
+            choice=None,
             fit=self.result,
             evaluation=self.evaluation,
             residuals=residuals,

@@ -1,0 +1,484 @@
+"""Sizes and ridge by cross-validation, and what the choice is worth on data that it has not seen.
+
+Four stretches of the estimation records are left out in turn (``lfrtorch.fitting.folds``). Linear
+and nonlinear models are fitted to the rest, and simulated through what was left out:
+
+1. The best linear approximations of several orders, each refined without the stretch.
+2. Nonlinear models from small to large: the first few sizes always, and larger ones as long as one
+   of them lowers the error. Each is fitted from two starts along falling ridges, each ridge from
+   where the last one ended, all towards the same start, and simulates by the mean of its starts.
+3. Of all sizes and ridges the fewest parameters are chosen that do as well as the best
+   (``lfrtorch.paired_blocks``), and of their ridges the largest.
+
+What a choice of many is worth is not its own error, which is the least of many. So the choice is
+made again without each of the stretches, and judged there (nested cross-validation): the errors of
+``Choice.responses``, of both models, have chosen nothing.
+
+References:
+    Stone, "Cross-validatory choice and assessment of statistical predictions", Journal of the Royal
+    Statistical Society B 36(2), 1974.
+    Varma and Simon, "Bias in error estimation when using cross-validation for model selection", BMC
+    Bioinformatics 7:91, 2006 (nested).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import product
+from math import isfinite, nan, sqrt
+from threading import Event
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from lfrtorch._support import tables
+from lfrtorch._support.arguments import typed
+from lfrtorch._support.errors import InputError
+from lfrtorch._support.tables import percent, quantity
+from lfrtorch._support.threads import each_alone
+from lfrtorch._support.types import Array, Integers
+from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
+from lfrtorch.distributed import Ranks
+from lfrtorch.fitting.folds import Fold, as_folded, folds
+from lfrtorch.fitting.multistart import NEAR
+from lfrtorch.fitting.side_by_side import any_of
+from lfrtorch.fitting.trainer import Stop, StoppedError
+from lfrtorch.least_squares.guarantee import Name
+from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
+from lfrtorch.least_squares.problem import Problem
+from lfrtorch.linear.bla import refined_near
+from lfrtorch.linear.model import LinearModel
+from lfrtorch.model import Model
+from lfrtorch.paired_blocks import as_good, standard_errors_above
+from lfrtorch.records import Record, Scaler, as_records
+
+Sizes = dict[str, int]
+
+FOLDS = 4
+"""Stretches that are left out in turn: each fit has three quarters of the data."""
+
+_BLOCKS = 4  # of each stretch: 16 differences of squared errors tell two models apart
+
+_RIDGES = ((10.0, 12), (1.0, 12), (0.1, 10), (1e-2, 10), (1e-3, 10), (1e-4, 10), (1e-6, 10))
+"""Ridges and the iterations of each."""
+
+_STARTS = 2
+
+_OVERFIT = 2.0  # error in what is left out over the least of larger ridges, that ends a path
+
+_SMALL = ({"nz": 1, "nw": 1, "nn": 4, "degree": 3}, {"nz": 2, "nw": 2, "nn": 8, "degree": 3})
+"""Sizes that are always tried."""
+
+_TINY = 1e-30  # a linear model that is exact has a ratio to it, too
+
+_GAIN = 0.98  # error over the linear model's, or the last best one's, that larger sizes need
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Sizes and a ridge that were tried.
+
+    Args:
+        sizes: nx, nz, nw, and nn or degree.
+        ridge: weight of the squared distance to the start.
+        parameters_net: without the gauge directions.
+        ratio: rms error in what was left out over that of the linear model.
+        squares: sums of the squared relative errors in the blocks of each stretch, (folds, B).
+        outputs: what simulates each stretch (samples, ny), physical units.
+    """
+
+    sizes: Sizes
+    ridge: float
+    parameters_net: int
+    ratio: float
+    squares: Array = field(repr=False)
+    outputs: Sequence[Array] = field(repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Sizes and ridges by cross-validation.
+
+    Args:
+        candidates: all that were tried.
+        chosen: the fewest net parameters that do as well as the best.
+        nx: the best order of a linear model.
+        counts: samples of each block, (folds, B).
+        left_out: for each record that has scored samples its outputs where they were left out, of
+            the linear model and the NL-LFR that were chosen without them, (T, ny), physical units.
+        seconds: that it took.
+    """
+
+    candidates: tuple[Candidate, ...]
+    chosen: Candidate
+    nx: int
+    counts: Integers = field(repr=False)
+    left_out: Sequence[tuple[Record, Array, Array]] = field(repr=False)
+    seconds: float
+
+    def entries(self) -> list[dict[str, Any]]:
+        """Numbers of each, by name."""
+        squares = np.array([c.squares.ravel() for c in self.candidates])
+        above = standard_errors_above(squares, self.counts.ravel())
+        return [
+            {
+                **c.sizes,
+                "ridge": c.ridge,
+                "parameters_net": c.parameters_net,
+                "ratio": c.ratio,
+                "standard_errors_above": float(far),
+                "chosen": c is self.chosen,
+            }
+            for c, far in zip(self.candidates, above, strict=True)
+        ]
+
+    def table(self) -> str:
+        """One line for each size, with the best of its ridges."""
+        return f"{tables.table(*choice_table(self.entries()))}\n{LEGEND}"
+
+
+LEGEND = """\
+/ linear: rms error where it was left out over the linear model's. It compares sizes: the least of
+many is smaller than on new data.
+above best: in standard errors of the difference.
+chosen: the fewest net parameters with 1 at most and an error up to 5 % above the best, or with an
+error up to 1 % above it."""
+
+
+def choice_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
+    """Return head and rows of a table of all sizes, each with its best ridge, and the chosen."""
+    names = [name for name in ("nx", "nz", "nw", "nn", "degree") if entries and name in entries[0]]
+    best: dict[tuple[int, ...], Mapping[str, Any]] = {}
+    for entry in entries:
+        key = tuple(entry[name] for name in names)
+        rank = (not entry["chosen"], entry["ratio"] if entry["ratio"] is not None else np.inf)
+        other = best.get(key)
+        if other is None or rank < (not other["chosen"], other["ratio"]):
+            best[key] = entry
+    columns = (*names, "ridge", "parameters_net", "ratio", "standard_errors_above")
+    rows = [
+        [*(entry[name] for name in columns), "chosen" if entry["chosen"] else ""]
+        for entry in sorted(best.values(), key=lambda entry: entry["parameters_net"])
+    ]
+    return [*names, "ridge", "net", "/ linear", "above best", ""], rows
+
+
+Start = Callable[[LinearModel, Sequence[Record], Sizes, int], Model]
+"""Makes the model of given sizes that a fit to records starts from, with a seed."""
+
+
+@typed()
+def choose_sizes(
+    records: Record | Sequence[Record],
+    orders: Sequence[int],
+    linear: Callable[[int], LinearModel],
+    start: Start,
+    *,
+    given: Mapping[str, int] | None = None,
+    last: str = "nn",
+    seed: int = 0,
+    guarantee: Name | None = None,
+    watch: Callable[[str], None] = lambda _: None,
+    ranks: Ranks | None = None,
+    stop: Stop | None = None,
+) -> Choice:
+    """Choose sizes and ridge of an NL-LFR by cross-validation.
+
+    Args:
+        records: all that a model may be estimated from.
+        orders: of the linear models, 1, 2, ...; those of the NL-LFR may be higher, unless ``given``
+            has nx.
+        linear: the best linear approximation of an order, which is refined without each stretch.
+        start: makes a model, for example ``lambda bla, train, sizes, seed: initialise(bla, train,
+            seed=seed, **sizes)``, with sizes nz, nw and ``last``.
+        given: sizes that are known.
+        last: name of the third size, nn or degree.
+        seed: of the first start; the second has seed + 1000.
+        guarantee: of the trainer.
+        watch: called with a line after each size.
+        ranks: processes that must agree; each does all of the work.
+        stop: asked before each iteration.
+
+    Raises:
+        ValueError: records too short to be cut, or no model that is stable on them.
+        StoppedError: by Ctrl-C or ``stop``: there is no choice yet.
+
+    Example:
+        >>> def start(bla, train, sizes, seed):
+        ...     return lfrtorch.initialise(bla, train, seed=seed, **sizes)
+        >>> given = {"nx": 1, "nz": 1, "nw": 1, "nn": 2}
+        >>> choice = lfrtorch.choose_sizes(record, [1], lambda nx: bla, start, given=given)
+        >>> choice.chosen.sizes
+        {'nx': 1, 'nz': 1, 'nw': 1, 'nn': 2}
+    """
+    clock = time.perf_counter()
+    ranks = Ranks() if ranks is None else ranks
+    halt = Event()
+    study = _Study(as_folded(as_records(records)), linear, guarantee, any_of(halt, stop), halt.set)
+    given = {} if given is None else dict(given)
+    base, tried = study.best_linear(orders), list[Candidate]()
+    begun = set[tuple[int, ...]]()
+    budget = _budget(study.rows)
+
+    def attempt(sizes: Sizes) -> None:
+        nonlocal budget
+        key = tuple(sizes.values())
+        if key in begun or not study.has_order(sizes["nx"]):
+            return
+        begun.add(key)
+        since = time.perf_counter()
+        found = study.candidates(sizes, start, seed, base.total)
+        budget -= study.work(found[0].parameters_net if found else 0)
+        tried.extend(found)
+        best = min((c.ratio for c in found), default=nan)
+        text = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        error = f"{percent(best)} of the linear model's error" if isfinite(best) else "diverges"
+        watch(f"sizes: {text}: {error}, {quantity(time.perf_counter() - since, 's')}")
+
+    def leader() -> Candidate | None:
+        finite = [c for c in tried if isfinite(c.ratio)]
+        ratios = ranks.first(torch.tensor([c.ratio for c in finite], dtype=torch.float64))
+        return finite[int(ratios.argmin())] if finite else None
+
+    names = ("nz", "nw", last)
+    for nx, small in product([given["nx"]] if "nx" in given else _first(base.nx), _SMALL):
+        attempt({"nx": nx, **{name: given.get(name, small[name]) for name in names}})
+    before = 1.0
+    while (best := leader()) and best.ratio < _GAIN * before and budget > 0.0:
+        before = best.ratio
+        for change in _larger(best.sizes, given, last):
+            attempt(change)
+    if leader() is None:
+        raise InputError(
+            "all models that were tried diverge where they are not fitted; give training data at "
+            "amplitudes like these, or set the sizes."
+        )
+    counts, base = study.counts, study.best_linear()
+    tried = [replace(c, ratio=sqrt(c.squares.sum() / base.total)) for c in tried]
+    chosen = _chosen(tried, range(FOLDS), counts, ranks)
+    nested = [
+        _chosen(tried, [j for j in range(FOLDS) if j != k], counts, ranks) for k in range(FOLDS)
+    ]
+    both = [base.outputs, [each.outputs[k] for k, each in enumerate(nested)]]
+    seconds = time.perf_counter() - clock
+    left_out = study.whole(both)
+    return Choice(tuple(tried), chosen, base.nx, counts, left_out, seconds)
+
+
+def _budget(rows: int) -> float:
+    """Return seconds of one core that a search may take, about; a rule, no measured time."""
+    return 60.0 * sqrt(max(rows, 500) / 500)
+
+
+def _first(order: int) -> list[int]:
+    """Return the orders tried first: the linear model's, one more, and much lower ones."""
+    # A linear model takes more states than the system has where the system is nonlinear.
+    return sorted({order, order + 1} | {low for low in (2, 4) if order > low + 1})
+
+
+def _larger(sizes: Sizes, given: Mapping[str, int], last: str) -> Iterator[Sizes]:
+    """Yield the next larger sizes: one more state, a wider map, more neurons."""
+    factor, most = (2, 60) if last == "nn" else (1, 5)
+    more = min(most, factor * sizes[last] + (factor == 1))
+    wide = {"nz": min(4, sizes["nz"] + 1), "nw": min(4, sizes["nw"] + 1), last: more}
+    for change in ({"nx": sizes["nx"] + 1}, wide, {last: more}):
+        yield {**sizes, **{name: size for name, size in change.items() if name not in given}}
+
+
+def _chosen(
+    tried: Sequence[Candidate], of: Sequence[int], counts: Integers, ranks: Ranks
+) -> Candidate:
+    """Return the fewest parameters that do as well as the best in some folds, and most ridge."""
+    squares = np.array([c.squares[list(of)].ravel() for c in tried])
+    squares = ranks.first(torch.from_numpy(squares)).numpy()
+    good = as_good(squares, counts[list(of)].ravel())
+    near = [c for c, enough in zip(tried, good, strict=True) if enough]
+    return min(near, key=lambda c: (c.parameters_net, -c.ridge))
+
+
+class _Linear(NamedTuple):
+    """Linear models of an order, one without each stretch, and what they make of it."""
+
+    nx: int
+    models: list[LinearModel]
+    outputs: list[Array]
+    squares: Array
+
+    @property
+    def total(self) -> float:
+        """Sum of the squares, not 0."""
+        return max(float(self.squares.sum()), _TINY)
+
+
+class _Study:
+    """Fits without a stretch each, and errors there."""
+
+    def __init__(
+        self,
+        records: list[Record],
+        linear: Callable[[int], LinearModel],
+        guarantee: Name | None,
+        stop: Stop | None,
+        halt: Callable[[], None],
+    ) -> None:
+        self._records, self._whole, self._guarantee = records, linear, guarantee
+        self._stop, self._halt = stop, halt
+        self._folds = folds(records, FOLDS)
+        self._scale = Scaler.of(records).y_scale
+        self.rows = sum(record.y.size for record in records)
+        self.counts = np.array(
+            [[len(b) for b in np.array_split(y, _BLOCKS)] for y in self._left_out("y")]
+        )
+        self._linear: dict[int, _Linear | None] = {}
+
+    def has_order(self, nx: int) -> bool:
+        """Refine the linear model of an order without each stretch; False if there is none."""
+        if nx not in self._linear:
+            self._linear[nx] = None
+            try:
+                models = self._alone(partial(_refined, self._whole(nx)), self._folds)
+            except ValueError:
+                return False
+            outputs = self._alone(self._simulated, list(zip(models, self._folds, strict=True)))
+            squares = self._squares(outputs)
+            if np.isfinite(squares).all():
+                self._linear[nx] = _Linear(nx, models, outputs, squares)
+        return self._linear[nx] is not None
+
+    def best_linear(self, orders: Sequence[int] = ()) -> _Linear:
+        """Return the lowest order that does as well as the best of these and all before."""
+        for nx in orders:
+            self.has_order(nx)
+        found = [each for _, each in sorted(self._linear.items()) if each is not None]
+        if not found:
+            raise InputError(
+                "no linear model of these records is stable without a quarter of them; give longer "
+                "records, or set the sizes."
+            )
+        good = as_good([each.squares.ravel() for each in found], self.counts.ravel())
+        return found[int(np.argmax(good))]
+
+    def candidates(self, sizes: Sizes, start: Start, seed: int, base: float) -> list[Candidate]:
+        """Return a candidate for each ridge; none if a fit cannot begin."""
+        static = {name: size for name, size in sizes.items() if name != "nx"}
+        jobs = [(k, seed + 1000 * i) for k in range(FOLDS) for i in range(_STARTS)]
+        linear = self._linear[sizes["nx"]]
+        assert linear is not None
+
+        def path(job: tuple[int, int]) -> tuple[int, list[tuple[float, Array]]]:
+            k, own = job
+            fold = self._folds[k]
+            model = start(linear.models[k], fold.train, static, own)
+            return model.net_parameter_count, list(self._path(model, fold))
+
+        try:
+            paths = self._alone(path, jobs)
+        except InputError:
+            return []
+        found = []
+        for i, (ridge, _) in enumerate(_RIDGES):
+            outputs = [
+                _mean([steps[i] for (fold, _), (_, steps) in zip(jobs, paths, strict=True)
+                       if fold == k])
+                for k in range(FOLDS)
+            ]  # fmt: skip
+            squares = self._squares(outputs)
+            ratio = sqrt(squares.sum() / base)
+            found.append(Candidate(sizes, ridge, paths[0][0], ratio, squares, outputs))
+        return found
+
+    def work(self, parameters: int) -> float:
+        """Return the seconds that a size takes one core, about."""
+        iterations = FOLDS * _STARTS * sum(count for _, count in _RIDGES)
+        return iterations * (5e-3 + 20e-9 * self.rows * parameters)
+
+    def whole(self, outputs: Sequence[Sequence[Array]]) -> list[tuple[Record, Array, Array]]:
+        """Put what was left out of each fold together again: record, linear and NL-LFR output."""
+        found = []
+        for i, record in enumerate(self._records):
+            if record.samples - record.skip < 1:
+                continue
+            signals = []
+            for own in outputs:
+                y = np.array(record.y)
+                for fold, part in zip(self._folds, own, strict=True):
+                    first, last = fold.windows[i]
+                    at = sum(b - a for a, b in fold.windows[:i])
+                    y[first:last] = part[at : at + last - first]
+                signals.append(y)
+            found.append((record, *signals))
+        return found
+
+    def _path(self, model: Model, fold: Fold) -> Iterator[tuple[float, Array]]:
+        """Yield the cost in training and the output left out at each ridge."""
+        measured = fold.left_out([record.y for record in self._records])
+        problem = Problem.of(model, fold.train, guarantee=self._guarantee)
+        theta, least, cost = problem.theta, np.inf, np.inf
+        over = stable = False
+        output = np.full_like(measured, np.inf)
+        for ridge, iterations in _RIDGES:
+            if not over:
+                problem.weigh(ridge)
+                search = LevenbergMarquardt(max_iter=iterations, tolerance=1e-3, patience=2)
+                try:
+                    state = search.init(problem, theta)
+                except InputError:  # it diverges on the training records
+                    over = True
+                    yield cost, output
+                    continue
+                while not state.reason:
+                    if self._stop is not None and self._stop():
+                        raise StoppedError("stopped while sizes were chosen")
+                    state = search.step(problem, state)
+                theta, cost = state.theta, state.cost
+                problem.write(theta)
+                output = self._simulated((model, fold))
+                stable = largest_stable_amplitude(model, fold.train) >= max(LOUDER)
+                with np.errstate(over="ignore", invalid="ignore"):
+                    error = float(np.mean(((output - measured) / self._scale) ** 2))
+                over = not error < _OVERFIT**2 * least
+                least = min(least, error)
+            yield cost if stable else np.inf, output
+
+    def _simulated(self, job: tuple[Model | LinearModel, Fold]) -> Array:
+        """Return the simulated output where it was left out."""
+        model, fold = job
+        with np.errstate(over="ignore", invalid="ignore"):
+            return fold.left_out([model.simulate(record) for record in self._records])
+
+    def _left_out(self, name: str) -> list[Array]:
+        signals = [getattr(record, name) for record in self._records]
+        return [fold.left_out(signals) for fold in self._folds]
+
+    def _squares(self, outputs: Sequence[Array]) -> Array:
+        """Return sums of the squared relative errors in blocks of each stretch, (folds, B)."""
+        pairs = zip(self._left_out("y"), self._left_out("scored"), outputs, strict=True)
+        with np.errstate(over="ignore", invalid="ignore"):
+            errors = [
+                np.mean(np.where(there, (y_hat - y) / self._scale, 0.0) ** 2, axis=1)
+                for y, there, y_hat in pairs
+            ]
+        found = np.array([[b.sum() for b in np.array_split(e, _BLOCKS)] for e in errors])
+        return found if np.isfinite(found).all() else np.full(found.shape, np.inf)
+
+    def _alone(self, work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+        """Do the work of each item on a thread; Ctrl-C ends all."""
+        try:
+            return each_alone(work, items, self._halt)
+        except KeyboardInterrupt:
+            raise StoppedError("stopped while sizes were chosen") from None
+
+
+def _refined(model: LinearModel, fold: Fold) -> LinearModel:
+    return refined_near(model, fold.train)
+
+
+def _mean(steps: Sequence[tuple[float, Array]]) -> Array:
+    """Return the mean output of the starts whose cost, infinite if unstable, is near the least."""
+    least = min(cost for cost, _ in steps)
+    near = [output for cost, output in steps if cost <= NEAR**2 * least < np.inf]
+    return np.mean(near, axis=0) if near else np.full_like(steps[0][1], np.inf)

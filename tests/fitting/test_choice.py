@@ -1,0 +1,160 @@
+"""Sizes and ridge by cross-validation, and what the choice is worth on data it has not seen."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import lfrtorch
+from lfrtorch import Choice, LinearModel, Model, Record
+from lfrtorch.fitting import choice as procedure
+from lfrtorch.fitting.trainer import StoppedError
+
+
+def measured(strength: float, samples: int = 400, seed: int = 0, noise: float = 0.05) -> Record:
+    """A first-order system before a saturation of some strength, with noise."""
+    rng = np.random.default_rng(seed)
+    u, x = rng.standard_normal(samples), np.zeros(samples)
+    for k in range(samples - 1):
+        x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
+    y = np.tanh(strength * x) / strength if strength else x
+    return Record(u, y + noise * rng.standard_normal(samples), skip=20)
+
+
+def start(bla: LinearModel, train: Sequence[Record], sizes: dict[str, int], seed: int) -> Model:
+    options: dict[str, Any] = dict(sizes)
+    return lfrtorch.initialise(bla, train, seed=seed, **options)
+
+
+def chosen(records: Record | list[Record], **options: Any) -> Choice:
+    def linear(nx: int) -> LinearModel:
+        return lfrtorch.estimate_bla(records, nx)
+
+    given: dict[str, Any] = {"given": {"nz": 1, "nw": 1}, "orders": [1, 2]}
+    given |= options
+    return procedure.choose_sizes(records, given.pop("orders"), linear, start, **given)
+
+
+@pytest.fixture(scope="module")
+def saturating() -> Choice:
+    return chosen(measured(2.0))
+
+
+def nested(choice: Choice) -> float:
+    """Error of the NL-LFR over the linear model's, in what had no part in the choice."""
+    pairs = [(r.errors(y), r.errors(linear)) for r, linear, y in choice.left_out]
+    own, linear = (np.concatenate(errors) for errors in zip(*pairs, strict=True))
+    return float(np.sqrt(np.mean(own**2) / np.mean(linear**2)))
+
+
+def test_a_saturation_is_found_with_few_parameters(saturating: Choice):
+    sizes = saturating.chosen.sizes
+    assert (saturating.nx, sizes["nx"], sizes["nz"], sizes["nw"]) == (1, 1, 1, 1)
+    assert saturating.chosen.ratio < 0.5
+    assert saturating.chosen.parameters_net < 40
+
+
+def test_nested_errors_tell_new_data(saturating: Choice):
+    new = measured(2.0, samples=4000, seed=9, noise=0.0)
+    train = measured(2.0)
+    bla = lfrtorch.estimate_bla(train, 1)
+    sizes = {n: s for n, s in saturating.chosen.sizes.items() if n != "nx"}
+    model = start(bla, [train], sizes, 0)
+    lfrtorch.fit(model, train, ridge=saturating.chosen.ridge, monitors=[])
+    noise = 0.05
+    errors = [np.hypot(lfrtorch.rmse(new, m.simulate(new)), noise) for m in (model, bla)]
+    assert nested(saturating) == pytest.approx(errors[0] / errors[1], rel=0.25)
+
+
+def test_a_linear_system_is_not_called_nonlinear():
+    found = chosen(measured(0.0))
+    assert nested(found) > 0.98
+    # Nothing is gained by the first sizes, so that no others are tried.
+    assert len({tuple(c.sizes.values()) for c in found.candidates}) <= 4
+
+
+def test_left_out_is_each_scored_sample_once(saturating: Choice):
+    ((record, linear, y),) = saturating.left_out
+    assert record.skip == 20
+    assert not np.any(linear[20:] == record.y[20:])
+    assert np.array_equal(y[:20], record.y[:20])
+    assert saturating.counts.sum() == 380
+
+
+def test_a_fold_sees_nothing_of_what_is_left_out():
+    """Other outputs in a stretch change nothing of what simulates it but the choice."""
+    train = measured(1.0, samples=240)
+    y = train.y.copy()
+    y[20:75] += 5.0
+    given = {"nx": 1, "nz": 1, "nw": 1, "nn": 2}
+    spoilt = Record(train.u, y, skip=20)
+    bla = lfrtorch.estimate_bla(train, 1)
+    first, other = (
+        procedure.choose_sizes(r, [1], lambda nx: bla, start, given=given) for r in (train, spoilt)
+    )
+    pairs = zip(first.candidates, other.candidates, strict=True)
+    for one, two in pairs:
+        assert np.allclose(one.outputs[0], two.outputs[0], rtol=1e-3, atol=1e-3)
+
+
+def test_sizes_given_are_kept():
+    found = chosen(measured(1.0), given={"nx": 2, "nz": 2, "nw": 1, "nn": 3}, orders=[2])
+    assert {tuple(c.sizes.items()) for c in found.candidates} == {
+        (("nx", 2), ("nz", 2), ("nw", 1), ("nn", 3))
+    }
+    ridges = [c.ridge for c in found.candidates]
+    assert ridges == sorted(ridges, reverse=True)
+
+
+def test_several_records_and_periodic_ones_are_cut():
+    rng = np.random.default_rng(3)
+    u = np.tile(rng.standard_normal(60), 4)
+    x = np.zeros(240)
+    for k in range(239):
+        x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
+    steady = Record(u[60:], np.tanh(x[60:]), start="periodic", period=60)
+    found = chosen([measured(1.0, 150), steady], given={"nz": 1, "nw": 1, "nn": 3}, orders=[1])
+    assert [record.samples for record, *_ in found.left_out] == [150, 180]
+    assert np.isfinite(found.chosen.ratio)
+
+
+def test_records_too_short_say_so():
+    with pytest.raises(ValueError, match=r"scored samples, of which 4 stretches"):
+        chosen(measured(1.0, samples=50))
+
+
+def test_a_stop_ends_the_choice():
+    with pytest.raises(StoppedError, match="while sizes were chosen"):
+        chosen(measured(1.0), stop=lambda: True)
+
+
+def test_table_has_a_line_for_each_size_and_marks_the_chosen(saturating: Choice):
+    lines = saturating.table().splitlines()
+    sizes = {tuple(c.sizes.values()) for c in saturating.candidates}
+    assert sum("chosen" in line for line in lines[: len(sizes) + 2]) == 1
+    assert len(lines) == len(sizes) + 2 + len(procedure.LEGEND.splitlines())
+    entries = saturating.entries()
+    assert sum(entry["chosen"] for entry in entries) == 1
+
+
+def test_a_mean_leaves_out_what_runs_away():
+    low, high = np.zeros((3, 1)), np.full((3, 1), 100.0)
+    assert procedure._mean([(1.0, low), (np.inf, high)]).max() == 0.0
+    assert procedure._mean([(1.0, low), (1.3, high)]).max() == 50.0
+    assert procedure._mean([(1.0, low), (2.0, high)]).max() == 0.0
+    assert np.isinf(procedure._mean([(np.inf, low)])).all()
+
+
+def test_all_processes_take_the_choice_of_the_first(saturating: Choice):
+    class Other(lfrtorch.distributed.Ranks):
+        """A process that is told the numbers of the first."""
+
+        def first(self, part: torch.Tensor) -> torch.Tensor:
+            squares = torch.full_like(part, 4.0)
+            squares[-1] = 1.0
+            return squares
+
+    best = procedure._chosen(saturating.candidates, [0, 1], saturating.counts, Other())
+    assert best is saturating.candidates[-1]
