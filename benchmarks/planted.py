@@ -3,7 +3,7 @@
     planted(3).u, planted(3).y, planted(3).new_u, planted(3).new_y
 
 Seven of each twenty are linear. Time is counted in samples: ``pace`` is the time constant of a
-system, 3 to 300 samples and at most an eighth of its record. ``strength`` of a nonlinearity is
+system, 3 to 200 samples and at most a twelfth of its record. ``strength`` of a nonlinearity is
 log-uniform, and signals inside a system are near 1, so that it means about the same for each.
 """
 
@@ -93,7 +93,7 @@ def planted(number: int) -> Planted:
     rng = np.random.default_rng([2026, number])
     kind = CYCLE[number % len(CYCLE)]
     T = round(_log_uniform(rng, 150, 5000))
-    pace = _log_uniform(rng, 3, min(300, T / 8))
+    pace = _log_uniform(rng, 3, min(200, T / 12))
     nu = 2 if kind in ("linear", "wiener", "cubic") and rng.random() < 0.25 else 1
     skip = round(8 * pace)
     in_motion, continues, coloured = rng.random(3) < (0.4, 0.5, 1 / 3)
@@ -127,7 +127,8 @@ def planted(number: int) -> Planted:
 
 def _excitation(rng: np.random.Generator, pace: float, T: int, nu: int) -> Callable[[int], Array]:
     """An input of a class and band, drawn anew at each call, with unit root mean square."""
-    band = min(_log_uniform(rng, 1, 8) / (2 * np.pi * pace), 0.4)  # cycles a sample
+    band = min(_log_uniform(rng, 2, 10) / (2 * np.pi * pace), 0.4)  # cycles a sample
+    N = T // int(rng.integers(1, 3))  # a period of the multisine
     period = int(min(16 / band, T / 2))
 
     def noise(count: int) -> Array:
@@ -135,10 +136,10 @@ def _excitation(rng: np.random.Generator, pace: float, T: int, nu: int) -> Calla
         return lfilter(b, a, rng.standard_normal(count + period))[period:]
 
     def multisine(count: int) -> Array:
-        lines = max(2, round(band * period))
-        spectrum = np.zeros(period // 2 + 1, complex)
-        spectrum[1 : lines + 1] = np.exp(2j * np.pi * rng.random(min(lines, period // 2)))
-        return np.resize(np.fft.irfft(spectrum, period), count)
+        lines = max(8, round(band * N))
+        spectrum = np.zeros(N // 2 + 1, complex)
+        spectrum[1 : lines + 1] = np.exp(2j * np.pi * rng.random(lines))
+        return np.resize(np.fft.irfft(spectrum, N), count)
 
     def staircase(count: int) -> Array:
         hold = max(2, round(0.3 / band))
