@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from first_try import cart, ced, emps, linear, silverbox, tanks, wiener_hammerstein
+from measurements import cart, ced, emps, linear, silverbox, tanks, wiener_hammerstein
 from scipy.signal import lfilter
 
 import lfrtorch
@@ -67,12 +67,12 @@ Signals = tuple[Array, Array, int]
 
 
 def measured(
-    load: Callable[[Path], Any], first: int, step: int, samples: int, root: Path
+    load: Callable[[Path], tuple[Array, Array]], first: int, step: int, samples: int, root: Path
 ) -> Signals:
     """Every ``step``-th sample of a part of a measurement."""
-    signals = next(iter(load(root).values()))
+    u, y = load(root)
     part = slice(first, first + step * samples, step)
-    return signals.u[part], signals.y[part], 0
+    return u[part], y[part], 0
 
 
 def lowpass(x: Array, pole: float = 0.8) -> Array:
