@@ -93,7 +93,9 @@ def case(name: str, root: Path) -> Case:
     end = begin + round(len(record) * FITTED)
     rest = max(record[:begin], record[end:], key=len)
     u, y = record[begin:end, :nu], record[begin:end, nu:]
-    return Case(u, y, _new(rest[:, :nu], rest[:, nu:], fs, SKIP), {"kind": kind, "linear": None})
+    used = np.ptp(u, axis=0) > 0  # a trial of the robot leaves one of its inputs alone
+    new = _new(rest[:, :nu][:, used], rest[:, nu:], fs, SKIP)
+    return Case(u[:, used], y, new, {"kind": kind, "linear": None})
 
 
 def _new(u: Array, y: Array, fs: float, skip: int) -> lfrtorch.Record:

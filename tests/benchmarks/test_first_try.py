@@ -50,6 +50,16 @@ def test_splits_are_stretches_that_share_no_sample(
     assert len(begins) == first_try.SPLITS
 
 
+def test_an_input_that_does_not_move_is_left_out(first_try: ModuleType, tmp_path: Path):
+    (tmp_path / "soft_robot").mkdir()
+    table = np.random.default_rng(0).standard_normal((400, 5))
+    table[:, 1] = 0.0
+    np.savetxt(tmp_path / "soft_robot/train.csv", table, "%.4f", ",", header="", comments="a")
+    found = first_try.case("soft_robot 0", tmp_path)
+    assert found.u.shape[1] == found.new.u.shape[1] == 2
+    assert found.y.shape[1] == 2
+
+
 def test_command_is_run_and_scored_on_new_data(
     first_try: ModuleType, monkeypatch: pytest.MonkeyPatch
 ):
