@@ -51,7 +51,7 @@ check: $(READY)  ## format, lint, types, import order
 bench: $(READY)  ## costs against what is required (PEERS=DIR, ARGS=--quick), or beside BASELINE=DIR
 	@$(BIN)/python benchmarks/$(if $(BASELINE),baseline.py "$(BASELINE)",engine.py $(if $(PEERS),--peers "$(PEERS)")) $(ARGS)
 
-first-try: $(READY)  ## eight measurements with all sizes auto, beside a grid (ARGS="tanks --root DIR")
+first-try: $(READY)  ## is the verdict with all sizes auto right on new data? (ARGS="--label NAME --cases planted:0-39")
 	@$(BIN)/python benchmarks/first_try.py $(ARGS)
 
 reproduce: $(READY)  ## the public benchmarks at hand -> RESULTS.md (ARGS="silverbox data.root=DIR")

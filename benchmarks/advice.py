@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from first_try import cart, ced, emps, linear, silverbox, tanks, wiener_hammerstein
+from measurements import cart, ced, emps, linear, silverbox, tanks, wiener_hammerstein
 from scipy.signal import lfilter
 
 import lfrtorch
@@ -67,12 +67,12 @@ Signals = tuple[Array, Array, int]
 
 
 def measured(
-    load: Callable[[Path], Any], first: int, step: int, samples: int, root: Path
+    load: Callable[[Path], tuple[Array, Array]], first: int, step: int, samples: int, root: Path
 ) -> Signals:
     """Every ``step``-th sample of a part of a measurement."""
-    signals = next(iter(load(root).values()))
+    u, y = load(root)
     part = slice(first, first + step * samples, step)
-    return signals.u[part], signals.y[part], 0
+    return u[part], y[part], 0
 
 
 def lowpass(x: Array, pole: float = 0.8) -> Array:
@@ -183,8 +183,7 @@ def settings(base: str) -> lfrtorch.Settings:
     """Those of a fit that is advised."""
     given = dict(BASES[base])
     trainer = lfrtorch.LevenbergMarquardt(max_iter=given.pop("max_iter"))
-    search = lfrtorch.SizesSearch(nn=(4, 8), starts=2, iterations=SEARCHED / trainer.max_iter)
-    return lfrtorch.Settings(**given, trainer=trainer, nx_max=NX_MAX, sizes_search=search)
+    return lfrtorch.Settings(**given, trainer=trainer, nx_max=NX_MAX)
 
 
 def attempts(case: str, base: str, root: Path) -> list[dict[str, Any]]:

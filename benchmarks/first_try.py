@@ -1,35 +1,33 @@
-"""Eight measurements as a newcomer would give them: one command each, and what it is worth.
+"""What the plain command is worth: are its verdict and its recommended model right on new data?
 
-    python benchmarks/first_try.py [CASE ...] [--root DIR]  # runs, beside the grid and the verdicts
-    python benchmarks/first_try.py [CASE ...] --grid [--minutes M]  # the grid -> first_try.json
+    python benchmarks/first_try.py --label NAME [--cases planted:0-39 ...] [--root DIR] [--jobs 2]
+    python benchmarks/first_try.py --report                # the tables of first_try.md
 
-Each case is a CSV file and the command ``lfrtorch fit data=file ... nx=auto nz=auto nw=auto
-nn=auto``, whose default is to train on the first 60 %, to choose on the next 20 % and to score the
-last 20 %. The records are estimation data alone: no official test record is read.
-
-The grid: every nx of 1 .. 12, nz and nw of 1 .. 3, and 5, 15 and 30 neurons, from three seeds, with
-the same parts. Its models are fitted in a random order that is fixed, so that one which is not at
-its end is a fair sample of the whole; a later call goes on.
+Each case is a CSV file and the command ``lfrtorch fit x.csv test=0 nx=auto nz=auto nw=auto
+nn=auto``, on one thread; new data judge the linear model, the NL-LFR, and which of the two the run
+recommends. Cases are ``planted`` systems (see ``planted.py``), and ``measured`` records: folders of
+CSV files below DIR, each with three splits. Those that a label has are not repeated.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from statistics import median
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.io import loadmat
+import torch
+from planted import COUNT, planted
 
 import lfrtorch
 from lfrtorch._support import tables
@@ -38,316 +36,245 @@ from lfrtorch._support.types import Array
 
 RESULTS = Path(__file__).with_name("first_try.json")
 
-NX, NZ, NW, NN, SEEDS = range(1, 13), (1, 2, 3), (1, 2, 3), (5, 15, 30), (0, 1000, 2000)
-"""The grid."""
+WORDS = "test=0", "nx=auto", "nz=auto", "nw=auto", "nn=auto"
+"""Of the command, beside those of the data."""
 
-ITERATIONS = 60
-"""Of each fit of the grid."""
+MEASURED = {
+    "mr_damper": (1, 200.0),
+    "two_tanks": (1, 5.0),
+    "robot_arm_10": (1, 200.0),
+    "dc_motor": (1, 1.0),
+    "exchanger": (1, 1.0),
+    "winding": (5, 10.0),
+    "disc": (1, 40.0),
+    "soft_robot": (3, 1 / 0.083),
+}
+"""Folders of measured records: how many of the first columns are inputs, and Hz."""
 
-WITHIN = 1.10
-"""What is chosen may have this error over that of the best of the grid."""
+SPLITS, FITTED, LONGEST, SKIP = 3, 0.6, 5000, 50
+"""Of a measured record: how many, the part for estimation, samples of both parts, and those of
+the new part from which its start is estimated."""
 
-MINUTES = 10.0
-"""A case may take on two cores."""
+CHOSEN_ON = 40
+"""Planted systems that choices may be made on; the others are for the last word."""
+
+WORTH, NEAR, DIVERGED = 0.8, 1.05, 1e3
+"""A nonlinear model is worth it up to this error over the linear one's; a recommended model is
+near the better one up to this; no error counts as more."""
+
+Entries = dict[str, dict[str, Any]]
+"""What is known of each case, by its name."""
 
 
-@dataclass(frozen=True)
-class Signals:
-    """A measurement, as it stands in a file."""
+class Case(NamedTuple):
+    """Data for estimation and new data, after whose first ``skip`` samples models are scored."""
 
     u: Array
     y: Array
-    fs: float
+    new: lfrtorch.Record
+    about: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Case:
-    """A measurement and what is expected of it.
-
-    Args:
-        measure: the files' signals by name; ``root`` is the folder of the benchmarks' files.
-        start: how the records begin.
-        expected: kind of the verdict, written before the first run.
-        limit: minutes that it may take.
-    """
-
-    measure: Callable[[Path], dict[str, Signals]]
-    start: str
-    expected: str
-    limit: float = MINUTES
-
-
-def tanks(root: Path) -> dict[str, Signals]:
-    """The whole estimation record of the cascaded tanks, whose levels begin anywhere."""
-    return _signals(lfrtorch.datasets.cascaded_tanks.load(root=root).train[0])
-
-
-def silverbox(root: Path) -> dict[str, Signals]:
-    """6000 samples amid the first multisine realisations."""
-    record = lfrtorch.datasets.silverbox.load(root=root).train[0]
-    return _signals(record[2000:8000])
+def case(name: str, root: Path) -> Case:
+    """The case of a name such as "planted 007" or "disc 2"."""
+    kind, _, number = name.rpartition(" ")
+    if kind == "planted":
+        s = planted(int(number))
+        about = {"kind": s.kind, "linear": s.linear, "snr": round(s.snr, 1)}
+        return Case(s.u, s.y, _new(s.new_u, s.new_y, s.fs, s.skip), about)
+    files, split = sorted((root / kind).glob("*.csv")), int(number)
+    if not files:
+        raise FileNotFoundError(f"'{root / kind}' has no CSV file")
+    nu, fs = MEASURED[kind]
+    record = np.loadtxt(files[split % len(files)], delimiter=",", skiprows=1)
+    first = (len(record) - LONGEST) * split // (SPLITS - 1)  # windows of a long one
+    record = record[max(first, 0) :][:LONGEST]
+    begin = round(len(record) * (1 - FITTED) * split / (SPLITS - 1))
+    end = begin + round(len(record) * FITTED)
+    rest = max(record[:begin], record[end:], key=len)
+    u, y = record[begin:end, :nu], record[begin:end, nu:]
+    used = np.ptp(u, axis=0) > 0  # a trial of the robot leaves one of its inputs alone
+    new = _new(rest[:, :nu][:, used], rest[:, nu:], fs, SKIP)
+    return Case(u[:, used], y, new, {"kind": kind, "linear": None})
 
 
-def wiener_hammerstein(root: Path) -> dict[str, Signals]:
-    """6000 samples amid the estimation record."""
-    record = lfrtorch.datasets.wiener_hammerstein.load(root=root).train[0]
-    return _signals(record[20000:26000])
+def _new(u: Array, y: Array, fs: float, skip: int) -> lfrtorch.Record:
+    return lfrtorch.Record(u, y, fs=fs, start="estimated", skip=skip, name="new")
 
 
-def emps(root: Path) -> dict[str, Signals]:
-    """The estimation record of the positioning system, every fourth sample."""
-    file = loadmat(root / "EMPS/DATA_EMPS.mat")
-    step = float(np.median(np.diff(file["t"].ravel())))
-    u, y = file["vir"][::4] * file["gtau"], file["qm"][::4]
-    return {"emps": Signals(u, y, round(1.0 / step / 4.0, 6))}
-
-
-def f16(root: Path) -> dict[str, Signals]:
-    """Three periods at the third level of the aircraft, from rest."""
-    file = loadmat(root / "F16/F16GVT_Files/BenchmarkData/F16Data_FullMSine_Level3.mat")
-    return {"f16": Signals(file["Force"].T[:24576], file["Acceleration"].T[:24576], 400.0)}
-
-
-def ced(root: Path) -> dict[str, Signals]:
-    """The estimation parts of the coupled drives' uniform records, both levels."""
-    found = lfrtorch.datasets.ced.load(root=root).validation
-    return {name: signals for record in found for name, signals in _signals(record).items()}
-
-
-def cart(root: Path) -> dict[str, Signals]:
-    """A simulated axis: force -> position, with friction, in a position loop that is closed.
-
-    m dv/dt = F - c v - Fc tanh(v / vs), dx/dt = v, F = Kp (r - x) - Kd v, at 1 kHz, kept at 100 Hz;
-    the noise of the position, 20 µm rms, is that of the record alone.
-    """
-    del root
-    rng, fs, steps, T = np.random.default_rng(5), 100.0, 10, 4000
-    target = np.repeat(rng.uniform(-0.1, 0.1, T // 100), 100)
-    smooth = np.convolve(np.r_[np.zeros(59), target], np.ones(60) / 60, "valid")
-    mass, viscous, coulomb, slip, dt = 2.0, 4.0, 3.0, 5e-3, 1.0 / fs / steps
-    x = v = 0.0
-    u, y = np.zeros((T, 1)), np.zeros((T, 1))
-    for k in range(T):
-        force = 400.0 * (smooth[k] - x) - 30.0 * v
-        u[k], y[k] = force, x
-        for _ in range(steps):
-            v += dt * (force - viscous * v - coulomb * np.tanh(v / slip)) / mass
-            x += dt * v
-    return {"cart": Signals(u, y + 20e-6 * rng.standard_normal(y.shape), fs)}
-
-
-def linear(root: Path) -> dict[str, Signals]:
-    """A linear system of two resonances, with white noise of 5 % at its output."""
-    del root
-    rng, T = np.random.default_rng(7), 3000
-    u = rng.standard_normal((T, 1))
-    poles = np.array([0.9 * np.exp(0.4j), 0.85 * np.exp(1.1j)])
-    state, y = np.zeros(2, complex), np.zeros((T, 1))
-    for k in range(T):
-        y[k] = np.real(state @ np.array([1.0 + 0.3j, 0.5 - 0.4j]))
-        state = poles * state + u[k]
-    return {"linear": Signals(u, y + 0.05 * y.std() * rng.standard_normal(y.shape), 100.0)}
-
-
-CASES = {
-    "tanks": Case(tanks, "estimated", "better"),
-    "silverbox": Case(silverbox, "estimated", "better"),
-    "wiener_hammerstein": Case(wiener_hammerstein, "estimated", "better"),
-    "emps": Case(emps, "zero", "better"),
-    "f16": Case(f16, "zero", "better", limit=60.0),
-    "ced": Case(ced, "estimated", "better"),
-    "cart": Case(cart, "zero", "better"),
-    "linear": Case(linear, "zero", "linear"),
-}
-
-
-def main() -> int:
-    """Run the cases, or the grid."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES))
-    parser.add_argument("--root", type=Path, help="folder of the benchmarks' files")
-    parser.add_argument("--out", type=Path, help="folder of the runs; default: one that is removed")
-    parser.add_argument("--grid", action="store_true", help="fit the grid, and keep its errors")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="where they are kept")
-    parser.add_argument("--minutes", type=float, default=np.inf, help="of the grid, for each case")
-    options = parser.parse_args()
-    if unknown := set(options.cases) - set(CASES):
-        parser.error(f"no case {', '.join(sorted(unknown))}; there are {', '.join(CASES)}")
-    shared = Path(__file__).resolve().parents[2] / "shared" / "data" / "nonlinear_benchmarks"
-    root = options.root or Path(os.environ.get("LFRTORCH_DATA", shared))
-    names = [name for name in options.cases or CASES if at_hand(name, root)]
-    with tempfile.TemporaryDirectory() as temporary:
-        out = options.out or Path(temporary)
-        if options.grid:
-            for name in names:
-                grid(name, root, out, options.results, 60.0 * options.minutes)
-            return 0
-        tried = []
-        for name in names:
-            tried.append(attempt(name, root, out, options.results))
-            print(", ".join(f"{key} {value}" for key, value in tried[-1].items()), flush=True)
-    if not tried:
-        return 0
-    print(tables.table(list(tried[0]), [list(row.values()) for row in tried]))
-    return int(any(row["found wrong"] for row in tried))
-
-
-def at_hand(name: str, root: Path) -> bool:
-    """Whether there are the files of a case; says so if not."""
-    try:
-        CASES[name].measure(root)
-    except FileNotFoundError as missing:
-        print(f"{name} is left out: {missing}", file=sys.stderr)
-        return False
-    return True
-
-
-def attempt(name: str, root: Path, out: Path, results: Path) -> dict[str, Any]:
-    """One command, its time, and its errors beside the best of the grid."""
-    case, folder = CASES[name], out / name
-    command = [sys.executable, "-m", "lfrtorch.cli", "fit", *words(name, root, out)]
-    command += [f"{size}=auto" for size in ("nx", "nz", "nw", "nn")]
-    begin = time.perf_counter()
-    done = subprocess.run(
-        [*command, f"hydra.run.dir={folder}"], capture_output=True, text=True, check=False
-    )
-    minutes = (time.perf_counter() - begin) / 60.0
-    (out / f"{name}.log").write_text(done.stdout + done.stderr)
-    if done.returncode:
-        raise RuntimeError(f"{name} failed:\n{done.stdout}{done.stderr}")
-    metrics = json.loads((folder / "metrics.json").read_text())
-    verdict = metrics["verdict"]
-    scores = metrics["scores"].values()
-    linear = verdict["use"] == "linear model"  # which is then chosen, and said
-    which = "lti_rmse" if linear else "rmse"
-    error = float(np.sqrt(np.mean([score[which] ** 2 for score in scores])))
-    fitted = _kept(results).get(name, [])
-    best = min((entry["error"] for entry in fitted), default=np.nan)
-    wrong = []
-    if verdict["kind"] != case.expected:
-        wrong.append(f"expected {case.expected}")
-    if not linear and error > WITHIN * best:
-        wrong.append(f"over {WITHIN:g} of the grid")
-    if minutes > case.limit:
-        wrong.append(f"over {case.limit:g} min")
-    sizes = " ".join(f"{key}={value}" for key, value in metrics["sizes"].items())
-    return {
-        "case": name,
-        "minutes": minutes,
-        "sizes": sizes,
-        "verdict": verdict["kind"],
-        "use": verdict["use"],
-        "error": error,
-        "grid": best,
-        "of": len(fitted),
-        "ratio": error / best,
-        "found wrong": ", ".join(wrong),
-    }
-
-
-def words(name: str, root: Path, out: Path) -> list[str]:
-    """The settings of a case's data, whose files are written below ``out``."""
-    case, folder = CASES[name], out / f"{name}_data"
-    folder.mkdir(parents=True, exist_ok=True)
-    measured = case.measure(root)
-    signals = next(iter(measured.values()))
-    nu, ny = signals.u.shape[1], signals.y.shape[1]
-    for record, signals in measured.items():
-        head = [f"u{i}" for i in range(nu)] + [f"y{i}" for i in range(ny)]
-        table = np.hstack([signals.u, signals.y])
-        np.savetxt(folder / f"{record}.csv", table, "%.9g", ",", header=",".join(head), comments="")
+def attempt(name: str, root: Path) -> dict[str, Any]:
+    """One command, its seconds on the processor, and its errors."""
+    torch.set_num_threads(1)
+    u, y, new, about = case(name, root)
     inputs, outputs = (
-        f"[{','.join(f'{letter}{i}' for i in range(count))}]"
-        for letter, count in (("u", nu), ("y", ny))
+        ",".join(f"{letter}{i}" for i in range(signal.shape[1]))
+        for letter, signal in (("u", u), ("y", y))
     )
-    return [
-        "data=file",
-        f"data.path='{folder}/*.csv'",
-        f"data.inputs={inputs}",
-        f"data.outputs={outputs}",
-        f"data.fs={signals.fs:g}",
-        f"data.start={case.start}",
-    ]
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, file = Path(temporary) / "run", Path(temporary) / "x.csv"
+        table, head = np.hstack([u, y]), f"{inputs},{outputs}"
+        np.savetxt(file, table, "%.9g", ",", header=head, comments="")
+        command = [sys.executable, "-m", "lfrtorch.cli", "fit", str(file), f"fs={new.fs:.9g}"]
+        command += [f"inputs=[{inputs}]", f"outputs=[{outputs}]", "figures=false", "threads=1"]
+        before = _seconds()
+        done = subprocess.run(
+            [*command, *WORDS, f"hydra.run.dir={folder}"],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        about |= {"samples": len(u), "seconds": round(_seconds() - before, 1)}
+        if done.returncode:
+            return about | {"failed": (done.stderr or done.stdout).strip()[-500:]}
+        metrics = json.loads((folder / "metrics.json").read_text())
+        verdict, model = metrics["verdict"], lfrtorch.load(folder / "model")
+        linear = lfrtorch.LinearModel.load(folder / "linear")
+    errors = {"nonlinear": _error(new, model.simulate), "lti": _error(new, linear.simulate)}
+    use = "nonlinear" if verdict["use"] == "NL-LFR" else "lti"
+    about |= {"verdict": verdict["kind"], "use": use, "text": verdict["text"]}
+    about["sizes"] = model.sizes | {"linear nx": linear.nx}
+    return about | {"errors": errors, "recommended": errors[use]}
 
 
-def grid(name: str, root: Path, out: Path, results: Path, seconds: float) -> None:
-    """Fit the models of the grid that are not yet kept, and keep their errors on the last part."""
-    case = CASES[name]
-    words(name, root, out)
-    measured = case.measure(root)
-    signals = next(iter(measured.values()))
-    nu, ny = signals.u.shape[1], signals.y.shape[1]
-    data = lfrtorch.load_records(
-        f"{out / f'{name}_data'}/*.csv",
-        inputs=list(range(nu)),
-        outputs=list(range(nu, nu + ny)),
-        fs=float(f"{signals.fs:g}"),
-        start=case.start,  # pyright: ignore[reportArgumentType]
-    )
-
-    @cache
-    def bla(nx: int) -> lfrtorch.LinearModel:
-        return lfrtorch.estimate_bla(data.train, nx=nx)
-
-    candidates = list(itertools.product(NX, NZ, NW, NN, SEEDS))
-    np.random.default_rng(0).shuffle(candidates)
-    begin = time.perf_counter()
-    kept = {_key(entry) for entry in _kept(results).get(name, [])}
-    for each in candidates:
-        nx, nz, nw, nn, seed = (int(size) for size in each)
-        if (nx, nz, nw, nn, seed) in kept:
-            continue
-        if time.perf_counter() - begin > seconds:
-            break
-        clock = time.perf_counter()
-        try:
-            linear = bla(nx)
-            model = lfrtorch.initialise(linear, data.train, nz=nz, nw=nw, nn=nn, seed=seed)
-            trainer = lfrtorch.LevenbergMarquardt(max_iter=ITERATIONS)
-            found = lfrtorch.fit([model], data.train, data.validation, trainer=trainer)
-            error = pooled(data.tests, found.model.simulate)
-            lti = pooled(data.tests, linear.simulate)
-        except ValueError as failure:
-            print(f"{name} {each}: {failure}", file=sys.stderr)
-            error, lti = np.inf, np.inf
-        entry = {
-            **{"nx": nx, "nz": nz, "nw": nw, "nn": nn, "seed": seed},
-            **{"error": error, "linear": lti, "seconds": time.perf_counter() - clock},
-        }
-        # Another process may have kept another case's errors since.
-        with whole_file(results) as path:
-            entries = _kept(results)
-            entries.setdefault(name, []).append(entry)
-            path.write_text(_lines(entries))
+def _error(record: lfrtorch.Record, simulate: Callable[[lfrtorch.Record], Array]) -> float:
+    """Root mean square error over the output's deviation."""
+    found = lfrtorch.nrmse(record, simulate(record))
+    return float(f"{min(found, DIVERGED):.6g}") if np.isfinite(found) else DIVERGED
 
 
-def pooled(records: Sequence[lfrtorch.Record], simulate: Callable[..., Array]) -> float:
-    """Root mean square of the records' errors; infinite for a simulation that diverges."""
-    errors = [lfrtorch.rmse(record, simulate(record)) for record in records]
-    total = float(np.sqrt(np.mean(np.square(errors))))
-    return total if np.isfinite(total) else float("inf")
+def _seconds() -> float:
+    """Of the processor, in all commands that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
-def _signals(record: lfrtorch.Record) -> dict[str, Signals]:
-    return {record.name: Signals(record.u, record.y, record.fs)}
-
-
-def _key(entry: dict[str, Any]) -> tuple[int, ...]:
-    return tuple(entry[name] for name in ("nx", "nz", "nw", "nn", "seed"))
-
-
-def _kept(results: Path) -> dict[str, list[dict[str, Any]]]:
+def known(results: Path) -> dict[str, Entries]:
+    """All that is kept, by label."""
     return json.loads(results.read_text()) if results.exists() else {}
 
 
-def _lines(entries: dict[str, list[dict[str, Any]]]) -> str:
-    """JSON with a line for each model."""
-    parts = [
-        f'"{name}": [\n' + ",\n".join(json.dumps(entry) for entry in fitted) + "\n]"
-        for name, fitted in entries.items()
+def keep(results: Path, label: str, name: str, entry: dict[str, Any]) -> None:
+    """Add an entry to the file, which has a line for each."""
+    with whole_file(results) as path:
+        every = known(results)
+        every.setdefault(label, {})[name] = entry
+        parts = [
+            f"{json.dumps(label)}: {{\n"
+            + ",\n".join(f"{json.dumps(n)}: {json.dumps(e)}" for n, e in sorted(entries.items()))
+            + "\n}"
+            for label, entries in every.items()
+        ]
+        path.write_text("{\n" + ",\n".join(parts) + "\n}\n")
+
+
+def report(every: dict[str, Entries]) -> str:
+    """Tables in Markdown, a column for each label."""
+    best: dict[str, float] = {}  # of all labels' nonlinear models
+    for name, entry in (item for entries in every.values() for item in entries.items()):
+        if "failed" not in entry:
+            best[name] = min(entry["errors"]["nonlinear"], best.get(name, np.inf))
+    lines: list[str] = []
+    for part in sorted({_part(name) for entries in every.values() for name in entries}):
+        columns = [
+            measures({name: entry for name, entry in entries.items() if _part(name) == part}, best)
+            for entries in every.values()
+        ]
+        lines += [f"| {part} | {' | '.join(every)} |", "|---|" + "---|" * len(every)]
+        lines += [f"| {' | '.join([name, *(c[name] for c in columns)])} |" for name in columns[0]]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def measures(entries: Entries, best: dict[str, float]) -> dict[str, str]:
+    """What is reported of the cases of a label, beside the least errors known."""
+    ended = {name: entry for name, entry in entries.items() if "failed" not in entry}
+    better = [e for e in ended.values() if _better(e)]
+    worth = [
+        e for n, e in ended.items() if not e["linear"] and best[n] <= WORTH * e["errors"]["lti"]
     ]
-    return "{\n" + ",\n".join(parts) + "\n}\n"
+    regrets = [e["recommended"] / min(e["errors"].values()) for e in ended.values()]
+    behind = [e["recommended"] / min(best[n], e["errors"]["lti"]) for n, e in ended.items()]
+    found = {
+        "cases, of these failed": f"{len(entries)}, {len(entries) - len(ended)}",
+        "“better” agrees with new data": _share(
+            e["errors"]["nonlinear"] < e["errors"]["lti"] for e in better
+        ),
+        "truth linear: “better”": _share(_better(e) for e in ended.values() if e["linear"]),
+        f"best model at most {WORTH:g} of the linear error: “better”": _share(map(_better, worth)),
+        f"recommended within {NEAR:g} of the better of the two": _share(r <= NEAR for r in regrets),
+        "recommended over the better of the two": _spread(regrets),
+        "recommended over the best of all columns": _spread(behind),
+    }
+    for low, high in pairwise((0, 300, 1000, 2500, LONGEST + 1)):
+        seconds = [e["seconds"] for e in entries.values() if low <= e["samples"] < high]
+        found[f"seconds, {low} to {high - 1} samples"] = _spread(seconds)
+    return found
+
+
+def _better(entry: dict[str, Any]) -> bool:
+    return entry["verdict"] == "better"
+
+
+def _part(name: str) -> str:
+    """The table that a case is in."""
+    if not name.startswith("planted"):
+        return "measured records"
+    last = name.split()[1] >= f"{CHOSEN_ON:03d}"
+    return f"planted {CHOSEN_ON} to {COUNT - 1}" if last else f"planted 0 to {CHOSEN_ON - 1}"
+
+
+def _share(true: Iterable[bool]) -> str:
+    every = [*true]
+    return f"{sum(every)} of {len(every)}" if every else tables.UNKNOWN
+
+
+def _spread(values: Sequence[float]) -> str:
+    """The median and the largest."""
+    if not values:
+        return tables.UNKNOWN
+    return f"{tables.number(median(values))}, worst {tables.number(max(values))}"
+
+
+def chosen(words: Sequence[str]) -> list[str]:
+    """Names of cases, from ``planted``, ``planted:0-39``, ``measured``, ``measured:disc``."""
+    names: list[str] = []
+    for word in words:
+        kind, _, which = word.partition(":")
+        if kind == "planted":
+            first, _, last = (which or f"0-{COUNT - 1}").partition("-")
+            names += [f"planted {n:03d}" for n in range(int(first), int(last or first) + 1)]
+        elif kind == "measured" and which in ("", *MEASURED):
+            names += [f"{n} {k}" for n in ([which] if which else MEASURED) for k in range(SPLITS)]
+        else:
+            raise ValueError(f"no cases '{word}'; give planted:0-39, measured:disc or the like.")
+    return names
+
+
+def main() -> None:
+    """Run the cases that are missing, or report."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--label", help="names the state of the code")
+    parser.add_argument("--cases", nargs="+", default=[f"planted:0-{CHOSEN_ON - 1}"])
+    parser.add_argument("--root", type=Path, default=Path(), help="folder of measured records")
+    parser.add_argument("--jobs", type=int, default=1, help="commands at a time")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="where they are kept")
+    parser.add_argument("--report", action="store_true", help="print the tables of all labels")
+    options = parser.parse_args()
+    if options.report:
+        print(report(known(options.results)))
+        return
+    if not options.label:
+        parser.error("--label is needed: it names the state of the code")
+    kept = known(options.results).get(options.label, {})
+    names = [name for name in chosen(options.cases) if name not in kept]
+    with ProcessPoolExecutor(options.jobs) as pool:
+        under_way = {pool.submit(attempt, name, options.root): name for name in names}
+        for done in as_completed(under_way):
+            name, entry = under_way[done], done.result()
+            keep(options.results, options.label, name, entry)
+            print(name, json.dumps(entry), flush=True)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -21,12 +21,12 @@ in processes of its own that import the package from there.
 - Arguments: all but ``self`` and ``cls``, of functions that are not compiled. A function is public
   if neither its name nor its class's begins with an underscore.
 - Constants: names in upper case, of two letters or more, assigned at the top of a module.
-- Settings: fields of ``Settings``, ``SizesSearch`` and the trainers; and the leaves of
+- Settings: fields of ``Settings`` and the trainers; and the leaves of
   ``conf/config.yaml`` composed with ``data=file``, without Hydra's own.
 - Exclusions: raised errors whose message names two settings or more, as ``name=``, ``name is`` or
   ``{self.name}``.
 - Edits for an activation: files of the package with the word softplus. Edits for a setting: files
-  of the package, conf/ and docs/guide with the name of a field of ``Settings`` or ``SizesSearch``;
+  of the package, conf/ and docs/guide with the name of a field of ``Settings``;
   names without an underscore are left out, as most are words of English, too.
 - ``Any``, ``cast``, ``assert``: uses in the package, imports left out.
 """
@@ -239,7 +239,7 @@ def constants(tree: ast.Module) -> list[str]:
 
 
 def settings() -> tuple[list[str], list[str]]:
-    """Fields of ``Settings`` and ``SizesSearch``, and these with those of the trainers."""
+    """Fields of ``Settings``, and these with those of the trainers."""
     import dataclasses
 
     import lfrtorch
@@ -248,7 +248,7 @@ def settings() -> tuple[list[str], list[str]]:
         found = [getattr(lfrtorch, name) for name in classes if hasattr(lfrtorch, name)]
         return [field.name for each in found for field in dataclasses.fields(each)]
 
-    own = names("Settings", "SizesSearch")
+    own = names("Settings")
     return own, own + names("LevenbergMarquardt", "Adam")
 
 

@@ -61,7 +61,21 @@ def in_full(command: str, given: Sequence[str], unnamed: str = "data.path") -> l
     if command in _DATA_CHOSEN and not chosen and at is not None:
         words.insert(at, "data=file")
     several = not SWEEPS.isdisjoint(words)
-    return [_listed(word, several=several) for word in in_groups(command, words)]
+    words = [_listed(word, several=several) for word in in_groups(command, words)]
+    return words + _chosen_by_data(words) if command == "config" else words
+
+
+def _chosen_by_data(words: Sequence[str]) -> list[str]:
+    """Sizes of a model of files that nobody gave, which the data choose."""
+    given = dict(word.lstrip("+").partition("=")[::2] for word in words)
+    names = {name.split(".")[0] for name in given}
+    if given.get("data") != "file" or not names.isdisjoint({"bench", "resume", "init_from"}):
+        return []
+    last = "degree" if given.get("static") == "polynomial" else "nn"
+    static = {"nz", "nw", last}
+    if given.get("static") == "own" or not names.isdisjoint({"structure", "ridge"}):
+        static = set()
+    return [f"{name}=auto" for name in sorted({"nx"} | static) if name not in given]
 
 
 def with_names(given: Sequence[str], option: str) -> list[str]:
