@@ -58,10 +58,6 @@ BASES: dict[str, dict[str, Any]] = {
 ONLY = {"largest": "Overfit", "tested": "The gain on"}
 """What is followed after these fits, which are there for that: how this advice begins."""
 
-SEARCHED = 10
-"""Iterations of a model if validation chooses the sizes, which is followed after the small fits
-alone."""
-
 Signals = tuple[Array, Array, int]
 """Input, output, and the period or 0."""
 

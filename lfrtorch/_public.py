@@ -27,7 +27,7 @@ from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.noise_estimate import estimate_noise
 from lfrtorch.fitting.refit import refit
-from lfrtorch.fitting.choice import Choice
+from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.snapshots import Snapshots
 from lfrtorch.fitting.starts import initialise
 from lfrtorch.fitting.trainer import FitResult
@@ -75,6 +75,7 @@ __all__ = [
     "Settings",
     "Snapshots",
     "analysis",
+    "choose_sizes",
     "datasets",
     "distil",
     "distributed",

@@ -67,7 +67,8 @@ def in_full(command: str, given: Sequence[str], unnamed: str = "data.path") -> l
 
 def _chosen_by_data(words: Sequence[str]) -> list[str]:
     """Sizes of a model of files that nobody gave, which the data choose."""
-    given = dict(word.lstrip("+").partition("=")[::2] for word in words)
+    pairs = [word.lstrip("+").partition("=") for word in words]
+    given = {name: value for name, _, value in pairs}
     names = {name.split(".")[0] for name in given}
     if given.get("data") != "file" or not names.isdisjoint({"bench", "resume", "init_from"}):
         return []

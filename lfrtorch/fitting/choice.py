@@ -325,7 +325,8 @@ class _Study:
         stop: Stop | None,
         halt: Callable[[], None],
     ) -> None:
-        self._records, self._whole, self._guarantee = records, linear, guarantee
+        self._records, self._whole = records, linear
+        self._guarantee: Name | None = guarantee
         self._stop, self._halt = stop, halt
         self._folds = folds(records, FOLDS)
         self._scale = Scaler.of(records).y_scale

@@ -39,7 +39,6 @@ from lfrtorch.cli import claim, config, errors, evaluate, fit, interrupts, run_f
 from lfrtorch.cli.hydra_versions import instantiate
 from lfrtorch.datasets import boucwen, f16, official
 from lfrtorch.reporting import plots
-from lfrtorch.reporting.advice import Advice
 
 
 @pytest.fixture
