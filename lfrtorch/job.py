@@ -22,7 +22,7 @@ from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.choice import Choice, choose_sizes
 from lfrtorch.fitting.first_fit import begun_on_part, part_of
-from lfrtorch.fitting.last_fits import distilled, refitted
+from lfrtorch.fitting.last_fits import distilled, refitted, without_poor_starts
 from lfrtorch.fitting.multistart import cheap_starts, fit
 from lfrtorch.fitting.observer import LineObserver, Observer
 from lfrtorch.fitting.plain_settings import PlainSettings
@@ -177,6 +177,8 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
         **stage.options,
     )
     observer.end(result)
+    if choice is not None:
+        result = without_poor_starts(stage, result)
     if settings.distil:
         result = distilled(replace(stage, settings=settings), result)
     again = None

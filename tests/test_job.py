@@ -97,8 +97,12 @@ def test_chosen_sizes_are_fitted_to_all_estimation_records(dataset: Dataset):
     assert run.metrics["data"]["samples"] == samples
     assert run.dataset.validation == []
     # Stands for validation: errors in what was left out of fit and choice.
-    (held_out,) = (r for r in run.simulations if r.use == "validation")
-    assert held_out.score.rmse == pytest.approx(run.metrics["validation"]["rmse"])
+    held_out = [r for r in run.simulations if r.use == "validation"]
+    assert [r.record.name for r in held_out] == [
+        f"{name}, cross-validation" for name in ("train", "validation")
+    ]
+    errors = [r.score.rmse for r in held_out]
+    assert min(errors) < run.metrics["validation"]["rmse"] < max(errors)
     assert run.fit.averaged > 1
     assert run.model.sizes["nx"] == run.fit.averaged * chosen.sizes["nx"]
 
@@ -108,7 +112,9 @@ def test_without_tests_what_was_left_out_judges(dataset: Dataset):
     alone = replace(dataset, tests=[])
     run = identify(alone, settings(nx=1, nz="auto", nn=3, starts=1))
     assert run.verdict.kind == "better"
-    assert "on cross-validation the NL-LFR's error is" in run.verdict.text
+    assert "on 2 validation records the NL-LFR's error is" in run.verdict.text
+    one = identify(replace(alone, validation=[]), settings(nx=1, nz="auto", nn=3, starts=1))
+    assert "on cross-validation the NL-LFR's error is" in one.verdict.text
     assert (run.settings.nx, run.settings.nn) == (1, 3)
 
 

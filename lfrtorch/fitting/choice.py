@@ -44,7 +44,6 @@ from lfrtorch._support.types import Array, Integers
 from lfrtorch.analysis.amplitude_margin import LOUDER, largest_stable_amplitude
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.folds import Fold, as_folded, folds
-from lfrtorch.fitting.multistart import NEAR
 from lfrtorch.fitting.side_by_side import any_of
 from lfrtorch.fitting.trainer import Stop, StoppedError
 from lfrtorch.least_squares.guarantee import Name
@@ -67,6 +66,9 @@ _RIDGES = ((10.0, 12), (1.0, 12), (0.1, 10), (1e-2, 10), (1e-3, 10), (1e-4, 10),
 """Ridges and the iterations of each."""
 
 _STARTS = 2
+
+NEAR = 1.2
+"""Rms error in training over the least up to which a start takes part in a mean."""
 
 _OVERFIT = 2.0  # error in what is left out over the least of larger ridges, that ends a path
 

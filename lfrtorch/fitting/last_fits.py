@@ -11,11 +11,14 @@ import torch
 from lfrtorch._support.reasons import CUT_SHORT, Reason
 from lfrtorch._support.tables import number, quantity
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
+from lfrtorch.fitting.choice import NEAR
 from lfrtorch.fitting.distillation import distil
 from lfrtorch.fitting.first_fit import cost_in_full
+from lfrtorch.fitting.means import mean_model
 from lfrtorch.fitting.multistart import AS_GOOD
 from lfrtorch.fitting.refit import refit
 from lfrtorch.fitting.stage import Stage
+from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.records import common_unit
@@ -58,6 +61,23 @@ def distilled(stage: Stage, result: FitResult) -> FitResult:
     if not taken:
         return result
     return replace(result, model=one.model, averaged=1, members=(), distilled=result.averaged)
+
+
+def without_poor_starts(stage: Stage, result: FitResult) -> FitResult:
+    """The fit whose mean is of starts with training errors near the least, as sizes are chosen."""
+    if not result.members:
+        return result
+    judges = [Problem.judge(model, stage.dataset.train) for model in result.members]
+    costs = torch.tensor([j.cost(j.residual(j.theta)) for j in judges], dtype=torch.float64)
+    costs = stage.ranks.first(costs)
+    near = [m for m, c in zip(result.members, costs, strict=True) if c <= NEAR**2 * costs.min()]
+    if len(near) == len(result.members):
+        return result
+    mean = near[0] if len(near) == 1 else mean_model(near)
+    given = any(record.start == "given" for record in stage.dataset.train)
+    scale_states(mean, stage.dataset.train, keep_coordinates=given)
+    members = () if len(near) == 1 else tuple(near)
+    return replace(result, model=mean, averaged=len(near), members=members)
 
 
 def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | None]:

@@ -73,9 +73,6 @@ from lfrtorch.score_window import with_window
 ROUNDS = (1 / 16, 1 / 8)
 """Parts of the iterations after which the worse half is left."""
 
-NEAR = 1.2
-"""Rms error in training over the least up to which a start takes part in a mean."""
-
 _MINUTE = 60.0  # seconds of one core that starts may take together
 
 AS_GOOD = 1.01
@@ -142,8 +139,8 @@ def fit(
         average: most starts that the model of the result is the mean of
             (:func:`lfrtorch.mean_model`); at least this many go to the end. As many of the best are
             averaged as bring the mean within 1 % of the least error on validation and selection,
-            which may be one; without such records those whose training error is at most 1.2 times
-            the least. Starts that diverge when the training input is doubled take no part.
+            which may be one; without such records all are. Starts that diverge when the training
+            input is doubled take no part.
         monitors: called with the model and its progress after every iteration. For several models,
             give a list for each; they are called one at a time. Each process calls its own: give
             those that print or write files to the first alone. Default: a line on a terminal or in
@@ -309,7 +306,7 @@ def _fitted(
     if not alone:
         result = replace(result, starts=judge.summaries(ranked))
     if average > 1:
-        best = judge.alike(field, as_records(train))[:average]
+        best = judge.stable(field, as_records(train))[:average]
         mean, count = judge.mean(best)
         if mean is not None:
             result = replace(result, model=mean, averaged=count, members=tuple(best[:count]))
@@ -402,22 +399,18 @@ class _Judge:
             )
         return tuple(found)
 
-    def alike(self, fits: Sequence[Fit], train: Sequence[Record]) -> list[Model]:
-        """Return the models that a mean may be of, the best first."""
-        # They stay stable on louder inputs: with one that does not, a mean runs away. If nothing
-        # but training judges them, their errors there are near the least. Rounding may differ
-        # between processes, and the choice must not.
-        found = self.ranked(fits)
-        reach = self._same([largest_stable_amplitude(fit.model, train) for fit in found])
-        stable = [fit for fit, to in zip(found, reach, strict=True) if to >= max(LOUDER)]
-        if not self._records:
-            stable = [fit for fit in stable if fit.best <= NEAR**2 * stable[0].best]
-        return [fit.model for fit in stable]
+    def stable(self, fits: Sequence[Fit], train: Sequence[Record]) -> list[Model]:
+        """Return the models that stay stable on louder inputs, the best first."""
+        # With one that does not, a mean runs away. Rounding may differ between processes, and the
+        # choice must not.
+        models = [fit.model for fit in self.ranked(fits)]
+        reach = self._same([largest_stable_amplitude(model, train) for model in models])
+        return [model for model, to in zip(models, reach, strict=True) if to >= max(LOUDER)]
 
     def mean(self, best: Sequence[Model]) -> tuple[Model | None, int]:
         """Return the mean of as many models as do about as well as the best, and of how many."""
         # None if a single start is better than all means. Without records to judge on, the mean of
-        # all that are near the best.
+        # all.
         if not self._records:
             return (mean_model(best), len(best)) if len(best) > 1 else (None, 1)
         means = [mean_model(best[:count]) for count in range(2, len(best) + 1)]

@@ -19,6 +19,7 @@ OTHERS: dict[str, tuple[Any, ...]] = {
     "structure": ("wiener", "hammerstein", "wiener_hammerstein", "parallel"),
     "relaxations": (1,), "modes": (2,), "z_feedthrough": (False,),
     "noise": ("innovation", "both"), "horizon": (50,), "first_part": (0.5,), "average": (2,),
+    "ridge": (0.1, {"static": 0.1}),
     "distil": (True,), "guarantee": ("stable", "contracting"), "integrators": (1,),
 }  # fmt: skip
 """Values that are no defaults."""

@@ -184,14 +184,14 @@ def test_residuals_of_the_worst_record_are_shown(single: Run):
 
 
 def test_sizes_that_were_tried(single: Run):
-    entry = {"nz": 1, "nw": 1, "rounds": 3, "iterations": 75, "parameters": 25}
-    entry |= {"parameters_net": 19, "seconds": 2.0}
-    entry |= {"error": 0.02, "error_std": 0.001, "ratio": 0.5, "standard_errors_above": 0.0}
-    large = entry | {"nn": 9, "parameters_net": 37, "chosen": False}
-    left = large | {"nn": 30, "rounds": 2, "iterations": 25}
-    page = single.page(search=[large, left, entry | {"nn": 3, "chosen": True, "error": 0.03}])
-    assert "1 1 3 75 25 19 2.00 0.0300 0.00100 0.500 0 chosen 1 1 9 75 25 37 2.00" in page.text
-    assert "3 models were tried; the table has the chosen one and the last round." in page.text
+    entry = {"nz": 1, "nw": 1, "nn": 3, "ridge": 0.1, "parameters_net": 19, "ratio": 0.5}
+    entry |= {"standard_errors_above": 0.0, "chosen": False}
+    less = entry | {"ridge": 0.01, "ratio": 0.52, "chosen": True}
+    large = entry | {"nn": 9, "parameters_net": 37, "ratio": 0.6}
+    runs_away = large | {"ridge": 0.01, "ratio": None, "standard_errors_above": None}
+    page = single.page(search=[large, runs_away, entry, less])
+    assert "1 1 3 0.0100 19 0.520 0 chosen 1 1 9 0.100 37 0.600 0" in page.text
+    assert "4 models were tried; the table has each size with its best ridge." in page.text
     assert "Sizes" not in single.page().text
 
 
