@@ -58,6 +58,8 @@ TESTS: dict[str, str] = {
     "least_squares/linear_systems": "least_squares/linear_systems least_squares/problem",
     "least_squares/record_groups": "least_squares/problem",
     "least_squares/gauge": "least_squares/gauge least_squares/problem",
+    "least_squares/ridge": "least_squares/problem",
+    "least_squares/term": "least_squares/problem",
     "least_squares/problem": "least_squares/problem fitting/trainer",
     "least_squares/levenberg_marquardt": "least_squares/levenberg_marquardt",
     "least_squares/adam": "least_squares/adam",

@@ -27,7 +27,7 @@ from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.trainer import FitResult, Monitor, Stop, Trainer
-from lfrtorch.least_squares.simulation_errors import Ridge
+from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.records import Record, as_records
 
 

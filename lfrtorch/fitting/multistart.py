@@ -65,7 +65,7 @@ from lfrtorch.fitting.trainer import (
 )
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
-from lfrtorch.least_squares.simulation_errors import Ridge
+from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records, common_unit
 from lfrtorch.score_window import with_window

@@ -23,7 +23,7 @@ from lfrtorch.fitting.multistart import fit
 from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.trainer import FitResult, Monitor, Stop, Trainer
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
-from lfrtorch.least_squares.simulation_errors import Ridge
+from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.records import Record, as_records
 
 

@@ -11,7 +11,7 @@ from lfrtorch.fitting.observer import Observer
 from lfrtorch.fitting.plain_settings import Noise
 from lfrtorch.fitting.settings import Settings
 from lfrtorch.fitting.trainer import Stop, Trainer
-from lfrtorch.least_squares.simulation_errors import Ridge
+from lfrtorch.least_squares.ridge import Ridge
 
 
 class FitOptions(TypedDict):

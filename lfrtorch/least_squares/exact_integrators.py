@@ -27,13 +27,11 @@ def integrating_states(cell: LFRCell) -> Bool[Tensor, " nx"]:
     return found
 
 
-def fixed_parameters(cell: LFRCell) -> Bool[Tensor, " free"] | None:
-    """Which entries of the free parameters a fit must not change; None if there are none."""
+def fixed_parameters(cell: LFRCell) -> Bool[Tensor, " free"]:
+    """Which entries of the free parameters a fit must not change."""
     # Columns of exact integrators, those of past outputs in a predictor (``engine.innovation``),
     # and the zeros of a structure (``engine.block_form``).
     states, zeros = integrating_states(cell), zeros_of(cell)
-    if not (states.any() or cell.past_outputs or zeros):
-        return None
     inputs = torch.arange(cell.nu, device=states.device) >= cell.nu - cell.past_outputs
     columns = {"A": states, "Cz": states, "Dzu": inputs, "Dyu": inputs}
     none = states.new_zeros(())
@@ -42,4 +40,4 @@ def fixed_parameters(cell: LFRCell) -> Bool[Tensor, " free"] | None:
         for name, p in cell.named_parameters()
         if p.requires_grad
     ]
-    return torch.cat([mask.flatten() for mask in masks])
+    return torch.cat([states[:0], *(mask.flatten() for mask in masks)])

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -37,6 +37,7 @@ from lfrtorch.least_squares.linear_systems import (
 from lfrtorch.least_squares.output_columns import OutputColumns
 from lfrtorch.least_squares.record_groups import RecordGroup
 from lfrtorch.least_squares.start_states import EliminatedSystem, Eliminator, StartStates
+from lfrtorch.least_squares.term import PenaltyRows, TermRows
 
 NORMAL = 1e4
 """Relative damping, in rounding errors, above which the normal equations are as good as QR."""
@@ -48,164 +49,122 @@ CACHED_BYTES = 1 << 27
 """Rows are cached up to this size, all groups together."""
 
 
-class TermRows(Protocol):
-    """Some rows of J, weighted, and the residual there."""
-
-    @property
-    def count(self) -> int:
-        """How many rows there are."""
-        ...
-
-    @property
-    def states(self) -> StartStates | None:
-        """The initial states that the last ``fold`` eliminated."""
-        ...
-
-    def fold(
-        self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
-    ) -> int:
-        """Add the rows [J r] in the kept columns; bytes cached, which are at most ``room``."""
-        ...
-
-    def tangent(
-        self, d_theta: Float[Tensor, " P"], reduced: Float[Tensor, " K"]
-    ) -> Float[Tensor, " count"]:
-        """J dθ; the change is given in the kept columns, too."""
-        ...
-
-    def adjoint(
-        self,
-        residual: Float[Tensor, " count"],
-        gradient: Float[Tensor, " P"],
-        reduced: Float[Tensor, " K"],
-    ) -> None:
-        """Add Jᵀ residual to the gradient, or to the one in the kept columns."""
-        ...
-
-    def whole(self, parameters: int) -> Float[Tensor, "count P"]:
-        """All rows, with as many columns as θ has parameters."""
-        ...
-
-
 class Jacobian:
     """J (M, P) of a residual at one θ."""
 
-    # ``ridge`` has factors of θ - θ_0 (``penalty``), the last entries of the residual of the first
-    # process. ``reduced`` is of the shared parameters alone if the parts eliminate start states.
+    # ``fixed`` columns are zeros. ``reduced`` is of the shared parameters alone if the parts
+    # eliminate start states.
 
     def __init__(
         self,
-        parts: Sequence[TermRows],
+        parts: Sequence[TermRows | PenaltyRows],
         reduced: Reduction,
-        ridge: Float[Tensor, " P"],
-        penalty: Float[Tensor, " P"],
+        fixed: Bool[Tensor, " P"],
         ranks: Ranks,
-        fixed: Bool[Tensor, " P"] | None = None,
         bounded: Callable[[System], System] = lambda system: system,
     ) -> None:
-        self.parts, self._reduced, self.ranks = parts, reduced, ranks
-        self._bounded = bounded
-        self._fixed = torch.zeros_like(ridge, dtype=torch.bool) if fixed is None else fixed
-        self._ridge, self._penalty = ridge.masked_fill(self._fixed, 0.0), penalty
-        self._penalised = bool(ridge.any())  # its rows are there, whatever is fixed
-        self._own_penalty = self._penalised and ranks.rank == 0
+        self.parts, self._reduced, self._fixed = parts, reduced, fixed
+        self.ranks, self._bounded = ranks, bounded
+        self._zeros = reduced.expand.new_zeros(len(fixed))
 
     def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
         """The least-squares system of J and its gradient Jᵀr; see the search's ``Jacobian``."""
-        kept, expand = self._reduced
-        if len(self._ridge) > self._shared:
-            system, gradient = self._eliminated(damping, truncation)
-            return self._bounded(system), gradient
-        if damping <= NORMAL * torch.finfo(expand.dtype).eps:
-            R, gradient = self._factor()
-            system = SVDSystem(R, truncation)
-        else:
-            total = GramAccumulator()
-            self._fold(total)
-            gradient = (expand.mT @ total.G[:-1, -1]).masked_fill(self._fixed, 0.0)
-            G, ridge = total.G[:-1, :-1], self._ridge.square()
-            free = ridge[~self._fixed]
-            if bool((free == free[0]).all()) and not self._fixed[kept].any():
-                system = ReducedSystem(G, expand, float(free[0]))
+        gram = damping > NORMAL * torch.finfo(self._zeros.dtype).eps
+        total = GramAccumulator() if gram else QRAccumulator()
+        # Rows [J r] of outputs in the kept columns. Those of a penalty are added to all columns:
+        # they are no combinations.
+        penalty, slope, states, room = self._zeros, self._zeros, [], CACHED_BYTES
+        for part in self.parts:
+            if isinstance(part, PenaltyRows):
+                penalty = penalty + part.diagonal.square()
+                slope = slope + part.diagonal * part.residual
             else:
-                # JᵀJ = expandᵀ G expand: the columns first, then the rows of a symmetric matrix.
-                G = self._reduced.columns(self._reduced.columns(G).mT)
-                G = G.masked_fill(self._fixed | self._fixed.unsqueeze(1), 0.0)
-                rank = int((~self._fixed[kept]).sum())
-                system = CholeskySystem(G + torch.diag(ridge), rank)
-            gradient = gradient + ridge * self._penalty
+                room -= part.fold(self._reduced.kept, total, room)
+                states += [] if part.states is None else [part.states]
+        total.combine(self.ranks)
+        penalty = penalty.masked_fill(self._fixed, 0.0)
+        if states:
+            system, gradient = self._eliminated(total, states, penalty, truncation)
+        elif isinstance(total, GramAccumulator):
+            system, gradient = self._normal(total.G, penalty)
+        else:
+            system, gradient = self._orthogonal(total.R, penalty, truncation)
+        gradient = (gradient + slope).masked_fill(self._fixed, 0.0)
         system = self._bounded(system)
         if self.ranks.world == 1:
             return system, gradient
         return BroadcastSystem(system, self.ranks), self.ranks.first(gradient)
+
+    def _normal(
+        self, G: Float[Tensor, "columns columns"], penalty: Float[Tensor, " P"]
+    ) -> tuple[System, Float[Tensor, " P"]]:
+        """The system and the gradient, by the normal equations."""
+        kept, expand = self._reduced
+        G, gradient = G[:-1, :-1], expand.mT @ G[:-1, -1]
+        free = penalty[~self._fixed]
+        if bool((free == free[0]).all()) and not self._fixed[kept].any():
+            return ReducedSystem(G, expand, float(free[0])), gradient
+        # JᵀJ = expandᵀ G expand: the columns first, then the rows of a symmetric matrix.
+        G = self._reduced.columns(self._reduced.columns(G).mT)
+        G = G.masked_fill(self._fixed | self._fixed.unsqueeze(1), 0.0)
+        rank = int((~self._fixed[kept]).sum())
+        return CholeskySystem(G + torch.diag(penalty), rank), gradient
+
+    def _orthogonal(
+        self, R: Float[Tensor, "k columns"], penalty: Float[Tensor, " P"], truncation: float
+    ) -> tuple[System, Float[Tensor, " P"]]:
+        """The system and the gradient, by singular values."""
+        R, r = self._reduced.columns(R[:, :-1]).masked_fill(self._fixed, 0.0), R[:, -1]
+        rows = torch.cat([R, penalty.sqrt().diag()]) if penalty.any() else R
+        return SVDSystem(rows, truncation), R.mT @ r
+
+    def _eliminated(
+        self,
+        total: QRAccumulator | GramAccumulator,
+        found: Sequence[StartStates],
+        penalty: Float[Tensor, " P"],
+        truncation: float,
+    ) -> tuple[System, Float[Tensor, " P"]]:
+        """The system and the gradient, the start states eliminated."""
+        states = StartStates(*map(torch.cat, zip(*found, strict=True)))
+        fixed = self._fixed[: self._shared]
+        states = states._replace(A=states.A.masked_fill(fixed, 0.0))
+        gram = isinstance(total, GramAccumulator)
+        if gram:
+            left, gradient = total.G[:-1, :-1], total.G[:-1, -1]
+            left = left.masked_fill(fixed | fixed.unsqueeze(1), 0.0)
+        else:
+            left = total.R[:, :-1].masked_fill(fixed, 0.0)
+            gradient = left.mT @ total.R[:, -1]
+        whole = self._zeros.clone()
+        whole[: self._shared] = gradient + torch.einsum("rij,ri->j", states.A, states.r)
+        whole[states.place] = torch.einsum("rij,ri->rj", states.Vh, states.s * states.r)
+        return EliminatedSystem(left, states, penalty, gram=gram, truncation=truncation), whole
 
     @property
     def _shared(self) -> int:
         """Number of parameters whose columns all records have."""
         return self._reduced.expand.shape[1]
 
-    def _eliminated(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
-        """The system and the gradient, the start states eliminated."""
-        gram = damping > NORMAL * torch.finfo(self._ridge.dtype).eps
-        total = GramAccumulator() if gram else QRAccumulator()
-        self._fold(total)
-        found = [part.states for part in self.parts if part.states is not None]
-        states = StartStates(*map(torch.cat, zip(*found, strict=True)))
-        fixed = self._fixed[: self._shared]
-        states = states._replace(A=states.A.masked_fill(fixed, 0.0))
-        if isinstance(total, GramAccumulator):
-            left, gradient = total.G[:-1, :-1], total.G[:-1, -1]
-            left = left.masked_fill(fixed | fixed.unsqueeze(1), 0.0)
-        else:
-            left = total.R[:, :-1].masked_fill(fixed, 0.0)
-            gradient = left.mT @ total.R[:, -1]
-        whole = torch.zeros_like(self._ridge)
-        whole[: self._shared] = gradient + torch.einsum("rij,ri->j", states.A, states.r)
-        whole[states.place] = torch.einsum("rij,ri->rj", states.Vh, states.s * states.r)
-        ridge = self._ridge.square()
-        system = EliminatedSystem(left, states, ridge, gram=gram, truncation=truncation)
-        return system, whole.masked_fill(self._fixed, 0.0) + ridge * self._penalty
-
-    def _factor(self) -> tuple[Float[Tensor, "k P"], Float[Tensor, " P"]]:
-        """R with RᵀR = JᵀJ, and the gradient Jᵀr, of all processes."""
-        total = QRAccumulator()
-        self._fold(total)
-        R, r = self._reduced.columns(total.R[:, :-1]), total.R[:, -1]
-        R = R.masked_fill(self._fixed, 0.0)
-        gradient = R.mT @ r + self._ridge.square() * self._penalty
-        return torch.cat([R, torch.diag(self._ridge)] if self._penalised else [R]), gradient
-
-    def _fold(self, total: QRAccumulator | GramAccumulator) -> None:
-        """Take [J r] in the kept columns into an accumulator; the last column belongs to r."""
-        room = CACHED_BYTES
-        for part in self.parts:
-            room -= part.fold(self._reduced.kept, total, room)
-        total.combine(self.ranks)
-
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """J dθ."""
         d_theta = d_theta.masked_fill(self._fixed, 0.0)
         reduced = self._reduced.expand @ d_theta[: self._shared]
-        parts = [part.tangent(d_theta, reduced) for part in self.parts]
-        return torch.cat([*parts, *([self._ridge * d_theta] if self._own_penalty else [])])
+        return torch.cat([part.tangent(d_theta, reduced) for part in self.parts])
 
     def adjoint(self, residual: Float[Tensor, " M"]) -> Float[Tensor, " P"]:
         """Jᵀ residual."""
-        gradient = torch.zeros_like(self._ridge)
+        gradient = self._zeros.clone()
         reduced = gradient.new_zeros(len(self._reduced.kept))
-        first = 0
-        for part in self.parts:
-            part.adjoint(residual[first : first + part.count], gradient, reduced)
-            first += part.count
+        each = residual.split([part.count for part in self.parts])
+        for part, own in zip(self.parts, each, strict=True):
+            part.adjoint(own, gradient, reduced)
         gradient[: self._shared] += self._reduced.expand.mT @ reduced
-        if self._own_penalty:
-            gradient = gradient + self._ridge * residual[first:]
         return self.ranks.sum(gradient.masked_fill(self._fixed, 0.0))
 
     def whole(self) -> Float[Tensor, "M P"]:
         """J as one matrix, for small problems."""
-        parts = [part.whole(len(self._ridge)) for part in self.parts]
-        J = torch.cat([*parts, *([torch.diag(self._ridge)] if self._own_penalty else [])])
+        J = torch.cat([part.whole(len(self._fixed)) for part in self.parts])
         return J.masked_fill(self._fixed, 0.0)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol, Self
+from functools import partial
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,47 +18,20 @@ from lfrtorch.least_squares.exact_integrators import fixed_parameters
 from lfrtorch.least_squares.fit_memory import check_fit_memory
 from lfrtorch.least_squares.gauge import Reduction, everything, reduction
 from lfrtorch.least_squares.guarantee import Guarantee, Name, guarantee_of
-from lfrtorch.least_squares.jacobian import Jacobian, TermRows
+from lfrtorch.least_squares.jacobian import Jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LeastSquares
-from lfrtorch.least_squares.linear_systems import System
-from lfrtorch.least_squares.simulation_errors import Ridge, SimulationErrors, SystemErrors
+from lfrtorch.least_squares.ridge import Ridge, RidgePenalty, ridge_by_entry
+from lfrtorch.least_squares.simulation_errors import SimulationErrors, SystemErrors
+from lfrtorch.least_squares.term import Term
 from lfrtorch.model import Model
 from lfrtorch.records import Record, as_records
 
 
-class Term(Protocol):
-    """One summand |r(θ)|² of a problem."""
-
-    eliminates: bool
-    """Whether initial states can be eliminated from its rows."""
-
-    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
-        """r at θ; infinite or NaN where it is undefined."""
-        ...
-
-    def linearise(self, theta: Float[Tensor, " P"], *, eliminate: bool) -> Sequence[TermRows]:
-        """The rows of dr/dθ at θ; ``eliminate``: initial states are eliminated from them."""
-        ...
-
-    def release(self) -> None:
-        """Free the memory of what only speeds up the next evaluation."""
-        ...
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """What the next evaluations depend on besides θ, to the last bit."""
-        ...
-
-    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what the same term had."""
-        ...
-
-
 class Problem(LeastSquares):
-    """r(θ): the residual of each term, one after another, then √ridge (θ - θ_0)."""
+    """r(θ): the residual of each term, one after another; a ridge is the last."""
 
     # θ are the free parameters of an LFR, then the initial states of the records whose start is
-    # ``"estimated"``; θ_0 is θ now. The LFR gets a θ by ``write`` alone. The ridge is a prior on
-    # each parameter: noise variance over prior variance, both normalised.
+    # ``"estimated"``; θ_0 is θ now. The LFR gets a θ by ``write`` alone.
 
     def __init__(
         self,
@@ -75,12 +49,9 @@ class Problem(LeastSquares):
         self._theta_0 = self.theta
         self.weigh(ridge)
         self._guarantee = guarantee
-        fixed = fixed_parameters(lfr.cell) if fixed is None else fixed
-        self.fixed: Bool[Tensor, " P"] | None = None
+        self.fixed = torch.zeros_like(self._theta_0, dtype=torch.bool)
         """Which entries of θ are constants: columns of zeros in J."""
-        if fixed is not None:
-            self.fixed = torch.zeros_like(self._theta_0, dtype=torch.bool)
-            self.fixed[: len(fixed)] = fixed
+        self.fixed[: errors.parameters.own] = fixed_parameters(lfr.cell) if fixed is None else fixed
         self._reduced: Reduction | None = None
         self._checked: set[bool] = set()  # whether the memory of these systems was checked
 
@@ -125,7 +96,7 @@ class Problem(LeastSquares):
         costs = [found.cost(term.residual(theta)) for term in (errors, system)]
         weight = simulation * math.sqrt(costs[0] / costs[1]) if costs[1] > 0 else 0.0
         system.weight = weight if math.isfinite(weight) else 0.0
-        found._terms.append(system)
+        found._terms.insert(1, system)
         return found
 
     @classmethod
@@ -134,19 +105,18 @@ class Problem(LeastSquares):
     ) -> Self:
         """The errors on records that are not fitted, each from its most probable initial state."""
         errors = _errors_of(model, records, Ranks(), solve_initial_states=True)
-        others = []
-        for term in like._terms[1:] if like is not None else ():
-            assert isinstance(term, SystemErrors)
-            normalised = [model.scaler.normalise(record) for record in as_records(records)]
-            others.append(
-                SystemErrors(
-                    model.lfr.cell,
-                    normalised,
-                    errors.ranks,
-                    solve_initial_states=True,
-                    weight=term.weight,
-                )
+        normalised = [model.scaler.normalise(record) for record in as_records(records)]
+        others = [
+            SystemErrors(
+                model.lfr.cell,
+                normalised,
+                errors.ranks,
+                solve_initial_states=True,
+                weight=term.weight,
             )
+            for term in ([] if like is None else like._terms)
+            if isinstance(term, SystemErrors)
+        ]
         return cls(model.lfr, errors, others)
 
     @property
@@ -166,8 +136,11 @@ class Problem(LeastSquares):
         self._initial_states = self.errors.parameters.initial_states(theta)
 
     def weigh(self, ridge: Ridge) -> None:
-        """Give the ridge another weight; it still pulls to θ_0."""
-        self._ridge = self.errors.parameters.ridge(ridge).to(self._theta_0)
+        """Give the ridge another weight; it still pulls to where the search began."""
+        weight = ridge_by_entry(ridge, self.errors.parameters.sizes)
+        self._terms = [term for term in self._terms if not isinstance(term, RidgePenalty)]
+        if weight.any() and self.ranks.rank == 0:
+            self._terms.append(RidgePenalty(weight, self._theta_0))
 
     def rmse(self, theta: Float[Tensor, " P"]) -> float:
         """RMSE at θ over scored samples and outputs, unweighted, in output units, as in a score."""
@@ -179,10 +152,7 @@ class Problem(LeastSquares):
 
     def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """r at θ; infinite or NaN if the model diverges."""
-        parts = [term.residual(theta) for term in self._terms]
-        if self._ridge.any() and self.ranks.rank == 0:
-            parts.append(self._ridge.sqrt() * (theta - self._theta_0))
-        return torch.cat(parts)
+        return torch.cat([term.residual(theta) for term in self._terms])
 
     def admissible(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
         """θ, or one near it that keeps the guarantee."""
@@ -211,15 +181,10 @@ class Problem(LeastSquares):
             reduced = self._reduction(theta)
         else:
             reduced = everything(theta)
-        penalty, ridge = theta - self._theta_0, self._ridge.sqrt()
         if self._guarantee is None:
-            return Jacobian(rows, reduced, ridge, penalty, self.ranks, self.fixed)
-        guarantee = self._guarantee
-
-        def bounded(system: System) -> System:
-            return guarantee.bounded(theta, system)
-
-        return Jacobian(rows, reduced, ridge, penalty, self.ranks, self.fixed, bounded)
+            return Jacobian(rows, reduced, self.fixed, self.ranks)
+        bounded = partial(self._guarantee.bounded, theta)
+        return Jacobian(rows, reduced, self.fixed, self.ranks, bounded)
 
     def _reduction(self, theta: Float[Tensor, " P"]) -> Reduction:
         """The columns that gauge directions leave, the same ones on all processes."""
@@ -271,7 +236,6 @@ class Problem(LeastSquares):
                 "the fit that is to go on began elsewhere: the data, the settings or the package "
                 "have changed since. Start a new one, from its best model: init_from=DIR."
             )
-        self._theta_0 = theta_0
         for number, term in enumerate(self._terms):
             own = f"{number}."
             term.load_state_dict(

@@ -15,8 +15,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfrtorch._support.checks import number
-from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
@@ -27,11 +25,6 @@ from lfrtorch.engine.simulation import Trajectory, is_compiled, simulate, steady
 from lfrtorch.least_squares.jacobian import MappedRows, Memory, OutputRows
 from lfrtorch.least_squares.record_groups import group_records
 from lfrtorch.records import NormalisedRecord
-
-Ridge = float | Mapping[str, float]
-
-LARGEST_RIDGE = 1e100
-"""Largest ridge: its square does not overflow."""
 
 
 class Parameters:
@@ -44,6 +37,9 @@ class Parameters:
         self.states, self._nx = states, cell.nx
         self.own = sum(self._sizes)
         """Entries before the initial states."""
+        own = dict(zip(self.names, self._sizes, strict=True))
+        self.sizes = own | ({"x0": states * cell.nx} if states else {})
+        """Entries of each parameter, and of the initial states if there are any."""
 
     def of(self, cell: LFRCell, initial_states: Float[Tensor, "states nx"]) -> Float[Tensor, " P"]:
         """θ of the weights of a cell and initial states."""
@@ -60,35 +56,6 @@ class Parameters:
         for name, part in zip(self.names, theta[: self.own].split(self._sizes), strict=True):
             parameter = cell.get_parameter(name)
             parameter.data = part.view(parameter.shape)
-
-    def ridge(self, ridge: Ridge) -> Float[Tensor, " P"]:
-        """The weight of every entry of θ."""
-        # One number, or one for each group of parameters by the beginning of their names,
-        # ``{"static": 1e-3, "A": 1e-2, "x0": 0}``; other groups get 0.
-        groups = ridge if isinstance(ridge, Mapping) else {"": ridge}
-        names, sizes = list(self.names), list(self._sizes)
-        if self.states:
-            names.append("x0")
-            sizes.append(self.states * self._nx)
-        weights = [0.0] * len(names)
-        for group, value in groups.items():
-            name = f"ridge of '{group}'" if group else "ridge"
-            number(name, value)
-            if value > LARGEST_RIDGE:
-                raise InputError(f"{name} is {value}; give {LARGEST_RIDGE} at most.")
-            own = [i for i, name in enumerate(names) if _belongs(name, group)]
-            if not own:
-                raise InputError(
-                    f"ridge has a group '{group}', and no parameter's name begins so; "
-                    f"the parameters are {', '.join(dict.fromkeys(names))}."
-                )
-            for i in own:
-                weights[i] = float(value)
-        return torch.tensor(weights, dtype=torch.float64).repeat_interleave(torch.tensor(sizes))
-
-
-def _belongs(name: str, group: str) -> bool:
-    return not group or name == group or name.startswith(f"{group}.")
 
 
 class SimulationErrors:

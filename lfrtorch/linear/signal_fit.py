@@ -12,7 +12,7 @@ minimises them. A constant among the inputs of the cell gives the offset of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,10 +24,10 @@ from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import spectral_radius
-from lfrtorch.least_squares.jacobian import TermRows
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.least_squares.simulation_errors import SimulationErrors
+from lfrtorch.least_squares.term import Term, TermRows
 from lfrtorch.linear.model import linear_cell
 from lfrtorch.linear.refinement import TRUNCATION, Matrices, Refined, Search
 from lfrtorch.linear.subspace import LARGEST_POLE, SubspaceEstimate, from_signals
@@ -264,13 +264,11 @@ class SignalFit:
         return change @ covariance @ change.T
 
 
-class _PoleWall:
+class _PoleWall(Term):
     """A term without rows: infinite if a pole of a linear cell passes LARGEST_POLE.
 
     If the cell is a predictor of ``outputs`` among its inputs, its system must be stable, too.
     """
-
-    eliminates = True
 
     def __init__(self, errors: SimulationErrors, outputs: slice | None) -> None:
         self._errors, self._outputs = errors, outputs
@@ -285,12 +283,3 @@ class _PoleWall:
 
     def linearise(self, theta: Tensor, *, eliminate: bool) -> list[TermRows]:
         return []
-
-    def release(self) -> None:
-        pass
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return {}
-
-    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        pass

@@ -160,9 +160,7 @@ def test_the_derivatives_of_both_errors_are_those_of_differences(start: Start):
     parts = [replace(part, skip=5, start=start) for part in (record[:25], record[25:])]
     driven = [with_past_outputs(part) for part in parts]
     problem = Problem.of_predictor(model.predictor(), driven, simulation=0.5)
-    free = torch.ones_like(problem.theta)
-    if problem.fixed is not None:
-        free[: len(problem.fixed)] = ~problem.fixed
+    free = (~problem.fixed).to(problem.theta)
     theta = problem.theta + 0.01 * normal(len(free)) * free
     d_theta, h = normal(len(free), seed=1) * free, 1e-5
     r, jacobian = problem.residual(theta), problem.linearise(theta)

@@ -279,6 +279,17 @@ def test_penalty_is_no_part_of_the_score(model: Model):
     assert ridged.rmse(theta) == pytest.approx(plain.rmse(theta), rel=1e-9)
 
 
+def test_a_search_that_goes_on_keeps_the_start_of_its_ridge(model: Model):
+    records = some_records(model)
+    first = Problem.of(model, records, ridge=4.0)
+    theta = first.theta + 0.1
+    first.write(first.theta * (1.0 + 1e-9))  # another machine rounds in other ways
+    second = Problem.of(model, records, ridge=4.0)
+    second.load_state_dict(first.state_dict())
+    penalty = slice(-len(theta), None)
+    assert torch.equal(second.residual(theta)[penalty], first.residual(theta)[penalty])
+
+
 def test_jacobian_is_that_of_its_argument_whatever_the_module_holds(model: Model):
     records = some_records(model)
     theta = Problem.of(model, records).theta
@@ -378,6 +389,7 @@ def test_nothing_to_fit(model: Model):
         Problem.of(model, some_records(model))
     start = replace(some_records(model)[0], start="estimated")
     assert len(Problem.of(model, start).theta) == 2
+    assert len(Problem.judge(model, start).theta) == 0
 
 
 def cached_rows(jacobian: Jacobian, group: int = 0) -> Tensor | None:

@@ -11,7 +11,7 @@ from lfrtorch.least_squares import jacobian
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.linear_systems import SVDSystem
 from lfrtorch.least_squares.problem import Problem
-from lfrtorch.least_squares.simulation_errors import Ridge
+from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 

@@ -1,0 +1,64 @@
+"""A ridge: the penalty on parameters that leave where the search began."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lfrtorch._support.checks import number
+from lfrtorch._support.errors import InputError
+from lfrtorch.least_squares.term import PenaltyRows, Term
+
+Ridge = float | Mapping[str, float]
+"""One number, or one for each group of parameters by the beginning of their names,
+``{"static": 1e-3, "A": 1e-2, "x0": 0}``; other groups get 0."""
+
+LARGEST_RIDGE = 1e100
+"""Largest ridge: its square does not overflow."""
+
+
+class RidgePenalty(Term):
+    """A term of a problem: √ridge (θ - θ_0)."""
+
+    # A prior on each parameter: the ridge is noise variance over prior variance, both normalised.
+
+    def __init__(self, ridge: Float[Tensor, " P"], theta_0: Float[Tensor, " P"]) -> None:
+        self._root, self._theta_0 = ridge.to(theta_0).sqrt(), theta_0
+
+    def residual(self, theta: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+        """r at θ."""
+        return self._root * (theta - self._theta_0)
+
+    def linearise(self, theta: Float[Tensor, " P"], *, eliminate: bool) -> list[PenaltyRows]:
+        """The rows of dr/dθ, a diagonal matrix."""
+        return [PenaltyRows(self._root, self.residual(theta))]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """θ_0."""
+        return {"start": self._theta_0}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take over θ_0."""
+        self._theta_0 = tensors.get("start", self._theta_0)
+
+
+def ridge_by_entry(ridge: Ridge, sizes: Mapping[str, int]) -> Float[Tensor, " P"]:
+    """The ridge of every entry of θ, from the sizes of its parameters by name."""
+    weights = dict.fromkeys(sizes, 0.0)
+    for group, value in (ridge if isinstance(ridge, Mapping) else {"": ridge}).items():
+        name = f"ridge of '{group}'" if group else "ridge"
+        number(name, value)
+        if value > LARGEST_RIDGE:
+            raise InputError(f"{name} is {value}; give {LARGEST_RIDGE} at most.")
+        own = [each for each in sizes if not group or f"{each}.".startswith(f"{group}.")]
+        if group and not own:
+            raise InputError(
+                f"ridge has a group '{group}', and no parameter's name begins so; "
+                f"the parameters are {', '.join(sizes)}."
+            )
+        weights |= dict.fromkeys(own, float(value))
+    every = [weight for name, weight in weights.items() for _ in range(sizes[name])]
+    return torch.tensor(every, dtype=torch.float64)
