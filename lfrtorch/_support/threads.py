@@ -11,6 +11,7 @@ from contextvars import ContextVar
 from functools import cache
 from typing import TypeVar
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
@@ -149,3 +150,8 @@ def has_kernels(tensor: Tensor) -> bool:
 def to_numpy(tensor: Tensor) -> NDArray:
     """A CPU tensor as a contiguous array for compiled code."""
     return tensor.detach().contiguous().numpy()
+
+
+def to_float64(tensor: Tensor) -> NDArray[np.float64]:
+    """A tensor of any device as an array of float64."""
+    return tensor.detach().cpu().double().numpy()

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from lfrtorch._support.checks import integer
 from lfrtorch._support.errors import InputError
+from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 
 
@@ -128,8 +129,7 @@ class LFRCell(nn.Module):
 
     def matrices(self) -> Matrices:
         """The linear block as arrays."""
-        weights = (self.get_parameter(name) for name in Matrices._fields)
-        return Matrices(*(w.detach().cpu().double().numpy() for w in weights))
+        return Matrices(*(to_float64(self.get_parameter(name)) for name in Matrices._fields))
 
     def check(self) -> None:
         """Refuse weights that do not fit each other, which machine code would not notice.

@@ -6,8 +6,6 @@ Compiled code serves the CPU; other devices form F and use ``scan``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -20,9 +18,7 @@ from lfrtorch.engine.blocked_kernel import add_feedback
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.jacobian_kernel import copy_to
 from lfrtorch.engine.linear_recurrence import flush, linear_recurrence, scan
-from lfrtorch.engine.linearised import PASS, linearise_at, static_slope
-
-Weights = Mapping[str, Tensor]
+from lfrtorch.engine.linearised import PASS, Weights, linearise_at, static_slope
 
 
 def states(
@@ -61,9 +57,10 @@ def transition(
     return Phi
 
 
+@torch.no_grad()
 def monodromy(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R nx nx"]:
     """Transition matrix over a whole record: the product of all F(k)."""
-    weights = {name: p.detach() for name, p in cell.named_parameters()}
+    weights = dict(cell.named_parameters())
     Phi = torch.eye(cell.nx).to(z).expand(len(z), cell.nx, cell.nx)
     for part in z.split(max(1, PASS // len(z)), dim=1):
         Phi = transition(weights, static_slope(cell, part), Phi)

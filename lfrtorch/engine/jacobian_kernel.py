@@ -11,7 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lfrtorch.engine.linear_recurrence import NOTHING
+from lfrtorch.engine.linear_recurrence import flush
+
+_TILE = 4
+"""Rows and columns of the tiles in which matrices are multiplied."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -46,8 +49,9 @@ def jacobian_rows(
     d_w = np.zeros((nw, n_weights), rows.dtype)
     # S(k+1) = M(k) X(k) and dy(k) = N(k) X(k) with X = [S; direct terms of w], M = [F Bw] and
     # N = [H Dyw], padded with zeros to whole tiles.
-    M, X, X_next = _tiled(nx, nw, c1 - c0, rows.dtype)
-    N = np.zeros((ny, M.shape[1]), rows.dtype)
+    tall, depth = _TILE * (-(-nx // _TILE)), _TILE * (-(-(nx + nw) // _TILE))
+    M, N = np.zeros((tall, depth), rows.dtype), np.zeros((ny, depth), rows.dtype)
+    X, X_next = np.zeros((depth, c1 - c0), rows.dtype), np.zeros((depth, c1 - c0), rows.dtype)
     copy_to(Bw, M, nx)
     copy_to(Dyw, N, nx)
     for i in range(nx):
@@ -76,25 +80,10 @@ def jacobian_rows(
             rows[k, y_own[n, 1], c0 + y_own[n, 0]] += v[k, y_own[n, 2]]
         X, X_next = X_next, X
         if k % 256 == 0:
-            # Fading states would reach denormal numbers, a hundred times slower, and stay there.
-            for i in range(nx):
-                for c in range(c1 - c0):
-                    if abs(X[i, c]) < NOTHING:
-                        X[i, c] = 0.0
+            flush(X[:nx])
     for i in range(nx):
         for c in range(c1 - c0):
             S[i, c0 + c] = X[i, c]
-
-
-_TILE = 4
-
-
-@njit(nogil=True)
-def _tiled(nx, nw, columns, dtype):
-    """M of nx rows and X, X_next of nx + nw, all zero and padded to whole tiles."""
-    depth = _TILE * (-(-(nx + nw) // _TILE))
-    M = np.zeros((_TILE * (-(-nx // _TILE)), depth), dtype)
-    return M, np.zeros((depth, columns), dtype), np.zeros((depth, columns), dtype)
 
 
 # Loops for assignments of slices and masks: the latter take numba seconds to compile.

@@ -171,8 +171,12 @@ def _static(z, WzT, Ww, bz, bw, activation, growth, w, J):
             h[n] = bz[n]
             for j in range(nz):
                 h[n] += WzT[j, n] * z[j]
-                dh[n, j] = WzT[j, n]
-        _activate(activation, h, dh)
+        v = h.copy()
+        activate(activation, h)
+        for n in range(nn):
+            slope = slope_of(activation, v[n], h[n])
+            for j in range(nz):
+                dh[n, j] = WzT[j, n] * slope
     for q in range(len(w)):
         w[q] = bw[q]
         for n in range(nn):
@@ -181,17 +185,6 @@ def _static(z, WzT, Ww, bz, bw, activation, growth, w, J):
             J[q, j] = 0.0
             for n in range(nn):
                 J[q, j] += Ww[q, n] * dh[n, j]
-
-
-@njit(nogil=True, error_model="numpy")
-def _activate(activation, h, dh):
-    """h = σ(h), and the rows of dh times σ'(h)."""
-    v = h.copy()
-    activate(activation, h)
-    for n in range(len(h)):
-        slope = slope_of(activation, v[n], h[n])
-        for j in range(dh.shape[1]):
-            dh[n, j] *= slope
 
 
 @njit(nogil=True, error_model="numpy")

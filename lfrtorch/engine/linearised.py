@@ -12,6 +12,9 @@ from torch import Tensor
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import linearise_static, of_static
 
+Weights = Mapping[str, Tensor]
+"""Parameters of a cell by name."""
+
 PASS = 1 << 14
 """Most samples, of all records together, that are linearised in one pass."""
 
@@ -32,11 +35,10 @@ def linearise(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Linearised:
 @torch.no_grad()
 def static_slope(cell: LFRCell, z: Float[Tensor, "R T nz"]) -> Float[Tensor, "R T nw nz"]:
     """∂w/∂z of the static map at every sample."""
-    weights = {name: p.detach() for name, p in cell.named_parameters()}
-    return linearise_static(cell.static, z, of_static(weights)).J
+    return linearise_static(cell.static, z, of_static(dict(cell.named_parameters()))).J
 
 
-def linearise_at(weights: Mapping[str, Tensor], J: Float[Tensor, "R T nw nz"]) -> Linearised:
+def linearise_at(weights: Weights, J: Float[Tensor, "R T nw nz"]) -> Linearised:
     """F = A + Bw J Cz and H = Cy + Dyw J Cz, with J = ∂w/∂z.
 
     Both are linear in J: its entries times one constant matrix give [F; H]. That is one large

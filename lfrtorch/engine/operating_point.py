@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import static_slope
@@ -68,7 +69,7 @@ def linearised_at(cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"
     """
     z, _ = cell.internal(u, x)
     A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw = cell.matrices()
-    J = static_slope(cell, z[None, None])[0, 0].double().cpu().numpy()
+    J = to_float64(static_slope(cell, z[None, None])[0, 0])
     Bw, Dyw = Bw @ J, Dyw @ J
     return StateSpace(A + Bw @ Cz, Bu + Bw @ Dzu, Cy + Dyw @ Cz, Dyu + Dyw @ Dzu)
 

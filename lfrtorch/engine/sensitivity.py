@@ -232,14 +232,11 @@ class Linearisation:
         names = [name for name, _ in cell.named_parameters()]
         self.weights = {n: p.detach().clone() for n, p in zip(names, own, strict=True)}
         self.layout = layout(cell, every=weights is not None)
+        self.parameters = self.layout.table.shape[1]
+        """P."""
         self.state = cell.A.new_zeros(len(u), cell.nx)
         self._ny = cell.ny
         self._known_transition: tuple[Tensor, list[slice]] | None = None
-
-    @property
-    def parameters(self) -> int:
-        """P."""
-        return self.layout.table.shape[1]
 
     def signals(self, records: slice, time: slice) -> Float[Tensor, "R B v"]:
         """v = [x; u; w]."""

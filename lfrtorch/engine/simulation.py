@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.threads import has_kernels, spread, to_numpy
-from lfrtorch.engine.cell import LFRCell
+from lfrtorch.engine.cell import LFRCell, Matrices
 from lfrtorch.engine.feedback_recurrence import monodromy
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.newton import newton_states
@@ -112,13 +112,12 @@ def steady_state(
         guess: initial state of the search, or the states of a nearby solution. Default: zero.
     """
     x0 = u.new_zeros(len(u), cell.nx) if guess is None else guess
+    x0, states = (x0[:, 0], x0) if x0.ndim == 3 else (x0, None)
     compiled = is_compiled(cell, u)
     if not compiled:
-        states = x0 if x0.ndim == 3 else None
-        x = newton_states(cell, u, x0[:, 0] if x0.ndim == 3 else x0, guess=states, periodic=True)
+        x = newton_states(cell, u, x0, guess=states, periodic=True)
         if torch.isfinite(x).all():
             return signals(cell, u, x)
-    x0 = x0[:, 0] if x0.ndim == 3 else x0
     # `settled` and `lost` tell for each record whether it is periodic, or will never be.
     identity = torch.eye(cell.nx, dtype=u.dtype, device=u.device)
     eps = torch.finfo(u.dtype).eps
@@ -237,5 +236,5 @@ def kernel_arguments(cell: LFRCell) -> list[Any]:
     static, zeros = known(cell.static), cell.A.new_zeros
     nothing = Kernel(zeros(0, 0), zeros(0, 0), zeros(0), zeros(cell.nw))
     *own, code, growth = nothing if static is None else static.kernel
-    lti = (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
+    lti = map(cell.get_parameter, Matrices._fields)
     return [*map(to_numpy, (*lti, *own)), code, growth]

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.engine.activations import FAR
 from lfrtorch.engine.nonlinearity import Network
@@ -87,7 +88,7 @@ def enclosure(
     ``a`` is what Wz z (nn,) cannot leave besides. With ``K``, w - K z is bounded instead of w.
     """
     sigma = static.sigma
-    Wz, bz, Ww, bw = (_array(p) for p in (static.Wz, static.bz, static.Ww, static.bw))
+    Wz, bz, Ww, bw = (to_float64(p) for p in (static.Wz, static.bz, static.Ww, static.bw))
     K = np.zeros((len(Ww), Wz.shape[1])) if K is None else K
     cells = _cells(z, Wz, bz)
     inside = _product(Wz, cells)
@@ -99,8 +100,7 @@ def enclosure(
     v = Interval(inside.low + bz, inside.high + bz)
     slopes = _range(sigma.slopes, sigma.slope_extremes, v)
     # J = Ww diag(slopes) Wz: an entry is a sum over the neurons.
-    J = _product(Ww, _transposed(_scaled(Wz, slopes)))
-    J = _transposed(J)
+    J = _transposed(_product(Ww, _transposed(_scaled(Wz, slopes))))
     w = _product(Ww, _range(sigma.values, sigma.extremes, v))
     linear = _product(K, cells)
     w = Interval(w.low + bw - linear.high, w.high + bw - linear.low)
@@ -110,10 +110,6 @@ def enclosure(
     at = sigma.values(centres @ Wz.T + bz) @ Ww.T + bw - centres @ K.T
     w = w.within(Interval(at - reach, at + reach))
     return Enclosure(_hull(w).wider(), _hull(J).wider(), _hull(slopes).wider(), centres)
-
-
-def _array(parameter) -> Array:
-    return parameter.detach().double().cpu().numpy()
 
 
 def _product(M: Float[Array, "m k"], x: Interval) -> Interval:

@@ -19,10 +19,8 @@ Weights = dict[str, Tensor]
 class StaticJacobian(Protocol):
     """dw = J dz + (∂w/∂φ) dφ; φ are all weights of the map in the order of its parameters."""
 
-    @property
-    def J(self) -> Float[Tensor, "R T nw nz"]:
-        """∂w/∂z."""
-        ...
+    J: Float[Tensor, "R T nw nz"]
+    """∂w/∂z."""
 
     def part(self, records: slice, time: slice) -> StaticJacobian:
         """The same for some of the records and samples."""

@@ -18,25 +18,17 @@ ROUNDING = 1e-12
 class Bounds(Protocol):
     """Bounds C δ <= room of a step δ, to first order."""
 
-    @property
-    def slopes(self) -> Float[Tensor, "bounds own"]:
-        """C, for the first entries of a step; the others are 0."""
-        ...
+    slopes: Float[Tensor, "bounds own"]
+    """C, for the first entries of a step; the others are 0."""
 
-    @property
-    def room(self) -> Float[Tensor, " bounds"]:
-        """How far a step may go."""
-        ...
+    room: Float[Tensor, " bounds"]
+    """How far a step may go."""
 
-    @property
-    def trusted(self) -> bool:
-        """Whether a free step within the bounds is taken as it is."""
-        ...
+    trusted: bool
+    """Whether a free step within the bounds is taken as it is."""
 
-    @property
-    def corrections(self) -> int:
-        """Most rounds in which they are tightened."""
-        ...
+    corrections: int
+    """Most rounds in which they are tightened."""
 
     def tightened(
         self, step: Float[Tensor, " P"], room: Float[Tensor, " bounds"]

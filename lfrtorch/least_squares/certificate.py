@@ -35,6 +35,7 @@ import scipy
 from jaxtyping import Float
 
 from lfrtorch._support.optional import imported
+from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import Network, is_network
@@ -82,7 +83,7 @@ class Differences:
     @classmethod
     def by_neuron(cls, cell: LFRCell, static: Network, slopes: Interval) -> Differences:
         """The slope of each neuron is anywhere in its interval."""
-        Wz, Ww = _array(static.Wz), _array(static.Ww)
+        Wz, Ww = to_float64(static.Wz), to_float64(static.Ww)
         J = Ww * slopes.middle @ Wz
         return replace(cls._about(cell, J, Ww, slopes.radius[:, None] * Wz), neurons=True)
 
@@ -335,7 +336,3 @@ def _solved(
     Z = np.zeros((n, n))
     Z[i, j] = Z[j, i] = dual[len(dual) - len(i) :] / weights
     return found, Z
-
-
-def _array(parameter: Any) -> Array:
-    return parameter.detach().double().cpu().numpy()

@@ -21,7 +21,7 @@ from torch.nn.utils import vector_to_parameters
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.nonlinearity import Network, is_network, linearise_static, of_static
+from lfrtorch.engine.nonlinearity import Network, is_network, linearise_static
 from lfrtorch.engine.static_enclosure import enclosure, everywhere
 from lfrtorch.least_squares.bounded_system import BoundedSystem
 from lfrtorch.least_squares.certificate import (
@@ -160,7 +160,7 @@ class Contracting:
         else:
             # Each entry's extremes are at certain z, which stay the extremes to first order.
             centres = torch.as_tensor(slopes.centres)
-            weights = of_static(dict(cell.named_parameters()))
+            weights: dict[str, Tensor] = dict(static.named_parameters())
             with torch.no_grad():
                 at = linearise_static(static, centres.unsqueeze(0), weights).J[0].flatten(1)
             ends = centres[torch.cat([at.argmin(0), at.argmax(0)])]

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lfrtorch._support.threads import to_float64
 from lfrtorch._support.types import Array, Integers
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.nonlinearity import is_network
@@ -65,12 +66,7 @@ def reduction(
     # Those of ``initial_states`` come last and are kept. ``coordinates``: no initial state is given
     # in those of x. ``before``: the reduction at weights close by, whose columns are kept if they
     # still do. ``fixed`` entries of the free parameters have columns of zeros.
-    G = (
-        _directions(cell, initial_states)[:, 0 if coordinates else cell.nx**2 :]
-        .double()
-        .cpu()
-        .numpy()
-    )
+    G = to_float64(_directions(cell, initial_states))[:, 0 if coordinates else cell.nx**2 :]
     parameters = list(cell.named_parameters())
     counts = [p.numel() for _, p in parameters] + [initial_states.numel()]
     mask = np.repeat([p.requires_grad for _, p in parameters] + [True], counts)

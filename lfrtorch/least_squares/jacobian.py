@@ -66,6 +66,8 @@ class Jacobian:
         self.parts, self._reduced, self._fixed = parts, reduced, fixed
         self.ranks, self._bounded = ranks, bounded
         self._zeros = reduced.expand.new_zeros(len(fixed))
+        self._shared = reduced.expand.shape[1]
+        """Number of parameters whose columns all records have."""
 
     def system(self, damping: float, truncation: float) -> tuple[System, Float[Tensor, " P"]]:
         """The least-squares system of J and its gradient Jᵀr; see the search's ``Jacobian``."""
@@ -141,11 +143,6 @@ class Jacobian:
         whole[states.place] = torch.einsum("rij,ri->rj", states.Vh, states.s * states.r)
         return EliminatedSystem(left, states, penalty, gram=gram, truncation=truncation), whole
 
-    @property
-    def _shared(self) -> int:
-        """Number of parameters whose columns all records have."""
-        return self._reduced.expand.shape[1]
-
     def tangent(self, d_theta: Float[Tensor, " P"]) -> Float[Tensor, " M"]:
         """J dθ."""
         d_theta = d_theta.masked_fill(self._fixed, 0.0)
@@ -218,22 +215,15 @@ class OutputRows:
     ) -> None:
         self.group, self.linearisation, self.x0, self._memory = group, linearisation, x0, memory
         self._eliminate = eliminate and x0 is not None
+        self.count = group.y.numel()
+        self.has_initial_state = linearisation.periodic or x0 is not None
+        """Whether the rows have columns of the initial state."""
         self.states: StartStates | None = None
         """The initial states that the last ``fold`` eliminated."""
         self._buffer: Tensor | None = None
         self._cached: _Cached | None = None
         self._tied: tuple[Tensor, Tensor, Tensor] | None = None
         """Kept parameters, those of them that move the initial state, and how."""
-
-    @property
-    def count(self) -> int:
-        """How many rows there are."""
-        return self.group.y.numel()
-
-    @property
-    def has_initial_state(self) -> bool:
-        """Whether the rows have columns of the initial state."""
-        return self.linearisation.periodic or self.x0 is not None
 
     def fold(
         self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
@@ -401,12 +391,7 @@ class MappedRows:
 
     def __init__(self, rows: OutputRows, change: Float[Tensor, "Q P"], weight: float) -> None:
         self._rows, self._change, self._weight = rows, weight * change, weight
-        self._every = everything(change[:, 0])
-
-    @property
-    def count(self) -> int:
-        """How many rows there are."""
-        return self._rows.count
+        self._every, self.count = everything(change[:, 0]), rows.count
 
     def fold(
         self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int

@@ -40,15 +40,11 @@ KRYLOV = 400
 class System(Protocol):
     """JᵀJ decomposed, for several dampings."""
 
-    @property
-    def scale(self) -> float:
-        """Largest eigenvalue of JᵀJ; NaN if an entry is not finite."""
-        ...
+    scale: float
+    """Largest eigenvalue of JᵀJ; NaN if an entry is not finite."""
 
-    @property
-    def rank(self) -> int:
-        """Directions that J sees."""
-        ...
+    rank: int
+    """Directions that J sees."""
 
     def solve(self, gradient: Float[Tensor, " P"], damping: float) -> Float[Tensor, " P"]:
         """-(JᵀJ + λI)⁻¹ gradient."""

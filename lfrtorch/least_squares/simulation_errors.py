@@ -14,6 +14,7 @@ from dataclasses import replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.utils import vector_to_parameters
 
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
@@ -31,15 +32,13 @@ class Parameters:
     """θ: the parameters of a cell that require a gradient, then initial states of records."""
 
     def __init__(self, cell: LFRCell, states: int) -> None:
-        free = [(name, p) for name, p in cell.named_parameters() if p.requires_grad]
-        self.names = [name for name, _ in free]
-        self._sizes = [p.numel() for _, p in free]
-        self.states, self._nx = states, cell.nx
-        self.own = sum(self._sizes)
-        """Entries before the initial states."""
-        own = dict(zip(self.names, self._sizes, strict=True))
-        self.sizes = own | ({"x0": states * cell.nx} if states else {})
+        self.sizes = {n: p.numel() for n, p in cell.named_parameters() if p.requires_grad}
         """Entries of each parameter, and of the initial states if there are any."""
+        self.names, self.own = list(self.sizes), sum(self.sizes.values())
+        """Names of the cell's parameters, and their entries, before those of initial states."""
+        self.states, self._nx = states, cell.nx
+        if states:
+            self.sizes["x0"] = states * cell.nx
 
     def of(self, cell: LFRCell, initial_states: Float[Tensor, "states nx"]) -> Float[Tensor, " P"]:
         """θ of the weights of a cell and initial states."""
@@ -52,10 +51,8 @@ class Parameters:
 
     def write(self, cell: LFRCell, theta: Float[Tensor, " P"]) -> None:
         """Put θ into a cell, whose weights are views of it from then on."""
-        theta = theta.detach().to(cell.A)
-        for name, part in zip(self.names, theta[: self.own].split(self._sizes), strict=True):
-            parameter = cell.get_parameter(name)
-            parameter.data = part.view(parameter.shape)
+        weights = [cell.get_parameter(name) for name in self.names]
+        vector_to_parameters(theta[: self.own].detach().to(cell.A), weights)
 
 
 class SimulationErrors:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lfrtorch._support.threads import to_float64
 from lfrtorch.distributed import Ranks
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import spectral_radius
@@ -46,7 +47,7 @@ def stabilised(
     own = fading(A, integrating)
     if spectral_radius(own) <= limit:
         return A
-    T, Q = scipy.linalg.schur(own.double().cpu().numpy(), output="real")
+    T, Q = scipy.linalg.schur(to_float64(own), output="real")
     i = 0
     while i < len(T):
         block = slice(i, i + 1 + (i + 1 < len(T) and T[i + 1, i] != 0))
@@ -96,7 +97,7 @@ class PoleBounds:
         self, A: Float[Tensor, "nx nx"], integrating: Bool[Tensor, " nx"], limit: float
     ) -> None:
         self._own = torch.nonzero(~integrating).flatten().cpu().numpy()
-        self._A = fading(A, integrating).double().cpu().numpy()
+        self._A = to_float64(fading(A, integrating))
         self._limit = limit
         values, left, right = scipy.linalg.eig(self._A, left=True, right=True)
         near = np.flatnonzero((np.imag(values) >= 0) & (np.abs(values) > NEAR * limit))
@@ -115,7 +116,7 @@ class PoleBounds:
         self, step: Float[Tensor, " P"], room: Float[Tensor, " near"]
     ) -> Float[Tensor, " near"] | None:
         """The room less what a step takes each pole beyond the limit; None if it takes none."""
-        dA = step[: self.slopes.shape[1]].double().cpu().numpy()
+        dA = to_float64(step[: self.slopes.shape[1]])
         size = round(len(dA) ** 0.5)
         after = np.linalg.eigvals(self._A + dA.reshape(size, size)[np.ix_(self._own, self._own)])
         expected = self._values + self._changes @ dA

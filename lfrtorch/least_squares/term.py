@@ -43,15 +43,11 @@ class Term(Protocol):
 class TermRows(Protocol):
     """Some rows of J, weighted, and the residual there; gauge directions leave them as they are."""
 
-    @property
-    def count(self) -> int:
-        """How many rows there are."""
-        ...
+    count: int
+    """How many rows there are."""
 
-    @property
-    def states(self) -> StartStates | None:
-        """The initial states that the last ``fold`` eliminated."""
-        ...
+    states: StartStates | None
+    """The initial states that the last ``fold`` eliminated."""
 
     def fold(
         self, kept: Int[Tensor, " K"], total: QRAccumulator | GramAccumulator, room: int
