@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfrtorch._support.threads import has_kernels, spread, to_numpy
-from lfrtorch.engine.cell import LFRCell, Matrices
+from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.feedback_recurrence import monodromy
 from lfrtorch.engine.linearised import spectral_radius
 from lfrtorch.engine.newton import newton_states
@@ -236,5 +236,5 @@ def kernel_arguments(cell: LFRCell) -> list[Any]:
     static, zeros = known(cell.static), cell.A.new_zeros
     nothing = Kernel(zeros(0, 0), zeros(0, 0), zeros(0), zeros(cell.nw))
     *own, code, growth = nothing if static is None else static.kernel
-    lti = map(cell.get_parameter, Matrices._fields)
+    lti = (cell.A, cell.Bu, cell.Bw, cell.Cz, cell.Dzu, cell.Cy, cell.Dyu, cell.Dyw)
     return [*map(to_numpy, (*lti, *own)), code, growth]
