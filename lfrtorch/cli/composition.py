@@ -48,7 +48,10 @@ def take_words(
 ) -> None:
     """Check the words, after ``whole`` has completed them, and quote them for Hydra."""
     given = in_full(command, sys.argv[1:], unnamed)
-    sys.argv[1:] = [quoted(word) for word in whole(given)]
+    completed = whole(given)
+    if command == "config":
+        completed = [*completed, *chosen_by_data(completed)]
+    sys.argv[1:] = [quoted(word) for word in completed]
     check_words(command, given, sys.argv[1:])
 
 
@@ -61,11 +64,10 @@ def in_full(command: str, given: Sequence[str], unnamed: str = "data.path") -> l
     if command in _DATA_CHOSEN and not chosen and at is not None:
         words.insert(at, "data=file")
     several = not SWEEPS.isdisjoint(words)
-    words = [_listed(word, several=several) for word in in_groups(command, words)]
-    return words + _chosen_by_data(words) if command == "config" else words
+    return [_listed(word, several=several) for word in in_groups(command, words)]
 
 
-def _chosen_by_data(words: Sequence[str]) -> list[str]:
+def chosen_by_data(words: Sequence[str]) -> list[str]:
     """Sizes of a model of files that nobody gave, which the data choose."""
     pairs = [word.lstrip("+").partition("=") for word in words]
     given = {name: value for name, _, value in pairs}

@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 
 from lfrtorch import InputError
-from lfrtorch.cli.composition import check_words, composed, in_full, in_groups, parsed
+from lfrtorch.cli.composition import (
+    check_words,
+    chosen_by_data,
+    composed,
+    in_full,
+    in_groups,
+    parsed,
+)
 from lfrtorch.cli.quotes import quoted
 
 FILE = ["data=file", "data.path=x.csv"]
@@ -142,6 +149,28 @@ def test_few_words_are_a_whole_command_line(command: str, short: str, long: list
     words = [quoted(word) for word in in_full(command, short.split())]
     check_words(command, words)
     assert composed(command, words) == composed(command, long)
+
+
+AUTO = ["nn=auto", "nw=auto", "nx=auto", "nz=auto"]
+
+
+@pytest.mark.parametrize(
+    ("words", "added"),
+    [
+        (FILE, AUTO),
+        ([*FILE, "nx=3", "seed=1"], ["nn=auto", "nw=auto", "nz=auto"]),
+        ([*FILE, "nx=3", "nz=1", "nw=1", "nn=4"], []),
+        ([*FILE, "static=polynomial"], ["degree=auto", "nw=auto", "nx=auto", "nz=auto"]),
+        ([*FILE, "static=own"], ["nx=auto"]),
+        ([*FILE, "ridge=0.1"], ["nx=auto"]),
+        ([*FILE, "structure=wiener", "nx=2"], []),
+        ([*FILE, "init_from=runs/a"], []),
+        ([*FILE, "resume=runs/a"], []),
+        (["+bench=boucwen"], []),
+    ],
+)
+def test_sizes_of_a_model_of_files_are_chosen_by_the_data(words: list[str], added: list[str]):
+    assert chosen_by_data(words) == added
 
 
 def test_names_of_columns_that_need_quotes_are_a_list_too():
