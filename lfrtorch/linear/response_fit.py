@@ -107,7 +107,9 @@ class ResponseFit:
         r = _real(self.data.weighted(self.data.Y)).numpy()
         if not np.isfinite(J).all():
             return np.inf, matrices
-        size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+        size = np.linalg.norm(J, axis=0)
+        # A state that nothing sees has a column that is 0 but for underflow: its input stays 0.
+        size = np.maximum(size, max(1e-100 * size.max(), 1e-300))
         best = scipy.linalg.lstsq(J / size, r, check_finite=False)[0] / size
         _, B, _, D = matrices
         B[free_B], D[free] = np.split(best, [len(of_B)])

@@ -357,12 +357,6 @@ def test_balancing_close_to_the_unit_circle():
     np.testing.assert_allclose(G, expected, rtol=0, atol=1e-7)
 
 
-def test_an_unstable_model_has_no_balanced_coordinates():
-    one = np.ones((1, 1))
-    with pytest.raises(ValueError, match="unstable, and has no balanced"):
-        balancing(1.5 * one, one, one)
-
-
 def test_balancing_states_that_no_input_reaches_changes_nothing():
     A, C = np.diag([0.5, 0.2]), np.ones((1, 2))
     for matrix in balancing(A, np.zeros((2, 1)), C):

@@ -389,3 +389,13 @@ def test_covariance_of_window_errors_is_that_of_all_lines_together():
     # The blocks of one line are the covariances of the response.
     own = np.einsum("kurl,kvrl,kop->koupv", errors.weights, errors.weights.conj(), errors.noise)
     np.testing.assert_allclose(own.reshape(F, 4, 4), frf.cov_total, rtol=0, atol=1e-9)
+
+
+def test_a_state_that_nothing_sees_has_no_input():
+    """Its column underflows, and is no column that a huge input makes up for."""
+    data = lines(records_of(2, 1, 1), offset=True)
+    problem = ResponseFit(data, known=False, feedthrough=True)
+    A, C = np.diag([0.5, 0.3]), np.array([[1.0, 1e-290]])
+    cost, (_, B, _, _) = problem.with_input_matrices(A, C)
+    assert np.isfinite(cost)
+    assert np.abs(B).max() < 1e10
