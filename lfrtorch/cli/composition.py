@@ -68,7 +68,9 @@ def in_full(command: str, given: Sequence[str], unnamed: str = "data.path") -> l
 
 
 def chosen_by_data(words: Sequence[str]) -> list[str]:
-    """Sizes of a model of files that nobody gave, which the data choose."""
+    """Sizes of a model of files that nobody gave, which the data choose; not in several runs."""
+    if not SWEEPS.isdisjoint(words):
+        return []
     pairs = [word.lstrip("+").partition("=") for word in words]
     given = {name: value for name, _, value in pairs}
     names = {name.split(".")[0] for name in given}

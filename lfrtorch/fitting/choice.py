@@ -113,6 +113,14 @@ class Choice:
         left_out: for each record that has scored samples its outputs where they were left out, of
             the linear model and the NL-LFR that were chosen without them, (T, ny), physical units.
         seconds: that it took.
+
+    Example:
+        >>> def start(bla, train, sizes, seed):
+        ...     return lfrtorch.initialise(bla, train, seed=seed, **sizes)
+        >>> given = {"nx": 1, "nz": 1, "nw": 1, "nn": 2}
+        >>> choice = lfrtorch.choose_sizes(record, [1], lambda nx: bla, start, given=given)
+        >>> choice.chosen in choice.candidates
+        True
     """
 
     candidates: tuple[Candidate, ...]

@@ -167,6 +167,7 @@ AUTO = ["nn=auto", "nw=auto", "nx=auto", "nz=auto"]
         ([*FILE, "init_from=runs/a"], []),
         ([*FILE, "resume=runs/a"], []),
         (["+bench=boucwen"], []),
+        (["-m", *FILE, "nn=5,10"], []),
     ],
 )
 def test_sizes_of_a_model_of_files_are_chosen_by_the_data(words: list[str], added: list[str]):
