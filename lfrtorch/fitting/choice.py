@@ -12,7 +12,7 @@ and nonlinear models are fitted to the rest, and simulated through what was left
 
 What a choice of many is worth is not its own error, which is the least of many. So the choice is
 made again without each of the stretches, and judged there (nested cross-validation): the errors of
-``Choice.responses``, of both models, have chosen nothing.
+``Choice.left_out``, of both models, had no part in the choice.
 
 References:
     Stone, "Cross-validatory choice and assessment of statistical predictions", Journal of the Royal
@@ -70,8 +70,6 @@ _STARTS = 2
 NEAR = 1.2
 """Rms error in training over the least up to which a start takes part in a mean."""
 
-_OVERFIT = 2.0  # error in what is left out over the least of larger ridges, that ends a path
-
 _SMALL = ({"nz": 1, "nw": 1, "nn": 4, "degree": 3}, {"nz": 2, "nw": 2, "nn": 8, "degree": 3})
 """Sizes that are always tried."""
 
@@ -110,8 +108,8 @@ class Choice:
         chosen: the fewest net parameters that do as well as the best.
         nx: the best order of a linear model.
         counts: samples of each block, (folds, B).
-        left_out: for each record that has scored samples its outputs where they were left out, of
-            the linear model and the NL-LFR that were chosen without them, (T, ny), physical units.
+        left_out: each record, with its outputs where they were left out, of the linear model and
+            of the NL-LFR that was chosen without them, (T, ny), physical units.
         seconds: that it took.
 
     Example:
@@ -162,13 +160,13 @@ error up to 1 % above it."""
 def choice_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
     """Return head and rows of a table of all sizes, each with its best ridge, and the chosen."""
     names = [name for name in ("nx", "nz", "nw", "nn", "degree") if entries and name in entries[0]]
+
+    def rank(entry: Mapping[str, Any]) -> tuple[bool, float]:
+        return not entry["chosen"], np.inf if entry["ratio"] is None else entry["ratio"]
+
     best: dict[tuple[int, ...], Mapping[str, Any]] = {}
-    for entry in entries:
-        key = tuple(entry[name] for name in names)
-        rank = (not entry["chosen"], entry["ratio"] if entry["ratio"] is not None else np.inf)
-        other = best.get(key)
-        if other is None or rank < (not other["chosen"], other["ratio"]):
-            best[key] = entry
+    for entry in sorted(entries, key=rank):
+        best.setdefault(tuple(entry[name] for name in names), entry)
     columns = (*names, "ridge", "parameters_net", "ratio", "standard_errors_above")
     rows = [
         [*(entry[name] for name in columns), "chosen" if entry["chosen"] else ""]
@@ -374,7 +372,7 @@ class _Study:
         return found[int(np.argmax(good))]
 
     def candidates(self, sizes: Sizes, start: Start, seed: int, base: float) -> list[Candidate]:
-        """Return a candidate for each ridge; none if a fit cannot begin."""
+        """Return a candidate for each ridge; none if no fit can begin."""
         static = {name: size for name, size in sizes.items() if name != "nx"}
         jobs = [(k, seed + 1000 * i) for k in range(FOLDS) for i in range(_STARTS)]
         linear = self._linear[sizes["nx"]]
@@ -384,7 +382,12 @@ class _Study:
             k, own = job
             fold = self._folds[k]
             model = start(linear.models[k], fold.train, static, own)
-            return model.net_parameter_count, list(self._path(model, fold))
+            parameters = model.net_parameter_count
+            try:
+                return parameters, list(self._path(model, fold))
+            except InputError:  # it diverges on what it is fitted to
+                lost = np.full_like(linear.outputs[k], np.inf)
+                return parameters, [(np.inf, lost)] * len(_RIDGES)
 
         try:
             paths = self._alone(path, jobs)
@@ -411,8 +414,6 @@ class _Study:
         """Put what was left out of each fold together again: record, linear and NL-LFR output."""
         found = []
         for i, record in enumerate(self._records):
-            if record.samples - record.skip < 1:
-                continue
             signals = []
             for own in outputs:
                 y = np.array(record.y)
@@ -426,34 +427,21 @@ class _Study:
 
     def _path(self, model: Model, fold: Fold) -> Iterator[tuple[float, Array]]:
         """Yield the cost in training and the output left out at each ridge."""
-        measured = fold.left_out([record.y for record in self._records])
+        # Nothing here looks at what is measured where it is left out.
         problem = Problem.of(model, fold.train, guarantee=self._guarantee)
-        theta, least, cost = problem.theta, np.inf, np.inf
-        over = stable = False
-        output = np.full_like(measured, np.inf)
+        theta = problem.theta
         for ridge, iterations in _RIDGES:
-            if not over:
-                problem.weigh(ridge)
-                search = LevenbergMarquardt(max_iter=iterations, tolerance=1e-3, patience=2)
-                try:
-                    state = search.init(problem, theta)
-                except InputError:  # it diverges on the training records
-                    over = True
-                    yield cost, output
-                    continue
-                while not state.reason:
-                    if self._stop is not None and self._stop():
-                        raise StoppedError("stopped while sizes were chosen")
-                    state = search.step(problem, state)
-                theta, cost = state.theta, state.cost
-                problem.write(theta)
-                output = self._simulated((model, fold))
-                stable = largest_stable_amplitude(model, fold.train) >= max(LOUDER)
-                with np.errstate(over="ignore", invalid="ignore"):
-                    error = float(np.mean(((output - measured) / self._scale) ** 2))
-                over = not error < _OVERFIT**2 * least
-                least = min(least, error)
-            yield cost if stable else np.inf, output
+            problem.weigh(ridge)
+            search = LevenbergMarquardt(max_iter=iterations, tolerance=1e-3, patience=2)
+            state = search.init(problem, theta)
+            while not state.reason:
+                if self._stop is not None and self._stop():
+                    raise StoppedError("stopped while sizes were chosen")
+                state = search.step(problem, state)
+            theta = state.theta
+            problem.write(theta)
+            stable = largest_stable_amplitude(model, fold.train) >= max(LOUDER)
+            yield state.cost if stable else np.inf, self._simulated((model, fold))
 
     def _simulated(self, job: tuple[Model | LinearModel, Fold]) -> Array:
         """Return the simulated output where it was left out."""

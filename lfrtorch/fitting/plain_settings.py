@@ -113,7 +113,7 @@ class PlainSettings:
     first_iterations: int = setting(40, "how many of these there are.", least=1)
     starts: Size = setting(
         "auto",
-        "random starts, of which the best is kept; at least 2 if sizes are searched. "
+        "random starts, of which the best is kept; at least 4 if sizes are chosen. "
         '``"auto"``: 8, or fewer if they would take more than about a minute on one core. A single '
         "one may end in a poor minimum.",
         least=1,
@@ -121,8 +121,7 @@ class PlainSettings:
     )
     seed: int = setting(
         0,
-        "of the first start; the others have seed + 1000, seed + 2000, ... If sizes are searched, "
-        "the first start of the fit is the one that brought the sizes chosen.",
+        "of the first start; the others have seed + 1000, seed + 2000, ...",
         least=0,
     )
     device: str = setting("cpu", 'of the fit: ``"cpu"`` or ``"cuda"``.')

@@ -188,10 +188,11 @@ def refined_near(model: LinearModel, records: Sequence[Record]) -> LinearModel:
     if model.poles.size and np.abs(model.poles).max() >= 1.0:
         return model
     data = [without_coordinates(record) for record in records]
-    scaler = Scaler.of(data, offset=bool(model.y_offset.any() or model.u_offset.any()))
+    offset = bool(model.y_offset.any() or model.u_offset.any())
+    scaler = Scaler.of(data, offset=offset)
     problem = SignalFit(
         [scaler.normalise(record) for record in data],
-        offset=True,
+        offset=offset,
         prediction=False,
         feedthrough=bool(model.D.any()),
     )

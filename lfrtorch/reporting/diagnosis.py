@@ -88,7 +88,7 @@ class Evidence:
     started: int = 1
     continued: bool = False  # from a model, so that there are no other starts
     sizes: Mapping[str, int] = field(default_factory=dict)  # nx is that of the linear model
-    searched: bool = False  # whether validation chose them
+    searched: bool = False  # whether the data chose them
     trainer: Any = field(default_factory=LevenbergMarquardt)
     ridge: bool = False
     louder: Mapping[str, float] = field(default_factory=dict)  # largest input / training's, by test

@@ -6,8 +6,7 @@ few resonances have most of the error, even where one model is better in every b
 clear if it is beyond Student's quantile, or if one error is twice the other: one burst of a model
 that runs away has a large standard error, and is no chance. A difference below 5 % of the error is
 none. What was left out in turn is the whole record, each stretch judged by models that were chosen
-without it: there 1.5 standard errors and 1 % are enough. Of 38 planted systems 16 are called better
-so, all of them rightly, and 13 with the limits of other records.
+without it: there 1.5 standard errors and 1 % are enough (``benchmarks/first_try.md``).
 """
 
 from __future__ import annotations

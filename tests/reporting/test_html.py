@@ -189,7 +189,7 @@ def test_sizes_that_were_tried(single: Run):
     less = entry | {"ridge": 0.01, "ratio": 0.52, "chosen": True}
     large = entry | {"nn": 9, "parameters_net": 37, "ratio": 0.6}
     runs_away = large | {"ridge": 0.01, "ratio": None, "standard_errors_above": None}
-    page = single.page(search=[large, runs_away, entry, less])
+    page = single.page(search=[runs_away, large, entry, less])
     assert "1 1 3 0.0100 19 0.520 0 chosen 1 1 9 0.100 37 0.600 0" in page.text
     assert "4 models were tried; the table has each size with its best ridge." in page.text
     assert "Sizes" not in single.page().text
