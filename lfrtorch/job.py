@@ -21,6 +21,7 @@ from lfrtorch.distributed import Ranks
 from lfrtorch.engine.nonlinearity import is_network
 from lfrtorch.engine.simulation import is_compiled
 from lfrtorch.fitting.choice import Choice, choose_sizes
+from lfrtorch.fitting.exclusions import allowed
 from lfrtorch.fitting.first_fit import begun_on_part, part_of
 from lfrtorch.fitting.last_fits import distilled, refitted, without_poor_starts
 from lfrtorch.fitting.multistart import cheap_starts, fit
@@ -198,11 +199,12 @@ def _all_estimation(dataset: Dataset) -> Dataset:
 def _of_choice(settings: Settings, choice: Choice) -> Settings:
     """The settings with what was chosen; the fit has no validation records."""
     trainer: Any = settings.trainer
+    mean = settings.static == "network" and allowed("average", _AVERAGED, vars(settings))
     return replace(
         settings,
         **choice.chosen.sizes,
         ridge=choice.chosen.ridge,
-        average=max(settings.average, _AVERAGED) if settings.static == "network" else 1,
+        average=max(settings.average, _AVERAGED) if mean else 1,
         refit=False,
         trainer=replace(trainer, max_iter=min(trainer.limit, _ITERATIONS)),
     )

@@ -60,6 +60,12 @@ def dataset() -> Dataset:
     return Dataset("saturation", [train], [validation], [test])
 
 
+@pytest.fixture
+def short_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two ridges in the place of seven."""
+    monkeypatch.setattr("lfrtorch.fitting.choice._RIDGES", ((0.1, 8), (1e-3, 8)))
+
+
 def settings(**given) -> Settings:
     return Settings(**{"nx": 1, "nz": 1, "nn": 3, "starts": 1, "trainer": SHORT} | given)
 
@@ -80,6 +86,7 @@ def test_the_job_scores_every_record_and_advises(dataset: Dataset):
     assert repr(run).startswith("Run(saturation, nx=1, nz=1, nw=1, nn=3")
 
 
+@pytest.mark.usefixtures("short_paths")
 @pytest.mark.numeric
 def test_chosen_sizes_are_fitted_to_all_estimation_records(dataset: Dataset):
     observer = Said()
@@ -106,6 +113,7 @@ def test_chosen_sizes_are_fitted_to_all_estimation_records(dataset: Dataset):
     assert run.model.sizes["nx"] == run.fit.averaged * chosen.sizes["nx"]
 
 
+@pytest.mark.usefixtures("short_paths")
 @pytest.mark.numeric
 def test_without_tests_what_was_left_out_judges(dataset: Dataset):
     alone = replace(dataset, tests=[])
@@ -117,22 +125,38 @@ def test_without_tests_what_was_left_out_judges(dataset: Dataset):
     assert (run.settings.nx, run.settings.nn) == (1, 3)
 
 
-@pytest.mark.parametrize("feature", ["noise", "init", "periodic", "polynomial"])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {},
+        {"noise": "innovation"},
+        {"init": "paper"},
+        {"static": "polynomial", "degree": "auto"},
+        {"static": lambda nz, nw: lfrtorch.Network(nz, nw, 3)},
+        {"structure": "hammerstein"},
+        {"first_part": 0.5},
+    ],
+    ids=str,
+)
+@pytest.mark.usefixtures("short_paths")
 @pytest.mark.numeric
-def test_sizes_are_chosen_beside(feature: str, dataset: Dataset):
-    asked: dict[str, Any] = {"nx": 1, "nz": 1, "nw": 1, "nn": "auto"}
-    if feature == "noise":
-        asked |= {"noise": "innovation"}
-    elif feature == "init":
-        asked |= {"init": "paper"}
-    elif feature == "polynomial":
-        asked |= {"static": "polynomial", "nn": 3, "degree": "auto"}
-    else:
-        u, y = dataset.train[0].u, dataset.train[0].y
-        steady = Record(u[-100:], y[-100:], start="periodic", name="steady")
-        dataset = replace(dataset, train=[*dataset.train, steady])
-    run = identify(replace(dataset, tests=[]), settings(**asked))
+def test_a_ridge_is_chosen_beside(asked: dict[str, Any], dataset: Dataset):
+    u, y = dataset.train[0].u, dataset.train[0].y
+    steady = Record(u[-100:], y[-100:], start="periodic", name="steady")
+    dataset = replace(dataset, train=[*dataset.train, steady], tests=[])
+    run = identify(dataset, settings(nw=1, ridge="auto", **asked))
     assert run.verdict.kind == "better"
+    assert run.choice is not None
+    assert run.settings.ridge in [c.ridge for c in run.choice.candidates]
+    sizes = [{k: v for k, v in c.sizes.items() if k != "degree"} for c in run.choice.candidates]
+    assert all({"nx": 1, "nz": 1, "nw": 1}.items() <= s.items() for s in sizes)
+    assert run.settings.structure == asked.get("structure", "free")
+
+
+def test_a_ridge_is_not_chosen_for_a_model_that_has_seen_the_data(dataset: Dataset):
+    model = identify(dataset, settings()).model
+    with pytest.raises(ValueError, match=r"ridge is auto, and the model of init_from has seen"):
+        settings(init_from=model, ridge="auto")
 
 
 def test_a_model_to_go_on_from_is_not_changed(dataset: Dataset):
@@ -406,6 +430,7 @@ def test_a_refit_that_cannot_help_leaves_the_model(dataset: Dataset, monkeypatch
     assert "unstable on louder inputs" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("short_paths")
 def test_the_console_prints_each_step(dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     identify(dataset, settings(nz="auto", nn=3), observer=Console())
     printed = capsys.readouterr().out

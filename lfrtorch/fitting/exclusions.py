@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -61,6 +62,12 @@ EXCLUSIONS = (
     Exclusion("structure", "z_feedthrough", "its z is of the inputs alone", ("hammerstein",)),
     Exclusion("structure", "static", "its map is a network for each z", ("parallel",)),
 )
+
+
+def allowed(name: str, value: Any, given: Mapping[str, Any]) -> bool:
+    """Return whether no row refuses a value of one setting beside the others."""
+    rows = [row for row in EXCLUSIONS if name in (row.first, row.second)]
+    return not any(row.holds({**given, name: value}) for row in rows)
 
 
 def refuse_together(**given: Any) -> None:

@@ -68,10 +68,11 @@ class PlainSettings:
         'of which blocks the model is made, and a fit keeps to: ``"wiener"``, ``"hammerstein"``, '
         '``"wiener_hammerstein"`` or ``"parallel"``, see :func:`lfrtorch.initialise`.',
     )
-    ridge: float | Mapping[str, float] = setting(
+    ridge: float | Literal["auto"] | Mapping[str, float] = setting(
         0.0,
         "weight of the squared distance to the start, against overfitting; or weights by the "
-        "parameters' names, see :func:`lfrtorch.fit`.",
+        'parameters\' names, see :func:`lfrtorch.fit`. ``"auto"``: chosen by cross-validation, as '
+        "it is with sizes that are.",
     )
     noise: Noise = setting(
         "output",

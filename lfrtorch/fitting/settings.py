@@ -71,7 +71,12 @@ class Settings(PlainSettings):
             )
         if self.init_from is None:
             self._check_sizes()
-        if self.init_from is not None:
+        else:
+            if self.ridge == "auto":
+                raise InputError(
+                    "ridge is auto, and the model of init_from has seen what would be left out to "
+                    "choose it; give a number."
+                )
             for name, size in self.init_from.sizes.items():
                 object.__setattr__(self, name, size)
         check_settings(self, without={} if self.init_from is None else self.init_from.sizes)
@@ -127,6 +132,8 @@ class Settings(PlainSettings):
             else set()
         )
         given = {name: getattr(self, name, None) for name in {*USUAL} - own}
+        if given["ridge"] == "auto":  # it is, with sizes that are
+            given["ridge"] = USUAL["ridge"]
         parts = {"guarantee": getattr(self.trainer, "guarantee", None)}
         return given | parts | {"integrators": self.linear.get("integrators", 0)}
 
@@ -139,8 +146,8 @@ class Settings(PlainSettings):
 
     @property
     def searched(self) -> tuple[str, ...]:
-        """Names of the sizes that are ``"auto"``."""
-        return tuple(name for name in self.size_names if getattr(self, name) == "auto")
+        """Names of what cross-validation chooses: sizes of the map, and the ridge with them."""
+        return tuple(name for name in (*self.size_names, "ridge") if getattr(self, name) == "auto")
 
     @property
     def sizes(self) -> dict[str, Size | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import TypedDict, cast
 
 from lfrtorch.dataset import Dataset
 from lfrtorch.distributed import Ranks
@@ -40,7 +40,7 @@ class Stage:
         """Keywords of its fit."""
         return {
             "trainer": self.settings.trainer,
-            "ridge": self.settings.ridge,
+            "ridge": cast(Ridge, self.settings.ridge),  # chosen before a fit begins
             "noise": self.settings.noise,
             "horizon": self.settings.horizon,
             "ranks": self.ranks,

@@ -56,13 +56,14 @@ def diverges(e: Evidence) -> Advice | None:
     """A record on which the simulation runs away."""
     if not e.diverged:
         return None
-    ridge = "a larger ridge" if e.ridge else "ridge=1e-3"
+    change = {} if e.ridge or e.continued else {"ridge": "auto"}
+    ridge = _written(change) if change else "a larger ridge" if e.ridge else "ridge=1e-3"
     loud = any(e.louder.get(name, 0.0) > _LOUDER for name in e.diverged)
     return Advice(
         "The model is not usable yet: "
         + (f"train on inputs as loud as the tests', or use {ridge}." if loud else f"use {ridge}."),
         f"the NL-LFR diverges on {_listed([repr(name) for name in e.diverged])}",
-        None if e.ridge else {"ridge": 1e-3},
+        change or None,
     )
 
 
@@ -175,15 +176,9 @@ def overfits(e: Evidence) -> Advice | None:
         )
     else:
         return None
-    change: dict[str, Any] = {}
-    if e.searched or not e.crowded:
-        pass  # validation chose the sizes, or the samples bear them
-    elif e.sizes.get("degree", 0) > 2:
-        change = {"degree": e.sizes["degree"] - 1}
-    elif e.sizes.get("nn", 0) > 1:
-        change = {"nn": e.sizes["nn"] // 2}
-    smaller = f"{_written(change)}, or " if change else ""
-    return Advice(f"Overfit: {smaller}more data.", evidence, change or None)
+    change = {} if e.searched or e.ridge or e.continued else {"ridge": "auto"}
+    ridge = f"{_written(change)}, or " if change else ""
+    return Advice(f"Overfit: {ridge}more data.", evidence, change or None)
 
 
 def linear_part_incomplete(e: Evidence) -> Advice | None:

@@ -154,13 +154,8 @@ class Evidence:
     def overtrained(self) -> bool:
         """Whether validation rose after the kept iterate, as training went on with noise."""
         # Training error falls while validation rises.
-        crowded = self.crowded and not self.states_missing
+        crowded = not (self.bears(1.0) or self.states_missing)
         return crowded and self.risen >= 1.05 and self.fell <= 0.99
-
-    @property
-    def crowded(self) -> bool:
-        """Whether there are so many parameters that a smaller static map is advised."""
-        return not self.bears(1.0)
 
     def bears(self, growth: float) -> bool:
         """Whether the samples bear ``growth`` times the parameters."""

@@ -163,6 +163,7 @@ AUTO = ["nn=auto", "nw=auto", "nx=auto", "nz=auto"]
         ([*FILE, "static=polynomial"], ["degree=auto", "nw=auto", "nx=auto", "nz=auto"]),
         ([*FILE, "static=own"], ["nx=auto"]),
         ([*FILE, "ridge=0.1"], ["nx=auto"]),
+        ([*FILE, "ridge=auto"], AUTO),
         ([*FILE, "structure=wiener", "nx=2"], []),
         ([*FILE, "init_from=runs/a"], []),
         ([*FILE, "resume=runs/a"], []),
