@@ -378,6 +378,7 @@ def _choice(stage: Stage, linear: LinearModel, scan: OrderScan | None) -> Choice
         approximation,
         start,
         given=given,
+        ridge=0.0 if settings.ridge == "auto" else settings.ridge,
         last=settings.size_names[-1],
         seed=settings.seed,
         guarantee=settings.trainer.guarantee,

@@ -78,7 +78,7 @@ def chosen_by_data(words: Sequence[str]) -> list[str]:
         return []
     last = "degree" if given.get("static") == "polynomial" else "nn"
     static = {"nz", "nw", last}
-    if given.get("static") == "own" or "structure" in names or given.get("ridge", "auto") != "auto":
+    if given.get("static") == "own" or "structure" in names:
         static = set()
     return [f"{name}=auto" for name in sorted({"nx"} | static) if name not in given]
 

@@ -49,6 +49,7 @@ from lfrtorch.fitting.trainer import Stop, StoppedError
 from lfrtorch.least_squares.guarantee import Name
 from lfrtorch.least_squares.levenberg_marquardt import LevenbergMarquardt
 from lfrtorch.least_squares.problem import Problem
+from lfrtorch.least_squares.ridge import Ridge
 from lfrtorch.linear.bla import refined_near
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
@@ -84,7 +85,7 @@ class Candidate:
 
     Args:
         sizes: nx, nz, nw, and nn or degree.
-        ridge: weight of the squared distance to the start.
+        ridge: weight of the squared distance to the start, or weights by group.
         parameters_net: without the gauge directions.
         ratio: rms error in what was left out over that of the linear model.
         squares: sums of the squared relative errors in the blocks of each stretch, (folds, B).
@@ -92,7 +93,7 @@ class Candidate:
     """
 
     sizes: Sizes
-    ridge: float
+    ridge: Ridge
     parameters_net: int
     ratio: float
     squares: Array = field(repr=False)
@@ -169,10 +170,14 @@ def choice_table(entries: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[
         best.setdefault(tuple(entry[name] for name in names), entry)
     columns = (*names, "ridge", "parameters_net", "ratio", "standard_errors_above")
     rows = [
-        [*(entry[name] for name in columns), "chosen" if entry["chosen"] else ""]
+        [*(_cell(entry[name]) for name in columns), "chosen" if entry["chosen"] else ""]
         for entry in sorted(best.values(), key=lambda entry: entry["parameters_net"])
     ]
     return [*names, "ridge", "net", "/ linear", "above best", ""], rows
+
+
+def _cell(value: Any) -> Any:
+    return str(value) if isinstance(value, Mapping) else value  # ridges by group
 
 
 Start = Callable[[LinearModel, Sequence[Record], Sizes, int], Model]
@@ -187,6 +192,7 @@ def choose_sizes(
     start: Start,
     *,
     given: Mapping[str, int] | None = None,
+    ridge: Ridge = 0.0,
     last: str = "nn",
     seed: int = 0,
     guarantee: Name | None = None,
@@ -204,6 +210,7 @@ def choose_sizes(
         start: makes a model, for example ``lambda bla, train, sizes, seed: initialise(bla, train,
             seed=seed, **sizes)``, with sizes nz, nw and ``last``.
         given: sizes that are known.
+        ridge: the one of all fits. Default: it is chosen, too.
         last: name of the third size, nn or degree.
         seed: of the first start; the second has seed + 1000.
         guarantee: of the trainer.
@@ -226,7 +233,9 @@ def choose_sizes(
     clock = time.perf_counter()
     ranks = Ranks() if ranks is None else ranks
     halt = Event()
-    study = _Study(as_folded(as_records(records)), linear, guarantee, any_of(halt, stop), halt.set)
+    path = [(ridge, sum(count for _, count in _RIDGES))] if ridge != 0.0 else _RIDGES
+    folded = as_folded(as_records(records))
+    study = _Study(folded, linear, path, guarantee, any_of(halt, stop), halt.set)
     given = {} if given is None else dict(given)
     base, tried = study.best_linear(orders), list[Candidate]()
     begun = set[tuple[int, ...]]()
@@ -301,11 +310,12 @@ def _chosen(
     tried: Sequence[Candidate], of: Sequence[int], counts: Integers, ranks: Ranks
 ) -> Candidate:
     """Return the fewest parameters that do as well as the best in some folds, and most ridge."""
+    # Of a size the largest ridge was tried first.
     squares = np.array([c.squares[list(of)].ravel() for c in tried])
     squares = ranks.first(torch.from_numpy(squares)).numpy()
     good = as_good(squares, counts[list(of)].ravel())
     near = [c for c, enough in zip(tried, good, strict=True) if enough]
-    return min(near, key=lambda c: (c.parameters_net, -c.ridge))
+    return min(near, key=lambda c: c.parameters_net)
 
 
 class _Linear(NamedTuple):
@@ -329,11 +339,12 @@ class _Study:
         self,
         records: list[Record],
         linear: Callable[[int], LinearModel],
+        path: Sequence[tuple[Ridge, int]],
         guarantee: Name | None,
         stop: Stop | None,
         halt: Callable[[], None],
     ) -> None:
-        self._records, self._whole = records, linear
+        self._records, self._whole, self._ridges = records, linear, path
         self._guarantee: Name | None = guarantee
         self._stop, self._halt = stop, halt
         self._folds = folds(records, FOLDS)
@@ -387,14 +398,14 @@ class _Study:
                 return parameters, list(self._path(model, fold))
             except InputError:  # it diverges on what it is fitted to
                 lost = np.full_like(linear.outputs[k], np.inf)
-                return parameters, [(np.inf, lost)] * len(_RIDGES)
+                return parameters, [(np.inf, lost)] * len(self._ridges)
 
         try:
             paths = self._alone(path, jobs)
         except InputError:
             return []
         found = []
-        for i, (ridge, _) in enumerate(_RIDGES):
+        for i, (ridge, _) in enumerate(self._ridges):
             outputs = [
                 _mean([steps[i] for (fold, _), (_, steps) in zip(jobs, paths, strict=True)
                        if fold == k])
@@ -430,7 +441,7 @@ class _Study:
         # Nothing here looks at what is measured where it is left out.
         problem = Problem.of(model, fold.train, guarantee=self._guarantee)
         theta = problem.theta
-        for ridge, iterations in _RIDGES:
+        for ridge, iterations in self._ridges:
             problem.weigh(ridge)
             search = LevenbergMarquardt(max_iter=iterations, tolerance=1e-3, patience=2)
             state = search.init(problem, theta)

@@ -43,10 +43,6 @@ EXCLUSIONS = (
         Exclusion(size, "structure", "sizes of a structure are not searched", ("auto",))
         for size in ("nz", "nw", "nn", "degree")
     ),
-    *(
-        Exclusion(size, "ridge", "the ridge is chosen with the sizes", ("auto",))
-        for size in ("nz", "nw", "nn", "degree")
-    ),
     Exclusion("horizon", "noise", "predictions one sample ahead are not fitted in windows"),
     Exclusion("distil", "noise", "the mean of predictors is not distilled"),
     Exclusion("guarantee", "noise", "it holds for the predictor, and the model could run away"),

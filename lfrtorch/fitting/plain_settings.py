@@ -71,8 +71,8 @@ class PlainSettings:
     ridge: float | Literal["auto"] | Mapping[str, float] = setting(
         0.0,
         "weight of the squared distance to the start, against overfitting; or weights by the "
-        'parameters\' names, see :func:`lfrtorch.fit`. ``"auto"``: chosen by cross-validation, as '
-        "it is with sizes that are.",
+        'parameters\' names, see :func:`lfrtorch.fit`. ``"auto"``: chosen by cross-validation; so '
+        "is 0 with sizes that are.",
     )
     noise: Noise = setting(
         "output",

@@ -132,8 +132,6 @@ class Settings(PlainSettings):
             else set()
         )
         given = {name: getattr(self, name, None) for name in {*USUAL} - own}
-        if given["ridge"] == "auto":  # it is, with sizes that are
-            given["ridge"] = USUAL["ridge"]
         parts = {"guarantee": getattr(self.trainer, "guarantee", None)}
         return given | parts | {"integrators": self.linear.get("integrators", 0)}
 

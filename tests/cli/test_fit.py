@@ -669,7 +669,6 @@ def test_user_errors_are_one_message(
         (["nz=many"], "nz is 'many'; give a whole number of at least 1, or auto"),
         (["degree=auto"], "degree is auto, and this static map has none; give nn='auto'"),
         (["nn=auto", "static=polynomial"], "nn is auto, and this static map has none"),
-        (["nn=auto", "ridge=0.1"], "nn is 'auto' and ridge is 0.1: the ridge is chosen with"),
         (["init=magic"], "init is 'magic'; give 'zero_output' or 'paper'"),
         (["static=own", "nz=auto"], "a map of one's own is not searched; give numbers"),
         (["activation=softsign"], "activation is 'softsign'"),

@@ -104,8 +104,16 @@ def test_sizes_given_are_kept():
     assert {tuple(c.sizes.items()) for c in found.candidates} == {
         (("nx", 2), ("nz", 2), ("nw", 1), ("nn", 3))
     }
-    ridges = [c.ridge for c in found.candidates]
+    ridges = [c.ridge for c in found.candidates if isinstance(c.ridge, float)]
+    assert len(ridges) == len(found.candidates)
     assert ridges == sorted(ridges, reverse=True)
+
+
+def test_a_ridge_that_is_given_is_that_of_all_fits():
+    given = {"nx": 2, "nz": 1, "nw": 1}
+    found = chosen(measured(1.0), given=given, orders=[2], ridge={"static": 0.1})
+    assert all(c.ridge == {"static": 0.1} for c in found.candidates)
+    assert "{'static': 0.1}" in found.table()
 
 
 def test_several_records_and_periodic_ones_are_cut():
