@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from lfrtorch._support.tables import number, percent
 from lfrtorch.reporting.diagnosis import (
+    EXTRAPOLATES,
     FALLING,
     NOISE_LIMITED,
     NONLINEAR,
@@ -25,7 +26,6 @@ from lfrtorch.reporting.diagnosis import (
 )
 
 _TRANSIENT = 3.0  # error in the first twentieth of the scored samples over that in the rest
-_LOUDER = 1.25  # largest test input over the largest in training above which the model extrapolates
 _CLOSE = 1.2  # growth as of OVERFIT, up to which a larger map is advised
 _FEW = 3  # most records or outputs that are named
 
@@ -58,7 +58,7 @@ def diverges(e: Evidence) -> Advice | None:
         return None
     change = {} if e.ridge or e.continued else {"ridge": "auto"}
     ridge = _written(change) if change else "a larger ridge" if e.ridge else "ridge=1e-3"
-    loud = any(e.louder.get(name, 0.0) > _LOUDER for name in e.diverged)
+    loud = any(e.louder.get(name, 0.0) > EXTRAPOLATES for name in e.diverged)
     return Advice(
         "The model is not usable yet: "
         + (f"train on inputs as loud as the tests', or use {ridge}." if loud else f"use {ridge}."),
@@ -294,13 +294,17 @@ def one_start(e: Evidence) -> Advice | None:
 
 def tests_are_louder(e: Evidence) -> Advice | None:
     """Tests beyond the amplitudes of the training data."""
-    far = {name: ratio for name, ratio in e.louder.items() if ratio > _LOUDER}
+    far = {name: ratio for name, ratio in e.louder.items() if ratio > EXTRAPOLATES}
     if not far:
         return None
     ratios = _listed([f"'{name}' up to {number(ratio)} times" for name, ratio in far.items()])
+    apart = max((e.apart.get(name, 0.0) for name in far), default=0.0)
+    more = (
+        f"; by {percent(apart)} of the output's deviation the starts differ there" if apart else ""
+    )
     return Advice(
         "Some tests extrapolate: train on inputs as loud as those the model is for.",
-        f"the largest input, over that in training: {ratios}",
+        f"the largest input, over that in training: {ratios}{more}",
     )
 
 
@@ -311,7 +315,7 @@ def choose_sizes(e: Evidence) -> Advice | None:
     static = "degree" if e.sizes.get("degree") else "nn"
     change: dict[str, Any] = dict.fromkeys(["nx", "nz", "nw", static], "auto")
     return Advice(
-        f"Let validation choose the sizes: {_written(change)}.",
+        f"Let the data choose the sizes: {_written(change)}.",
         "the sizes were given",
         change,
     )

@@ -57,6 +57,9 @@ NONLINEAR = 0.1
 """Part that squares and cubes of the outputs explain: 0.39 and 0.93 for the linear models of
 Bouc-Wen and Silverbox, 0.00 and 0.10 for good NL-LFRs."""
 
+EXTRAPOLATES = 1.25
+"""Largest input of a test over the largest in training, above which the model extrapolates."""
+
 _BEGINNING = 0.05  # part of a record that is its beginning
 
 LAST = 5
@@ -92,6 +95,7 @@ class Evidence:
     trainer: Any = field(default_factory=LevenbergMarquardt)
     ridge: bool = False
     louder: Mapping[str, float] = field(default_factory=dict)  # largest input / training's, by test
+    apart: Mapping[str, float] = field(default_factory=dict)  # deviation among starts, if a mean
     diverged: Sequence[str] = ()  # names of records
     tests: float | None = None  # the NL-LFR's error over the linear model's on all tests together
     verdict: Verdict | None = None  # which advice must agree with
@@ -220,6 +224,12 @@ def evidence(
     here, there = ([r.linear_error / scale for r in part] for part in (train, validation))
     risen, fell = after_kept(result)
     peak = _peak(train, result.model.scaler.u_offset)
+    loud = {
+        test.record.name: float(
+            np.max(_peak([test], result.model.scaler.u_offset) / np.where(peak > 0, peak, 1.0))
+        )
+        for test in tests
+    }
     transient, free = (None, None) if bla is None else _transient(train, scale, bla)
     test = _error([r.error for r in tests], scale)
     linear_test = _error([r.linear_error for r in tests], scale)
@@ -248,16 +258,24 @@ def evidence(
         searched=searched,
         trainer=LevenbergMarquardt() if trainer is None else trainer,
         ridge=ridge,
-        louder={
-            test.record.name: float(
-                np.max(_peak([test], result.model.scaler.u_offset) / np.where(peak > 0, peak, 1.0))
-            )
-            for test in tests
+        louder=loud,
+        apart={
+            r.record.name: _apart(result, r, scale)
+            for r in tests
+            if loud[r.record.name] > EXTRAPOLATES
         },
         diverged=[r.record.name for r in responses if r.use != "train" and r.diverged],
         tests=test / linear_test if test and linear_test else None,
         verdict=verdict,
     )
+
+
+def _apart(result: FitResult, response: Response, scale: Array) -> float:
+    """Deviation of the outputs of the starts that a mean is of, over the scale; 0 if it is none."""
+    if not result.members:
+        return 0.0
+    outputs = [model.simulate(response.record) for model in result.members]
+    return float(rms(np.std(outputs, axis=0, ddof=1)[response.record.skip :] / scale))
 
 
 def falling(result: FitResult) -> float:

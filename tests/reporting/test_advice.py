@@ -116,6 +116,15 @@ def test_a_rule_speaks_if_its_number_says_so(rule, change, said):
         assert replace(SETTINGS, **found.change) != SETTINGS
 
 
+def test_louder_tests_say_by_how_much_the_starts_differ_there():
+    loud = replace(GOOD, louder={"arrow": 1.5, "other": 1.0}, apart={"arrow": 0.12})
+    found = advice.tests_are_louder(loud)
+    assert found is not None
+    assert found.evidence.endswith(
+        "'arrow' up to 1.50 times; by 12.0 % of the output's deviation the starts differ there"
+    )
+
+
 def test_nonlinear_behaviour_is_left_where_the_error_is_neither_noise_nor_linear():
     rule = advice.nonlinear_part_incomplete
     guessed = replace(GOOD, searched=False)
@@ -157,7 +166,7 @@ def test_missing_states_come_before_a_larger_map():
     useless = replace(useless, searched=False)
     states, sizes = (item.text for item in advise(useless))
     assert states == "The linear part is incomplete: nx=4, nx=5 or nx='auto'."
-    assert sizes.startswith("Let validation choose the sizes")
+    assert sizes.startswith("Let the data choose the sizes")
 
 
 def test_what_spoils_the_linear_model_as_much_is_no_overfit():

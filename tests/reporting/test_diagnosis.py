@@ -96,6 +96,14 @@ def test_evidence_is_measured_on_the_records(fitted):
     offset = result.model.scaler.u_offset
     test, train = (np.abs(r.record.u - offset).max() for r in responses[::-1])
     assert found.louder == {"loud": pytest.approx(test / train)}
+    assert found.apart == {"loud": 0.0}  # the model is no mean
+    of_two = replace(result, members=(result.model, relaxed))
+    outputs = [model.simulate(responses[-1].record) for model in of_two.members]
+    spread = (np.abs(outputs[0] - outputs[1]) / np.sqrt(2.0) / deviation)[
+        responses[-1].record.skip :
+    ]
+    apart = evidence(of_two, responses).apart["loud"]
+    assert apart == pytest.approx(np.sqrt(np.mean(spread**2)))
     texts = [item.text for item in advise(found)]
     assert any(text.startswith("The records do not begin at the model's rest") for text in texts)
 
