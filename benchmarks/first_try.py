@@ -5,8 +5,9 @@
 
 Each case is a CSV file and the command ``lfrtorch fit x.csv test=0 nx=auto nz=auto nw=auto
 nn=auto``, on one thread; new data judge the linear model, the NL-LFR, and which of the two the run
-recommends. Cases are ``planted`` systems (see ``planted.py``), and ``measured`` records: folders of
-CSV files below DIR, each with three splits. Those that a label has are not repeated.
+recommends. Cases are ``planted`` systems (see ``planted.py``), ``louder`` ones, whose new data have
+three amplitudes, and ``measured`` records: folders of CSV files below DIR, each with three splits.
+Those that a label has are not repeated.
 """
 
 from __future__ import annotations
@@ -18,21 +19,23 @@ import resource
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from planted import COUNT, planted
+from planted import AMPLITUDES, COUNT, louder, planted
 
 import lfrtorch
 from lfrtorch._support import tables
 from lfrtorch._support.atomic import whole_file
 from lfrtorch._support.types import Array
+from lfrtorch.records import Start
 
 RESULTS = Path(__file__).with_name("first_try.json")
 
@@ -55,6 +58,9 @@ SPLITS, FITTED, LONGEST, SKIP = 3, 0.6, 5000, 50
 """Of a measured record: how many, the part for estimation, samples of both parts, and those of
 the new part from which its start is estimated."""
 
+SYSTEMS = {"planted": COUNT, "louder": 16}
+"""How many there are, by name."""
+
 CHOSEN_ON = 40
 """Planted systems that choices may be made on; the others are for the last word."""
 
@@ -73,6 +79,9 @@ class Case(NamedTuple):
     y: Array
     new: lfrtorch.Record
     about: dict[str, Any]
+    louder: Mapping[float, lfrtorch.Record] = MappingProxyType(
+        {}
+    )  # new data by amplitude over that of u
 
 
 def case(name: str, root: Path) -> Case:
@@ -82,6 +91,11 @@ def case(name: str, root: Path) -> Case:
         s = planted(int(number))
         about = {"kind": s.kind, "linear": s.linear, "snr": round(s.snr, 1)}
         return Case(s.u, s.y, _new(s.new_u, s.new_y, s.fs, s.skip), about)
+    if kind == "louder":
+        s = louder(int(number))
+        news = {a: _new(u, y, 1.0, s.skip, "zero") for a, (u, y) in s.at.items()}
+        about = {"kind": s.kind, "linear": False}
+        return Case(s.u, s.y, news[AMPLITUDES[0]], about, news)
     files, split = sorted((root / kind).glob("*.csv")), int(number)
     if not files:
         raise FileNotFoundError(f"'{root / kind}' has no CSV file")
@@ -98,14 +112,14 @@ def case(name: str, root: Path) -> Case:
     return Case(u[:, used], y, new, {"kind": kind, "linear": None})
 
 
-def _new(u: Array, y: Array, fs: float, skip: int) -> lfrtorch.Record:
-    return lfrtorch.Record(u, y, fs=fs, start="estimated", skip=skip, name="new")
+def _new(u: Array, y: Array, fs: float, skip: int, start: Start = "estimated") -> lfrtorch.Record:
+    return lfrtorch.Record(u, y, fs=fs, start=start, skip=skip, name="new")
 
 
 def attempt(name: str, root: Path) -> dict[str, Any]:
     """One command, its seconds on the processor, and its errors."""
     torch.set_num_threads(1)
-    u, y, new, about = case(name, root)
+    u, y, new, about, loud = case(name, root)
     inputs, outputs = (
         ",".join(f"{letter}{i}" for i in range(signal.shape[1]))
         for letter, signal in (("u", u), ("y", y))
@@ -131,6 +145,11 @@ def attempt(name: str, root: Path) -> dict[str, Any]:
         verdict, model = metrics["verdict"], lfrtorch.load(folder / "model")
         linear = lfrtorch.LinearModel.load(folder / "linear")
     errors = {"nonlinear": _error(new, model.simulate), "lti": _error(new, linear.simulate)}
+    if loud:
+        about["at"] = {
+            f"{a:g}": float(f"{_error(r, model.simulate) / _error(r, linear.simulate):.4g}")
+            for a, r in loud.items()
+        }
     use = "nonlinear" if verdict["use"] == "NL-LFR" else "lti"
     about |= {"verdict": verdict["kind"], "use": use, "text": verdict["text"]}
     about["sizes"] = model.sizes | {"linear nx": linear.nx}
@@ -206,6 +225,9 @@ def measures(entries: Entries, best: dict[str, float]) -> dict[str, str]:
         "recommended over the better of the two": _spread(regrets),
         "recommended over the best of all columns": _spread(behind),
     }
+    for a in AMPLITUDES if any("at" in e for e in ended.values()) else ():
+        of_linear = [e["at"][f"{a:g}"] for e in ended.values()]
+        found[f"error over the linear model's at {a:g} times the amplitude"] = _spread(of_linear)
     for low, high in pairwise((0, 300, 1000, 2500, LONGEST + 1)):
         seconds = [e["seconds"] for e in entries.values() if low <= e["samples"] < high]
         found[f"seconds, {low} to {high - 1} samples"] = _spread(seconds)
@@ -219,7 +241,7 @@ def _better(entry: dict[str, Any]) -> bool:
 def _part(name: str) -> str:
     """The table that a case is in."""
     if not name.startswith("planted"):
-        return "measured records"
+        return "louder systems" if name.startswith("louder") else "measured records"
     last = name.split()[1] >= f"{CHOSEN_ON:03d}"
     return f"planted {CHOSEN_ON} to {COUNT - 1}" if last else f"planted 0 to {CHOSEN_ON - 1}"
 
@@ -241,9 +263,9 @@ def chosen(words: Sequence[str]) -> list[str]:
     names: list[str] = []
     for word in words:
         kind, _, which = word.partition(":")
-        if kind == "planted":
-            first, _, last = (which or f"0-{COUNT - 1}").partition("-")
-            names += [f"planted {n:03d}" for n in range(int(first), int(last or first) + 1)]
+        if kind in SYSTEMS:
+            first, _, last = (which or f"0-{SYSTEMS[kind] - 1}").partition("-")
+            names += [f"{kind} {n:03d}" for n in range(int(first), int(last or first) + 1)]
         elif kind == "measured" and which in ("", *MEASURED):
             names += [f"{n} {k}" for n in ([which] if which else MEASURED) for k in range(SPLITS)]
         else:

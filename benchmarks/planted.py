@@ -1,6 +1,7 @@
 """Two hundred planted systems: a noisy record of each, and new data without noise.
 
     planted(3).u, planted(3).y, planted(3).new_u, planted(3).new_y
+    louder(3).at[2.0]                                      # an input and its output, twice as loud
 
 Seven of each twenty are linear. Time is counted in samples: ``pace`` is the time constant of a
 system, 3 to 200 samples and at most a twelfth of its record. ``strength`` of a nonlinearity is
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -53,6 +55,12 @@ DUFFING, FRICTION, HYSTERESIS, BILINEAR, TANK, TWO_TANKS = range(6)
 NEW = 2000
 """Samples of new data that are scored."""
 
+LOUDER = "friction", "saturation", "duffing", "hysteresis"
+"""Kinds with louder new data than the estimation record, in turn; a Duffing spring stiffens."""
+
+AMPLITUDES = 1.0, 2.0, 3.0
+"""Of these new data, over that of the estimation record."""
+
 Response = Callable[[Array], Array]
 
 
@@ -84,6 +92,30 @@ class Planted:
     skip: int
     fs: float
     snr: float
+
+
+class Louder(NamedTuple):
+    """A measurement (T, 1) of a system at rest, and inputs and outputs at several amplitudes."""
+
+    kind: str
+    u: Array
+    y: Array
+    at: dict[float, tuple[Array, Array]]
+    skip: int
+
+
+def louder(number: int) -> Louder:
+    """System ``number`` of 0, 1, ...: 400 to 2000 samples with noise of 20 to 40 dB below them."""
+    rng = np.random.default_rng([77, number])
+    kind = LOUDER[number % len(LOUDER)]
+    T, pace = round(_log_uniform(rng, 400, 2000)), _log_uniform(rng, 3, 30)
+    skip, excite = round(8 * pace), _excitation(rng, pace, T, 1)
+    u, new = excite(T), excite(skip + NEW)
+    respond = _system(kind, rng, pace, u)
+    y = respond(u)
+    y = y + 10 ** (-rng.uniform(20, 40) / 20) * y.std() * rng.standard_normal(T)
+    at = {gain: (gain * new, respond(gain * new)[:, None]) for gain in AMPLITUDES}
+    return Louder(kind, u, y[:, None], at, skip)
 
 
 def planted(number: int) -> Planted:
