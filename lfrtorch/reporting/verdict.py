@@ -6,7 +6,9 @@ few resonances have most of the error, even where one model is better in every b
 clear if it is beyond Student's quantile, or if one error is twice the other: one burst of a model
 that runs away has a large standard error, and is no chance. A difference below 5 % of the error is
 none. What was left out in turn is the whole record, each stretch judged by models that were chosen
-without it: there 1.5 standard errors and 1 % are enough (``benchmarks/first_try.md``).
+without it: there 1.5 standard errors and 1 % are enough (``benchmarks/first_try.md``). There one
+stretch in which the choice without it is poor may have most of the error; so it is enough, too, if
+the mean of the blocks' own log ratios is clear by 3 standard errors, and the whole ratio below 1.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
 _CROSS_SAME, _CROSS_CLEAR = 0.01, 1.5  # likewise, and the standard errors, in cross-validation
+_CROSS_TYPICAL = 3.0  # and those of the mean log ratio of the blocks
 
 _CLEAR = 2.0  # ratio of two errors that is no chance, whatever its standard error
 
@@ -96,6 +99,7 @@ class _Compared(NamedTuple):
     nrmse: float  # error over the output's standard deviation
     linear_nrmse: float
     same: float = SAME  # difference of the errors that is none
+    typical: bool = False  # whether it is clearly smaller in most blocks of cross-validation
 
     @property
     def worse(self) -> bool:
@@ -106,7 +110,7 @@ class _Compared(NamedTuple):
     @property
     def better(self) -> bool:
         """Whether it is clearly smaller."""
-        certain = self.deviations < -self.clear or self.ratio <= 1.0 / _CLEAR
+        certain = self.deviations < -self.clear or self.typical or self.ratio <= 1.0 / _CLEAR
         return certain and self.ratio < 1.0 - self.same
 
 
@@ -325,7 +329,15 @@ def _compared(
         nrmse=math.sqrt(sum(e.squares.sum() for e in errors) / power),
         linear_nrmse=math.sqrt(sum(e.linear.sum() for e in errors) / power),
         same=_CROSS_SAME if cross else SAME,
+        typical=cross and _typical(squares, linear),
     )
+
+
+def _typical(squares: Array, linear: Array) -> bool:
+    """Whether the mean log ratio over the blocks is clearly below 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(squares / linear)
+        return bool(logs.mean() < -_CROSS_TYPICAL * logs.std(ddof=1) / math.sqrt(len(logs)))
 
 
 def _numbers(compared: _Compared) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from lfrtorch._support.reasons import Reason
 from lfrtorch.fitting.trainer import FitResult
 from lfrtorch.records import Record
 from lfrtorch.reporting import verdict
-from lfrtorch.reporting.evaluation import Response
+from lfrtorch.reporting.evaluation import CROSS, Response
 from lfrtorch.reporting.verdict import Kind, Verdict
 
 judge = partial(verdict.judge, linear_nx=2)
@@ -100,6 +100,21 @@ def test_better_in_every_block_is_better_where_one_resonance_has_the_error():
     record = Record(np.zeros((1000, 1)), y)
     found = judge(result(), [Response(record, "test", {"linear": y - linear, "NL-LFR": y - own})])
     assert found.kind == Kind.BETTER, found.text
+
+
+@pytest.mark.parametrize(
+    ("poor", "cross", "other"),
+    [(2.2, Kind.BETTER, Kind.LINEAR), (3.4, Kind.LINEAR, Kind.LINEAR)],
+)
+def test_one_poor_stretch_does_not_decide_in_cross_validation(
+    poor: float, cross: Kind, other: Kind
+):
+    part = np.where(np.arange(1000) // 100 == 4, poor, 0.4)
+    kinds = [
+        judge(result(), [TRAIN, response("validation", part, name=name)]).kind
+        for name in (CROSS, "other")
+    ]
+    assert kinds == [cross, other]
 
 
 @pytest.mark.parametrize("part", [0.1, 0.8, 3.0])
