@@ -30,6 +30,12 @@ settings.register_profile("lfrtorch", deadline=None, derandomize=True, database=
 settings.load_profile("lfrtorch")
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """The name of a test is the same in each process, or the workers cannot share the tests."""
+    if " at 0x" in item.name:
+        raise pytest.UsageError(f"{item.nodeid} is named by an address: give ids to parametrize")
+
+
 def pytest_collection_finish() -> None:
     """From now on garbage is collected, except in what has been imported: it is looked at once."""
     gc.freeze()

@@ -136,7 +136,7 @@ def test_without_tests_what_was_left_out_judges(dataset: Dataset):
         {"structure": "hammerstein"},
         {"first_part": 0.5},
     ],
-    ids=str,
+    ids=lambda asked: next(iter(asked), "nothing"),
 )
 @pytest.mark.usefixtures("short_paths")
 @pytest.mark.numeric
