@@ -55,8 +55,8 @@ from lfrtorch.reporting.verdict import judge, reconsidered
 _CHOOSING = 20_000
 """Training samples that sizes are chosen with, at most."""
 
-_AVERAGED = 4
-"""Starts that a model of chosen sizes is the mean of, at most."""
+_STARTS = 4
+"""Of a model of chosen sizes, at least; all go to the end, where it shows which are good."""
 
 _ITERATIONS = 75
 """Of a fit that no validation record ends: about as many as its ridge was chosen with."""
@@ -150,7 +150,7 @@ def _identified(given: Stage, snapshots: Snapshots | None) -> Run:
         settings = replace(settings, nx=linear.nx)
     stage = replace(stage, settings=settings)
     settings, models = starting_models(
-        dataset.train, settings, begun, observer, least=1 if choice is None else _AVERAGED
+        dataset.train, settings, begun, observer, chosen=choice is not None
     )
     settings, models = begun_on_part(replace(stage, settings=settings), models)
     average = _most_averaged(models, settings.average, observer)
@@ -199,12 +199,12 @@ def _all_estimation(dataset: Dataset) -> Dataset:
 def _of_choice(settings: Settings, choice: Choice) -> Settings:
     """The settings with what was chosen; the fit has no validation records."""
     trainer: Any = settings.trainer
-    mean = settings.static == "network" and allowed("average", _AVERAGED, vars(settings))
+    mean = settings.static == "network" and allowed("average", _STARTS, vars(settings))
     return replace(
         settings,
         **choice.chosen.sizes,
         ridge=choice.chosen.ridge,
-        average=max(settings.average, _AVERAGED) if mean else 1,
+        average=_STARTS if mean else 1,
         refit=False,
         trainer=replace(trainer, max_iter=min(trainer.limit, _ITERATIONS)),
     )
@@ -396,7 +396,7 @@ def starting_models(
     linear: LinearModel,
     observer: Observer,
     *,
-    least: int,
+    chosen: bool,
 ) -> tuple[Settings, list[Model]]:
     """The settings with the number of starts, and their models; that of ``init_from`` alone."""
     if settings.init_from is not None:
@@ -410,7 +410,10 @@ def starting_models(
     if count == "auto":
         rows = sum(record.y.size for record in train)
         count = cheap_starts(rows, first.parameter_count, settings.trainer.limit)
-    settings = replace(settings, starts=max(least, count))
+    if chosen:
+        count = max(_STARTS, count)
+        settings = replace(settings, average=count if settings.average > 1 else 1)
+    settings = replace(settings, starts=count)
     more = [starting_model(train, settings, linear, seed) for seed in settings.seeds[1:]]
     return settings, [first, *more]
 

@@ -68,7 +68,7 @@ _RIDGES = ((10.0, 12), (1.0, 12), (0.1, 10), (1e-2, 10), (1e-3, 10), (1e-4, 10),
 
 _STARTS = 2
 
-NEAR = 1.2
+_NEAR = 1.2
 """Rms error in training over the least up to which a start takes part in a mean."""
 
 _SMALL = ({"nz": 1, "nw": 1, "nn": 4, "degree": 3}, {"nz": 2, "nw": 2, "nn": 8, "degree": 3})
@@ -490,5 +490,5 @@ def _refined(model: LinearModel, fold: Fold) -> LinearModel:
 def _mean(steps: Sequence[tuple[float, Array]]) -> Array:
     """Return the mean output of the starts whose cost, infinite if unstable, is near the least."""
     least = min(cost for cost, _ in steps)
-    near = [output for cost, output in steps if cost <= NEAR**2 * least < np.inf]
+    near = [output for cost, output in steps if cost <= _NEAR**2 * least < np.inf]
     return np.mean(near, axis=0) if near else np.full_like(steps[0][1], np.inf)

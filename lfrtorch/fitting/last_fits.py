@@ -11,7 +11,6 @@ import torch
 from lfrtorch._support.reasons import CUT_SHORT, Reason
 from lfrtorch._support.tables import number, quantity
 from lfrtorch.analysis.amplitude_margin import largest_stable_amplitude
-from lfrtorch.fitting.choice import NEAR
 from lfrtorch.fitting.distillation import distil
 from lfrtorch.fitting.first_fit import cost_in_full
 from lfrtorch.fitting.means import mean_model
@@ -22,6 +21,10 @@ from lfrtorch.fitting.state_scaling import scale_states
 from lfrtorch.fitting.trainer import FitResult, StoppedError
 from lfrtorch.least_squares.problem import Problem
 from lfrtorch.records import common_unit
+
+_AVERAGED, _POOR = 3, 2.0
+"""Starts of a mean that no held-out record judges, and their training errors over the least, at
+most: the start with the least may be the one that is overfitted (``benchmarks/first_try.md``)."""
 
 
 def distilled(stage: Stage, result: FitResult) -> FitResult:
@@ -64,20 +67,19 @@ def distilled(stage: Stage, result: FitResult) -> FitResult:
 
 
 def without_poor_starts(stage: Stage, result: FitResult) -> FitResult:
-    """The fit whose mean is of starts with training errors near the least, as sizes are chosen."""
-    if not result.members:
+    """The fit whose mean is of the few starts with the least training errors."""
+    members = result.members[:_AVERAGED]
+    if not members:
         return result
-    judges = [Problem.judge(model, stage.dataset.train) for model in result.members]
+    judges = [Problem.judge(model, stage.dataset.train) for model in members]
     costs = torch.tensor([j.cost(j.residual(j.theta)) for j in judges], dtype=torch.float64)
-    costs = stage.ranks.first(costs)
-    near = [m for m, c in zip(result.members, costs, strict=True) if c <= NEAR**2 * costs.min()]
-    if len(near) == len(result.members):
+    near = int((stage.ranks.first(costs) <= _POOR**2 * costs.min()).sum())
+    if near == len(result.members):
         return result
-    mean = near[0] if len(near) == 1 else mean_model(near)
+    mean = members[0] if near == 1 else mean_model(members[:near])
     given = any(record.start == "given" for record in stage.dataset.train)
     scale_states(mean, stage.dataset.train, keep_coordinates=given)
-    members = () if len(near) == 1 else tuple(near)
-    return replace(result, model=mean, averaged=len(near), members=members)
+    return replace(result, model=mean, averaged=near, members=members[:near] if near > 1 else ())
 
 
 def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | None]:
