@@ -48,6 +48,13 @@ def shapes_are_checked() -> None:
     calls.clear()
 
 
+@pytest.fixture
+def short_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two ridges in the place of seven and the small sizes alone, where sizes are chosen."""
+    monkeypatch.setattr("lfrtorch.fitting.choice._RIDGES", ((0.1, 8), (1e-3, 8)))
+    monkeypatch.setattr("lfrtorch.fitting.choice._budget", lambda rows: 0.0)
+
+
 @pytest.fixture(scope="session")
 def benchmark_root() -> Path:
     """Folder of the nonlinear benchmarks, one subfolder a benchmark."""

@@ -60,12 +60,6 @@ def dataset() -> Dataset:
     return Dataset("saturation", [train], [validation], [test])
 
 
-@pytest.fixture
-def short_paths(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two ridges in the place of seven."""
-    monkeypatch.setattr("lfrtorch.fitting.choice._RIDGES", ((0.1, 8), (1e-3, 8)))
-
-
 def settings(**given) -> Settings:
     return Settings(**{"nx": 1, "nz": 1, "nn": 3, "starts": 1, "trainer": SHORT} | given)
 
@@ -115,6 +109,7 @@ def test_chosen_sizes_are_fitted_to_all_estimation_records(dataset: Dataset):
 
 @pytest.mark.usefixtures("short_paths")
 @pytest.mark.numeric
+@pytest.mark.usefixtures("short_paths")
 def test_without_tests_what_was_left_out_judges(dataset: Dataset):
     alone = replace(dataset, tests=[])
     run = identify(alone, settings(nx=1, nz="auto", nn=3, starts=1))

