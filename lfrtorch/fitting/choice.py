@@ -37,7 +37,8 @@ import torch
 
 from lfrtorch._support import tables
 from lfrtorch._support.arguments import typed
-from lfrtorch._support.errors import InputError
+from lfrtorch._support.checks import integer
+from lfrtorch._support.errors import InputError, LfrtorchError, brief
 from lfrtorch._support.tables import percent, quantity
 from lfrtorch._support.threads import each_alone
 from lfrtorch._support.types import Array, Integers
@@ -211,7 +212,7 @@ def choose_sizes(
             seed=seed, **sizes)``, with sizes nz, nw and ``last``.
         given: sizes that are known.
         ridge: the one of all fits. Default: it is chosen, too.
-        last: name of the third size, nn or degree.
+        last: name of the last size, nn or degree; nw if the map has no other.
         seed: of the first start; the second has seed + 1000.
         guarantee: of the trainer.
         watch: called with a line after each size.
@@ -220,6 +221,7 @@ def choose_sizes(
 
     Raises:
         ValueError: records too short to be cut, or no model that is stable on them.
+        LfrtorchError: ``linear`` or ``start`` returned no model.
         StoppedError: by Ctrl-C or ``stop``: there is no choice yet.
 
     Example:
@@ -231,6 +233,9 @@ def choose_sizes(
         {'nx': 1, 'nz': 1, 'nw': 1, 'nn': 2}
     """
     clock = time.perf_counter()
+    integer("seed", seed, 0)
+    if last not in _SMALL[0]:
+        raise InputError(f"last is '{last}'; give one of {', '.join(_SMALL[0])}.")
     ranks = Ranks() if ranks is None else ranks
     halt = Event()
     path = [(ridge, sum(count for _, count in _RIDGES))] if ridge != 0.0 else _RIDGES
@@ -360,7 +365,11 @@ class _Study:
         if nx not in self._linear:
             self._linear[nx] = None
             try:
-                models = self._alone(partial(_refined, self._whole(nx)), self._folds)
+                model = self._whole(nx)
+                if not isinstance(model, LinearModel):
+                    said = f"linear returned {brief(repr(model))}; it is to return a LinearModel."
+                    raise LfrtorchError(said)
+                models = self._alone(partial(_refined, model), self._folds)
             except ValueError:
                 return False
             outputs = self._alone(self._simulated, list(zip(models, self._folds, strict=True)))
@@ -393,6 +402,10 @@ class _Study:
             k, own = job
             fold = self._folds[k]
             model = start(linear.models[k], fold.train, static, own)
+            if not isinstance(model, Model):
+                raise LfrtorchError(
+                    f"start returned {brief(repr(model))}; it is to return a Model."
+                )
             parameters = model.net_parameter_count
             try:
                 return parameters, list(self._path(model, fold))

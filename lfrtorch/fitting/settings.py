@@ -69,6 +69,11 @@ class Settings(PlainSettings):
                 f"trainer is {self.trainer!r}; give lfrtorch.LevenbergMarquardt() or "
                 "lfrtorch.Adam()."
             )
+        if self.init_from is None and self.nx is None:
+            raise InputError(
+                "nx, the number of states, is not set: give nx=2, for example, or nx='auto'."
+            )
+        check_settings(self, without={} if self.init_from is None else self.init_from.sizes)
         if self.init_from is None:
             self._check_sizes()
         else:
@@ -79,7 +84,6 @@ class Settings(PlainSettings):
                 )
             for name, size in self.init_from.sizes.items():
                 object.__setattr__(self, name, size)
-        check_settings(self, without={} if self.init_from is None else self.init_from.sizes)
         refuse_together(**self._that_exclude())
         if self.noise != "output":
             refine = self.linear.get("refine") or "prediction"
@@ -101,10 +105,6 @@ class Settings(PlainSettings):
             ) from None
 
     def _check_sizes(self) -> None:
-        if self.nx is None:
-            raise InputError(
-                "nx, the number of states, is not set: give nx=2, for example, or nx='auto'."
-            )
         known = isinstance(self.static, str) and self.static in LAST_SIZE
         if not (known or callable(self.static)):
             raise InputError(

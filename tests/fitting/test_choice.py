@@ -137,6 +137,26 @@ def test_records_too_short_say_so():
         chosen(measured(1.0, samples=50))
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"seed": "one"}, "seed is 'one'"),
+        ({"last": "neurons"}, "last is 'neurons'; give one of nz, nw, nn, degree"),
+        ({"linear": lambda nx: nx}, "linear returned 2; it is to return a LinearModel"),
+        ({"start": lambda *_: None}, "start returned None; it is to return a Model"),
+    ],
+)
+def test_what_is_not_to_be_used_is_named(change: dict[str, Any], said: str):
+    record = measured(1.0)
+    given: dict[str, Any] = {
+        "linear": lambda nx: lfrtorch.estimate_bla(record, nx),
+        "start": start,
+        **change,
+    }
+    with pytest.raises(lfrtorch.LfrtorchError, match=said):
+        procedure.choose_sizes(record, [2], **given)
+
+
 def test_a_stop_ends_the_choice():
     with pytest.raises(StoppedError, match="while sizes were chosen"):
         chosen(measured(1.0), stop=lambda: True)
