@@ -67,3 +67,10 @@ def test_an_estimated_start_must_be_clearly_better():
     assert StartTrial(1.0, 0.94, 9.0).chosen == "estimated"
     assert StartTrial(1.0, 0.94, 1.2).chosen == "zero"
     assert "and rest explains the beginning: start is zero" in str(StartTrial(1.0, 0.94, 1.2))
+
+
+def test_a_beginning_that_rest_does_not_explain_is_in_motion():
+    plain = StartTrial(1.0, 1.04, 11.0)
+    assert plain.chosen == "estimated"
+    assert "and rest does not explain the beginning: start is estimated" in str(plain)
+    assert StartTrial(1.0, 1.06, 11.0).chosen == "zero"
