@@ -54,7 +54,7 @@ TESTS: dict[str, str] = {
     "engine/static_jacobian": "engine/static_jacobian engine/sensitivity",
     "engine/jacobian_kernel": "engine/sensitivity least_squares/problem",
     "engine/sensitivity": "engine/sensitivity least_squares/problem",
-    "least_squares/jacobian": "least_squares/problem memory",
+    "least_squares/jacobian": "least_squares/problem least_squares/start_states memory",
     "least_squares/linear_systems": "least_squares/linear_systems least_squares/problem",
     "least_squares/record_groups": "least_squares/problem",
     "least_squares/gauge": "least_squares/gauge least_squares/problem",

@@ -216,6 +216,19 @@ def test_products_in_blocks_are_those_in_one_piece(
         assert_close(mine, other, rtol=1e-11, atol=1e-11)
 
 
+def test_output_errors_are_passed_back_to_the_input_and_the_start():
+    cell = random_cell(2, 2, 3, 2, 2, 3)
+    u, x0 = normal(2, 20, 2).requires_grad_(), normal(2, 3, seed=1).requires_grad_()
+    e = normal(2, 20, 2, seed=2)
+    W = reference.weights(cell)
+    y = torch.stack([reference.nl_lfr(cell, W, *pair).y for pair in zip(u, x0, strict=True)])
+    expected = torch.autograd.grad((y * e).sum(), (u, x0))
+    with torch.no_grad():
+        found = Linearisation(cell, u, simulate(cell, u, x0)).adjoint(e)
+    assert_jacobian(found.u, expected[0])
+    assert_jacobian(found.x0, expected[1])
+
+
 @pytest.mark.parametrize("threads", [1, 2, 7, 100])
 def test_columns_are_shared_among_any_number_of_threads(threads: int, monkeypatch):
     cell = random_cell(2, 2, 3, 2, 2, 3)

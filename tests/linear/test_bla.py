@@ -15,7 +15,7 @@ from reference import System, random_system
 from lfrtorch._support.types import Array
 from lfrtorch.excitation import multisine
 from lfrtorch.linear import minima
-from lfrtorch.linear.bla import estimate_bla
+from lfrtorch.linear.bla import estimate_bla, refined_near
 from lfrtorch.linear.frf import estimate_frf
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.linear.requirements import steady_state
@@ -93,6 +93,22 @@ def test_all_poles_at_the_origin():
     A, B, C = np.eye(3, k=-1), np.eye(3, 1), np.array([[0.0, 0.5, 1.0]])
     system = A, B, C, np.zeros((1, 1))
     assert frf_error(estimate_bla(record_of(system, "zero"), 3), system) < EXACT
+
+
+def test_a_model_is_refined_without_samples_that_are_left_out():
+    """From the model of all samples, of outputs in other units and about other means."""
+    A, B, C, D = random_system(2, 1, 2)
+    system = A, B, C * [[1.0], [1e3]], D * [[1.0], [1e3]]
+    record = record_of(system, "zero", T=300, offset=True)
+    wrong = np.where(np.arange(300)[:, None] < 200, record.y, record.y[::-1])
+    valid = np.broadcast_to(np.arange(300)[:, None] < 200, wrong.shape)
+    part = replace(record, y=wrong, valid=valid)
+    rough = estimate_bla(replace(record, y=record.y * [1.2, 0.9]), 2, max_iter=0)
+    refined = refined_near(rough, [part])
+    errors = record.errors(refined.simulate(record))[200:]
+    assert np.all(np.abs(errors).max(axis=0) < 1e-6 * np.std(record.y, axis=0))
+    unstable = replace(refined, A=refined.A * 1.1 / np.abs(refined.poles).max())
+    assert refined_near(unstable, [part]) is unstable
 
 
 def test_small_and_large_units_change_nothing():
