@@ -282,6 +282,7 @@ def test_bad_calls_are_refused():
     models[1].lfr.cell.static = Polynomial(1, 1, 3, dtype=torch.float64)
     with pytest.raises(ValueError, match="average is 2, and the mean is of models with a network"):
         fit(models, train, average=2, trainer=Adam(max_iter=10**9))
+    assert fit(models, train, trainer=LevenbergMarquardt(max_iter=1)).averaged == 1
 
 
 @pytest.mark.parametrize("judged_on", ["validation", "selection"])
