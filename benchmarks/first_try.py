@@ -61,8 +61,9 @@ the new part from which its start is estimated."""
 SYSTEMS = {"planted": COUNT, "louder": 16}
 """How many there are, by name."""
 
-CHOSEN_ON = 40
-"""Planted systems that choices may be made on; the others are for the last word."""
+PARTS = (0, 40, 200, COUNT)
+"""Planted systems that choices are made on; those that one limit was set by at last; the others are
+for the last word."""
 
 WORTH, NEAR, DIVERGED = 0.8, 1.05, 1e3
 """A nonlinear model is worth it up to this error over the linear one's; a recommended model is
@@ -200,7 +201,10 @@ def report(every: dict[str, Entries]) -> str:
             for entries in every.values()
         ]
         lines += [f"| {part} | {' | '.join(every)} |", "|---|" + "---|" * len(every)]
-        lines += [f"| {' | '.join([name, *(c[name] for c in columns)])} |" for name in columns[0]]
+        names = max(columns, key=len)
+        lines += [
+            f"| {' | '.join([n, *(c.get(n, tables.UNKNOWN) for c in columns)])} |" for n in names
+        ]
         lines.append("")
     return "\n".join(lines)
 
@@ -242,8 +246,9 @@ def _part(name: str) -> str:
     """The table that a case is in."""
     if not name.startswith("planted"):
         return "louder systems" if name.startswith("louder") else "measured records"
-    last = name.split()[1] >= f"{CHOSEN_ON:03d}"
-    return f"planted {CHOSEN_ON} to {COUNT - 1}" if last else f"planted 0 to {CHOSEN_ON - 1}"
+    number = int(name.split()[1])
+    first, after = next(pair for pair in pairwise(PARTS) if pair[0] <= number < pair[1])
+    return f"planted {first} to {after - 1}"
 
 
 def _share(true: Iterable[bool]) -> str:
@@ -277,7 +282,7 @@ def main() -> None:
     """Run the cases that are missing, or report."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--label", help="names the state of the code")
-    parser.add_argument("--cases", nargs="+", default=[f"planted:0-{CHOSEN_ON - 1}"])
+    parser.add_argument("--cases", nargs="+", default=[f"planted:0-{PARTS[1] - 1}"])
     parser.add_argument("--root", type=Path, default=Path(), help="folder of measured records")
     parser.add_argument("--jobs", type=int, default=1, help="commands at a time")
     parser.add_argument("--results", type=Path, default=RESULTS, help="where they are kept")

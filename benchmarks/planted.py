@@ -20,7 +20,7 @@ from scipy.signal import butter, lfilter
 
 from lfrtorch._support.types import Array
 
-COUNT = 200
+COUNT = 260
 """Systems there are."""
 
 CYCLE = (

@@ -73,13 +73,15 @@ def without_poor_starts(stage: Stage, result: FitResult) -> FitResult:
         return result
     judges = [Problem.judge(model, stage.dataset.train) for model in members]
     costs = torch.tensor([j.cost(j.residual(j.theta)) for j in judges], dtype=torch.float64)
-    near = int((stage.ranks.first(costs) <= _POOR**2 * costs.min()).sum())
+    costs = stage.ranks.first(costs.nan_to_num(torch.inf))  # the simulation of some may run away
+    near = int((costs <= _POOR**2 * costs.min()).sum())
     if near == len(result.members):
         return result
-    mean = members[0] if near == 1 else mean_model(members[:near])
+    members = tuple(members[i] for i in costs.argsort(stable=True)[:near].tolist())
+    mean = members[0] if near == 1 else mean_model(members)
     given = any(record.start == "given" for record in stage.dataset.train)
     scale_states(mean, stage.dataset.train, keep_coordinates=given)
-    return replace(result, model=mean, averaged=near, members=members[:near] if near > 1 else ())
+    return replace(result, model=mean, averaged=near, members=members if near > 1 else ())
 
 
 def refitted(stage: Stage, result: FitResult) -> tuple[FitResult, FitResult | None]:

@@ -6,7 +6,7 @@ few resonances have most of the error, even where one model is better in every b
 clear if it is beyond Student's quantile, or if one error is twice the other: one burst of a model
 that runs away has a large standard error, and is no chance. A difference below 5 % of the error is
 none. What was left out in turn is the whole record, each stretch judged by models that were chosen
-without it: there 1.5 standard errors and 1 % are enough (``benchmarks/first_try.md``). There one
+without it: there 2.25 standard errors and 1 % are enough (``benchmarks/first_try.md``). There one
 stretch in which the choice without it is poor may have most of the error; so it is enough, too, if
 the mean of the blocks' own log ratios is clear by 3 standard errors, and the whole ratio below 1.
 """
@@ -36,7 +36,7 @@ NL_LFR, LINEAR_MODEL, NEITHER = "NL-LFR", "linear model", "neither"
 SAME = 0.05
 """Difference of the errors, relative to the linear model's, below which neither is preferred."""
 
-_CROSS_SAME, _CROSS_CLEAR = 0.01, 1.5  # likewise, and the standard errors, in cross-validation
+_CROSS_SAME, _CROSS_CLEAR = 0.01, 2.25  # likewise, and the standard errors, in cross-validation
 _CROSS_TYPICAL = 3.0  # and those of the mean log ratio of the blocks
 
 _CLEAR = 2.0  # ratio of two errors that is no chance, whatever its standard error

@@ -118,6 +118,6 @@ def test_cases_are_named_in_short(first_try: ModuleType):
     assert first_try.chosen(["planted:3-4", "measured:disc"]) == [
         *("planted 003", "planted 004", "disc 0", "disc 1", "disc 2")
     ]
-    assert len(first_try.chosen(["planted", "measured"])) == 200 + 8 * 3
+    assert len(first_try.chosen(["planted", "measured"])) == 260 + 8 * 3
     with pytest.raises(ValueError, match="no cases 'measured:drone'"):
         first_try.chosen(["measured:drone"])
