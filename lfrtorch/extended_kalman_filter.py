@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -14,7 +15,13 @@ from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
 from lfrtorch.engine.cell import LFRCell
-from lfrtorch.engine.kalman_kernel import correct, filter_record, propagate
+from lfrtorch.engine.kalman_kernel import (
+    advance_sample,
+    correct,
+    correct_sample,
+    filter_record,
+    propagate,
+)
 from lfrtorch.engine.linearised import linearise
 from lfrtorch.records import Channel, Record, Scaler
 from lfrtorch.state_observer import StateObserver
@@ -115,28 +122,39 @@ class ExtendedKalmanFilter(StateObserver):
         x0: ArrayLike,
         noise: NoiseCovariance,
         P0: ArrayLike | None = None,
+        disturbances: int = 0,
     ) -> None:
-        super().__init__(cell, scaler, inputs, outputs, x0)
+        super().__init__(cell, scaler, inputs, outputs, x0, disturbances)
         nx, ny = cell.nx, cell.ny
         self._G = noise.root(nx, ny)
         self._G[:ny] /= np.asarray(scaler.y_scale)[:, None]
         if P0 is None:
             self._U = data_root(self._cell)
         else:
-            P = _covariance("P0", P0, nx)
-            U = _root(P, np.abs(P).max())
-            if U is None:
-                raise InputError("P0 has a negative eigenvalue; give a covariance of the states.")
-            self._U = U
-        self._now = self._u[0], self._y_now[None]
-        self._filter: list[Any] | None = None
+            self._U = _covariance_root("P0", P0, nx)
+        self._w_hat, self._log_p = np.zeros(nx), 0.0
+        self._left: list[Any] = []
         if self._weights is not None:
-            self._filter = [*self._weights, self._G, self._x_now, self._U]
+            w, tail = self._weights, (self._G, self._x_now, self._U)
+            ahead = [*w[:5], *w[8:]]  # without Cy, Dyu and Dyw
+            self._filter = [*w, *tail]
+            self._corrector = [self._u_now, self._y_now, *w, *tail, self._w_hat]
+            after: list[Any] = [self._w_hat, self._x_now, self._U]
+            self._advancer = [self._u_now, *ahead], after
 
     @property
-    def covariance(self) -> Float[Array, "nx nx"]:
-        """Covariance of the error of ``state``, in the model's coordinates."""
+    def covariance(self) -> Float[Array, "n n"]:
+        """Covariance of the error of ``state``, then ``disturbance``; it may be set.
+
+        Raises:
+            ValueError: a covariance of another size, or one that is none.
+        """
         return self._U @ self._U.T
+
+    @covariance.setter
+    def covariance(self, P: ArrayLike) -> None:
+        self._U[:] = _covariance_root("covariance", P, len(self._U))
+        self._predicted = self._corrected = False
 
     def follow(self, u: Float[Array, "T nu"], y: Float[Array, "T ny"]) -> float:
         """Go on over many samples at once, as ``predict`` and ``update`` would one by one.
@@ -149,29 +167,42 @@ class ExtendedKalmanFilter(StateObserver):
         """
         u = np.ascontiguousarray(self._scaler.normalise_u(u), dtype=np.float64)
         y = np.ascontiguousarray(self._scaler.normalise_y(y), dtype=np.float64)
-        self._predicted = False
+        self._predicted = self._corrected = False
         return self._filtered(u, y)
 
-    def _go_on(self, y: Float[Array, " ny"], e: Float[Array, " ny"]) -> None:
-        self._filtered(*self._now)
-
     def _filtered(self, u: Float[Array, "T nu"], y: Float[Array, "T ny"]) -> float:
-        if self._filter is not None:
+        if self._weights is not None:
             return filter_record(u, y, *self._filter)
-        x, total = self._x_now, 0.0
-        w_hat = np.zeros_like(x)
-        for u_k, y_k in zip(torch.as_tensor(u), y, strict=True):
-            y_hat, _, _, H = self._step(u_k, x)
-            M, known, log_p = correct(y_k - y_hat, H, self._G, x, self._U, w_hat)
-            _, x_next, F, _ = self._step(u_k, x)
-            propagate(F, M, known, self._U)
-            x[:], total = x_next + w_hat, total + log_p
+        total = 0.0
+        for u_k, y_k in zip(u, y, strict=True):
+            self._u_now[:], self._y_now[:] = u_k, y_k
+            self._correct()
+            self._go_on()
+            total += self._log_p
         return total
 
+    def _correct(self) -> None:
+        if self._weights is not None:
+            *self._left, self._log_p = correct_sample(*self._corrector)
+        else:
+            y_hat, _, _, H = self._slopes()
+            e = self._y_now - y_hat
+            found = correct(e, H, self._G, self._x_now, self._U, self._w_hat)
+            *self._left, self._log_p = found
+
+    def _go_on(self) -> None:
+        if self._weights is not None:
+            before, after = self._advancer
+            advance_sample(*before, *self._left, *after)
+            return
+        _, x_next, F, _ = self._slopes()
+        propagate(F, self._left[0], self._left[1], self._U)
+        self._x_now[:] = x_next + self._w_hat
+
     @torch.no_grad()
-    def _step(self, u: torch.Tensor, x: Array) -> tuple[Array, Array, Array, Array]:
+    def _slopes(self) -> tuple[Array, Array, Array, Array]:
         """y, x+, F = ∂x+/∂x and H = ∂y/∂x of a map that is not compiled."""
-        state = torch.as_tensor(x)
+        u, state = torch.as_tensor(self._u_now), torch.as_tensor(self._x_now)
         y, x_next = self._cell(u, state)
         F, H = linearise(self._cell, self._cell.internal(u, state)[0][None, None])
         return y.numpy(), x_next.numpy(), F[0, 0].contiguous().numpy(), H[0, 0].contiguous().numpy()
@@ -181,6 +212,14 @@ def data_root(cell: LFRCell) -> Float[Array, "nx nx"]:
     """Return U with U Uᵀ = the covariance of the states over the training data."""
     U = _root(cell.state_covariance.detach().double().cpu().numpy(), np.inf)
     assert U is not None
+    return U
+
+
+def _covariance_root(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
+    P = _covariance(name, given, size)
+    U = _root(P, np.abs(P).max())
+    if U is None:
+        raise InputError(f"{name} has a negative eigenvalue; give a covariance of the states.")
     return U
 
 
@@ -203,6 +242,13 @@ def _covariance(name: str, given: ArrayLike, size: int) -> Float[Array, "n n"]:
     if not (np.isfinite(value).all() and (np.abs(value - value.T) <= rounding).all()):
         raise InputError(f"{name} is not symmetric, or not finite; give a covariance.")
     return (value + value.T) / 2.0
+
+
+def with_variances(
+    name: str, given: ArrayLike, more: Float[Array, " m"], size: int
+) -> Float[Array, "n n"]:
+    """Return a covariance of some states and of more that are independent of them."""
+    return scipy.linalg.block_diag(_covariance(name, given, size), np.diag(more))
 
 
 def _root(P: Float[Array, "n n"], size: float) -> Float[Array, "n n"] | None:

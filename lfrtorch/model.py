@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 import torch
@@ -23,6 +23,12 @@ from lfrtorch._support.types import Array
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
+from lfrtorch.engine.disturbance import (
+    disturbance_scale,
+    disturbed_cell,
+    drift_variance,
+    tells_apart,
+)
 from lfrtorch.engine.initial_state import estimated_start
 from lfrtorch.engine.innovation import predictor_cell, split_predictor
 from lfrtorch.engine.lfr import LFR
@@ -33,6 +39,7 @@ from lfrtorch.extended_kalman_filter import (
     ExtendedKalmanFilter,
     NoiseCovariance,
     inside_limits,
+    with_variances,
 )
 from lfrtorch.records import (
     Channel,
@@ -53,6 +60,9 @@ NO_OBSERVER = (
     "this model has no innovation gain K: give noise=lfrtorch.NoiseCovariance(Q, R) for a Kalman "
     "filter, or fit it with noise='innovation'."
 )
+
+Disturbance = Literal["input", "output"] | ArrayLike
+"""Where a constant disturbance acts: on all inputs, on all outputs, or a matrix."""
 
 _SCALING = ("u_offset", "u_scale", "y_offset", "y_scale")  # fields of a Scaler, in a checkpoint
 
@@ -330,6 +340,7 @@ class Model:
         self,
         *,
         noise: NoiseCovariance,
+        disturbance: Disturbance | None = None,
         after: Record | None = None,
         x0: ArrayLike | None = None,
         P0: ArrayLike | None = None,
@@ -340,6 +351,7 @@ class Model:
         self,
         *,
         noise: NoiseCovariance | None = None,
+        disturbance: Disturbance | None = None,
         after: Record | None = None,
         x0: ArrayLike | None = None,
         P0: ArrayLike | None = None,
@@ -351,6 +363,9 @@ class Model:
 
         Args:
             noise: on states and outputs. Default: the gain K.
+            disturbance: what nobody measures and stays, such as a load, is estimated too, on the
+                ``"input"``, the ``"output"``, or by a matrix, see ``with_disturbance``. A
+                controller needs it to be without offset. Default: none.
             after: what was measured until now; the states go on from its end. A filter begins at
                 its first sample from x = 0 and P0.
             x0: where they begin otherwise, in the model's coordinates. Default: 0.
@@ -359,7 +374,8 @@ class Model:
 
         Raises:
             ValueError: neither K nor noise, covariances that are none, both a record and a state,
-                or a record of other channels or another rate.
+                a record of other channels or another rate, or a disturbance without noise or that
+                the outputs do not tell.
 
         Example:
             >>> linear = lfrtorch.estimate_bla(record, nx=1, refine="prediction")
@@ -375,15 +391,110 @@ class Model:
         known = self.lfr.cell, self.scaler, self.inputs, self.outputs
         begin = np.zeros(self.lfr.cell.nx) if x0 is None else x0
         if noise is not None:
-            found = ExtendedKalmanFilter(*known, begin, noise, P0)
+            nd = 0
+            if disturbance is not None:
+                whole, noise = self.with_disturbance(disturbance, noise)
+                nd = whole.lfr.cell.nx - self.lfr.cell.nx
+                known = whole.lfr.cell, *known[1:]
+                begin = np.append(reals("x0", begin), np.zeros(nd))
+                if P0 is not None:
+                    P0 = with_variances(
+                        "P0", P0, np.diag(whole.state_covariance)[-nd:], self.lfr.cell.nx
+                    )
+            found = ExtendedKalmanFilter(*known, begin, noise, P0, nd)
             if after is not None:
                 found.follow(after.u, inside_limits(after))
             return found
+        if disturbance is not None:
+            raise InputError(
+                "a disturbance is estimated by a Kalman filter: give noise, too, for example that "
+                "of lfrtorch.estimate_noise(model, record)."
+            )
         if self.K is None:
             raise InputError(NO_OBSERVER)
         if after is not None:
             begin = self.predictor().signals(with_past_outputs(after)).x[0, -1].double().numpy()
         return SteadyGainObserver(*known, begin, self.K)
+
+    @typed()
+    def with_disturbance(
+        self, at: Disturbance, noise: NoiseCovariance
+    ) -> tuple[Model, NoiseCovariance]:
+        """The model with constant disturbances as states, and the noise of all its states.
+
+        Its states are x and then d, in physical units: u + Eu d enters in the place of u, and Ey d
+        is added to y. So it may be exported with its observer, and a controller that predicts with
+        it, from estimates of both, has no offset.
+
+        Args:
+            at: ``"input"``, one on each input; ``"output"``, one on each output; or the matrix
+                [Eu; Ey] with a row for each input, then each output, and a column for each
+                disturbance.
+            noise: of the model. A disturbance drifts by a tenth of its channel's scale, rms, in the
+                slowest time constant, unless Q is of all states.
+
+        Shape:
+            at: (nu + ny, nd).
+
+        Raises:
+            ValueError: a matrix of another size, or disturbances that the outputs at rest do not
+                tell from each other and from the states: more than outputs, for example.
+
+        References:
+            Pannocchia and Rawlings, "Disturbance models for offset-free model-predictive control",
+            AIChE Journal 49(2), 2003.
+
+        Example:
+            >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
+            >>> disturbed, all_noise = model.with_disturbance("input", noise)
+            >>> disturbed.sizes["nx"], np.shape(all_noise.Q)
+            (2, (2, 2))
+            >>> observer = model.observer(noise=noise, disturbance="input")
+            >>> e = observer.correct(0.3, u=0.5)
+            >>> observer.state.shape, observer.disturbance.shape
+            ((1,), (1,))
+        """
+        cell, scaler = double(self.lfr.cell), self.scaler
+        nu, ny, nx = cell.nu, cell.ny, cell.nx
+        E = self._entries(at)
+        nd = E.shape[1]
+        whole = disturbed_cell(cell, E, scaler)
+        at_rest = equilibrium(cell, cell.A.new_zeros(nu))
+        x = cell.A.new_zeros(nx + nd)
+        if at_rest is not None:
+            x[:nx] = at_rest
+        local = linearised_at(whole, cell.A.new_zeros(nu), x)
+        if not tells_apart(local, nx):
+            raise InputError(
+                f"the {ny} output(s) at rest do not tell {nd} such disturbance(s) from the states "
+                "and from each other; give fewer, or a matrix of those that act: one row for each "
+                f"of the {nu} input(s), then the {ny} output(s), and one column for each "
+                "disturbance."
+            )
+        if np.shape(noise.Q) != (nx + nd, nx + nd):
+            moduli = np.abs(np.linalg.eigvals(local.A[:nx, :nx]))
+            drift = drift_variance(moduli, disturbance_scale(E, scaler))
+            S = None if noise.S is None else np.vstack([reals("S", noise.S), np.zeros((nd, ny))])
+            noise = NoiseCovariance(with_variances("Q", noise.Q, drift, nx), noise.R, S)
+        return replace(self, lfr=LFR(whole), K=None), noise
+
+    def _entries(self, at: Disturbance) -> Float[Array, "n nd"]:
+        """[Eu; Ey] of disturbances."""
+        nu, ny = len(self.inputs), len(self.outputs)
+        named = {"input": np.eye(nu + ny, nu), "output": np.eye(nu + ny)[:, nu:]}
+        if isinstance(at, str):
+            if at not in named:
+                raise InputError(f"disturbance is '{at}'; give 'input', 'output' or a matrix.")
+            return named[at]
+        E = reals("disturbance", at)
+        E = E[:, None] if E.ndim == 1 else E
+        if E.ndim != 2 or len(E) != nu + ny or not (np.isfinite(E).all() and E.any(axis=0).all()):
+            raise InputError(
+                f"disturbance has the shape {E.shape}; give 'input', 'output', or {nu + ny} rows "
+                f"of finite numbers, for {listed(self.inputs)}, {listed(self.outputs)}, "
+                "and a column for each disturbance, not all 0."
+            )
+        return E
 
     def predictor(self) -> Model:
         """The model of the output one sample ahead; its inputs are u, then y.

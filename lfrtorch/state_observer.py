@@ -26,12 +26,16 @@ from lfrtorch.records import Channel, Scaler
 class StateObserver(ABC):
     """Follows the states of a running system: ``predict`` the output, then ``update`` by it.
 
+    A controller that measures y before it chooses u calls ``correct(y)``, after which the states
+    know that output, and then ``advance(u)``; ``update`` does both with the input of ``predict``.
+
     It works in float64, in machine code if the static map is the package's own. ``Model.observer``
     makes one with the constant gain K, or an extended Kalman filter.
 
     Args:
         cell, scaler, inputs, outputs: of the model.
         x0: where the states begin, in the model's coordinates.
+        disturbances: number of the last states that are disturbances, in physical units.
 
     Shape:
         x0: (nx,).
@@ -47,8 +51,10 @@ class StateObserver(ABC):
         inputs: tuple[Channel, ...],
         outputs: tuple[Channel, ...],
         x0: ArrayLike,
+        disturbances: int = 0,
     ) -> None:
         cell = folded(deepcopy(cell).double().cpu())
+        self._own = cell.nx - disturbances
         self._cell, self._scaler, self._inputs, self._outputs = cell, scaler, inputs, outputs
         self._u, self._x = np.zeros((1, 1, cell.nu)), np.zeros((1, 2, cell.nx))
         z, w, self._y = (np.zeros((1, 1, size)) for size in (cell.nz, cell.nw, cell.ny))
@@ -56,7 +62,9 @@ class StateObserver(ABC):
         self._call: list[Any] | None = None
         if self._weights is not None:
             self._call = [0, self._u, *self._weights, 0.0, self._x, z, w, self._y]
-        self._predicted = False
+        self._predicted, self._corrected = False, False
+        fed_back = bool(cell.Dyw.any()) and bool(cell.Dzu.any())
+        self._feedthrough = bool(cell.Dyu.any()) or fed_back
         # Parts of those arrays: making one takes longer than a product of small matrices.
         self._u_now, self._y_hat = self._u[0, 0], self._y[0, 0]
         self._y_now, self._e, self._zero = np.zeros((3, cell.ny))
@@ -71,8 +79,32 @@ class StateObserver(ABC):
 
     @property
     def state(self) -> Float[Array, " nx"]:
-        """The states at the next sample to be predicted, in the model's coordinates."""
-        return self._x_now.copy()
+        """The states, in the model's coordinates; they may be set, as after a change of the plant.
+
+        They are those at the next sample to be predicted, and after ``correct`` those that know the
+        output of this one.
+
+        Raises:
+            ValueError: another number of states, or some that are not finite.
+        """
+        return self._x_now[: self._own].copy()
+
+    @state.setter
+    def state(self, x: ArrayLike) -> None:
+        self._set(slice(0, self._own), "state", x)
+
+    @property
+    def disturbance(self) -> Float[Array, " nd"]:
+        """The disturbances, in physical units; they may be set. None without a disturbance model.
+
+        Raises:
+            ValueError: another number of disturbances, or some that are not finite.
+        """
+        return self._x_now[self._own :].copy()
+
+    @disturbance.setter
+    def disturbance(self, d: ArrayLike) -> None:
+        self._set(slice(self._own, None), "disturbance", d)
 
     def predict(self, u: ArrayLike) -> Float[Array, " ny"]:
         """The output at this sample, from its input and all samples before it; physical units.
@@ -83,18 +115,13 @@ class StateObserver(ABC):
             u: the input now, (nu,) or a number.
 
         Raises:
-            ValueError: another number of inputs, or one that is not finite.
+            ValueError: another number of inputs, one that is not finite, or this sample was
+                corrected before.
         """
-        given = _sample(u, self._inputs, "u")
-        if not _normalise(given, self._u_offset, self._u_scale, self._u_now):
-            raise InputError(f"u is {given}; give finite numbers.")
-        if self._call is not None:
-            self._x_next.fill(np.nan)  # no trajectory that this one could meet
-            simulate_record(*self._call)
-        else:
-            with torch.no_grad():
-                y, x = self._cell(torch.as_tensor(self._u[0]), torch.as_tensor(self._x[0, :1]))
-            self._y_hat[:], self._x_next[:] = y[0].numpy(), x[0].numpy()
+        if self._corrected:
+            raise InputError("this sample was corrected: call advance(u) before predict.")
+        self._take(u)
+        self._step()
         self._predicted = True
         return _restored(self._y_hat, self._y_offset, self._y_scale)
 
@@ -110,16 +137,95 @@ class StateObserver(ABC):
         """
         if not self._predicted:
             raise InputError("nothing was predicted at this sample: call predict(u) before.")
+        e = self._corrected_by(y)
+        self._go_on()
+        self._predicted = self._corrected = False
+        return e
+
+    def correct(self, y: ArrayLike | None, u: ArrayLike | None = None) -> Float[Array, " ny"]:
+        """Correct the states by the output of this sample; returns y - y_hat.
+
+        ``advance`` then goes on to the next sample. With the constant gain K the states stay: they
+        know all that the output tells of them, and the innovation enters the next ones.
+
+        Args:
+            y: as in ``update``.
+            u: the input at this sample, which only a model with feedthrough needs.
+
+        Raises:
+            ValueError: as ``update``; no u for a model with feedthrough; this sample was corrected
+                before.
+
+        Example:
+            >>> observer = model.observer(noise=lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2))
+            >>> e = observer.correct(0.3, u=0.5)
+            >>> filtered = observer.state
+            >>> observer.advance(0.5)
+        """
+        if self._corrected:
+            raise InputError("this sample was corrected: call advance(u) before the next one.")
+        if u is None and self._feedthrough:
+            raise InputError(
+                "the output of this model depends on its input at the same sample: give "
+                "correct(y, u), or fit it with feedthrough=false."
+            )
+        self._take(self._u_offset if u is None else u)
+        self._step()
+        return self._corrected_by(y)
+
+    def advance(self, u: ArrayLike) -> None:
+        """Go on to the next sample with the input of this one, (nu,) or a number.
+
+        A sample that was not corrected has no outputs.
+
+        Raises:
+            ValueError: another number of inputs, or one that is not finite.
+        """
+        self._take(u)
+        if not self._corrected:
+            self._corrected_by(None)
+        self._step()
+        self._go_on()
+        self._predicted = self._corrected = False
+
+    def _set(self, part: slice, name: str, given: ArrayLike) -> None:
+        x = np.atleast_1d(reals(name, given))
+        if x.shape != self._x_now[part].shape or not np.isfinite(x).all():
+            size = len(self._x_now[part])
+            raise InputError(f"{name} has the shape {x.shape}; give {size} finite numbers.")
+        self._x_now[part] = x
+        self._predicted = self._corrected = False
+
+    def _take(self, u: ArrayLike) -> None:
+        given = _sample(u, self._inputs, "u")
+        if not _normalise(given, self._u_offset, self._u_scale, self._u_now):
+            raise InputError(f"u is {given}; give finite numbers.")
+
+    def _step(self) -> None:
+        """Write the output and the next states without noise."""
+        if self._call is not None:
+            self._x_next.fill(np.nan)  # no trajectory that this one could meet
+            simulate_record(*self._call)
+        else:
+            with torch.no_grad():
+                y, x = self._cell(torch.as_tensor(self._u[0]), torch.as_tensor(self._x[0, :1]))
+            self._y_hat[:], self._x_next[:] = y[0].numpy(), x[0].numpy()
+
+    def _corrected_by(self, y: ArrayLike | None) -> Float[Array, " ny"]:
         given = np.full(len(self._outputs), np.nan) if y is None else _sample(y, self._outputs, "y")
         if not _innovation(given, self._y_offset, self._y_scale, self._y_hat, self._y_now, self._e):
             raise InputError(f"y is {given}; give finite numbers, or NaN for a missing output.")
-        self._go_on(self._y_now, self._e)
-        self._predicted = False
+        self._correct()
+        self._corrected = True
         return _restored(self._e, self._zero, self._y_scale)
 
     @abstractmethod
-    def _go_on(self, y: Float[Array, " ny"], e: Float[Array, " ny"]) -> None:
-        """Write the next states over those of now, from y and e = y - y_hat, normalised."""
+    def _correct(self) -> None:
+        """Correct the states by the normalised y and e = y - y_hat."""
+
+    @abstractmethod
+    def _go_on(self) -> None:
+        """Write the next states over those of now."""
 
 
 @final
@@ -154,7 +260,11 @@ class SteadyGainObserver(StateObserver):
         super().__init__(cell, scaler, inputs, outputs, x0)
         self._K = K.double().cpu().numpy()
 
-    def _go_on(self, y: Float[Array, " ny"], e: Float[Array, " ny"]) -> None:
+    def _correct(self) -> None:
+        """The states stay."""
+
+    def _go_on(self) -> None:
+        e = self._e
         missing = any(map(math.isnan, e.tolist()))
         np.matmul(self._K, np.nan_to_num(e) if missing else e, out=self._x_now)
         np.add(self._x_now, self._x_next, out=self._x_now)

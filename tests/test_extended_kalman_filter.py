@@ -90,6 +90,98 @@ def test_states_and_covariance_are_those_of_the_textbook(name: str):
     np.testing.assert_allclose(at_once.covariance, observer.covariance, rtol=1e-12)
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_correct_and_advance_are_an_update_and_know_the_output_between(name: str):
+    model, T = CASES[name], 8
+    noise, (u, y) = some_noise(model), measured_with_gaps(model, T)
+    apart, together = (model.observer(noise=noise, P0=0.5) for _ in range(2))
+    R = np.asarray(noise.R)
+    for u_k, y_k in zip(u, y, strict=True):
+        x, P, known = together.state, together.covariance, np.isfinite(y_k)
+        H = jacobians(model, x, u_k)[2][known]
+        L = P @ H.T @ np.linalg.inv(H @ P @ H.T + R[known][:, known])
+        e = apart.correct(y_k, u_k)
+        np.testing.assert_allclose(apart.state, x + L @ e[known], rtol=1e-9, atol=1e-12)
+        apart.advance(u_k)
+        together.predict(u_k)
+        np.testing.assert_allclose(e, together.update(y_k), atol=1e-12)
+        np.testing.assert_allclose(apart.state, together.state, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(apart.covariance, together.covariance, rtol=1e-9, atol=1e-12)
+
+
+def test_advance_alone_is_a_sample_without_outputs_and_states_may_be_set():
+    model = MODELS["softplus"]
+    noise, u = some_noise(model), inputs(model, 2)
+    first, second = (model.observer(noise=noise) for _ in range(2))
+    second.state, second.covariance = first.state, first.covariance
+    first.advance(u[0])
+    second.predict(u[0])
+    second.update(None)
+    np.testing.assert_allclose(first.state, second.state, rtol=1e-12)
+    np.testing.assert_allclose(first.covariance, second.covariance, rtol=1e-12)
+    first.state = np.ones(model.lfr.cell.nx)
+    assert (first.state == 1.0).all()
+    with pytest.raises(ValueError, match="state has the shape"):
+        first.state = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+    with pytest.raises(ValueError, match="covariance has a negative eigenvalue"):
+        first.covariance = -np.eye(model.lfr.cell.nx)
+
+
+def test_the_input_is_needed_only_with_feedthrough_and_a_sample_is_corrected_once():
+    model = MODELS["softplus"]
+    observer = model.observer(noise=some_noise(model))
+    y, u = model.scaler.y_offset, model.scaler.u_offset
+    with pytest.raises(ValueError, match="give correct\\(y, u\\)"):
+        observer.correct(y)
+    cell = copy.deepcopy(model.lfr.cell)
+    with torch.no_grad():
+        cell.Dyu.zero_()
+        cell.Dzu.zero_()
+    observer = replace(model, lfr=lfrtorch.LFR(cell)).observer(noise=some_noise(model))
+    observer.correct(y)
+    for again in (lambda: observer.correct(y), lambda: observer.predict(u)):
+        with pytest.raises(ValueError, match="call advance"):
+            again()
+
+
+@pytest.mark.parametrize("at", ["input", "output", "matrix"])
+def test_an_observer_finds_a_constant_disturbance(at: str):
+    model, T = MODELS["softplus"], 300
+    nu, ny = len(model.inputs), len(model.outputs)
+    E = np.ones((nu + ny, 1))
+    u, amount = inputs(model, T), 0.2
+    if at == "input":
+        E = np.eye(nu + ny, nu)[:, :1]
+    d = np.full(E.shape[1] if at != "output" else ny, amount)
+    Eu = E[:nu] @ d if at != "output" else np.zeros(nu)
+    Ey = E[nu:] @ d if at != "output" else d
+    y = model.simulate(u + Eu) + Ey
+    noise = NoiseCovariance(1e-8, np.diag((1e-3 * model.scaler.y_scale) ** 2))
+    observer = model.observer(noise=noise, disturbance=E if at != "output" else at)
+    whole, all_noise = model.with_disturbance(E if at != "output" else at, noise)
+    same = whole.observer(noise=all_noise)
+    for u_k, y_k in zip(u, y, strict=True):
+        same.predict(u_k)
+        same.update(y_k)
+        observer.correct(y_k, u_k)
+        observer.advance(u_k)
+    np.testing.assert_allclose(observer.disturbance, d, rtol=0.05)
+    np.testing.assert_allclose(same.state, [*observer.state, *observer.disturbance], rtol=1e-9)
+
+
+def test_disturbances_that_the_outputs_do_not_tell_are_refused():
+    model = MODELS["softplus"]
+    noise, count = some_noise(model), len(model.inputs) + len(model.outputs)
+    with pytest.raises(ValueError, match="do not tell"):
+        model.observer(noise=noise, disturbance=np.eye(count))
+    with pytest.raises(ValueError, match="disturbance is 'load'"):
+        model.with_disturbance("load", noise)
+    with pytest.raises(ValueError, match="finite numbers"):
+        model.with_disturbance(np.ones((count + 1, 1)), noise)
+    with pytest.raises(ValueError, match="give noise, too"):
+        model.observer(disturbance="input")  # pyright: ignore[reportCallIssue]
+
+
 def test_a_linear_model_settles_at_the_solution_of_the_riccati_equation():
     model = MODELS["linear"]
     noise = some_noise(model)

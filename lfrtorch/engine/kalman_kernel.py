@@ -40,33 +40,57 @@ def filter_record(
     Shape:
         u: (T, nu), y: (T, ny), G: (ny + nx, ny + nx), x: (nx,), U: (nx, nx).
     """
-    (nx, nw), nz, ny = Bw.shape, len(Cz), len(Cy)
-    z, w, J, by_x = np.empty(nz), np.empty(nw), np.empty((nw, nz)), np.empty((nw, nx))
-    e, H, F, w_hat = np.empty(ny), np.empty((ny, nx)), np.empty((nx, nx)), np.empty(nx)
-    x_next, total = np.empty(nx), 0.0
+    w_hat, total = np.empty(len(x)), 0.0
     for k in range(len(u)):
-        affine(Cz, x, Dzu, u[k], z)
-        _static(z, WzT, Ww, bz, bw, activation, growth, w, J)
-        affine(Cy, x, Dyu, u[k], e)
-        for i in range(ny):
-            e[i] = y[k, i] - e[i]
-            for q in range(nw):
-                e[i] -= Dyw[i, q] * w[q]
-        _slope(Cy, Dyw, J, Cz, by_x, H)
-        M, known, log_p = correct(e, H, G, x, U, w_hat)
+        M, known, log_p = correct_sample(
+            u[k], y[k], A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth,
+            G, x, U, w_hat,
+        )  # fmt: skip
+        advance_sample(
+            u[k], A, Bu, Bw, Cz, Dzu, WzT, Ww, bz, bw, activation, growth, M, known, w_hat, x, U
+        )
         total += log_p
-        affine(Cz, x, Dzu, u[k], z)
-        _static(z, WzT, Ww, bz, bw, activation, growth, w, J)
-        affine(A, x, Bu, u[k], x_next)
-        for i in range(nx):
-            x_next[i] += w_hat[i]
-            for q in range(nw):
-                x_next[i] += Bw[i, q] * w[q]
-        _slope(A, Bw, J, Cz, by_x, F)
-        propagate(F, M, known, U)
-        for i in range(nx):
-            x[i] = x_next[i]
     return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def correct_sample(
+    u, y, A, Bu, Bw, Cz, Dzu, Cy, Dyu, Dyw, WzT, Ww, bz, bw, activation, growth, G, x, U, w_hat
+):
+    """``correct`` by the outputs of a sample, (nu,) and (ny,)."""
+    (nx, nw), nz, ny = Bw.shape, len(Cz), len(Cy)
+    z, w, J = np.empty(nz), np.empty(nw), np.empty((nw, nz))
+    e, H, by_x = np.empty(ny), np.empty((ny, nx)), np.empty((nw, nx))
+    affine(Cz, x, Dzu, u, z)
+    _static(z, WzT, Ww, bz, bw, activation, growth, w, J)
+    affine(Cy, x, Dyu, u, e)
+    for i in range(ny):
+        e[i] = y[i] - e[i]
+        for q in range(nw):
+            e[i] -= Dyw[i, q] * w[q]
+    _slope(Cy, Dyw, J, Cz, by_x, H)
+    return correct(e, H, G, x, U, w_hat)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance_sample(
+    u, A, Bu, Bw, Cz, Dzu, WzT, Ww, bz, bw, activation, growth, M, known, w_hat, x, U
+):
+    """Take x and U to the next sample, from what ``correct_sample`` returned."""
+    (nx, nw), nz = Bw.shape, len(Cz)
+    z, w, J = np.empty(nz), np.empty(nw), np.empty((nw, nz))
+    x_next, F, by_x = np.empty(nx), np.empty((nx, nx)), np.empty((nw, nx))
+    affine(Cz, x, Dzu, u, z)
+    _static(z, WzT, Ww, bz, bw, activation, growth, w, J)
+    affine(A, x, Bu, u, x_next)
+    for i in range(nx):
+        x_next[i] += w_hat[i]
+        for q in range(nw):
+            x_next[i] += Bw[i, q] * w[q]
+    _slope(A, Bw, J, Cz, by_x, F)
+    propagate(F, M, known, U)
+    for i in range(nx):
+        x[i] = x_next[i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
