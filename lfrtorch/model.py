@@ -466,10 +466,8 @@ class Model:
         local = linearised_at(whole, cell.A.new_zeros(nu), x)
         if not tells_apart(local, nx):
             raise InputError(
-                f"the {ny} output(s) at rest do not tell {nd} such disturbance(s) from the states "
-                "and from each other; give fewer, or a matrix of those that act: one row for each "
-                f"of the {nu} input(s), then the {ny} output(s), and one column for each "
-                "disturbance."
+                f"the {ny} output(s) at rest do not tell {nd} disturbance(s) from each other and "
+                "from the states; give fewer: a matrix of those that act."
             )
         if np.shape(noise.Q) != (nx + nd, nx + nd):
             moduli = np.abs(np.linalg.eigvals(local.A[:nx, :nx]))

@@ -15,6 +15,7 @@ from lfrtorch.analysis.linear_bands import PoleBand, ResponseBand, pole_bands, r
 from lfrtorch.analysis.linearisation import linearise
 from lfrtorch.analysis.lpv_form import LPV, lpv
 from lfrtorch.analysis.residual_analysis import Residuals, residuals
+from lfrtorch.analysis.trim import Trim, trim
 from lfrtorch.model import Model
 from lfrtorch.records import Record
 
@@ -31,6 +32,7 @@ __all__ = [
     "Residuals",
     "ResponseBand",
     "Structure",
+    "Trim",
     "Uncertainty",
     "bound",
     "canonical",
@@ -43,6 +45,7 @@ __all__ = [
     "response_band",
     "spread",
     "structure",
+    "trim",
     "uncertainty",
 ]
 

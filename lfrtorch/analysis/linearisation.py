@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
@@ -12,6 +14,7 @@ from lfrtorch._support.checks import reals
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.tables import quantity
 from lfrtorch._support.types import Array, Complex
+from lfrtorch.analysis.trim import Trim
 from lfrtorch.engine.operating_point import (
     StateSpace,
     double,
@@ -28,22 +31,24 @@ from lfrtorch.records import Channel
 
 @typed()
 def linearise(
-    model: Model, u: ArrayLike | None = None, *, x: ArrayLike | None = None
+    model: Model, u: ArrayLike | Trim | None = None, *, x: ArrayLike | None = None
 ) -> LinearModel:
     """The model linearised about an operating point, in physical units.
 
     With u0 and the state x0 that it holds the model in, x0 = f(x0, u0), the deviations obey::
 
-        x+ = A x + B (u - u0)
-        y  = C x + D (u - u0) + y0
+        x+ = A x + B (u - u0) + K e
+        y  = C x + D (u - u0) + y0 + e
 
-    to first order: the error is quadratic in them. ``to_scipy`` and ``to_control`` of the result
+    to first order: the error is quadratic in them. u0, y0 and x0 are ``u_offset``, ``y_offset`` and
+    ``x_offset`` of the result, and K is that of a model in innovation form. So a state feedback is
+    u = u0 - F (observer.state - x0). ``to_scipy`` and ``to_control`` of the result
     hand the matrices on. The rest may be unstable, and is then of use to a controller.
 
     Args:
         model: nonlinear.
-        u: constant input u0, physical units. Default: the inputs' offsets in the data, or of an
-            integrating model the inputs next to them that hold it at rest.
+        u: constant input u0, physical units, or what ``trim`` found. Default: the inputs' offsets
+            in the data, or of an integrating model the inputs next to them that hold it at rest.
         x: state x0 in the model's coordinates, as ``model.signals(record).x[0, k]``. If u0 does not
             hold the model there, the result is of the deviations from the trajectory that passes
             through it. Default: the state at rest, by Newton's method; if there are several, the
@@ -62,6 +67,8 @@ def linearise(
         >>> system = local.to_scipy()
     """
     cell, scaler = double(model.lfr.cell), model.scaler
+    if isinstance(u, Trim):
+        u, x = u.u, u.x if x is None else x
     u0 = scaler.u_offset if u is None else vector("u", u, cell.nu, "the model has {} input(s)")
     v: Tensor = torch.as_tensor((u0 - scaler.u_offset) / scaler.u_scale)
     if x is None:
@@ -77,7 +84,9 @@ def linearise(
         found = torch.as_tensor(vector("x", x, cell.nx, "the model has {} states"))
     with torch.no_grad():
         y0 = scaler.restore_y(cell(v, found)[0].numpy())
-    return _linear_model(model, linearised_at(cell, v, found), np.array(u0), y0)
+    local = _linear_model(model, linearised_at(cell, v, found), np.array(u0), y0)
+    K = None if model.K is None else model.K.double().cpu().numpy() / scaler.y_scale
+    return replace(local, K=K, x_offset=found.numpy())
 
 
 def linear_part(model: Model) -> LinearModel:

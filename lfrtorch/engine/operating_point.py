@@ -81,11 +81,11 @@ def equilibrium(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nx"] 
     Newton's method begins at x = 0, and then at the end of a simulation from there. The rest may be
     unstable, and one of several.
     """
-    x = _newton(cell, u, u.new_zeros(cell.nx))
+    x = resting_near(cell, u, u.new_zeros(cell.nx))
     if x is None:
         constant = u.expand(1, _SETTLING, -1).contiguous()
         end = simulate(cell, constant, u.new_zeros(1, cell.nx)).x[0, -1]
-        x = _newton(cell, u, end) if torch.isfinite(end).all() else None
+        x = resting_near(cell, u, end) if torch.isfinite(end).all() else None
     return x
 
 
@@ -104,10 +104,11 @@ def resting_input(cell: LFRCell, u: Float[Tensor, " nu"]) -> Float[Tensor, " nu"
     return None
 
 
-def _newton(
+@torch.no_grad()
+def resting_near(
     cell: LFRCell, u: Float[Tensor, " nu"], x: Float[Tensor, " nx"]
 ) -> Float[Tensor, " nx"] | None:
-    """State at rest that Newton's method finds from x."""
+    """State at rest that Newton's method finds from x, or None."""
     identity = torch.eye(cell.nx, dtype=u.dtype)
     gap = cell(u, x)[1] - x
     for _ in range(_MAX_NEWTON):

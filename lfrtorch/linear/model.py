@@ -85,6 +85,7 @@ class LinearModel:
         covariance: of the P = (nx + ny) (nx + nu) entries of A, B, C and D, row by row, one matrix
             after another. Default: not known.
         fit: how the model was found.
+        x_offset: state of the nonlinear model that x = 0 stands for, if it is linearised.
 
     Example:
         >>> bla.nx, bla.A.shape, bla.fs
@@ -113,6 +114,7 @@ class LinearModel:
     state_covariance: Float[Array, "nx nx"] | None = None
     covariance: Float[Array, "P P"] | None = None
     fit: LinearFit | None = None
+    x_offset: Float[Array, " nx"] | None = None
 
     def __repr__(self) -> str:
         signals = f"{listed(self.inputs)} -> {listed(self.outputs)}"
@@ -315,6 +317,7 @@ class LinearModel:
             K=None if self.K is None else T @ self.K,
             covariance=covariance,
             state_covariance=None if P is None else T @ P @ T.T,
+            x_offset=None if self.x_offset is None else T @ self.x_offset,
         )
 
     def write(self, cell: LFRCell, scaler: Scaler) -> None:
@@ -471,6 +474,7 @@ _ALWAYS = ("A", "B", "C", "D", "u_offset", "y_offset")
 _SHAPES = {
     "A": "xx", "B": "xu", "C": "yx", "D": "yu", "u_offset": "u", "y_offset": "y", "K": "xy",
     "innovation_covariance": "yy", "state_covariance": "xx", "covariance": "PP",
+    "x_offset": "x",
 }  # fmt: skip
 
 
