@@ -149,7 +149,11 @@ class ExtendedKalmanFilter(StateObserver):
         Raises:
             ValueError: a covariance of another size, or one that is none.
         """
-        return self._U @ self._U.T
+        U = self._U
+        if self._corrected:
+            M, known = self._left
+            U = M[known : known + len(U), known:]
+        return U @ U.T
 
     @covariance.setter
     def covariance(self, P: ArrayLike) -> None:

@@ -29,8 +29,9 @@ def written(cfg: DictConfig) -> None:
     print(introduced(folder, model))
     name, observer = str(cfg.name), observer_of(cfg, model)
     paths = export.write(
-        model, str(cfg.to), cfg.out, name=name, overwrite=cfg.overwrite, observer=observer
-    )
+        model, str(cfg.to), cfg.out, name=name, overwrite=cfg.overwrite, observer=observer,
+        disturbance=cfg.disturbance,
+    )  # fmt: skip
     print(f"written: {', '.join(map(str, paths))}")
     print(f"use: {export.TARGETS[cfg.to].usage(name, paths, observer)}")
 

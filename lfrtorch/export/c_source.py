@@ -37,7 +37,9 @@ def c_source(
     computes in double precision.
 
     With an observer there are ``NAME_observer_reset``, ``NAME_observer_predict`` and
-    ``NAME_observer_update`` as well, on a struct ``NAME_observer`` of the caller.
+    ``NAME_observer_update`` as well, on a struct ``NAME_observer`` of the caller, and for a
+    controller that measures y before it chooses u ``NAME_observer_correct`` and
+    ``NAME_observer_advance``.
 
     Args:
         model: what is exported.
@@ -62,7 +64,7 @@ def c_source(
     e = equations(model)
     known = {"name": name, "NAME": name.upper(), "ts": repr(1.0 / e.fs), **e.sizes}
     known |= {"about": _comment(e.about(name)), "static": e.static, "arrays": list(_arrays(e))}
-    known["rest"] = bool(e.x_rest.size)
+    known["rest"], known["feedthrough"] = bool(e.x_rest.size), e.feedthrough
     match observer_equations(model, observer):
         case SteadyGain(K=K):
             known["K"] = True

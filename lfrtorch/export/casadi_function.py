@@ -62,14 +62,18 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
 
 def casadi_observer(
     model: Model | LinearModel, name: str = "model", *, observer: bool | NoiseCovariance = True
-) -> tuple[Any, Any]:
-    """An observer of a model as two ``casadi.Function``, physical units.
+) -> tuple[Any, Any, Any]:
+    """An observer of a model as three ``casadi.Function``, physical units.
 
     ``NAME_predict`` is (x, u) -> (y_hat). ``NAME_update`` is (x, u, y, missing) -> (x_next) with
-    the gain K, and (x, u, y, missing, P) -> (x_next, P_next) of an extended Kalman filter. An
-    output is left out if its ``missing`` is 1; by default none is. A P that is left out, or NaN, is
-    the covariance of the states over the training data: where a filter begins. The covariance is
-    updated in Joseph's form.
+    the gain K, and (x, u, y, missing, P) -> (x_next, P_next) of an extended Kalman filter.
+    ``NAME_correct`` takes the same and gives the state and P that know the output of this sample,
+    from which a controller chooses u; ``update`` then takes the x and P of before. With the gain K
+    the state stays. Without feedthrough the u of ``correct`` does not matter.
+
+    An output is left out if its ``missing`` is 1; by default none is. A P that is left out, or NaN,
+    is the covariance of the states over the training data: where a filter begins. The covariance
+    is updated in Joseph's form.
 
     Args:
         model: what is exported.
@@ -84,7 +88,8 @@ def casadi_observer(
 
     Example:
         >>> noise = lfrtorch.NoiseCovariance(Q=1e-4, R=1e-2)
-        >>> predict, update = lfrtorch.export.casadi_observer(model, "plant", observer=noise)
+        >>> made = lfrtorch.export.casadi_observer(model, "plant", observer=noise)
+        >>> predict, correct, update = made
         >>> update
         Function(plant_update:(x,u,y,missing,P)->(x_next,P_next) SXFunction)
         >>> after = update(x=0, u=0.5, y=0.2, P=model.state_covariance)
@@ -105,10 +110,16 @@ def casadi_observer(
     predict = ca.Function(f"{name}_predict", [x, u], [y_hat], ["x", "u"], ["y_hat"])
     e = ca.if_else(missing, 0.0, y - y_hat)
     given, names = [x, u, y, missing], ["x", "u", "y", "missing"]
+
+    def function(kind: str, made: list[Any], named: list[str]) -> Any:
+        default = [0.0] * 4 + [np.nan]
+        options = {"default_in": default[: len(given)]}
+        return ca.Function(f"{name}_{kind}", given, made, names, named, options)
+
     if not isinstance(found, KalmanNoise):
         assert found is not None
         made = [x_next + ca.mtimes(found.K, e)]
-        return predict, ca.Function(f"{name}_update", given, made, names, ["x_next"])
+        return predict, function("correct", [x], ["x_known"]), function("update", made, ["x_next"])
     given.append(ca.SX.sym("P", nx, nx))
     P, joint = ca.if_else(given[-1] < np.inf, given[-1], found.U @ found.U.T), found.G @ found.G.T
     Q, S, R = joint[ny:, ny:], joint[ny:, :ny], joint[:ny, :ny]
@@ -129,10 +140,9 @@ def casadi_observer(
     P_known = ca.mtimes([I_LH, P, I_LH.T]) + ca.mtimes([L, R, L.T])
     across = ca.mtimes([F, L, S.T])
     P_next = ca.mtimes([F, P_known, F.T]) + Q - ca.mtimes(from_e, S.T) - across - across.T
-    made = [x_next, 0.5 * (P_next + P_next.T)]
-    names, options = [*names, "P"], {"default_in": [0.0] * 4 + [np.nan]}
-    update = ca.Function(f"{name}_update", given, made, names, ["x_next", "P_next"], options)
-    return predict, update
+    names.append("P")
+    update = function("update", [x_next, 0.5 * (P_next + P_next.T)], ["x_next", "P_next"])
+    return predict, function("correct", [corrected, P_known], ["x_known", "P_known"]), update
 
 
 def _static(ca: Any, e: Equations, z: Any) -> Any:

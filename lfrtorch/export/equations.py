@@ -81,6 +81,12 @@ class Equations:
         (nz, nx), (ny, nw) = self.matrices.Cz.shape, self.matrices.Dyw.shape
         return {"nx": nx, "nu": len(self.u_offset), "ny": ny, "nz": nz, "nw": nw}
 
+    @property
+    def feedthrough(self) -> bool:
+        """Whether an output depends on an input at the same sample."""
+        M = self.matrices
+        return bool(M.Dyu.any()) or bool(M.Dyw.any() and M.Dzu.any())
+
     def about(self, name: str, place: str = "{0}[{1}]") -> list[str]:
         """What a reader of the export should know: equations, channels, units, offsets, rate."""
         # ``place`` is how its language writes a channel: letter {0}, number from 0 {1} and from 1

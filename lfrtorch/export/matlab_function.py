@@ -6,48 +6,65 @@ from typing import Any
 
 import numpy as np
 
+from lfrtorch._support.types import Array
 from lfrtorch.analysis.lpv_form import gauss_legendre, lpv
 from lfrtorch.engine.nonlinearity import Network, Polynomial
-from lfrtorch.export.equations import check_name, equations, rendered
+from lfrtorch.export.equations import (
+    KalmanNoise,
+    SteadyGain,
+    check_name,
+    equations,
+    observer_equations,
+    rendered,
+)
+from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
 
 def matlab_function(
-    model: Model | LinearModel, name: str = "model"
-) -> tuple[str, str, dict[str, Any]]:
+    model: Model | LinearModel, name: str = "model", *, observer: bool | NoiseCovariance = False
+) -> tuple[dict[str, str], dict[str, Any]]:
     """A model as functions of MATLAB and Octave.
 
     ``[x_next, y, A, B, C, D] = NAME(x, u)`` is one sample in physical units; A, B, C and D are the
-    matrices of the model linearised there. ``[A, B, C, D, p] = NAME_lpv(x, u)`` has those of the
-    exact LPV form, ``lfrtorch.analysis.lpv(model)``. Both load what ``scipy.io.savemat`` writes to
-    ``NAME.mat`` beside them: all matrices of the model, offsets, names and units of the channels,
-    fs, the state ``x_rest`` at rest under the inputs' offsets (empty if there is none), and in
-    ``lpv`` the matrices of the LPV form (the third index counts them) and its bounds.
+    matrices of the model linearised there. Its numbers are in ``NAME_numbers.m``, so that it may
+    stand in a MATLAB Function block and code can be generated. ``[A, B, C, D, p] = NAME_lpv(x, u)``
+    has the matrices of the exact LPV form, ``lfrtorch.analysis.lpv(model)``. What
+    ``scipy.io.savemat`` writes to ``NAME.mat`` has all matrices of the model, offsets, names and
+    units of the channels, fs, the state ``x_rest`` at rest under the inputs' offsets (empty if
+    there is none), and in ``lpv`` the matrices of the LPV form (the third index counts them) and
+    its bounds.
+
+    With an observer there are ``s = NAME_start()``, ``s = NAME_correct(s, u, y)`` and
+    ``s = NAME_advance(s, u)`` as well: s.x is its state, and s.P the covariance of its error.
 
     Args:
         model: what is exported.
         name: of the function.
+        observer: ``True`` for that with the model's gain K, noise for an extended Kalman filter.
 
     Returns:
-        The texts of ``NAME.m`` and ``NAME_lpv.m``, and the variables of ``NAME.mat``.
+        The texts of the functions by the names of their files, and the variables of ``NAME.mat``.
 
     Raises:
-        ValueError: a static map of the user's own class, or a name that is no identifier.
+        ValueError: a static map of the user's own class, a name that is no identifier, or an
+            observer that the model has not.
 
     Example:
-        >>> text, lpv_text, variables = lfrtorch.export.matlab_function(model, "actuator")
-        >>> text.splitlines()[0]
+        >>> texts, variables = lfrtorch.export.matlab_function(model, "actuator")
+        >>> sorted(texts)
+        ['actuator.m', 'actuator_lpv.m', 'actuator_numbers.m']
+        >>> texts["actuator.m"].splitlines()[0]
         'function [x_next, y, A, B, C, D] = actuator(x, u)'
-        >>> lpv_text.splitlines()[0]
-        'function [A, B, C, D, p] = actuator_lpv(x, u)'
         >>> variables["fs"], variables["A"].shape
         (100.0, (1, 1))
     """
     check_name(name)
     model = model.to_model() if isinstance(model, LinearModel) else model
     e, form = equations(model), lpv(model)
-    found: dict[str, Any] = {n: w if w.ndim == 2 else w[:, None] for n, w in e.arrays.items()}
+    literals = {n: w if w.ndim == 2 else w[:, None] for n, w in e.arrays.items()}
+    found: dict[str, Any] = {}
     found["fs"] = e.fs
     for side, channels in (("input", e.inputs), ("output", e.outputs)):
         found[f"{side}_names"] = np.array([c.name for c in channels], dtype=object)[:, None]
@@ -58,7 +75,16 @@ def matlab_function(
         "about": e.about(name, "{0}({2})"),
         "static": e.static,
         "rest": e.x_rest.size,
+        "feedthrough": e.feedthrough,
     }
+    match observer_equations(model, observer):
+        case SteadyGain(K=K):
+            known["K"], literals["K"] = True, K
+        case KalmanNoise(G=G, U=U):
+            ny, joint = e.sizes["ny"], G @ G.T
+            known["G"] = True
+            literals |= {"Q": joint[ny:, ny:], "S": joint[ny:, :ny], "R": joint[:ny, :ny]}
+            literals["P0"] = U @ U.T
     match e.static:
         case Network():
             known["value"], known["slope"] = e.static.sigma.matlab
@@ -70,7 +96,7 @@ def matlab_function(
             slopes = [
                 (n + 1.0, j + 1.0, float(times), m + 1.0) for n, j, times, m in e.static.slopes
             ]
-            found |= {"growth": np.array(growth), "slopes": np.array(slopes)}
+            literals |= {"growth": np.array(growth), "slopes": np.array(slopes)}
     found["lpv"] = {letter: np.moveaxis(getattr(form, letter), 0, -1) for letter in "ABCD"}
     points = {"x0": form.x0, "u0": form.u0, "x_next0": form.x_next0, "y0": form.y0}
     found["lpv"] |= {letters: value[:, None] for letters, value in points.items()}
@@ -78,6 +104,18 @@ def matlab_function(
     if isinstance(e.static, Polynomial):
         nodes = gauss_legendre(e.static)
         found["lpv"] |= dict(zip(("nodes", "weights"), nodes, strict=True))
-    known["schedule"] = form.schedule
-    known |= e.sizes
-    return rendered("model.m", **known), rendered("model_lpv.m", **known), found
+    known |= e.sizes | {"schedule": form.schedule}
+    known["literals"] = [(n, _literal(w)) for n, w in literals.items()]
+    templates = {"": "model.m", "_lpv": "model_lpv.m", "_numbers": "model_numbers.m"}
+    texts = {f"{name}{end}.m": rendered(file, **known) for end, file in templates.items()}
+    for part in ("start", "correct", "advance") if observer is not False else ():
+        texts[f"{name}_{part}.m"] = rendered("model_observer.m", part=part, **known)
+    return texts, found | literals
+
+
+def _literal(M: Array) -> str:
+    """A matrix, read back to the same bits."""
+    if not M.size:
+        return f"zeros({len(M)}, {M.shape[1]})"
+    rows = ("    " + " ".join(repr(float(v)) for v in row) for row in M)
+    return "[\n" + "\n".join(rows) + "\n]"

@@ -21,7 +21,7 @@ from lfrtorch.export.matlab_function import matlab_function
 from lfrtorch.export.onnx_graph import onnx_models
 from lfrtorch.extended_kalman_filter import NoiseCovariance
 from lfrtorch.linear.model import LinearModel
-from lfrtorch.model import Model
+from lfrtorch.model import Disturbance, Model
 
 
 class Target(NamedTuple):
@@ -73,12 +73,14 @@ def _onnx(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
         path.write_bytes(graph.SerializeToString())
 
 
-def _matlab(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
+def _matlab(
+    model: Model | LinearModel, name: str, paths: list[Path], observer: bool | NoiseCovariance
+) -> None:
     from scipy.io import savemat
 
-    *texts, variables = matlab_function(model, name)
+    texts, variables = matlab_function(model, name, observer=observer)
     savemat(paths[1], variables)
-    for path, text in zip([paths[0], paths[2]], texts, strict=True):
+    for path, text in zip([paths[0], *paths[2:]], texts.values(), strict=True):
         path.write_text(text, encoding="utf-8")
 
 
@@ -88,13 +90,13 @@ TARGETS = {
         _c,
         "{name}_step(x, u, x_next, y);",
         (),
-        "{name}_observer_predict(&observer, u, y_hat); {name}_observer_update(&observer, y);",
+        "{name}_observer_correct(&observer, u, y); {name}_observer_advance(&observer, u);",
     ),
     "casadi": Target(
         (".casadi", "_channels.json"),
         _casadi,
         "x_next, y = casadi.Function.load('{path}')(x, u)",
-        ("_predict.casadi", "_update.casadi"),
+        ("_predict.casadi", "_correct.casadi", "_update.casadi"),
         "after = casadi.Function.load('{path}')(x=x, u=u, y=y{P})",
     ),
     "onnx": Target(
@@ -102,7 +104,13 @@ TARGETS = {
         _onnx,
         "x_next, y = onnxruntime.InferenceSession('{path}').run(None, {{'x': x, 'u': u}})",
     ),
-    "matlab": Target((".m", ".mat", "_lpv.m"), _matlab, "[x_next, y] = {name}(x, u)"),
+    "matlab": Target(
+        (".m", ".mat", "_lpv.m", "_numbers.m"),
+        _matlab,
+        "[x_next, y] = {name}(x, u)",
+        ("_start.m", "_correct.m", "_advance.m"),
+        "s = {name}_correct(s, u, y); s = {name}_advance(s, u);",
+    ),
     "control": Target(
         (".py",),
         lambda model, name, paths: paths[0].write_text(python_source(model, name), "utf-8"),
@@ -126,6 +134,7 @@ def write(
     name: str = "model",
     overwrite: bool = False,
     observer: bool | NoiseCovariance = False,
+    disturbance: Disturbance | None = None,
 ) -> list[Path]:
     """Write a model as files of another tool.
 
@@ -134,13 +143,16 @@ def write(
         to: ``"c"``: ``NAME.h`` and ``NAME.c``; ``"casadi"``: ``NAME.casadi``, which
             ``casadi.Function.load`` reads, and ``NAME_channels.json`` with channels and rate;
             ``"onnx"``: ``NAME.onnx`` for a sample and ``NAME_simulate.onnx``; ``"matlab"``:
-            ``NAME.m`` and ``NAME_lpv.m`` with ``NAME.mat``; ``"control"``: ``NAME.py``, whose
-            ``system()`` is a ``control.NonlinearIOSystem``; ``"fmu"``: ``NAME.fmu``.
+            ``NAME.m``, ``NAME_numbers.m`` and ``NAME_lpv.m`` with ``NAME.mat``; ``"control"``:
+            ``NAME.py``, whose ``system()`` is a ``control.NonlinearIOSystem``; ``"fmu"``:
+            ``NAME.fmu``.
         folder: where to; it is made if need be.
         name: of the files, and in them.
         overwrite: whether files that exist may be replaced.
-        observer: of C and CasADi, ``True`` for the observer with the model's gain K as well, or
-            noise for an extended Kalman filter.
+        observer: of C, CasADi and MATLAB, ``True`` for the observer with the model's gain K as
+            well, or noise for an extended Kalman filter.
+        disturbance: constant disturbances are the last states, and the filter finds them, see
+            ``Model.with_disturbance``.
 
     Returns:
         The files.
@@ -148,7 +160,8 @@ def write(
     Raises:
         ValueError: an unknown target, one whose package is not installed, a name that is no
             identifier, a file that exists, the folder of a checkpoint, a static map of the user's
-            own class, or an observer that the target or the model has not.
+            own class, an observer that the target or the model has not, or a disturbance without
+            noise for the filter.
 
     Example:
         >>> [path.name for path in lfrtorch.export.write(model, "c", "made", name="actuator")]
@@ -157,6 +170,14 @@ def write(
     if to not in TARGETS:
         raise InputError(f"to is {to!r}; give one of {', '.join(TARGETS)}.")
     check_name(name)
+    if disturbance is not None:
+        if not isinstance(observer, NoiseCovariance):
+            raise InputError(
+                "a disturbance is estimated by a Kalman filter: give observer=noise, too "
+                "(observer=true Q=... R=... on the command line)."
+            )
+        model = model.to_model() if isinstance(model, LinearModel) else model
+        model, observer = model.with_disturbance(disturbance, observer)
     target, given = TARGETS[to], {}
     endings = target.endings
     if target.observer is not None:

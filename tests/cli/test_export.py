@@ -44,8 +44,24 @@ def test_an_observer_is_written_with_its_model(folder: Path, monkeypatch, capsys
     expected = exports.c_source(MODELS["tanh"], observer=noise)
     assert tuple((folder / f"model.{kind}").read_text() for kind in "hc") == expected
     assert capsys.readouterr().out.splitlines()[-1] == (
-        "use: model_observer_predict(&observer, u, y_hat); model_observer_update(&observer, y);"
+        "use: model_observer_correct(&observer, u, y); model_observer_advance(&observer, u);"
     )
+
+
+@pytest.mark.parametrize("to", ["c", "casadi", "matlab"])
+def test_disturbances_are_the_last_states_of_what_is_written(to: str, folder: Path, monkeypatch):
+    noise = NoiseCovariance(Q=1e-4, R=1e-2)
+    run(
+        monkeypatch, "checkpoint=model", f"to={to}", "observer=true", "Q=1e-4", "R=1e-2",
+        "disturbance=input",
+    )  # fmt: skip
+    model, whole = MODELS["tanh"].with_disturbance("input", noise)
+    expected = exports.write(model, to, folder / "other", observer=whole)
+    written = sorted(path.name for path in folder.iterdir() if path.is_file())
+    assert written == sorted(path.name for path in expected)
+    for path in expected:
+        if path.suffix != ".mat":
+            assert (folder / path.name).read_bytes() == path.read_bytes()
 
 
 @pytest.mark.parametrize(("K", "words"), [(True, []), (False, ["Q=1e-4", "R=1e-2"])])
@@ -73,6 +89,7 @@ def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
         (["checkpoint=model"], "to is not set: add to=c"),
         (["checkpoint=model", "to=rust"], "to is 'rust'; give one of c, casadi, onnx, matlab"),
         (["checkpoint=model", "to=c", "Q=1"], "give observer=true Q=... R=..."),
+        (["checkpoint=model", "to=c", "disturbance=input"], "(observer=true Q=... R=... on the"),
         (
             ["checkpoint=model", "to=c", "observer=true"],
             "this model has no innovation gain K: give Q=... R=..., the noise of a Kalman filter",

@@ -122,19 +122,31 @@ def test_a_model_without_rest_says_so():
 @pytest.mark.numeric
 @pytest.mark.parametrize("name", OBSERVED)
 @pytest.mark.parametrize("kind", ["k", "ekf"])
-def test_observers_are_those_of_the_model(name: str, kind: str, observers: ctypes.CDLL):
-    """The struct has x, then U with a filter, u and y_hat."""
+@pytest.mark.parametrize("way", ["update", "correct"])
+def test_observers_are_those_of_the_model(name: str, kind: str, way: str, observers: ctypes.CDLL):
+    """The struct has x, then U with a filter, u and y_hat, and more of its own."""
     model, (u, y) = OBSERVED[name], measured_with_gaps(OBSERVED[name], 200)
     nx, nu, ny = model.lfr.cell.nx, len(model.inputs), len(model.outputs)
     roots = nx * nx if kind == "ekf" else 0
     expected = model.observer(noise=some_noise(model)) if roots else model.observer()
-    struct, y_hat = np.full(nx + roots + nu + ny, np.nan), np.empty(ny)
+    left = (ny + 2 * nx) ** 2 + nx + 1 if roots else ny
+    struct, y_hat = np.full(nx + roots + nu + ny + left, np.nan), np.empty(ny)
     call(observers, f"{kind}_{name}_observer_reset", struct)
-    for u_k, y_k in zip(u, y, strict=True):
-        call(observers, f"{kind}_{name}_observer_predict", struct, u_k, y_hat)
-        call(observers, f"{kind}_{name}_observer_update", struct, y_k)
-        np.testing.assert_allclose(y_hat, expected.predict(u_k), rtol=1e-10, atol=1e-10)
-        expected.update(y_k)
+    for k, (u_k, y_k) in enumerate(zip(u, y, strict=True)):
+        if way == "update":
+            call(observers, f"{kind}_{name}_observer_predict", struct, u_k, y_hat)
+            call(observers, f"{kind}_{name}_observer_update", struct, y_k)
+            np.testing.assert_allclose(y_hat, expected.predict(u_k), rtol=1e-10, atol=1e-10)
+            expected.update(y_k)
+        elif k % 5 == 4:  # a sample without outputs
+            call(observers, f"{kind}_{name}_observer_advance", struct, u_k)
+            expected.advance(u_k)
+        else:
+            call(observers, f"{kind}_{name}_observer_correct", struct, u_k, y_k)
+            expected.correct(y_k, u_k)
+            np.testing.assert_allclose(struct[:nx], expected.state, rtol=1e-10, atol=1e-10)
+            call(observers, f"{kind}_{name}_observer_advance", struct, u_k)
+            expected.advance(u_k)
         np.testing.assert_allclose(struct[:nx], expected.state, rtol=1e-10, atol=1e-10)
         if isinstance(expected, ExtendedKalmanFilter):
             U = struct[nx : nx + roots].reshape(nx, nx)

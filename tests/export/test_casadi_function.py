@@ -64,15 +64,23 @@ def test_observers_are_those_of_the_model(name: str, kind: str, tmp_path: Path):
         paths = write(model, "casadi", tmp_path, observer=noise)
     else:
         expected, paths = model.observer(), write(model, "casadi", tmp_path, observer=True)
-    assert [path.name for path in paths[2:]] == ["model_predict.casadi", "model_update.casadi"]
-    predict, update = (casadi.Function.load(str(path)) for path in paths[2:])
+    names = [f"model_{each}.casadi" for each in ("predict", "correct", "update")]
+    assert [path.name for path in paths[2:]] == names
+    predict, correct, update = (casadi.Function.load(str(path)) for path in paths[2:])
     x, P = np.zeros(nx), np.full((nx, nx), np.nan)
     for u_k, y_k in zip(u, y, strict=True):
         y_hat = np.array(predict(x, u_k))[:, 0]
         np.testing.assert_allclose(y_hat, expected.predict(u_k), rtol=1e-10, atol=1e-10)
-        expected.update(y_k)
+        expected.correct(y_k, u_k)
         given = {"x": x, "u": u_k, "y": y_k} | ({} if np.isnan(P).all() else {"P": P})
         missing = {"missing": np.isnan(y_k)} if np.isnan(y_k).any() else {}
+        known = correct(**given, **missing)
+        x_known = np.array(known["x_known"])[:, 0]
+        np.testing.assert_allclose(x_known, expected.state, rtol=1e-10, atol=1e-10)
+        if isinstance(expected, ExtendedKalmanFilter):
+            P = np.array(known["P_known"])
+            np.testing.assert_allclose(P, expected.covariance, rtol=1e-10, atol=1e-12)
+        expected.advance(u_k)
         after = update(**given, **missing)
         x = np.array(after["x_next"])[:, 0]
         np.testing.assert_allclose(x, expected.state, rtol=1e-10, atol=1e-10)

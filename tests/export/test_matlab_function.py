@@ -8,11 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exported import MODELS, check_output, check_rest, inputs, jacobians
+from exported import (
+    MODELS,
+    OBSERVED,
+    check_output,
+    check_rest,
+    inputs,
+    jacobians,
+    measured_with_gaps,
+    some_noise,
+)
 from scipy.io import loadmat, savemat
 
 from lfrtorch.analysis import lpv
 from lfrtorch.export import write
+from lfrtorch.extended_kalman_filter import ExtendedKalmanFilter
 
 needs_octave = pytest.mark.skipif(
     not shutil.which("octave-cli"), reason="there is no octave-cli (Debian's package octave)"
@@ -43,6 +53,27 @@ for i = 1:numel(names)
         ps(k, :) = p;
     end
     r.lpv_run = y; r.p = ps;
+    if isfield(t, 'y')
+        for kind = {'k', 'ekf'}
+            observer = [name '_' kind{1}];
+            [start, correct, advance] = deal(str2func([observer '_start']), ...
+                str2func([observer '_correct']), str2func([observer '_advance']));
+            s = start();
+            before = []; after = [];
+            for k = 1:rows(t.y)
+                if mod(k, 5)
+                    s = correct(s, t.u(k, :), t.y(k, :));
+                end
+                before(k, :) = s.x;
+                s = advance(s, t.u(k, :));
+                after(k, :) = s.x;
+            end
+            r.(kind{1}) = struct('before', before, 'after', after);
+            if isfield(s, 'P')
+                r.(kind{1}).P = s.P;
+            end
+        end
+    end
     r.refused = {};
     for wrong = {{t.x, [t.u(1, :) 1]}, {[t.x; 1], t.u(1, :)}}
         for g = {str2func(name), lpv}
@@ -68,6 +99,11 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         write(model, "matlab", folder, name=f"f_{name}")
         x = np.random.default_rng(4).normal(size=(model.lfr.cell.nx, 1))
         tried[f"f_{name}"] = {"x": x, "u": inputs(model, 1000)}
+        if name in OBSERVED:
+            tried[f"f_{name}"]["y"] = measured_with_gaps(OBSERVED[name], 60)[1]
+            for kind, observer in (("k", True), ("ekf", some_noise(model))):
+                made = OBSERVED[name], "matlab", folder
+                write(*made, name=f"f_{name}_{kind}", observer=observer)
     savemat(folder / "tried.mat", tried)
     (folder / "run_all.m").write_text(SCRIPT)
     command = ["octave-cli", "--no-init-file", "--no-history", "run_all.m"]
@@ -99,6 +135,28 @@ def test_the_lpv_form_runs_as_the_model(name: str, found: dict[str, Any]):
     check_output(np.reshape(one["lpv_run"], (200, -1)), model, u)
     p = form.scheduling(model.signals(u).x[0, :-1].numpy(), u)
     np.testing.assert_allclose(np.reshape(one["p"], p.shape), p, rtol=0, atol=1e-9)
+
+
+@needs_octave
+@pytest.mark.numeric
+@pytest.mark.parametrize("kind", ["k", "ekf"])
+@pytest.mark.parametrize("name", OBSERVED)
+def test_observers_are_those_of_the_model(name: str, kind: str, found: dict[str, Any]):
+    model, one = OBSERVED[name], found[f"f_{name}"][kind]
+    observer = model.observer(noise=some_noise(model)) if kind == "ekf" else model.observer()
+    before, after = [], []
+    for k, (u, y) in enumerate(zip(*measured_with_gaps(model, 60), strict=True)):
+        if k % 5 != 4:
+            observer.correct(y, u)
+        before.append(observer.state)
+        observer.advance(u)
+        after.append(observer.state)
+    for when, expected in (("before", before), ("after", after)):
+        states = np.reshape(one[when], np.shape(expected))
+        np.testing.assert_allclose(states, expected, rtol=1e-9, atol=1e-9)
+    if isinstance(observer, ExtendedKalmanFilter):
+        P = np.reshape(one["P"], observer.covariance.shape)
+        np.testing.assert_allclose(P, observer.covariance, rtol=1e-9, atol=1e-11)
 
 
 @needs_octave

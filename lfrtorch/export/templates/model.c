@@ -195,14 +195,22 @@ void {{ name }}_observer_predict({{ name }}_observer *observer, const double u[N
 
 {% endif %}
 {% if K %}
-/* x_next = f(x, u) + K (y - y_hat). */
-void {{ name }}_observer_update({{ name }}_observer *observer, const double y[NY])
+void {{ name }}_observer_correct({{ name }}_observer *observer, const double u[NU], const double y[NY])
 {
-    double e[NY], y_hat[NY];
+    double y_hat[NY];
+    {{ name }}_observer_predict(observer, u, y_hat);
     for (int i = 0; i < NY; i++)
-        e[i] = isnan(y[i]) ? 0.0 : y[i] - observer->y_hat[i];
-    {{ name }}_step(observer->x, observer->u, observer->x, y_hat);
-    add(observer->x, K, e, NX, NY);
+        observer->e[i] = isnan(y[i]) ? 0.0 : y[i] - y_hat[i];
+}
+
+/* x_next = f(x, u) + K (y - y_hat). */
+void {{ name }}_observer_advance({{ name }}_observer *observer, const double u[NU])
+{
+    double y_hat[NY];
+    {{ name }}_step(observer->x, u, observer->x, y_hat);
+    add(observer->x, K, observer->e, NX, NY);
+    for (int i = 0; i < NY; i++)
+        observer->e[i] = 0.0;
 }
 {% endif %}
 {% if G %}
@@ -235,20 +243,23 @@ static void reflect(double *M, int rows, int count, int columns)
 
 /* The extended Kalman filter on square roots. The rows of M are roots, of the innovations that are
  * known, of the states and of their noise; the columns are the noise and the states before. */
-void {{ name }}_observer_update({{ name }}_observer *observer, const double y[NY])
+void {{ name }}_observer_correct({{ name }}_observer *observer, const double u[NU], const double y[NY])
 {
-    double *x = observer->x, *U = observer->U, M[NC * NC] = {0.0}, N[NX * NC] = {0.0};
+    double *x = observer->x, *U = observer->U, *M = observer->M;
     double F[NX * NX], B[NX * NU], H[NY * NX], D[NY * NU], HU[NY * NX] = {0.0};
-    double e[NY], noise[NX] = {0.0}, y_hat[NY];
+    double e[NY], y_hat[NY];
     int known = 0;
 
-    /* The output: with H = dy/dx, at the state before. */
-    {{ name }}_jacobians(x, observer->u, F, B, H, D);
+    /* With H = dy/dx at the state before. */
+    {{ name }}_observer_predict(observer, u, y_hat);
+    {{ name }}_jacobians(x, u, F, B, H, D);
     add_product(HU, H, U, NY, NX, NX);
+    for (int i = 0; i < NC * NC; i++)
+        M[i] = 0.0;
     for (int i = 0; i < NY; i++) {
         if (isnan(y[i]))
             continue;
-        e[known] = y[i] - observer->y_hat[i];
+        e[known] = y[i] - y_hat[i];
         copy(M + known * NC, G + i * NG, NG);
         copy(M + known * NC + NG, HU + i * NX, NX);
         known++;
@@ -257,6 +268,7 @@ void {{ name }}_observer_update({{ name }}_observer *observer, const double y[NY
     for (int i = 0; i < NX; i++) {
         copy(states + i * NC + NG, U + i * NX, NX);
         copy(moved + i * NC, G + (NY + i) * NG, NG);
+        observer->noise[i] = 0.0;
     }
     reflect(M, known, known + 2 * NX, NC);
     for (int a = 0; a < known; a++) {
@@ -265,15 +277,30 @@ void {{ name }}_observer_update({{ name }}_observer *observer, const double y[NY
         e[a] /= M[a * NC + a];
         for (int i = 0; i < NX; i++) {
             x[i] += states[i * NC + a] * e[a];
-            noise[i] += moved[i * NC + a] * e[a];
+            observer->noise[i] += moved[i * NC + a] * e[a];
         }
     }
+    observer->known = known;
+    observer->corrected = 1;
+}
 
-    /* The next sample: with F = dx_next/dx, at the state that knows the output. */
-    {{ name }}_jacobians(x, observer->u, F, B, H, D);
-    {{ name }}_step(x, observer->u, x, y_hat);
+void {{ name }}_observer_advance({{ name }}_observer *observer, const double u[NU])
+{
+    double *x = observer->x, *M = observer->M, N[NX * NC] = {0.0};
+    double F[NX * NX], B[NX * NU], H[NY * NX], D[NY * NU], y_hat[NY];
+
+    if (!observer->corrected) {
+        for (int i = 0; i < NY; i++)
+            y_hat[i] = NAN;
+        {{ name }}_observer_correct(observer, u, y_hat);
+    }
+    /* With F = dx_next/dx at the state that knows the output. */
+    const int known = observer->known;
+    const double *states = M + known * NC, *moved = states + NX * NC;
+    {{ name }}_jacobians(x, u, F, B, H, D);
+    {{ name }}_step(x, u, x, y_hat);
     for (int i = 0; i < NX; i++) {
-        x[i] += noise[i];
+        x[i] += observer->noise[i];
         for (int j = 0; j < NC - known; j++) {
             N[i * NC + j] = moved[i * NC + known + j];
             for (int n = 0; n < NX; n++)
@@ -282,6 +309,15 @@ void {{ name }}_observer_update({{ name }}_observer *observer, const double y[NY
     }
     reflect(N, NX, NX, NC - known);
     for (int i = 0; i < NX; i++)
-        copy(U + i * NX, N + i * NC, NX);
+        copy(observer->U + i * NX, N + i * NC, NX);
+    observer->corrected = 0;
+}
+{% endif %}
+{% if K or G %}
+
+void {{ name }}_observer_update({{ name }}_observer *observer, const double y[NY])
+{
+    {{ name }}_observer_correct(observer, observer->u, y);
+    {{ name }}_observer_advance(observer, observer->u);
 }
 {% endif %}

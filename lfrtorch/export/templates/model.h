@@ -30,13 +30,21 @@ void {{ name }}_jacobians(const double x[{{ NAME }}_NX], const double u[{{ NAME 
     double dy_dx[{{ NAME }}_NY * {{ NAME }}_NX], double dy_du[{{ NAME }}_NY * {{ NAME }}_NU]);
 
 {% if K or G %}
-/* An observer: the states of the running system, from its inputs and its outputs. */
+/* An observer: the states of the running system, from its inputs and its outputs. Once a sample
+ * call either predict and update, or correct and advance: correct before the input is chosen. */
 typedef struct {
-    double x[{{ NAME }}_NX]; /* the state at the next sample to be predicted */
+    double x[{{ NAME }}_NX]; /* the state, of the next sample to be predicted or after correct */
 {% if G %}
-    double U[{{ NAME }}_NX * {{ NAME }}_NX]; /* the covariance of its error is U times U transposed */
+    double U[{{ NAME }}_NX * {{ NAME }}_NX]; /* U times its transpose: covariance of predicted x */
 {% endif %}
-    double u[{{ NAME }}_NU], y_hat[{{ NAME }}_NY]; /* of the last call of predict */
+    double u[{{ NAME }}_NU], y_hat[{{ NAME }}_NY]; /* of the last call of predict or correct */
+{% if K %}
+    double e[{{ NAME }}_NY]; /* y - y_hat, from correct to advance */
+{% else %}
+    double M[({{ NAME }}_NY + 2 * {{ NAME }}_NX) * ({{ NAME }}_NY + 2 * {{ NAME }}_NX)];
+    double noise[{{ NAME }}_NX]; /* these are from correct to advance */
+    int corrected, known;
+{% endif %}
 } {{ name }}_observer;
 
 /* The state to start from: x = 0{% if G %}, with the covariance that the states have in the
@@ -49,6 +57,22 @@ void {{ name }}_observer_predict({{ name }}_observer *observer, const double u[{
 
 /* Go on to the next sample with the measured output; NaN is one that is missing. */
 void {{ name }}_observer_update({{ name }}_observer *observer, const double y[{{ NAME }}_NY]);
+
+{% if K %}
+/* Keep the output of this sample for advance: with a constant gain it corrects the next state.
+{% else %}
+/* Correct x by the output of this sample; NaN is one that is missing.
+{% endif %}
+{% if feedthrough %}
+ * The output depends on the input u at the same sample. */
+{% else %}
+ * No output depends on the input at the same sample: any u will do. */
+{% endif %}
+void {{ name }}_observer_correct({{ name }}_observer *observer, const double u[{{ NAME }}_NU],
+    const double y[{{ NAME }}_NY]);
+
+/* Go on to the next sample with the input of this one; one not corrected has no output. */
+void {{ name }}_observer_advance({{ name }}_observer *observer, const double u[{{ NAME }}_NU]);
 
 {% endif %}
 #ifdef __cplusplus

@@ -10,11 +10,12 @@ function [x_next, y, A, B, C, D] = {{ name }}(x, u)
 %{{ "   " + line if line }}
 {% endfor %}
 %
-%   Matrices, names, units and the sampling frequency fs are in {{ name }}.mat.
+%   Names, units and the sampling frequency fs are in {{ name }}.mat. The function can be called in a
+%   MATLAB Function block, and code can be generated from it.
 
 persistent m
 if isempty(m)
-    m = load([mfilename('fullpath') '.mat']);
+    m = {{ name }}_numbers();
 end
 if numel(x) ~= {{ nx }} || numel(u) ~= {{ nu }}
     error('{{ name }}:size', '{{ name }} takes x of {{ nx }} and u of {{ nu }} numbers; these have %d and %d.', ...
@@ -41,7 +42,7 @@ y = y + m.Dyw * w;
 {% endif %}
 if nargout > 2
 {% if value %}
-    J = m.Ww * bsxfun(@times, slope, m.Wz); % dw/dz
+    J = m.Ww * (repmat(slope, 1, {{ nz }}) .* m.Wz); % dw/dz
 {% elif static %}
     J = zeros({{ nw }}, {{ nz }}); % dw/dz
     for i = 1:size(m.slopes, 1)

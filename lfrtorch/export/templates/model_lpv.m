@@ -16,11 +16,12 @@ function [A, B, C, D, p] = {{ name }}_lpv(x, u)
 %   There is no p: the model is linear.
 {% endif %}
 
-persistent m
+persistent m f
 if isempty(m)
-    m = load(fullfile(fileparts(mfilename('fullpath')), '{{ name }}.mat'));
+    m = {{ name }}_numbers();
+    found = load(fullfile(fileparts(mfilename('fullpath')), '{{ name }}.mat'));
+    f = found.lpv;
 end
-f = m.lpv;
 if numel(x) ~= {{ nx }} || numel(u) ~= {{ nu }}
     error('{{ name }}:size', '{{ name }} takes x of {{ nx }} and u of {{ nu }} numbers; these have %d and %d.', ...
         numel(x), numel(u));
