@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -26,15 +27,18 @@ _LINE = 96
 
 
 def c_source(
-    model: Model | LinearModel, name: str = "model", *, observer: bool | NoiseCovariance = False
+    model: Model | LinearModel,
+    name: str = "model",
+    *,
+    observer: bool | NoiseCovariance = False,
+    single: bool = False,
 ) -> tuple[str, str]:
     """A model as C99: one step, its Jacobians, and the states to start from.
 
     ``NAME_step`` is one sample in physical units, ``NAME_jacobians`` the matrices of the model
     linearised at a state and an input, ``NAME_reset`` the state 0, ``NAME_rest`` that at rest with
     the inputs at their operating point, if there is one. Sizes and the sampling time are macros, as
-    ``NAME_NX`` and ``NAME_TS``. The code allocates nothing and keeps no state of its own. It
-    computes in double precision.
+    ``NAME_NX`` and ``NAME_TS``. The code allocates nothing and keeps no state of its own.
 
     With an observer there are ``NAME_observer_reset``, ``NAME_observer_predict`` and
     ``NAME_observer_update`` as well, on a struct ``NAME_observer`` of the caller, and for a
@@ -45,6 +49,7 @@ def c_source(
         model: what is exported.
         name: beginning of all names of the code.
         observer: ``True`` for that with the model's gain K, noise for an extended Kalman filter.
+        single: whether it computes in single precision, ``float``, for a processor without double.
 
     Returns:
         The texts of ``NAME.h`` and ``NAME.c``.
@@ -85,7 +90,20 @@ def c_source(
             known["monomials"] = True
             inner |= {"NM": e.static.C.shape[1], "NS": len(e.static.slopes)}
     known["inner"] = inner.items()
-    return rendered("model.h", **known), rendered("model.c", **known)
+    header, source = rendered("model.h", **known), rendered("model.c", **known)
+    return (_single(header), _single(source)) if single else (header, source)
+
+
+def _single(text: str) -> str:
+    """C of double precision as one of single precision; comments stay."""
+    # tgmath.h has exp, sqrt, .. of the type of what they are given.
+    text = text.replace("#include <math.h>", "#include <tgmath.h>")
+    parts = re.split(r"(/\*.*?\*/)", text, flags=re.DOTALL)
+    for i in range(0, len(parts), 2):
+        parts[i] = re.sub(r"\bdouble\b", "float", parts[i])
+        number = r"(?<![\w.])(\d+\.\d+(?:e[+-]?\d+)?|\d+e[+-]?\d+)"
+        parts[i] = re.sub(number, r"\1f", parts[i])
+    return "".join(parts)
 
 
 def _arrays(e: Equations) -> Iterator[str]:

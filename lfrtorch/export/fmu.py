@@ -1,4 +1,4 @@
-"""A model as a functional mock-up unit: FMI 2.0 for co-simulation, compiled from its C."""
+"""A model as a functional mock-up unit, FMI 2.0 or 3.0 for co-simulation, compiled from its C."""
 
 from __future__ import annotations
 
@@ -11,24 +11,59 @@ from pathlib import Path
 from xml.etree import ElementTree
 from zipfile import ZIP_DEFLATED, ZipFile
 
+import numpy as np
+
 from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
 from lfrtorch.export.equations import Equations, equations, printable, rendered
 from lfrtorch.linear.model import LinearModel
 from lfrtorch.model import Model
 
+_OTHERS = {
+    2: ["Integer", "Boolean", "String"],
+    3: ["Float32", *(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)),
+        "Boolean", "String", "Binary", "Clock"],
+}  # fmt: skip
+"""Types of variables that there are none of, by the version of FMI."""
 
-def write_fmu(model: Model | LinearModel, path: str | Path, name: str = "model") -> None:
-    """Write a model as an FMU 2.0 for co-simulation: a binary for Linux x86_64 and its sources.
+_UNSUPPORTED = {
+    2: [
+        "CancelStep",
+        *(f"Get{kind}Status" for kind in ("", "Real", "Integer", "Boolean", "String")),
+        "SetRealInputDerivatives", "GetRealOutputDerivatives",
+    ],
+    3: [
+        "GetNumberOfVariableDependencies", "GetVariableDependencies", "GetAdjointDerivative",
+        "EnterConfigurationMode", "ExitConfigurationMode", "EnterEventMode", "EnterStepMode",
+        *(f"{way}{what}{form}" for way in ("Get", "Set") for what in ("Interval", "Shift")
+          for form in ("Decimal", "Fraction")),
+        "EvaluateDiscreteStates", "UpdateDiscreteStates", "EnterContinuousTimeMode",
+        "CompletedIntegratorStep", "SetTime", "SetContinuousStates",
+        "GetContinuousStateDerivatives", "GetEventIndicators", "GetContinuousStates",
+        "GetNominalsOfContinuousStates", "GetNumberOfEventIndicators",
+        "GetNumberOfContinuousStates", "GetOutputDerivatives", "ActivateModelPartition",
+    ],
+}  # fmt: skip
+"""Functions that a version has and no unit for co-simulation of a sampled model needs."""
+
+
+def write_fmu(
+    model: Model | LinearModel, path: str | Path, name: str = "model", *, version: int = 2
+) -> None:
+    """Write a model as an FMU for co-simulation: a binary for Linux x86_64 and its sources.
 
     Inputs, outputs and states are real variables with the channels' names and units; the states can
-    be set before the simulation starts. An output is that of the state and the inputs at the time
-    when it is read. A communication step is a whole number of samples, with the inputs held.
+    be set before the simulation starts. The model samples its inputs every 1 / fs seconds and holds
+    its outputs in between: a communication step may have any size. At a sample an output is that of
+    the state and the inputs when it is read. The whole state can be saved, restored and serialized,
+    outputs have directional derivatives by inputs and states, and the description lists the inputs
+    that each output depends on.
 
     Args:
         model: what is exported.
         path: the file.
         name: of the model in it.
+        version: 2 or 3, of FMI.
 
     Raises:
         ValueError: no C compiler, another machine than Linux on x86_64, a static map of the user's
@@ -40,7 +75,8 @@ def write_fmu(model: Model | LinearModel, path: str | Path, name: str = "model")
     header, source = c_source(model, name)
     e = equations(model)
     guid = str(uuid.uuid5(uuid.NAMESPACE_OID, header + source))
-    known = {"name": name, "NAME": name.upper(), "guid": guid, "ts": repr(1.0 / e.fs)}
+    known = {"name": name, "NAME": name.upper(), "guid": guid, "version": version}
+    known |= {"others": _OTHERS[version], "unsupported": _UNSUPPORTED[version]}
     known["u_start"] = e.u_offset.tolist()
     files = {
         f"{name}.h": header,
@@ -48,9 +84,12 @@ def write_fmu(model: Model | LinearModel, path: str | Path, name: str = "model")
         f"{name}_fmu.c": rendered("fmu.c", **known),
     }
     binary = _compiled(files, name)
+    machine = "linux64" if version == 2 else "x86_64-linux"
     with ZipFile(path, "w", ZIP_DEFLATED) as archive:
-        archive.writestr("modelDescription.xml", _description(e, name, guid))
-        archive.writestr(f"binaries/linux64/{name}.so", binary)
+        archive.writestr("modelDescription.xml", _description(e, name, guid, version))
+        if version == 3:
+            archive.writestr("sources/buildDescription.xml", _build(name))
+        archive.writestr(f"binaries/{machine}/{name}.so", binary)
         for file, text in files.items():
             archive.writestr(f"sources/{file}", text)
 
@@ -79,20 +118,34 @@ def _compiled(files: dict[str, str], name: str) -> bytes:
         return (Path(folder) / "made.so").read_bytes()
 
 
-def _description(e: Equations, name: str, guid: str) -> bytes:
-    """modelDescription.xml."""
-    root = ElementTree.Element(
-        "fmiModelDescription",
-        fmiVersion="2.0", modelName=name, guid=guid, description=" ".join(e.about(name)[:2]),
-        generationTool="lfrtorch", variableNamingConvention="flat",
-    )  # fmt: skip
-    unit = ElementTree.SubElement(
-        root, "CoSimulation",
-        modelIdentifier=name, canHandleVariableCommunicationStepSize="true",
-    )  # fmt: skip
-    listed = ElementTree.SubElement(unit, "SourceFiles")
+def _build(name: str) -> bytes:
+    """buildDescription.xml of FMI 3.0: how the sources are compiled."""
+    root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
+    built = ElementTree.SubElement(root, "BuildConfiguration", modelIdentifier=name)
+    listed = ElementTree.SubElement(built, "SourceFileSet", language="C99")
     for file in (f"{name}.c", f"{name}_fmu.c"):
-        ElementTree.SubElement(listed, "File", name=file)
+        ElementTree.SubElement(listed, "SourceFile", name=file)
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+def _description(e: Equations, name: str, guid: str, version: int) -> bytes:
+    """modelDescription.xml."""
+    token = "guid" if version == 2 else "instantiationToken"
+    State = "FMUstate" if version == 2 else "FMUState"
+    root = ElementTree.Element("fmiModelDescription", {
+        "fmiVersion": f"{version}.0", "modelName": name, token: guid,
+        "description": " ".join(e.about(name)[:2]), "generationTool": "lfrtorch",
+        "variableNamingConvention": "flat",
+    })  # fmt: skip
+    unit = ElementTree.SubElement(root, "CoSimulation", {
+        "modelIdentifier": name, "canHandleVariableCommunicationStepSize": "true",
+        f"canGetAndSet{State}": "true", f"canSerialize{State}": "true",
+        f"providesDirectionalDerivative{'' if version == 2 else 's'}": "true",
+    })  # fmt: skip
+    if version == 2:
+        listed = ElementTree.SubElement(unit, "SourceFiles")
+        for file in (f"{name}.c", f"{name}_fmu.c"):
+            ElementTree.SubElement(listed, "File", name=file)
     units = list(dict.fromkeys(c.unit for c in (*e.inputs, *e.outputs) if c.unit))
     if units:
         listed = ElementTree.SubElement(root, "UnitDefinitions")
@@ -101,22 +154,49 @@ def _description(e: Equations, name: str, guid: str) -> bytes:
     ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(1.0 / e.fs))
     listed = ElementTree.SubElement(root, "ModelVariables")
     for number, (label, symbol, causality, start) in enumerate(_variables(e)):
-        variable = ElementTree.SubElement(
-            listed, "ScalarVariable", name=label, valueReference=str(number), causality=causality
-        )
+        known = {"name": label, "valueReference": str(number), "causality": causality}
         if causality == "local":
-            variable.set("initial", "exact")
-        known = {"start": None if start is None else repr(start), "unit": symbol or None}
-        known = {key: value for key, value in known.items() if value is not None}
-        ElementTree.SubElement(variable, "Real", known)
-    structure = ElementTree.SubElement(root, "ModelStructure")
-    nu = len(e.inputs)
-    for part in ("Outputs", "InitialUnknowns"):
-        listed = ElementTree.SubElement(structure, part)
-        for output in range(len(e.outputs)):
-            ElementTree.SubElement(listed, "Unknown", index=str(nu + output + 1))
+            known["initial"] = "exact"
+        real = {"start": None if start is None else repr(start), "unit": symbol or None}
+        real = {key: value for key, value in real.items() if value is not None}
+        if version == 2:
+            ElementTree.SubElement(
+                ElementTree.SubElement(listed, "ScalarVariable", known), "Real", real
+            )
+        else:
+            ElementTree.SubElement(listed, "Float64", known | real)
+    if version == 3:
+        known = {"name": _free("time", e), "causality": "independent", "variability": "continuous"}
+        ElementTree.SubElement(listed, "Float64", known, valueReference=str(len(_variables(e))))
+    _structure(ElementTree.SubElement(root, "ModelStructure"), e, version)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+def _structure(root: ElementTree.Element, e: Equations, version: int) -> None:
+    """Which inputs each output depends on, and at the beginning which states."""
+    M, nu, ny = e.matrices, len(e.inputs), len(e.outputs)
+    by_w = (M.Dyw != 0).any(axis=1)[:, None] & (M.Dzu != 0).any(axis=0)
+    by_u = (M.Dyu != 0) | by_w
+    for at_first in (False, True):
+        part = "InitialUnknown" if at_first else "Output"
+        under = ElementTree.SubElement(root, f"{part}s") if version == 2 else root
+        for output in range(ny):
+            known = np.flatnonzero(by_u[output]).tolist()
+            if at_first:
+                known += range(nu + ny, nu + ny + e.sizes["nx"])
+            number, first = nu + output, 1 if version == 2 else 0  # FMI 2 counts from 1
+            key = "index" if version == 2 else "valueReference"
+            depends = {"dependencies": " ".join(str(one + first) for one in known)}
+            place = {key: str(number + first)} | depends
+            ElementTree.SubElement(under, "Unknown" if version == 2 else part, place)
+
+
+def _free(name: str, e: Equations) -> str:
+    """A name that no variable has."""
+    while name in {label for label, *_ in _variables(e)}:
+        name += "_"
+    return name
 
 
 def _variables(e: Equations) -> list[tuple[str, str, str, float | None]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,9 +52,14 @@ class Target(NamedTuple):
 
 
 def _c(
-    model: Model | LinearModel, name: str, paths: list[Path], observer: bool | NoiseCovariance
+    model: Model | LinearModel,
+    name: str,
+    paths: list[Path],
+    observer: bool | NoiseCovariance,
+    single: bool = False,
 ) -> None:
-    for path, text in zip(paths, c_source(model, name, observer=observer), strict=True):
+    texts = c_source(model, name, observer=observer, single=single)
+    for path, text in zip(paths, texts, strict=True):
         path.write_text(text, encoding="utf-8")
 
 
@@ -92,6 +98,13 @@ TARGETS = {
         (),
         "{name}_observer_correct(&observer, u, y); {name}_observer_advance(&observer, u);",
     ),
+    "c_float": Target(
+        (".h", ".c"),
+        partial(_c, single=True),
+        "{name}_step(x, u, x_next, y);",
+        (),
+        "{name}_observer_correct(&observer, u, y); {name}_observer_advance(&observer, u);",
+    ),
     "casadi": Target(
         (".casadi", "_channels.json"),
         _casadi,
@@ -121,6 +134,11 @@ TARGETS = {
         lambda model, name, paths: write_fmu(model, paths[0], name),
         "found = fmpy.simulate_fmu('{path}')",
     ),
+    "fmu3": Target(
+        (".fmu",),
+        lambda model, name, paths: write_fmu(model, paths[0], name, version=3),
+        "found = fmpy.simulate_fmu('{path}')",
+    ),
 }
 """All kinds of export."""
 
@@ -140,12 +158,13 @@ def write(
 
     Args:
         model: what is exported.
-        to: ``"c"``: ``NAME.h`` and ``NAME.c``; ``"casadi"``: ``NAME.casadi``, which
-            ``casadi.Function.load`` reads, and ``NAME_channels.json`` with channels and rate;
+        to: ``"c"``: ``NAME.h`` and ``NAME.c``, or ``"c_float"`` in single precision;
+            ``"casadi"``: ``NAME.casadi``, which ``casadi.Function.load`` reads, and
+            ``NAME_channels.json`` with channels and rate;
             ``"onnx"``: ``NAME.onnx`` for a sample and ``NAME_simulate.onnx``; ``"matlab"``:
             ``NAME.m``, ``NAME_numbers.m`` and ``NAME_lpv.m`` with ``NAME.mat``; ``"control"``:
-            ``NAME.py``, whose ``system()`` is a ``control.NonlinearIOSystem``; ``"fmu"``:
-            ``NAME.fmu``.
+            ``NAME.py``, whose ``system()`` is a ``control.NonlinearIOSystem``; ``"fmu"`` and
+            ``"fmu3"``: ``NAME.fmu``, FMI 2.0 or 3.0.
         folder: where to; it is made if need be.
         name: of the files, and in them.
         overwrite: whether files that exist may be replaced.

@@ -87,7 +87,7 @@ def test_files_are_replaced_where_that_is_said(folder: Path, monkeypatch):
     [
         (["to=c"], "checkpoint is not set: add checkpoint=DIR"),
         (["checkpoint=model"], "to is not set: add to=c"),
-        (["checkpoint=model", "to=rust"], "to is 'rust'; give one of c, casadi, onnx, matlab"),
+        (["checkpoint=model", "to=rust"], "to is 'rust'; give one of c, c_float, casadi"),
         (["checkpoint=model", "to=c", "Q=1"], "give observer=true Q=... R=..."),
         (["checkpoint=model", "to=c", "disturbance=input"], "(observer=true Q=... R=... on the"),
         (

@@ -6,12 +6,14 @@ import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from exported import MODELS, check_output, inputs
+import torch
+from exported import MODELS, check_output, inputs, jacobians
 
 from lfrtorch import InputError
 from lfrtorch._support.types import Array
@@ -27,66 +29,167 @@ if not any(map(shutil.which, ("gcc", "cc", "clang"))):
     pytest.skip("there is no C compiler", allow_module_level=True)
 
 
+class Unit:
+    """An instance of one version, with the same calls for both."""
+
+    def __init__(self, path: Path, folder: Path) -> None:
+        found = fmpy.read_model_description(str(path), validate=True)
+        fmpy.extract(str(path), unzipdir=str(folder))
+        self.version = int(found.fmiVersion[0])
+        made = fmpy.fmi2.FMU2Slave if self.version == 2 else fmpy.fmi3.FMU3Slave
+        self.it = made(
+            guid=found.guid, unzipDirectory=str(folder), instanceName="it",
+            modelIdentifier=found.coSimulation.modelIdentifier,
+        )  # fmt: skip
+        self.it.instantiate()
+        self.begin()
+        self.references = {one.name: one.valueReference for one in found.modelVariables}
+        self.description = found
+
+    def begin(self) -> None:
+        if self.version == 2:
+            self.it.setupExperiment(startTime=0.0)
+            self.it.enterInitializationMode()
+        else:
+            self.it.enterInitializationMode(startTime=0.0)
+        self.it.exitInitializationMode()
+
+    def get(self, references: list[int]) -> Array:
+        read = self.it.getReal if self.version == 2 else self.it.getFloat64
+        return np.array(read(references))
+
+    def set(self, references: list[int], values: Array) -> None:
+        (self.it.setReal if self.version == 2 else self.it.setFloat64)(references, values)
+
+
 @contextmanager
-def started(path: Path, folder: Path) -> Iterator[tuple[Any, dict[str, int]]]:
+def started(path: Path, folder: Path) -> Iterator[tuple[Unit, dict[str, int]]]:
     """An instance before its first step, and the value references."""
-    found = fmpy.read_model_description(str(path), validate=True)
-    fmpy.extract(str(path), unzipdir=str(folder))
-    unit = fmpy.fmi2.FMU2Slave(
-        guid=found.guid, unzipDirectory=str(folder), instanceName="it",
-        modelIdentifier=found.coSimulation.modelIdentifier,
-    )  # fmt: skip
-    unit.instantiate()
-    unit.setupExperiment(startTime=0.0)
-    unit.enterInitializationMode()
-    unit.exitInitializationMode()
-    yield unit, {one.name: one.valueReference for one in found.modelVariables}
-    unit.terminate()
-    unit.freeInstance()
+    unit = Unit(path, folder)
+    yield unit, unit.references
+    unit.it.terminate()
+    unit.it.freeInstance()
+
+
+@pytest.fixture(params=["fmu", "fmu3"])
+def to(request: pytest.FixtureRequest) -> str:
+    return request.param
 
 
 @pytest.mark.numeric
 @pytest.mark.parametrize("name", ["softplus", "polynomial", "linear"])
-def test_the_simulation_is_that_of_the_model(name: str, tmp_path: Path):
+def test_the_simulation_is_that_of_the_model(name: str, to: str, tmp_path: Path):
     model = MODELS[name]
-    (path,) = write(model, "fmu", tmp_path, name="engine")
+    (path,) = write(model, to, tmp_path, name="engine")
     u, T = inputs(model, 1000), 1.0 / model.fs
-    nu, ny = len(model.inputs), len(model.outputs)
+    nu, ny, nx = len(model.inputs), len(model.outputs), model.lfr.cell.nx
     with started(path, tmp_path / "unpacked") as (unit, references):
         assert list(references)[:nu] == [channel.name for channel in model.inputs]
         assert list(references)[nu : nu + ny] == [channel.name for channel in model.outputs]
-        given, read = list(references.values())[:nu], list(references.values())[nu : nu + ny]
-        assert np.array_equal(unit.getReal(given), model.scaler.u_offset)
+        numbers = list(references.values())
+        given, read, states = numbers[:nu], numbers[nu : nu + ny], numbers[nu + ny :][:nx]
+        assert np.array_equal(unit.get(given), model.scaler.u_offset)
 
-        def simulated() -> Array:
+        def simulated(parts: tuple[float, ...] = (1.0,)) -> Array:
             y = []
             for k, u_k in enumerate(u):
-                unit.setReal(given, u_k)
-                y.append(unit.getReal(read))
-                unit.doStep(k * T, T)
+                unit.set(given, u_k)
+                y.append(unit.get(read))
+                done = 0.0
+                for part in parts:
+                    unit.it.doStep((k + done) * T, part * T)
+                    done += part
+                    if done < 1.0 - 1e-9:  # held, and what is set now waits for the next sample
+                        unit.set(given, u_k + 5.0)
+                        assert np.array_equal(unit.get(read), y[-1])
             return np.array(y)
 
         check_output(simulated(), model, u)
-        unit.reset()
-        check_output(simulated(), model, u)
+        unit.it.reset()
+        check_output(simulated((0.3, 0.45, 0.25)), model, u)
         # From a given state, two samples in one step, with the input held.
-        states = list(references.values())[nu + ny :]
-        x0 = np.linspace(-1.0, 1.0, len(states))
-        unit.setReal(states, x0)
-        unit.setReal(given, u[0])
-        unit.doStep(0.0, 2 * T)
+        x0 = np.linspace(-1.0, 1.0, nx)
+        unit.set(states, x0)
+        unit.set(given, u[0])
+        unit.it.doStep(0.0, 2 * T)
         x = model.signals(np.stack([u[0], u[0]]), start="given", x0=x0).x[0, -1].numpy()
-        assert np.allclose(unit.getReal(states), x, rtol=0, atol=1e-12)
+        assert np.allclose(unit.get(states), x, rtol=0, atol=1e-12)
         with pytest.raises(Exception, match="DoStep failed"):
-            unit.doStep(0.0, 1.5 * T)
-        with pytest.raises(Exception, match="SetReal failed"):
-            unit.setReal(read, np.zeros(ny))
+            unit.it.doStep(0.0, -1.5 * T)
+        with pytest.raises(Exception, match="failed"):
+            unit.set(read, np.zeros(ny))
 
 
 @pytest.mark.numeric
-def test_the_code_of_the_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_state_is_restored_amid_a_sample(to: str, tmp_path: Path):
+    model = MODELS["softplus"]
+    (path,) = write(model, to, tmp_path, name="engine")
+    u, T = inputs(model, 20), 1.0 / model.fs
+    with started(path, tmp_path / "unpacked") as (unit, references):
+        numbers = list(references.values())
+        nu, ny = len(model.inputs), len(model.outputs)
+        given, read = numbers[:nu], numbers[nu : nu + ny]
+        get, put, free, serialize, again = (
+            getattr(unit.it, name if unit.version == 2 else name.replace("FMUstate", "FMUState"))
+            for name in (
+                "getFMUstate", "setFMUstate", "freeFMUstate", "serializeFMUstate",
+                "deSerializeFMUstate" if unit.version == 2 else "deserializeFMUState",
+            )
+        )  # fmt: skip
+
+        def run() -> Array:
+            y = []
+            for u_k in u:
+                unit.set(given, u_k)
+                unit.it.doStep(0.0, 0.6 * T)
+                y.append(unit.get(read))
+            return np.array(y)
+
+        unit.it.doStep(0.0, 0.4 * T)
+        kept = get()
+        stored = serialize(kept)
+        first = run()
+        put(kept)
+        assert np.array_equal(run(), first)
+        free(kept)
+        kept = again(stored)
+        put(kept)
+        assert np.array_equal(run(), first)
+        free(kept)
+
+
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", ["softplus", "without"])
+def test_derivatives_and_dependencies_are_those_of_the_model(name: str, to: str, tmp_path: Path):
+    model = deepcopy(MODELS["softplus"])
+    nu, ny, nx = len(model.inputs), len(model.outputs), model.lfr.cell.nx
+    if name == "without":
+        with torch.no_grad():
+            model.lfr.cell.Dyu.zero_()
+            model.lfr.cell.Dzu[:, 0] = 0.0
+            model.lfr.cell.Dyw[1:] = 0.0  # the first output depends on the second input alone
+    (path,) = write(model, to, tmp_path, name="engine")
+    with started(path, tmp_path / "unpacked") as (unit, references):
+        numbers = list(references.values())
+        read, knowns = numbers[nu : nu + ny], [*numbers[:nu], *numbers[nu + ny :][:nx]]
+        x, u = np.linspace(-1.0, 1.0, nx), inputs(model, 1)[0]
+        unit.set(knowns, np.append(u, x))
+        _, _, H, D = jacobians(model, x, u)
+        for column, known in enumerate(knowns):
+            found = unit.it.getDirectionalDerivative(read, [known], [1.0])
+            np.testing.assert_allclose(found, np.hstack([D, H])[:, column], rtol=1e-9, atol=1e-12)
+        for output, one in enumerate(unit.description.outputs):
+            depends = [each.name for each in one.dependencies]
+            expected = [c.name for c in model.inputs]
+            if name == "without":
+                expected = expected[1:] if output == 0 else []
+            assert depends == expected
+
+
+@pytest.mark.numeric
+def test_the_code_of_the_guide_runs(to: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     model = MODELS["smallest"]
-    write(model, "fmu", tmp_path, name="engine")
+    write(model, to, tmp_path, name="engine")
     monkeypatch.chdir(tmp_path)
     guide = Path(__file__).resolve().parents[2] / "docs" / "guide" / "export.md"
     section = guide.read_text(encoding="utf-8").split("## FMU")[1]
