@@ -231,10 +231,12 @@ def scored_run(
     """Score all records, the tests by the model fitted again; add verdict and advice."""
     samples = sum(record.samples for record in dataset.train)
     fitted_to = f"{dataset.name}: {len(dataset.train)} record(s), {samples} samples"
-    result = replace(result, model=replace(result.model, fitted_to=fitted_to))
+    model = replace(result.model, fitted_to=fitted_to).reaching(dataset.train)
+    result = replace(result, model=model)
     if again is not None:
         fitted_to += " and all other estimation records"
-        again = replace(again, model=replace(again.model, fitted_to=fitted_to))
+        known = [*dataset.train, *dataset.validation, *dataset.selection]
+        again = replace(again, model=replace(again.model, fitted_to=fitted_to).reaching(known))
     evaluation = Evaluation(
         dataset=dataset,
         linear=linear,

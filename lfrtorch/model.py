@@ -20,6 +20,7 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.checks import integer, reals
 from lfrtorch._support.errors import InputError, brief
 from lfrtorch._support.types import Array
+from lfrtorch.data_reach import Cloud, DataReach
 from lfrtorch.engine.block_form import IN_SERIES, STRUCTURES, zeros_of
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.description import in_columns, levels, listed, system_lines
@@ -90,6 +91,7 @@ class Model:
         K: gain of the innovations e in x+ = A x + Bu u + Bw w + K e, y = ... + e, with x and y
             normalised. Default: no noise model; ``lfrtorch.fit`` finds one with
             ``noise="innovation"``.
+        reach: how far the data went; ``reaching`` finds it.
 
     Shape:
         K: (nx, ny).
@@ -118,6 +120,7 @@ class Model:
     outputs: tuple[Channel, ...]
     fitted_to: str = ""
     K: Float[Tensor, "nx ny"] | None = None
+    reach: DataReach | None = None
 
     def __post_init__(self) -> None:
         cell, s = self.lfr.cell, self.scaler
@@ -191,6 +194,41 @@ class Model:
             array([[1.]])
         """
         return self.lfr.cell.state_covariance.double().cpu().numpy()
+
+    def reaching(self, records: Record | Sequence[Record]) -> Model:
+        """The model with the reach of these data: the ranges of u and y, and z of the simulation.
+
+        What ``lfrtorch.identify`` returns has that of its data for estimation. Exports and
+        ``lfrtorch.analysis.linearise`` then tell where the model extrapolates.
+
+        Example:
+            >>> model.reaching(record).reach.u.round(1).tolist() == [
+            ...     [record.u.min().round(1), record.u.max().round(1)]
+            ... ]
+            True
+        """
+        given = as_records(records)
+        z = np.concatenate([self.signals(record).z[0].double().numpy() for record in given])
+        with np.errstate(over="ignore"):
+            if not np.isfinite(np.sum(z**2)):
+                return replace(self, reach=None)
+        u, y = (np.concatenate([part(r) for r in given]) for part in (_inputs, inside_limits))
+        return replace(self, reach=DataReach.of(u, y, z))
+
+    def outside(self, u: Float[Array, " nu"], x: Float[Array, " nx"]) -> str:
+        """What of u (physical units) and x was outside of the data, in words; empty if nothing was.
+
+        Example:
+            >>> model.reaching(record).outside(np.zeros(1), np.zeros(1))
+            ''
+        """
+        if self.reach is None:
+            return ""
+        cell, s = double(self.lfr.cell), self.scaler
+        v, state = (torch.as_tensor(part) for part in ((u - s.u_offset) / s.u_scale, x))
+        with torch.no_grad():
+            y, z = s.restore_y(cell(v, state)[0].numpy()), cell.internal(v, state)[0].numpy()
+        return self.reach.outside(u, y, z, self.inputs, self.outputs)
 
     @property
     def parameter_count(self) -> int:
@@ -594,6 +632,8 @@ class Model:
         weights |= {f"scaler.{name}": torch.tensor(getattr(s, name)) for name in _SCALING}
         if self.K is not None:
             weights["K"] = self.K
+        if self.reach is not None:
+            weights |= {f"reach.{name}": torch.tensor(v) for name, v in _flat(self.reach).items()}
         return checkpoint.write(folder, description, weights)
 
 
@@ -732,6 +772,11 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         K = weights.pop("K", None)
+        parts = [f"reach.{name}" for name in ("u", "y", "middle", "axes", "farthest")]
+        reach = None
+        if parts[0] in weights:
+            u_ends, y_ends, middle, axes, far = (weights.pop(name).numpy() for name in parts)
+            reach = DataReach(u_ends, y_ends, Cloud(middle, axes, float(far)))
         weights.setdefault("state_covariance", torch.eye(cell.nx))  # checkpoints of before
         cell.load_state_dict(weights)
         cell.free_feedthrough(
@@ -742,11 +787,23 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
             raise InputError(f"structure is {cell.structure!r}")
         inputs, outputs = (described_channels(description[side]) for side in ("inputs", "outputs"))
         fitted_to = str(description.get("fitted_to", ""))
-        return Model(LFR(cell), scaler, float(description["fs"]), inputs, outputs, fitted_to, K)
+        fs = float(description["fs"])
+        return Model(LFR(cell), scaler, fs, inputs, outputs, fitted_to, K, reach)
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise InputError(
             f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."
         ) from None
+
+
+def _flat(reach: DataReach) -> dict[str, Array]:
+    """The arrays of a reach, for a checkpoint."""
+    z = reach.z
+    farthest = np.array(z.farthest)
+    return {"u": reach.u, "y": reach.y, "middle": z.middle, "axes": z.axes, "farthest": farthest}
+
+
+def _inputs(record: Record) -> Array:
+    return record.u
 
 
 def _zero(weight: Tensor) -> bool:

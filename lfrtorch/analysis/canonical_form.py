@@ -23,6 +23,7 @@ from jaxtyping import Complex128, Float
 from lfrtorch._support.arguments import typed
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array, Complex
+from lfrtorch.data_reach import whitening
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.linearised import static_slope
@@ -146,7 +147,8 @@ def canonical(model: Model, records: Record | Sequence[Record]) -> Canonical:
         "Cy": Cy @ back, "Dyu": Dyu, "Dyw": Dyw @ out,
     }  # fmt: skip
     K = None if model.K is None else torch.as_tensor(X) @ model.K.double().cpu()
-    same = replace(model, lfr=LFR(_cell(cell, made, slope, _inverse(Z), W)), K=K)
+    reach = model.reach and replace(model.reach, z=model.reach.z.turned(Z))
+    same = replace(model, lfr=LFR(_cell(cell, made, slope, _inverse(Z), W)), K=K, reach=reach)
     P = X @ model.state_covariance @ X.T
     same.lfr.cell.state_covariance.copy_(torch.as_tensor(P))
     shares, bends = (part / max(part.sum(), 1e-300) for part in (power, bends))
@@ -172,14 +174,6 @@ def nearest_affine(
     affine = np.hstack([z, np.ones((len(z), 1))])
     solution: Array = np.asarray(np.linalg.lstsq(affine, w, rcond=None)[0], dtype=np.float64)
     return solution[:-1].T, solution[-1]
-
-
-def whitening(signal: Float[Array, "S n"]) -> Float[Array, "n n"]:
-    """T such that T s has unit covariance."""
-    centred = signal - signal.mean(axis=0)
-    power, axes = np.linalg.eigh(centred.T @ centred / len(centred))
-    least = max(_FLAT * float(power.max(initial=0.0)), 1e-300)
-    return (axes / np.sqrt(np.maximum(power, least))).T
 
 
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:

@@ -35,7 +35,8 @@ from lfrtorch.analysis.linearisation import linear_part, linearise
 from lfrtorch.analysis.noise_model import LEAST, NoiseModel, Spectra, colours, innovations
 from lfrtorch.analysis.output_residuals import LEVEL, ROUNDING, SLIGHT, OutputResiduals
 from lfrtorch.analysis.residual_analysis import SHORTEST, of_simulation
-from lfrtorch.analysis.training_reach import FARTHEST, TrainingReach
+from lfrtorch.analysis.training_reach import TrainingReach
+from lfrtorch.data_reach import FARTHEST
 from lfrtorch.engine.lfr import LFR
 from lfrtorch.engine.operating_point import SINGULAR, equilibrium, linearised_at
 from lfrtorch.least_squares.exact_integrators import fixed_parameters

@@ -86,7 +86,8 @@ def linearise(
         y0 = scaler.restore_y(cell(v, found)[0].numpy())
     local = _linear_model(model, linearised_at(cell, v, found), np.array(u0), y0)
     K = None if model.K is None else model.K.double().cpu().numpy() / scaler.y_scale
-    return replace(local, K=K, x_offset=found.numpy())
+    outside = model.outside(np.asarray(u0), found.numpy())
+    return replace(local, K=K, x_offset=found.numpy(), outside=outside)
 
 
 def linear_part(model: Model) -> LinearModel:

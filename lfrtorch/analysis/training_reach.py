@@ -8,10 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lfrtorch._support.types import Array
-from lfrtorch.analysis.canonical_form import whitening
-
-FARTHEST = 0.99
-"""Part of the training samples whose surprise is below 1."""
+from lfrtorch.data_reach import FARTHEST, Cloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,27 +20,18 @@ class TrainingReach:
     standard deviation of the simulated output, which tells of dynamics, too.
     """
 
-    middle: Float[Array, " nz"]
-    white: Float[Array, "nz nz"]  # white (z - middle) has unit covariance
-    farthest: tuple[float, float, float]  # of 99 %: both distances, and then the larger ratio
+    z: Cloud
+    of_y: float
+    both: float  # of 99 %: the larger of the two
 
     @classmethod
     def of(cls, z: Float[Array, "S nz"], variance: Float[Array, "S ny"]) -> TrainingReach:
         """Build it from z and the variances of the outputs at the training samples."""
-        middle = z.mean(axis=0)
-        white = whitening(z)
-        found = cls(middle, white, (1.0, 1.0, 1.0))
-        far = [float(np.quantile(d, FARTHEST)) or 1.0 for d in found._distances(z, variance)]
-        found = cls(middle, white, (far[0], far[1], 1.0))
+        of_y = float(np.quantile(np.sqrt(variance.sum(axis=1)), FARTHEST)) or 1.0
+        found = cls(Cloud.of(z), of_y, 1.0)
         both = float(np.quantile(found.surprises(z, variance), FARTHEST)) or 1.0
-        return cls(middle, white, (far[0], far[1], both))
+        return cls(found.z, of_y, both)
 
     def surprises(self, z: Float[Array, "T nz"], variance: Float[Array, "T ny"]) -> Array:
         """Surprise of each sample: 1 is as far as 99 % of the training samples go."""
-        a, b, both = self.farthest
-        of_z, of_y = self._distances(z, variance)
-        return np.maximum(of_z / a, of_y / b) / both
-
-    def _distances(self, z: Array, variance: Array) -> tuple[Array, Array]:
-        of_z = np.linalg.norm((z - self.middle) @ self.white.T, axis=1)
-        return of_z, np.sqrt(variance.sum(axis=1))
+        return np.maximum(self.z.surprise(z), np.sqrt(variance.sum(axis=1)) / self.of_y) / self.both

@@ -32,6 +32,7 @@ class Trim:
         x: state in the model's coordinates.
         u, y: input and output, physical units.
         residual: y less the output that was asked for, 0 where none was.
+        outside: what the data of the fit did not reach of it, in words; empty if they reached all.
 
     Example:
         >>> found = lfrtorch.analysis.trim(model, u=0.5)
@@ -43,6 +44,7 @@ class Trim:
     u: Float[Array, " nu"]
     y: Float[Array, " ny"]
     residual: Float[Array, " ny"]
+    outside: str = ""
 
 
 @typed()
@@ -131,7 +133,8 @@ def _trim(
     with torch.no_grad():
         y = cell(v, x)[0].numpy()
     residual = np.where(asked, s.y_scale * (y - wanted), 0.0)
-    return Trim(x.numpy(), s.u_offset + s.u_scale * v.numpy(), s.restore_y(y), residual)
+    u = s.u_offset + s.u_scale * v.numpy()
+    return Trim(x.numpy(), u, s.restore_y(y), residual, model.outside(u, x.numpy()))
 
 
 def _numbers(name: str, given: ArrayLike, size: int) -> Array:

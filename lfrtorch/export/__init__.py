@@ -1,7 +1,7 @@
 """A model as a program of other tools, in physical units."""
 
 from lfrtorch.export.c_source import c_source
-from lfrtorch.export.casadi_function import casadi_function, casadi_observer
+from lfrtorch.export.casadi_function import casadi_function, casadi_observer, casadi_reach
 from lfrtorch.export.control_system import control_system, python_source
 from lfrtorch.export.fmu import write_fmu
 from lfrtorch.export.matlab_function import matlab_function
@@ -13,6 +13,7 @@ __all__ = [
     "c_source",
     "casadi_function",
     "casadi_observer",
+    "casadi_reach",
     "control_system",
     "matlab_function",
     "onnx_models",

@@ -37,8 +37,10 @@ def c_source(
 
     ``NAME_step`` is one sample in physical units, ``NAME_jacobians`` the matrices of the model
     linearised at a state and an input, ``NAME_reset`` the state 0, ``NAME_rest`` that at rest with
-    the inputs at their operating point, if there is one. Sizes and the sampling time are macros, as
-    ``NAME_NX`` and ``NAME_TS``. The code allocates nothing and keeps no state of its own.
+    the inputs at their operating point, if there is one, and ``NAME_reach`` the square of the
+    surprise index, 1 as far as 99 % of the data of the fit went, if the model knows it. Sizes and
+    the sampling time are macros, as ``NAME_NX`` and ``NAME_TS``. The code allocates nothing and
+    keeps no state of its own.
 
     With an observer there are ``NAME_observer_reset``, ``NAME_observer_predict`` and
     ``NAME_observer_update`` as well, on a struct ``NAME_observer`` of the caller, and for a
@@ -70,6 +72,10 @@ def c_source(
     known = {"name": name, "NAME": name.upper(), "ts": repr(1.0 / e.fs), **e.sizes}
     known |= {"about": _comment(e.about(name)), "static": e.static, "arrays": list(_arrays(e))}
     known["rest"], known["feedthrough"] = bool(e.x_rest.size), e.feedthrough
+    if e.distance is not None:
+        known["distance"] = True
+        for symbol, size, value in zip("Tt", ("NZ * NZ", "NZ"), e.distance, strict=True):
+            known["arrays"].append(_constant(f"reach_{symbol}", size, value))
     match observer_equations(model, observer):
         case SteadyGain(K=K):
             known["K"] = True

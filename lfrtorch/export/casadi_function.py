@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.optional import imported
 from lfrtorch.engine.nonlinearity import Network, Polynomial
 from lfrtorch.export.equations import (
@@ -58,6 +59,38 @@ def casadi_function(model: Model | LinearModel, name: str = "model") -> Any:
         w = _static(ca, e, ca.mtimes(M.Cz, x) + ca.mtimes(M.Dzu, v))
         x_next, y = x_next + ca.mtimes(M.Bw, w), y + ca.mtimes(M.Dyw, w)
     return ca.Function(name, [x, u], [x_next, y + e.y_offset], ["x", "u"], ["x_next", "y"])
+
+
+def casadi_reach(model: Model, name: str = "model") -> Any:
+    """How far an operating point is from the data of the fit, as a ``casadi.Function``.
+
+    ``NAME_reach`` is (x, u) -> (reach), the square of the surprise index: 99 % of the data are
+    within 1, and beyond the model extrapolates. So ``reach <= 1`` is a smooth constraint.
+
+    Args:
+        model: what ``lfrtorch.identify`` or ``Model.reaching`` returned.
+        name: first part of the function's name.
+
+    Raises:
+        ValueError: a linear model, one whose reach is not known, or as ``casadi_function``.
+
+    Example:
+        >>> reach = lfrtorch.export.casadi_reach(model.reaching(record), "plant")
+        >>> bool(reach(0, 0) < 1)
+        True
+    """
+    ca = imported("casadi", "casadi")
+    check_name(name)
+    e = equations(model)
+    if e.distance is None:
+        raise InputError(
+            "the reach of the data is not known; give model.reaching(records), of an NL-LFR."
+        )
+    x, u = ca.SX.sym("x", e.sizes["nx"]), ca.SX.sym("u", e.sizes["nu"])
+    T, t = e.distance
+    z = ca.mtimes(e.matrices.Cz, x) + ca.mtimes(e.matrices.Dzu, u - e.u_offset)
+    square = ca.sumsqr(ca.mtimes(T, z) - t)
+    return ca.Function(f"{name}_reach", [x, u], [square], ["x", "u"], ["reach"])
 
 
 def casadi_observer(

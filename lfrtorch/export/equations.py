@@ -17,6 +17,7 @@ from torch.nn import Module
 
 from lfrtorch._support.errors import InputError
 from lfrtorch._support.types import Array
+from lfrtorch.data_reach import DataReach
 from lfrtorch.engine.cell import Matrices
 from lfrtorch.engine.nonlinearity import Network, Polynomial, known
 from lfrtorch.engine.operating_point import double, equilibrium
@@ -57,6 +58,7 @@ class Equations:
         weights: of f, by the names of its parameters.
         fs: sampling frequency in Hz.
         inputs, outputs: channel names and units.
+        reach: how far the data of the fit went; None if that is not known.
     """
 
     matrices: Matrices
@@ -68,6 +70,7 @@ class Equations:
     fs: float
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
+    reach: DataReach | None = None
 
     @property
     def arrays(self) -> dict[str, Array]:
@@ -112,31 +115,49 @@ class Equations:
             f"    y      = Cy x + Dyu v{w} + y_offset",
             f"    x_next = A x + Bu v{bw}",
             "",
-            *_signals(place, "u", self.inputs, self.u_offset),
-            *_signals(place, "y", self.outputs, self.y_offset),
+            *_signals(place, "u", self.inputs, self.u_offset, self.reach and self.reach.u),
+            *_signals(place, "y", self.outputs, self.y_offset, self.reach and self.reach.y),
         ]
 
     def description(self, name: str) -> dict[str, Any]:
         """Name, rate, state at rest and channels, for JSON."""
         sides = ("inputs", self.inputs, self.u_offset), ("outputs", self.outputs, self.y_offset)
-        return {
-            "name": name,
-            "fs": self.fs,
-            "states": self.sizes["nx"],
-            "x_rest": self.x_rest.tolist(),
-            **{
-                side: [c._asdict() | {"offset": o} for c, o in zip(channels, offset, strict=True)]
-                for side, channels, offset in sides
-            },
+        ends = {} if self.reach is None else {"inputs": self.reach.u, "outputs": self.reach.y}
+        found: dict[str, Any] = {
+            side: [c._asdict() | {"offset": o} for c, o in zip(channels, offset, strict=True)]
+            for side, channels, offset in sides
         }
+        for side, ranges in ends.items():
+            for channel, (least, most) in zip(found[side], ranges.tolist(), strict=True):
+                channel |= {"least": least, "most": most}
+        known = {"name": name, "fs": self.fs, "states": self.sizes["nx"]}
+        return known | {"x_rest": self.x_rest.tolist(), **found}
+
+    @property
+    def distance(self) -> tuple[Array, Array] | None:
+        """T and t of |T z - t|², the square of the surprise index: 1 is as far as 99 % of the data.
+
+        None if it is not known, or the model is linear.
+        """
+        if self.reach is None or self.static is None:
+            return None
+        T = self.reach.z.axes / self.reach.z.farthest
+        return T, T @ self.reach.z.middle
 
 
-def _signals(place: str, letter: str, channels: Sequence[Channel], offset: Array) -> list[str]:
-    """A line for each channel: its place, name, unit and operating point."""
+def _signals(
+    place: str, letter: str, channels: Sequence[Channel], offset: Array, ends: Array | None
+) -> list[str]:
+    """A line for each channel: its place, name, unit, operating point and range in the data."""
     lines = [
         f"{place.format(letter, i, i + 1)}: {channel}, operating point {number:.6g}"
         for i, (channel, number) in enumerate(zip(channels, offset, strict=True))
     ]
+    if ends is not None:
+        lines = [
+            f"{line}, {low:.6g} to {high:.6g} in the data"
+            for line, (low, high) in zip(lines, ends, strict=True)
+        ]
     return [printable(line) for line in lines]
 
 
@@ -164,6 +185,7 @@ def equations(model: Model | LinearModel, *, own: bool = False) -> Equations:
         fs=model.fs,
         inputs=model.inputs,
         outputs=model.outputs,
+        reach=model.reach,
     )  # fmt: skip
     parts = [*found.matrices, found.u_offset, found.y_offset, *found.weights.values()]
     if not all(np.isfinite(part).all() for part in parts):

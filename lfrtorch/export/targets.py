@@ -14,7 +14,7 @@ from lfrtorch._support.arguments import typed
 from lfrtorch._support.atomic import refuse_existing, whole_file
 from lfrtorch._support.errors import InputError
 from lfrtorch.export.c_source import c_source
-from lfrtorch.export.casadi_function import casadi_function, casadi_observer
+from lfrtorch.export.casadi_function import casadi_function, casadi_observer, casadi_reach
 from lfrtorch.export.control_system import python_source
 from lfrtorch.export.equations import check_name, equations
 from lfrtorch.export.fmu import write_fmu
@@ -35,6 +35,7 @@ class Target(NamedTuple):
         observer: endings of further files with an observer; None if there is no observer.
             ``write`` then takes one.
         follow: what ``use`` is with an observer; {path} is the last file.
+        reach: endings of further files of a model that knows the reach of its data.
     """
 
     endings: tuple[str, ...]
@@ -42,6 +43,7 @@ class Target(NamedTuple):
     use: str
     observer: tuple[str, ...] | None = None
     follow: str = ""
+    reach: tuple[str, ...] = ()
 
     def usage(self, name: str, paths: list[Path], observer: bool | NoiseCovariance) -> str:
         """The line of a program that uses the files, the observer's if there is one."""
@@ -67,11 +69,18 @@ def _casadi(
     model: Model | LinearModel, name: str, paths: list[Path], observer: bool | NoiseCovariance
 ) -> None:
     functions = [casadi_function(model, name)]
+    if isinstance(model, Model) and knows_reach(model):
+        functions.append(casadi_reach(model, name))
     if observer is not False:
         functions += casadi_observer(model, name, observer=observer)
     for function, path in zip(functions, [paths[0], *paths[2:]], strict=True):
         function.save(str(path))
     paths[1].write_text(json.dumps(equations(model).description(name), indent=2) + "\n")
+
+
+def knows_reach(model: Model | LinearModel) -> bool:
+    """Whether a model tells how far the data of its fit went in its static map."""
+    return isinstance(model, Model) and model.reach is not None and model.lfr.cell.nz > 0
 
 
 def _onnx(model: Model | LinearModel, name: str, paths: list[Path]) -> None:
@@ -111,6 +120,7 @@ TARGETS = {
         "x_next, y = casadi.Function.load('{path}')(x, u)",
         ("_predict.casadi", "_correct.casadi", "_update.casadi"),
         "after = casadi.Function.load('{path}')(x=x, u=u, y=y{P})",
+        ("_reach.casadi",),
     ),
     "onnx": Target(
         (".onnx", "_simulate.onnx"),
@@ -198,7 +208,7 @@ def write(
         model = model.to_model() if isinstance(model, LinearModel) else model
         model, observer = model.with_disturbance(disturbance, observer)
     target, given = TARGETS[to], {}
-    endings = target.endings
+    endings = target.endings + (target.reach if knows_reach(model) else ())
     if target.observer is not None:
         given = {"observer": observer}
         endings += () if observer is False else target.observer

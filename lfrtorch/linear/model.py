@@ -86,6 +86,7 @@ class LinearModel:
             after another. Default: not known.
         fit: how the model was found.
         x_offset: state of the nonlinear model that x = 0 stands for, if it is linearised.
+        outside: what the data did not reach of that state and of its input, in words.
 
     Example:
         >>> bla.nx, bla.A.shape, bla.fs
@@ -115,6 +116,7 @@ class LinearModel:
     covariance: Float[Array, "P P"] | None = None
     fit: LinearFit | None = None
     x_offset: Float[Array, " nx"] | None = None
+    outside: str = ""
 
     def __repr__(self) -> str:
         signals = f"{listed(self.inputs)} -> {listed(self.outputs)}"
@@ -127,6 +129,7 @@ class LinearModel:
             ("inputs", levels(self.inputs, self.u_offset)),
             ("outputs", levels(self.outputs, self.y_offset)),
             ("order", f"{self.nx}"),
+            ("outside of the data", self.outside),
             ("fit", fit and f"{fit.criterion} error {number(fit.rmse)} (normalised), {fit.reason}"),
         ]
         system = {"": StateSpace(self.A, self.B, self.C, self.D)}
@@ -392,7 +395,8 @@ class LinearModel:
             True
         """
         description = {
-            "linear": {"fs": self.fs, "fit": None if self.fit is None else asdict(self.fit)},
+            "linear": {"fs": self.fs, "fit": None if self.fit is None else asdict(self.fit)}
+            | ({"outside": self.outside} if self.outside else {}),
             "inputs": [c._asdict() for c in self.inputs],
             "outputs": [c._asdict() for c in self.outputs],
         }
@@ -438,7 +442,9 @@ class LinearModel:
             fs = float(made["fs"])
             if not (np.isfinite(fs) and fs > 0):
                 raise InputError(f"fs is {fs}")
-            return cls(**arrays, fs=fs, inputs=inputs, outputs=outputs, fit=fit)
+            outside = str(made.get("outside", ""))
+            found: dict[str, Any] = {"inputs": inputs, "outputs": outputs, "outside": outside}
+            return cls(**arrays, fs=fs, fit=fit, **found)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"'{folder}' is damaged: its description and weights do not fit ({brief(error)})."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import shutil
 import subprocess
 from pathlib import Path
@@ -22,7 +23,7 @@ from exported import (
     measured_with_gaps,
     some_noise,
 )
-from reference import random_cell, random_model
+from reference import measure, random_cell, random_model
 
 from lfrtorch import InputError, NoiseCovariance
 from lfrtorch._support.types import Array
@@ -151,6 +152,29 @@ def test_observers_are_those_of_the_model(name: str, kind: str, way: str, observ
         if isinstance(expected, ExtendedKalmanFilter):
             U = struct[nx : nx + roots].reshape(nx, nx)
             np.testing.assert_allclose(U @ U.T, expected.covariance, rtol=1e-10, atol=1e-12)
+
+
+@needs_compiler
+@pytest.mark.numeric
+def test_the_reach_is_the_square_of_the_surprise(tmp_path: Path):
+    model = MODELS["tanh"]
+    model = model.reaching(measure(model, 300, seed=1))
+    assert model.reach is not None
+    library = compiled(tmp_path, {"it": model})
+    library.it_reach.restype = ctypes.c_double
+    u, x = inputs(model, 1)[0], np.random.default_rng(4).normal(size=model.lfr.cell.nx)
+    pointers = (a.ctypes.data_as(ctypes.c_void_p) for a in (x, u))
+    v = (u - model.scaler.u_offset) / model.scaler.u_scale
+    z = model.lfr.cell.internal(torch.tensor(v), torch.tensor(x))[0].detach().numpy()
+    expected = float(model.reach.z.surprise(z)) ** 2
+    assert abs(library.it_reach(*pointers) / expected - 1.0) < 1e-9
+    assert "in the data" in (tmp_path / "it.h").read_text()
+    casadi = pytest.importorskip("casadi")
+    write(model, "casadi", tmp_path, name="it")
+    reach = casadi.Function.load(str(tmp_path / "it_reach.casadi"))
+    assert abs(float(reach(x, u)) / expected - 1.0) < 1e-9
+    channels = json.loads((tmp_path / "it_channels.json").read_text())
+    assert channels["inputs"][0]["most"] == model.reach.u[0, 1]
 
 
 @needs_compiler

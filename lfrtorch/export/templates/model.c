@@ -174,6 +174,22 @@ void {{ name }}_jacobians(const double x[NX], const double u[NU], double dx_dx[N
     (void)x, (void)u; /* the model is linear: the same everywhere */
 {% endif %}
 }
+{% if distance %}
+
+double {{ name }}_reach(const double x[NX], const double u[NU])
+{
+    double v[NU], z[NZ] = {0.0}, distance[NZ], square = 0.0;
+    deviation(u, v);
+    add(z, Cz, x, NZ, NX);
+    add(z, Dzu, v, NZ, NU);
+    for (int i = 0; i < NZ; i++)
+        distance[i] = -reach_t[i];
+    add(distance, reach_T, z, NZ, NZ);
+    for (int i = 0; i < NZ; i++)
+        square += distance[i] * distance[i];
+    return square;
+}
+{% endif %}
 {% if K or G %}
 
 void {{ name }}_observer_reset({{ name }}_observer *observer)

@@ -29,6 +29,12 @@ void {{ name }}_jacobians(const double x[{{ NAME }}_NX], const double u[{{ NAME 
     double dx_dx[{{ NAME }}_NX * {{ NAME }}_NX], double dx_du[{{ NAME }}_NX * {{ NAME }}_NU],
     double dy_dx[{{ NAME }}_NY * {{ NAME }}_NX], double dy_du[{{ NAME }}_NY * {{ NAME }}_NU]);
 
+{% if distance %}
+/* How far x and u are from the middle of the data of the fit, squared: 99 % of them are within 1.
+ * Beyond it the model extrapolates. */
+double {{ name }}_reach(const double x[{{ NAME }}_NX], const double u[{{ NAME }}_NU]);
+
+{% endif %}
 {% if K or G %}
 /* An observer: the states of the running system, from its inputs and its outputs. Once a sample
  * call either predict and update, or correct and advance: correct before the input is chosen. */
