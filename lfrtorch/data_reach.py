@@ -25,22 +25,27 @@ class Cloud:
     Args:
         middle: mean.
         axes: axes (z - middle) has unit covariance.
-        farthest: length of that vector which 99 % of the samples do not exceed.
+        ends: the least and the largest entries of that vector: a box of all samples.
+        farthest: its length that 99 % of the samples do not exceed.
 
     Shape:
-        middle: (n,), axes: (n, n).
+        middle: (n,), axes: (n, n), ends: (n, 2).
     """
 
     middle: Float[Array, " n"]
     axes: Float[Array, "n n"]
+    ends: Float[Array, "n 2"]
     farthest: float
 
     @classmethod
     def of(cls, z: Float[Array, "S n"]) -> Cloud:
         """Build it from all samples."""
         middle, axes = z.mean(axis=0), whitening(z)
-        far = float(np.quantile(np.linalg.norm((z - middle) @ axes.T, axis=1), FARTHEST))
-        return cls(middle, axes, far or 1.0)
+        white = (z - middle) @ axes.T
+        far = float(np.quantile(np.linalg.norm(white, axis=1), FARTHEST))
+        return cls(
+            middle, axes, np.stack([white.min(axis=0), white.max(axis=0)], axis=1), far or 1.0
+        )
 
     def surprise(self, z: Float[Array, "*T n"]) -> Float[Array, "*T"]:
         """How far z is from the middle: 1 is as far as 99 % of the samples go."""
@@ -49,7 +54,7 @@ class Cloud:
 
     def turned(self, Z: Float[Array, "n n"]) -> Cloud:
         """Return that of Z z."""
-        return Cloud(Z @ self.middle, self.axes @ np.linalg.inv(Z), self.farthest)
+        return Cloud(Z @ self.middle, self.axes @ np.linalg.inv(Z), self.ends, self.farthest)
 
 
 @dataclass(frozen=True, eq=False)

@@ -772,11 +772,11 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
         static = _made(made, sizes["nz"], sizes["nw"], dtype, static)
         cell = LFRCell(**sizes, static=static, dtype=dtype).to(dtype)
         K = weights.pop("K", None)
-        parts = [f"reach.{name}" for name in ("u", "y", "middle", "axes", "farthest")]
+        parts = [f"reach.{name}" for name in ("u", "y", "middle", "axes", "ends", "farthest")]
         reach = None
         if parts[0] in weights:
-            u_ends, y_ends, middle, axes, far = (weights.pop(name).numpy() for name in parts)
-            reach = DataReach(u_ends, y_ends, Cloud(middle, axes, float(far)))
+            of_u, of_y, middle, axes, ends, far = (weights.pop(name).numpy() for name in parts)
+            reach = DataReach(of_u, of_y, Cloud(middle, axes, ends, float(far)))
         weights.setdefault("state_covariance", torch.eye(cell.nx))  # checkpoints of before
         cell.load_state_dict(weights)
         cell.free_feedthrough(
@@ -797,9 +797,7 @@ def load(folder: str | Path, *, static: Module | None = None) -> Model:
 
 def _flat(reach: DataReach) -> dict[str, Array]:
     """The arrays of a reach, for a checkpoint."""
-    z = reach.z
-    farthest = np.array(z.farthest)
-    return {"u": reach.u, "y": reach.y, "middle": z.middle, "axes": z.axes, "farthest": farthest}
+    return {"u": reach.u, "y": reach.y, **{k: np.asarray(v) for k, v in vars(reach.z).items()}}
 
 
 def _inputs(record: Record) -> Array:

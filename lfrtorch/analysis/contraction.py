@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,19 +19,41 @@ from lfrtorch._support.tables import factor_of, number
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.bounds import amplitudes, reach
 from lfrtorch.analysis.linearisation import levels_of
+from lfrtorch.data_reach import DataReach
 from lfrtorch.engine.activations import FAR
 from lfrtorch.engine.cell import LFRCell
 from lfrtorch.engine.linearised import linearise, spectral_radius
-from lfrtorch.engine.nonlinearity import is_network
+from lfrtorch.engine.nonlinearity import Network, is_network
 from lfrtorch.engine.operating_point import double
 from lfrtorch.engine.simulation import folded
-from lfrtorch.engine.static_enclosure import Enclosure, enclosure, everywhere
-from lfrtorch.least_squares.certificate import SLOWEST, Certificate, Differences, certificate, gain
+from lfrtorch.engine.static_enclosure import (
+    ROUNDING,
+    Enclosure,
+    Interval,
+    enclosure,
+    everywhere,
+    slopes_in,
+)
+from lfrtorch.least_squares.certificate import (
+    SLOWEST,
+    Certificate,
+    Differences,
+    certificate,
+    common_norm,
+    gain,
+)
 from lfrtorch.model import Model
-from lfrtorch.records import Channel
+from lfrtorch.records import Channel, Record
 
 _FARTHEST = 2.0**20
 """Factor of the data's rms to within which the largest amplitude is looked for."""
+
+_HALVINGS, _MORE_CELLS = 6, 20  # of the rate in the region of the data; a solver's call each
+
+_FIRST_CELLS, _LAST_CELLS = 2**12, 2**16  # of that region: of the first grid, and of all
+
+_SLACK = 0.02
+"""So much of 1 - ρ a proof there may lose to the size of its cells."""
 
 _LEAST = 1e-3
 """The rate is looked for between this part of the best possible 1 - ρ and all of it."""
@@ -47,6 +72,8 @@ class Contraction:
             inputs', of all channels together, in physical units; NaN if none was found.
         P: of the norm √(ΔxᵀPΔx), (nx, nx), in the model's coordinates; ``None`` if nothing was
             found.
+        data_rate: ρ as long as z stays in the region of the data, in a norm of its own; NaN if it
+            was not looked for or not found.
         reason: why nothing was found, or where a smaller rate may be.
         inputs, outputs: channel names and units.
 
@@ -63,6 +90,7 @@ class Contraction:
     reason: str
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
+    data_rate: float = math.nan
 
     @property
     def found(self) -> bool:
@@ -71,9 +99,12 @@ class Contraction:
 
     def __str__(self) -> str:
         if not self.found:
-            return f"no proof that the model contracts was found: {self.reason}"
+            lines = [f"no proof that the model contracts was found: {self.reason}"]
+            return "\n".join([*lines, *self._near_data()])
         for_which = "all inputs"
-        if np.isfinite(self.amplitude).all():
+        if np.isnan(self.amplitude).any():
+            for_which = "z in the region of the data"
+        elif np.isfinite(self.amplitude).all():
             for_which = f"inputs within {levels_of(self.inputs, self.amplitude)} of their offsets"
         samples = number(-1.0 / math.log(self.rate)) if self.rate > 0 else "0"
         lines = [
@@ -83,7 +114,13 @@ class Contraction:
         ]
         if math.isfinite(self.gain):
             lines.append(f"Incremental gain: {number(self.gain)}{self._gain_unit()}")
-        return "\n".join([*lines, *filter(None, [self.reason])])
+        return "\n".join([*lines, *filter(None, [self.reason]), *self._near_data()])
+
+    def _near_data(self) -> list[str]:
+        """A line on the rate in the region of the data, if it is another one."""
+        if math.isnan(self.data_rate) or self.data_rate == self.rate:
+            return []
+        return [f"As long as z is in the region of the data, they shrink to {self.data_rate:.6g}."]
 
     def _gain_unit(self) -> str:
         """The unit of the gain, with the channels whose root sums of squares it compares."""
@@ -100,7 +137,12 @@ class Contraction:
 
 
 @typed()
-def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction:
+def contraction(
+    model: Model,
+    records: Record | Sequence[Record] | None = None,
+    *,
+    amplitude: ArrayLike | None = None,
+) -> Contraction:
     """A proof that a model contracts, with its rate and gain, or why there is none.
 
     Under the same input, the difference of any two states shrinks to ``rate`` times its size or
@@ -112,9 +154,14 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
     ``bound`` proves, and the states those that such inputs reach from x = 0. Rate and gain may be
     far smaller then than for all inputs, however loud.
 
+    For the data of records the slopes are those in the smallest box, along the axes of its cloud,
+    that holds z of the simulations; then the proof is for trajectories whose z stay there. A model
+    that knows its data (``model.reach``) is told this rate, ``data_rate``, in any case.
+
     Args:
         model: with a network of any activation, or linear. With an amplitude, A must be stable, and
             the network of tanh, sigmoid or rbf.
+        records: whose region is asked for. Default: none.
         amplitude: of the inputs, largest |u - offset|, physical units. Default: all inputs, or, if
             nothing is found for them, the largest amplitude for which something is.
 
@@ -123,7 +170,8 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
 
     Raises:
         ValueError: a map whose slopes are not known to be bounded, an amplitude for a model that
-            ``bound`` refuses, or the package clarabel is missing: ``lfrtorch[certificate]``.
+            ``bound`` refuses, records and an amplitude, or the package clarabel is missing:
+            ``lfrtorch[certificate]``.
 
     Example:
         >>> contraction = lfrtorch.analysis.contraction(model)
@@ -131,6 +179,8 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
         True
         >>> nearby = lfrtorch.analysis.contraction(model, amplitude=0.1)
         >>> nearby.found
+        True
+        >>> lfrtorch.analysis.contraction(model, record).data_rate <= contraction.rate
         True
     """
     cell = folded(double(model.lfr.cell))
@@ -140,7 +190,18 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
             f"the static map is a {type(static).__name__}, whose slopes are not known to be "
             "bounded; a certificate needs a network, or no map."
         )
-    scale = model.scaler.u_scale
+    scale, channels = model.scaler.u_scale, (model.inputs, model.outputs)
+    if records is not None:
+        if amplitude is not None:
+            raise InputError("records and amplitude are two regions; give one of them.")
+        model = model.reaching(records)
+    in_data = _in_data(cell, model.reach)
+    if records is not None:
+        unknown = np.full(cell.nu, math.nan)
+        if isinstance(in_data, str):
+            return Contraction(0.0 * scale, math.nan, math.nan, None, in_data, *channels)
+        return Contraction(unknown, in_data.rate, math.nan, in_data.P, "", *channels, in_data.rate)
+    data_rate = math.nan if isinstance(in_data, str) else in_data.rate
     if amplitude is not None:
         size = amplitudes(amplitude, cell.nu)
         proof = _proof(cell, _slopes_within(cell, size / scale))
@@ -153,7 +214,7 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
             size = size * scale
     if isinstance(proof, str):
         nothing = 0.0 * scale
-        return Contraction(nothing, math.nan, math.nan, None, proof, model.inputs, model.outputs)
+        return Contraction(nothing, math.nan, math.nan, None, proof, *channels, data_rate)
     system, found = proof
     rate, found = _fastest(system, found)
     y = model.scaler.y_scale[:, None]
@@ -167,12 +228,112 @@ def contraction(model: Model, amplitude: ArrayLike | None = None) -> Contraction
     # It takes more than twice as long to forget as the spectral radius allows.
     slow = np.isinf(size).all() and rate**2 > _radius(system)
     hint = ""
-    if slow and static is not None:
+    if slow and static is not None and math.isnan(data_rate):
         hint = (
             "For inputs of an amplitude the rate may be far smaller: "
             "contraction(model, amplitude=...)."
         )
-    return Contraction(size, rate, proven, found.P, hint, model.inputs, model.outputs)
+    return Contraction(size, rate, proven, found.P, hint, *channels, data_rate)
+
+
+class _Norm(NamedTuple):
+    """A norm, and the rate to which it shrinks."""
+
+    P: Float[Array, "nx nx"]
+    rate: float
+
+
+def _in_data(cell: LFRCell, reach: DataReach | None) -> _Norm | str:
+    """The best norm for z in the box of the data, or why there is none."""
+    # The mean slope between two z in the box is a mean of slopes in its cells, so that a norm which
+    # shrinks in all cells shrinks between the two.
+    if not is_network(cell.static):
+        proof = _proof(cell, None)
+        return proof if isinstance(proof, str) else _Norm(proof[1].P, _fastest(*proof)[0])
+    if reach is None:
+        return "the reach of the data is not known."
+    static, T = deepcopy(cell.static), reach.z.axes
+    with torch.no_grad():
+        static.bz.add_(static.Wz @ torch.as_tensor(reach.z.middle))
+        static.Wz.copy_(static.Wz @ torch.linalg.inv(torch.as_tensor(T)))
+    box = _Box(cell, static, T, Interval(*reach.z.ends.T))
+    J = slopes_in(static, box.grid()).middle
+    A = box.A(J)
+    radii = np.abs(np.linalg.eigvals(A)).max(axis=1)
+    steepest = float(radii.max())
+    if steepest >= 1.0:
+        return (
+            f"linearised in the region of the data it has an eigenvalue of modulus {steepest:.4g}, "
+            "so that no norm shrinks there."
+        )
+    # The solver sees a few cells, and then those that it was wrong about.
+    entries = J.reshape(len(A), -1)
+    used = {int(radii.argmax()), *entries.argmin(axis=0), *entries.argmax(axis=0)}
+    best: _Norm | None = None
+    low, high = steepest, 1.0
+    for _ in range(_HALVINGS):
+        tried, P = (low + high) / 2, None
+        for _ in range(_MORE_CELLS):
+            P = common_norm(A[sorted(used)], tried)
+            if P is None:
+                break
+            norms = _norms(P, A)
+            if norms.max() <= tried * (1.0 + ROUNDING):
+                break
+            used.add(int(norms.argmax()))
+        low, high = (tried, high) if P is None else (low, tried)
+        rate = 1.0 if P is None else box.rate(P)
+        if P is not None and rate < (1.0 if best is None else best.rate):
+            best = _Norm(P, rate)
+    return best or "no norm was found that shrinks for all slopes in the region of the data."
+
+
+def _norms(P: Float[Array, "nx nx"], A: Float[Array, "C nx nx"]) -> Float[Array, " C"]:
+    """|A| in the norm of P."""
+    L = np.linalg.cholesky(P).T
+    return np.linalg.norm(L @ A @ np.linalg.inv(L), 2, axis=(1, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """A box of T z, with the network of it."""
+
+    cell: LFRCell
+    static: Network
+    T: Float[Array, "nz nz"]
+    ends: Interval
+
+    def grid(self) -> Interval:
+        """Some cells of the box."""
+        cells = Interval(self.ends.low[None], self.ends.high[None])
+        while 2 ** cells.low.shape[1] * len(cells.low) <= _FIRST_CELLS:
+            cells = cells.parts()
+        return cells
+
+    def A(self, J: Float[Array, "C nw nz"]) -> Float[Array, "C nx nx"]:
+        """∂x+/∂x for slopes of the network."""
+        M = self.cell.matrices()
+        return M.A + M.Bw @ J @ self.T @ M.Cz
+
+    def rate(self, P: Float[Array, "nx nx"]) -> float:
+        """What the norm of P shrinks to, proven: cells are halved where that is not known well."""
+        L = np.linalg.cholesky(P).T
+        M = self.cell.matrices()
+        left, right = np.abs(L @ M.Bw), np.abs(self.T @ M.Cz @ np.linalg.inv(L))
+        cells, proven, count = self.grid(), 0.0, 0
+        while len(cells.low):
+            J = slopes_in(self.static, cells)
+            norms = _norms(P, self.A(J.middle))
+            rates = norms + np.linalg.norm(left @ J.radius @ right, 2, axis=(1, 2)) + ROUNDING
+            count += len(rates)
+            # Where the cells' middles show that no better rate is true, none is looked for.
+            goal = max(proven, float(norms.max()) + _SLACK * (1.0 - float(norms.max())))
+            open_ = rates > goal
+            if count > _LAST_CELLS:
+                return max(proven, float(rates.max()))
+            proven = max(proven, float(rates[~open_].max(initial=0.0)))
+            cells = Interval(cells.low[open_], cells.high[open_]).parts()
+        return proven
 
 
 _Proof = tuple[Differences, Certificate]

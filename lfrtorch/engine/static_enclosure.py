@@ -12,6 +12,7 @@ References:
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -44,6 +45,13 @@ class Interval(NamedTuple):
     def middle(self) -> Array:
         """(low + high) / 2."""
         return (self.low + self.high) / 2
+
+    def parts(self) -> Interval:
+        """Halves along each axis: 2ⁿ cells of each of the cells (C, n)."""
+        n = self.low.shape[1]
+        upper = np.array(list(itertools.product((False, True), repeat=n)))[:, None]
+        low = np.where(upper, self.middle, self.low).reshape(-1, n)
+        return Interval(low, np.where(upper, self.high, self.middle).reshape(-1, n))
 
     @property
     def radius(self) -> Array:
@@ -99,8 +107,7 @@ def enclosure(
     centres = cells.middle
     v = Interval(inside.low + bz, inside.high + bz)
     slopes = _range(sigma.slopes, sigma.slope_extremes, v)
-    # J = Ww diag(slopes) Wz: an entry is a sum over the neurons.
-    J = _transposed(_product(Ww, _transposed(_scaled(Wz, slopes))))
+    J = _jacobians(Wz, Ww, slopes)
     w = _product(Ww, _range(sigma.values, sigma.extremes, v))
     linear = _product(K, cells)
     w = Interval(w.low + bw - linear.high, w.high + bw - linear.low)
@@ -110,6 +117,19 @@ def enclosure(
     at = sigma.values(centres @ Wz.T + bz) @ Ww.T + bw - centres @ K.T
     w = w.within(Interval(at - reach, at + reach))
     return Enclosure(_hull(w).wider(), _hull(J).wider(), _hull(slopes).wider(), centres)
+
+
+def slopes_in(static: Network, cells: Interval) -> Interval:
+    """What ∂w/∂z (C, nw, nz) cannot leave in each cell (C, nz)."""
+    Wz, bz, Ww = (to_float64(p) for p in (static.Wz, static.bz, static.Ww))
+    inside = _product(Wz, cells)
+    v = Interval(inside.low + bz, inside.high + bz)
+    return _jacobians(Wz, Ww, _range(static.sigma.slopes, static.sigma.slope_extremes, v)).wider()
+
+
+def _jacobians(Wz: Float[Array, "nn nz"], Ww: Float[Array, "nw nn"], slopes: Interval) -> Interval:
+    """J = Ww diag(slopes) Wz: an entry is a sum over the neurons."""
+    return _transposed(_product(Ww, _transposed(_scaled(Wz, slopes))))
 
 
 def _product(M: Float[Array, "m k"], x: Interval) -> Interval:

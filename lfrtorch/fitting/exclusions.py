@@ -21,7 +21,7 @@ class Exclusion(NamedTuple):
     Args:
         first, second: their names.
         reason: why a fit cannot have both.
-        values: of the first, if the others of its values go with the second.
+        values: of the first, or their types, if the others of its values go with the second.
     """
 
     first: str
@@ -34,7 +34,9 @@ class Exclusion(NamedTuple):
         if not {self.first, self.second} <= {*given}:
             return False
         first, second = given[self.first], given[self.second]
-        apart = first in self.values if self.values else first != USUAL[self.first]
+        apart = first != USUAL[self.first]
+        if self.values:
+            apart = first in self.values or type(first) in self.values
         return bool(apart and second != USUAL[self.second])
 
 
@@ -47,8 +49,8 @@ EXCLUSIONS = (
     Exclusion("distil", "noise", "the mean of predictors is not distilled"),
     Exclusion("guarantee", "noise", "it holds for the predictor, and the model could run away"),
     Exclusion("integrators", "noise", "a predictor has no exact integrators"),
-    Exclusion("guarantee", "integrators", "no integrator contracts", ("contracting",)),
-    Exclusion("guarantee", "static", "only slopes of networks are bounded", ("contracting",)),
+    Exclusion("guarantee", "integrators", "no integrator contracts", ("contracting", float)),
+    Exclusion("guarantee", "static", "only slopes of networks are bounded", ("contracting", float)),
     Exclusion("first_part", "average", "the first iterations keep one start"),
     Exclusion("structure", "average", "a mean of models does not keep their structure"),
     Exclusion("structure", "noise", "a predictor does not keep the structure"),

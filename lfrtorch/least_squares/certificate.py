@@ -72,6 +72,13 @@ class Differences:
     neurons: bool = False
 
     @classmethod
+    def free(cls, A: Float[Array, "nx nx"]) -> Differences:
+        """x+ = A x alone."""
+        n, none = len(A), np.zeros((0, 0))
+        right, below = np.zeros((n, 0)), np.zeros((0, n))
+        return cls(A, right, below, right, none, below, none, none)
+
+    @classmethod
     def by_entry(cls, cell: LFRCell, J: Interval) -> Differences:
         """Each entry of J = ∂w/∂z is anywhere in its interval."""
         i, j = np.nonzero(J.radius)
@@ -166,11 +173,33 @@ def margin(system: Differences, rate: float) -> Margin | None:
     F += [inequality(system, np.zeros((nx, nx)), e, rate) for e in np.eye(q)]
     F.append(np.eye(nx + q))
     trace = np.array([*(np.trace(E) for E in basis), *np.zeros(q + 1)]) / nx
-    solved = _solved(np.array(F), 0.0 * F[-1], len(F) - 1, -1.0, trace)
+    solved = _solved([np.array(F)], [0.0 * F[-1]], len(F) - 1, -1.0, trace)
     if solved is None:
         return None
     found, Z = solved
     return Margin(float(found[-1]), *_unpacked(found, nx, q), Z)
+
+
+def common_norm(A: Float[Array, "S nx nx"], rate: float) -> Float[Array, "nx nx"] | None:
+    """P of a norm that shrinks to the rate or less in a step by each of several A; None if none.
+
+    It is the solver's word: whoever asks checks.
+    """
+    nx = A.shape[-1]
+    moved = prepared(Differences.free(A.mean(axis=0)), rate)
+    if moved is None:
+        return None
+    L, basis, one = moved[1], _symmetric(nx), np.eye(nx)
+    F = [
+        np.array([*(M.T @ E @ M - rate**2 * E for E in basis), one])
+        for M in L @ A @ np.linalg.inv(L)
+    ]
+    F.append(np.array([*(-E for E in basis), 1e-6 * one]))
+    trace = np.array([*(np.trace(E) for E in basis), 0.0]) / nx
+    solved = _solved(F, [np.zeros((nx, nx))] * len(F), len(basis), -1.0, trace)
+    if solved is None or not solved[0][-1] > 0:
+        return None
+    return returned(np.einsum("k,kij->ij", solved[0][:-1], basis), np.empty(0), L, np.empty(0)).P
 
 
 def certificate(system: Differences, rate: float) -> Certificate | None:
@@ -208,7 +237,7 @@ def gain(system: Differences) -> float | None:
     F.append(inequality(x, zero, none, gain=1.0) - constant)
     for slack in (1e-6, 1e-4, 1e-2):
         shifted = constant + slack * np.eye(len(constant))
-        solved = _solved(np.array(F), shifted, len(F) - 1, 1.0)
+        solved = _solved([np.array(F)], [shifted], len(F) - 1, 1.0)
         if solved is not None and solved[0][-1] > 0:
             value = float(np.sqrt(solved[0][-1]))
             found = returned(*_unpacked(solved[0], nx, q), L, s)
@@ -307,19 +336,20 @@ def _symmetric(n: int) -> Float[Array, "k n n"]:
 
 
 def _solved(
-    F: Float[Array, "k n n"],
-    constant: Float[Array, "n n"],
+    F: Sequence[Float[Array, "k n n"]],
+    constants: Sequence[Float[Array, "n n"]],
     objective: int,
     weight: float,
     trace: Array | None = None,  # trace · ξ = 1
 ) -> tuple[Array, Array] | None:
-    """ξ of min weight ξ_objective with constant + Σ ξ_k F_k <= 0, and the multiplier."""
+    """ξ of min weight ξ_objective with all constant + Σ ξ_k F_k <= 0, and the last's multiplier."""
     clarabel: Any = imported("clarabel", "certificate")
-    n, count = F.shape[-1], len(F)
+    n, count = F[0].shape[-1], len(F[0])
     j, i = np.tril_indices(n)  # the upper triangle, column by column
     weights = np.where(i == j, 1.0, np.sqrt(2.0))
-    rows, right = (F[:, i, j] * weights).T, -constant[i, j] * weights
-    cones = [clarabel.PSDTriangleConeT(n)]
+    rows = np.vstack([(each[:, i, j] * weights).T for each in F])
+    right = np.concatenate([-constant[i, j] * weights for constant in constants])
+    cones = [clarabel.PSDTriangleConeT(n)] * len(F)
     if trace is not None:
         rows, right = np.vstack([trace, rows]), np.concatenate([[1.0], right])
         cones.insert(0, clarabel.ZeroConeT(1))

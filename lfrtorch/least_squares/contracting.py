@@ -45,14 +45,15 @@ KEPT = 0.1
 
 
 class Contracting:
-    """A guarantee: every model has a certificate."""
+    """A guarantee: every model has a certificate of a rate, by default one below 1."""
 
-    def __init__(self, cell: LFRCell) -> None:
+    def __init__(self, cell: LFRCell, rate: float = SLOWEST) -> None:
         if not is_network(cell.static):
             raise InputError(
                 "guarantee=contracting needs a network as the static map, whose slopes are "
                 f"bounded, not a {type(cell.static).__name__}."
             )
+        self._rate = rate
         self._cell = deepcopy(cell).to(device="cpu", dtype=torch.float64)
         self._free = [p for p in self._cell.parameters() if p.requires_grad]
         self._size = sum(p.numel() for p in self._free)
@@ -61,7 +62,7 @@ class Contracting:
         if self._found is None:
             raise InputError(
                 "guarantee=contracting needs a start that is proven to contract: init=zero_output, "
-                "a linear model with its poles inside the unit circle, and no integrators."
+                f"a linear model with poles within {rate:.6g}, and no integrators."
             )
 
     @property
@@ -86,10 +87,10 @@ class Contracting:
         systems = self._systems(theta)
         if known is not None:
             for system in systems:
-                if holds(system, known[1], SLOWEST):
+                if holds(system, known[1], self._rate):
                     return system, known[1]
         for system in systems:
-            found = certificate(system, SLOWEST)
+            found = certificate(system, self._rate)
             if found is not None:
                 return system, found
         return None
@@ -117,10 +118,10 @@ class Contracting:
             return system
         self._found = found
         own = found[0]
-        moved = prepared(own, SLOWEST)
+        moved = prepared(own, self._rate)
         assert moved is not None
         x, L, s = moved
-        start = margin(x, SLOWEST)
+        start = margin(x, self._rate)
         if start is None or not own.C.size:
             return system
 
@@ -128,7 +129,7 @@ class Contracting:
             """t after a step."""
             for there in self._systems(self._last + step.detach().cpu().double()):
                 if there.neurons == own.neurons and there.B.shape == own.B.shape:
-                    found = margin(there.moved(L, s)[0], SLOWEST)
+                    found = margin(there.moved(L, s)[0], self._rate)
                     return -np.inf if found is None else found.t
             return -np.inf
 

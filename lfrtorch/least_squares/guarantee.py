@@ -14,9 +14,9 @@ from lfrtorch.least_squares.exact_integrators import integrating_states
 from lfrtorch.least_squares.linear_systems import System
 from lfrtorch.least_squares.stable_states import Stable
 
-Name = Literal["stable", "contracting"]
+Name = Literal["stable", "contracting"] | float
 """``"stable"``: A's eigenvalues stay within the unit circle. ``"contracting"``: every model is
-proven to contract."""
+proven to contract, and a number to contract by that rate."""
 
 
 class Guarantee(Protocol):
@@ -35,5 +35,7 @@ def guarantee_of(name: Name | None, cell: LFRCell, samples: int, ranks: Ranks) -
     """The guarantee of a name; None if there is none, or nothing that could break it."""
     if name == "contracting":
         return Contracting(cell)
+    if isinstance(name, float):
+        return Contracting(cell, name)
     moves = cell.A.requires_grad and not integrating_states(cell).all()
     return Stable(cell, samples, ranks) if name == "stable" and moves else None

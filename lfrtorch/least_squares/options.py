@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from lfrtorch._support.errors import InputError
 from lfrtorch._support.settings import check_settings, setting
 
 _GUARANTEE: Any = setting(
@@ -13,8 +14,15 @@ _GUARANTEE: Any = setting(
     "circle, so that no bounded input makes a model with a bounded static map run away; if "
     "they are not inside at the start, they stay within the circle that they are in. "
     '``"contracting"``: the model is proven to contract, for all inputs, see '
-    "``lfrtorch.analysis.contraction``; the start must be. Default: nothing.",
+    "``lfrtorch.analysis.contraction``; the start must be. A number below 1, as 0.98: it is proven "
+    "to contract by that rate. Default: nothing.",
 )  # the field of both searches
+
+
+def _check_guarantee(given: object) -> None:
+    """Refuse a rate that is none."""
+    if isinstance(given, int | float) and not 0.0 < given < 1.0:
+        raise InputError(f"guarantee is {given!r}; give a rate above 0 and below 1, or a name.")
 
 
 @dataclass(frozen=True)
@@ -62,10 +70,11 @@ class LevenbergMarquardtOptions:
         "or more it does not.",
         positive=True,
     )
-    guarantee: Literal["stable", "contracting"] | None = _GUARANTEE
+    guarantee: Literal["stable", "contracting"] | float | None = _GUARANTEE
 
     def __post_init__(self) -> None:
         check_settings(self)
+        _check_guarantee(self.guarantee)
 
 
 @dataclass(frozen=True)
@@ -74,7 +83,8 @@ class AdamOptions:
 
     max_iter: int = setting(2000, "most steps; each sees all the data.", least=0)
     learning_rate: float = setting(1e-3, "step size, in normalised units.", positive=True)
-    guarantee: Literal["stable", "contracting"] | None = _GUARANTEE
+    guarantee: Literal["stable", "contracting"] | float | None = _GUARANTEE
 
     def __post_init__(self) -> None:
         check_settings(self)
+        _check_guarantee(self.guarantee)

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from reference import frf, polynomial_cell, random_cell, random_model
+from reference import frf, measure, polynomial_cell, random_cell, random_model
 
 from lfrtorch import Channel, analysis
 from lfrtorch._support.types import Array
 from lfrtorch.analysis.contraction import Contraction
 from lfrtorch.engine.nonlinearity import Network
 from lfrtorch.model import Model
+from lfrtorch.records import Record
 
 pytestmark = pytest.mark.numeric
 
@@ -104,13 +105,66 @@ def test_what_is_printed_says_how_far_in_which_units():
     assert "of their size or less in every sample, to 1/e in 99." in said[1]
     assert said[2].endswith(" mm/N")
     assert "contraction(model, amplitude=...)" in said[3]
-    assert "amplitude=" not in str(analysis.contraction(scalar(0.0, Ww=0.99), 0.5))
+    assert "amplitude=" not in str(analysis.contraction(scalar(0.0, Ww=0.99), amplitude=0.5))
     assert "amplitude=" not in str(analysis.contraction(scalar(0.5, Ww=0.25)))
     model = random_model(random_cell(2, 2, 2, 1, 1, 3))
     assert str(analysis.contraction(model)).endswith(" mm/N, of all channels together")
     mixed = replace(model, outputs=(Channel("y1", "mm"), Channel("y2")))
     said = str(analysis.contraction(mixed))
     assert said.endswith(", of all outputs together (mm, 1) over all inputs (N)")
+
+
+def test_the_region_of_the_data_has_a_proof_of_its_own():
+    """x+ = 0.5 x + 0.8 tanh(x) + u has a slope of 1.3 at 0, and less than 1 from |x| = 0.71 on."""
+    model = scalar(0.5, Ww=0.8)
+    v = 3.0 + 0.2 * np.random.default_rng(0).normal(size=400)
+    u = model.scaler.u_offset + model.scaler.u_scale * v[:, None]
+    away = Record(
+        u, model.simulate(u, start="given", x0=[6.0]), fs=model.fs,
+        inputs=model.inputs, outputs=model.outputs, start="given", x0=np.array([6.0]),
+    )  # fmt: skip
+    z = model.signals(away).z[0].numpy()
+    steepest = 0.5 + 0.8 / np.cosh(np.abs(z).min()) ** 2
+    contraction = analysis.contraction(model, away)
+    assert steepest <= contraction.rate <= steepest + 0.03 * (1 - steepest)
+    assert "for z in the region of the data" in str(contraction)
+    near = analysis.contraction(model, measure(model, 400))  # about 0
+    assert not near.found
+    assert "in the region of the data it has an eigenvalue of modulus 1.3" in near.reason
+    # A model that knows its data says it beside the rate for all inputs, or beside none.
+    known = analysis.contraction(model.reaching(away))
+    assert not known.found
+    assert known.data_rate == pytest.approx(contraction.rate)
+    assert "As long as z is in the region of the data" in str(known)
+    with pytest.raises(ValueError, match="records and amplitude are two regions"):
+        analysis.contraction(model, away, amplitude=0.1)
+
+
+@pytest.mark.parametrize("sizes", [{}, {"nz": 2, "nw": 2, "nn": 6}, {"nx": 2, "nz": 3, "nw": 2}])
+def test_differences_in_the_region_shrink_by_its_rate(sizes: dict[str, Any]):
+    default: dict[str, Any] = {"feedback": 0.3, "radius": 0.65}
+    model = random_model(random_cell(**default | sizes))
+    record = measure(model, 300)
+    contraction = analysis.contraction(model, record)
+    everywhere = analysis.contraction(model).rate
+    assert 1.0 - contraction.rate > 0.95 * (1.0 - everywhere)  # as far as it is looked for
+    assert contraction.P is not None
+    x = model.signals(record).x[0, :-1].double()
+    v = torch.as_tensor(model.scaler.normalise_u(record.u))
+    # Any two states of the record, under the input of the first: both z stay in its box.
+    other = x[torch.randperm(len(x), generator=torch.Generator().manual_seed(0))]
+    with torch.no_grad():
+        z = [model.lfr.cell.internal(v, state)[0].numpy() for state in (x, other)]
+        moved = [model.lfr.cell(v, state)[1] for state in (x, other)]
+    reach = model.reaching(record).reach
+    assert reach is not None
+    white = [(each - reach.z.middle) @ reach.z.axes.T for each in z]
+    low, high = reach.z.ends.T
+    inside = np.all([((low <= w) & (w <= high)).all(axis=1) for w in white], axis=0)
+    assert inside.sum() > 50
+    L = torch.as_tensor(np.linalg.cholesky(contraction.P))
+    before, after = (torch.linalg.norm((a - b) @ L, dim=1).numpy() for a, b in ((x, other), moved))
+    assert (after <= contraction.rate * (1 + 1e-9) * before)[inside].all()
 
 
 def test_two_rests_have_no_certificate():
@@ -136,8 +190,8 @@ def test_the_largest_amplitude_is_found_where_there_is_one():
     distance = differences(model, contraction, size, start=0.01, T=30)
     bound = contraction.rate ** np.arange(distance.shape[1])
     assert (distance <= 1.000001 * bound * distance[:, :1] + 1e-12).all()
-    assert analysis.contraction(model, 0.5 * size).rate < contraction.rate
-    louder = analysis.contraction(model, 1.1 * leads)
+    assert analysis.contraction(model, amplitude=0.5 * size).rate < contraction.rate
+    louder = analysis.contraction(model, amplitude=1.1 * leads)
     assert not louder.found
     assert "eigenvalue of modulus 1." in louder.reason
 
@@ -147,7 +201,7 @@ def test_without_a_bound_of_z_there_is_none_for_an_amplitude():
     assert "eigenvalue of modulus 1.1, so that no norm shrinks there" in contraction.reason
     assert "Nor is there one for an amplitude: A is not stable" in contraction.reason
     with pytest.raises(ValueError, match="A is not stable"):
-        analysis.contraction(scalar(1.1, Ww=-0.5), 0.1)
+        analysis.contraction(scalar(1.1, Ww=-0.5), amplitude=0.1)
 
 
 def test_what_is_not_known_is_refused(monkeypatch: pytest.MonkeyPatch):

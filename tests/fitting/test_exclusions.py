@@ -28,7 +28,7 @@ OTHERS: dict[str, tuple[Any, ...]] = {
 PAIRS = [
     (row, {row.first: first, row.second: second})
     for row in EXCLUSIONS
-    for first in row.values or OTHERS[row.first]
+    for first in (0.9 if value is float else value for value in row.values or OTHERS[row.first])
     for second in OTHERS[row.second]
 ]
 """Every row with every pair of values that it excludes."""

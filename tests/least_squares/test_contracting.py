@@ -116,3 +116,20 @@ def test_a_start_without_a_certificate_is_refused():
     trainer = LevenbergMarquardt(guarantee="contracting")
     with pytest.raises(ValueError, match=r"needs a network .* not a Polynomial"):
         fit(polynomial, measure(polynomial, 50), trainer=trainer)
+
+
+def test_a_rate_that_is_asked_for_is_kept():
+    model, record = bistable()
+    for rate in (0.97, 0.8):
+        trainer = LevenbergMarquardt(max_iter=6, guarantee=rate)
+        result = fit(model, record, trainer=trainer, monitors=[])
+        assert result.history[-1].train < result.history[0].train
+        Contracting(result.model.lfr.cell, rate)  # refuses a model without a certificate
+        with pytest.raises(ValueError, match="that is proven to contract"):
+            Contracting(result.model.lfr.cell, 0.4)
+        model, record = bistable()
+    with pytest.raises(ValueError, match=r"poles within 0\.4"):
+        Problem.of(model, record, guarantee=0.4)  # the start has 0.5
+    for wrong in (1.0, -0.5, 1):
+        with pytest.raises(ValueError, match=r"guarantee is .* a rate above 0 and below 1"):
+            LevenbergMarquardt(guarantee=wrong)

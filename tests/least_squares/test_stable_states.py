@@ -179,6 +179,6 @@ def test_a_start_that_is_not_stable_stays_within_its_own_circle():
     assert float(problem.admissible(theta)[0]) == pytest.approx(1.01)
 
 
-def test_a_guarantee_is_one_of_two():
-    with pytest.raises(ValueError, match="guarantee is 'yes'; give 'stable', 'contracting' or"):
+def test_a_guarantee_has_a_name_or_a_rate():
+    with pytest.raises(ValueError, match="guarantee is 'yes'; give 'stable', 'contracting',"):
         LevenbergMarquardt(guarantee="yes")  # pyright: ignore[reportArgumentType]
