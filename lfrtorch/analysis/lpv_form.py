@@ -8,7 +8,8 @@ parameters of the form are bounded.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,7 @@ from lfrtorch.engine.nonlinearity import Network, Polynomial, is_network, known
 from lfrtorch.engine.operating_point import double, equilibrium
 from lfrtorch.engine.simulation import folded
 from lfrtorch.model import Model
+from lfrtorch.records import Record, as_records
 
 _ROUNDING = 1e-14
 """Error of f(z) - f(z0), relative to both, that is one of rounding."""
@@ -53,6 +55,7 @@ class LPV:
             output there.
         Cz, Dzu: z - z0 = Cz (x - x0) + Dzu (u - u0).
         slopes: z - z0 -> p.
+        model: that it is the form of.
 
     Example:
         >>> form = lfrtorch.analysis.lpv(model)
@@ -73,6 +76,7 @@ class LPV:
     Cz: Float[Array, "nz nx"]
     Dzu: Float[Array, "nz nu"]
     slopes: Slopes
+    model: Model
 
     def scheduling(
         self, x: Float[Array, "*axes nx"], u: Float[Array, "*axes nu"]
@@ -81,6 +85,37 @@ class LPV:
         zeta = (x - self.x0) @ self.Cz.T + (u - self.u0) @ self.Dzu.T
         points = zeta.reshape(int(np.prod(zeta.shape[:-1])), len(self.Cz))
         return self.slopes(points).reshape(*zeta.shape[:-1], len(self.bounds))
+
+    def seen(self, records: Record | Sequence[Record]) -> Float[Array, "V P"]:
+        """Corners of a box that holds all p of the model's simulations of records.
+
+        The box lies along the axes of p or along the principal ones of their cloud, whichever is
+        smaller. The matrices at its corners, ``form.at(p)``, are the vertices of a polytope for
+        controllers and proofs in the region of the data; directions in which p do not move have no
+        corners.
+
+        Example:
+            >>> form = lfrtorch.analysis.lpv(model, schedule="map")
+            >>> corners = form.seen(record)
+            >>> p = form.scheduling(model.signals(record).x[0, :-1].numpy(), record.u)
+            >>> corners.shape, bool((p >= corners.min(axis=0) - 1e-9).all())
+            ((2, 1), True)
+        """
+        p = np.concatenate([
+            self.scheduling(self.model.signals(one).x[0, :-1].double().numpy(), one.u)
+            for one in as_records(records)
+        ])  # fmt: skip
+        middle = p.mean(axis=0)
+        principal = np.linalg.svd(p - middle, full_matrices=False)[2]
+        boxes = []
+        for axes in (np.eye(p.shape[1]), principal):
+            along = (p - middle) @ axes.T
+            ends = np.stack([along.min(axis=0), along.max(axis=0)])
+            width = ends[1] - ends[0]
+            moves = width > 1e-9 * width.max(initial=0.0)
+            corners = np.array(list(itertools.product(*ends[:, moves].T)))
+            boxes.append((moves.sum(), np.log(width[moves]).sum(), middle + corners @ axes[moves]))
+        return min(boxes, key=lambda box: box[:2])[2]
 
     def at(self, p: Float[Array, " P"]) -> tuple[Array, Array, Array, Array]:
         """A(p), B(p), C(p) and D(p)."""
@@ -196,6 +231,7 @@ def lpv(
         affine(scale * Cy, scale * Dyw, Cz),
         affine(scale * Dyu / s.u_scale, scale * Dyw, Dzu),
         bounds, schedule, x0.numpy(), np.array(u0), x_next0, s.restore_y(y0), Cz, Dzu, slopes,
+        model,
     )  # fmt: skip
 
 

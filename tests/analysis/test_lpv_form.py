@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from exported import MODELS, check_run, check_step, inputs
-from reference import SIGMA, random_cell, random_model
+from reference import SIGMA, measure, random_cell, random_model
 from torch import Tensor
 
 import lfrtorch
@@ -81,3 +81,25 @@ def test_what_cannot_be_scheduled_is_refused():
         lpv(MODELS["tanh"], schedule="state")
     with pytest.raises(lfrtorch.InputError, match="give \\(samples, 2\\)"):
         lpv(MODELS["tanh"]).simulate(np.zeros((5, 3)))
+
+
+@pytest.mark.numeric
+@pytest.mark.parametrize("name", ["softplus", "polynomial", "canonical", "smallest"])
+def test_what_is_seen_lies_within_the_corners(name: str):
+    model = MODELS[name]
+    records = [measure(model, 200, seed=seed) for seed in (1, 2)]
+    form = lpv(model, schedule="map")
+    corners = form.seen(records)
+    for record in records:
+        p = form.scheduling(model.signals(record).x[0, :-1].numpy(), record.u)
+        # In the frame of the corners about the first one, all p are between 0 and 1.
+        edges = corners[[2**i for i in range(int(np.log2(len(corners))))]] - corners[0]
+        along = np.linalg.lstsq(edges.T, (p - corners[0]).T, rcond=None)[0]
+        assert along.min() > -1e-6
+        assert along.max() < 1.0 + 1e-6
+        np.testing.assert_allclose(edges.T @ along, (p - corners[0]).T, atol=1e-6 * np.abs(p).max())
+
+
+def test_a_linear_model_has_one_corner():
+    model = MODELS["linear"]
+    assert lpv(model).seen(measure(model, 50, seed=1)).shape == (1, 0)
