@@ -264,7 +264,14 @@ def test_the_command_line_calls_the_same_function(tmp_path: Path):
     y = np.convolve(np.tanh(u), [0.0, 0.6, 0.3])[: len(u)]
     np.savez(tmp_path / "x.npz", u=u, y=y)
     words = ["data=file", f"data.path={tmp_path / 'x.npz'}", "data.inputs=[u]", "data.outputs=[y]"]
-    words += ["data.fs=10", "nx=1", "starts=2", "trainer.max_iter=3", "refit=true"]
+    words += [
+        "data.fs=10",
+        "nx=1",
+        "starts=2",
+        "trainer.max_iter=3",
+        "refit=true",
+        "data.start=zero",
+    ]
     cfg = configuration(*words)
     fit.run(cfg, tmp_path)
     run = identify(config.loaded(cfg), config.configured(cfg))

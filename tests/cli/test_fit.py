@@ -254,6 +254,7 @@ def test_a_resting_test_part_gives_a_score_that_is_null(tmp_path: Path):
     np.savez(tmp_path / "rest.npz", u=u, y=y)
     overrides = ["data=file", f"data.path={tmp_path / 'rest.npz'}", "data.inputs=[u]"]
     overrides += ["data.outputs=[y]", "data.fs=1", "data.test=0.1", "nx=1", "trainer.max_iter=1"]
+    overrides.append("data.start=zero")
     fit.run(configuration(*overrides), tmp_path)
     score = json.loads((tmp_path / "metrics.json").read_text())["scores"]["test"]
     assert score["nrmse"] is None
@@ -267,7 +268,7 @@ def test_a_run_without_test_and_validation_records(tmp_path: Path, capsys):
     np.savez(tmp_path / "all.npz", u=u, y=y)
     overrides = ["data=file", f"data.path={tmp_path / 'all.npz'}", "data.inputs=[u]"]
     overrides += ["data.outputs=[y]", "data.fs=1", "nx=1", "trainer.max_iter=1"]
-    overrides += ["data.test=0", "data.validation=0", "figures=true"]
+    overrides += ["data.test=0", "data.validation=0", "figures=true", "data.start=zero"]
     fit.run(configuration(*overrides), tmp_path)
     assert "nothing is scored" in capsys.readouterr().out
     assert json.loads((tmp_path / "metrics.json").read_text())["scores"] == {}
@@ -498,7 +499,7 @@ def test_a_run_goes_on_with_the_starts_that_were_cheap_for_its_iterations(
     csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     words = [str(csv), "inputs=u", "outputs=y", "fs=10", "nx=1", "nz=1", "nw=1", "nn=2"]
-    words.append("figures=false")
+    words += ["figures=false", "start=zero"]
     launched(monkeypatch, f"hydra.run.dir='{tmp_path}'", *words, "trainer.max_iter=2")
     monkeypatch.setattr("lfrtorch.fitting.multistart._MINUTE", 0.0)  # as of many more iterations
     launched(monkeypatch, f"resume={tmp_path}", "trainer.max_iter=3")

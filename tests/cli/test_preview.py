@@ -338,6 +338,7 @@ def test_train_says_the_notes_of_a_file(file: Path, signals, capsys):
     clean = written(file.parent / "clean.csv", signals | {"level": delayed})
     clipped = written(file.parent / "clipped.csv", signals | {"level": whole})
     words = ["data=file", "data.inputs=[force]", "data.outputs=[level]", "data.fs=50"]
+    words.append("data.start=zero")
     config.loaded(configuration(*words, f"data.path={clipped}"))
     assert "note: output 'level' has its largest value 0.3" in capsys.readouterr().out
     config.loaded(configuration(*words, f"data.path={clean}"))

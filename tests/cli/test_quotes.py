@@ -81,7 +81,7 @@ def test_a_run_on_names_of_any_alphabet(csv: Path, tmp_path, monkeypatch, capsys
     monkeypatch.chdir(tmp_path)
     data = [
         "data=file", f"data.path={lab}", f"data.inputs=[{FLOW}]", f"data.outputs=[{LEVEL}]",
-        "data.fs=10",
+        "data.fs=10", "data.start=zero",
     ]  # fmt: skip
     few = ["nx=1", "nn=2", "trainer.max_iter=1", "bla.max_iter=1", "figures=false", "starts=1"]
     run = tmp_path / "Läufe"

@@ -159,7 +159,7 @@ def test_column_order_is_the_users(tmp_path, signals):
 )
 def test_names_that_leave_no_doubt_are_taken(tmp_path, signals, header, told):
     path = write(tmp_path / "a.csv", signals, header)
-    data = load_records(path, fs=50)
+    data = load_records(path, fs=50, start="zero")
     assert f"{told}, by the names of the columns" in data.notes
     u, y = (",".join(c.name for c in getattr(data.train[0], s)) for s in ("inputs", "outputs"))
     assert f"inputs={u}, outputs={y}" == told
@@ -176,10 +176,12 @@ def test_names_that_leave_a_doubt_are_not(tmp_path, signals, header):
 
 def test_a_side_that_is_given_leaves_the_other_to_the_names(tmp_path, signals):
     path = write(tmp_path / "a.csv", signals, "u,force,y")
-    data = load_records(path, inputs="force", fs=50)
+    data = load_records(path, inputs="force", fs=50, start="zero")
     assert "outputs=y, by the names of the columns" in data.notes
     assert [channel.name for channel in data.train[0].inputs] == ["force"]
-    assert not any("by the names" in note for note in load_records(path, **BARE, fs=50).notes)
+    assert not any(
+        "by the names" in note for note in load_records(path, **BARE, fs=50, start="zero").notes
+    )
     refused("outputs is None", write(path, signals, "u,force,disp"), use={"inputs": "u", "fs": 50})
 
 

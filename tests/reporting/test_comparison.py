@@ -79,6 +79,7 @@ def test_command_writes_page_and_tables(study: Path, monkeypatch, capsys):
 def test_data_words_choose_the_record_that_is_simulated(study: Path, monkeypatch):
     (study / "x.csv").write_text("u,y\n" + "".join(f"{k % 7},{k % 5}\n" for k in range(60)))
     data = f"data=file data.path={study / 'x.csv'} data.inputs=[u] data.outputs=[y] data.fs=10"
+    data += " data.start=zero"
     chosen = []
     monkeypatch.setattr(command, "run", lambda *_, record: chosen.append(record))
     in_a_study = study / "nn=5,seed=0"  # a folder with the look of a setting
