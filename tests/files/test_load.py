@@ -179,9 +179,7 @@ def test_a_side_that_is_given_leaves_the_other_to_the_names(tmp_path, signals):
     data = load_records(path, inputs="force", fs=50, start="zero")
     assert "outputs=y, by the names of the columns" in data.notes
     assert [channel.name for channel in data.train[0].inputs] == ["force"]
-    assert not any(
-        "by the names" in note for note in load_records(path, **BARE, fs=50, start="zero").notes
-    )
+    assert not any("by the names" in note for note in load_records(path, **BARE, fs=50).notes)
     refused("outputs is None", write(path, signals, "u,force,disp"), use={"inputs": "u", "fs": 50})
 
 
