@@ -85,6 +85,12 @@ class Settings(PlainSettings):
             for name, size in self.init_from.sizes.items():
                 object.__setattr__(self, name, size)
         refuse_together(**self._that_exclude())
+        guarantee = getattr(self.trainer, "guarantee", None)
+        if self.searched and guarantee not in (None, "stable"):
+            raise InputError(
+                f"guarantee is {guarantee}, and {', '.join(self.searched)}: auto. Every step of "
+                "the choice would be proven, for hours; give what a fit without it has chosen."
+            )
         if self.noise != "output":
             refine = self.linear.get("refine") or "prediction"
             object.__setattr__(self, "linear", {**self.linear, "refine": refine})

@@ -279,7 +279,8 @@ def _terms(
 def prepared(system: Differences, rate: float) -> tuple[Differences, Array, Array] | None:
     """The system for L x and s v, in which A nearly shrinks x, L and s; None if A is not stable."""
     A = system.A / rate
-    if np.abs(np.linalg.eigvals(A)).max() >= 1.0 - ROUNDING:
+    finite = np.isfinite(A).all()  # the weights may be, and not their products
+    if not finite or np.abs(np.linalg.eigvals(A)).max() >= 1.0 - ROUNDING:
         return None
     P, power = np.eye(len(A)), A
     for _ in range(60):  # Σ (Aᵏ)ᵀ Aᵏ, by doubling

@@ -80,6 +80,7 @@ class Contracting:
             systems = [system for system in systems if system.neurons]
         return systems
 
+    @np.errstate(over="ignore", invalid="ignore")  # of a step that goes far too far
     def _certified(
         self, theta: Float[Tensor, " P"], known: tuple[Differences, Certificate] | None
     ) -> tuple[Differences, Certificate] | None:

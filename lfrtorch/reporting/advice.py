@@ -56,7 +56,7 @@ def diverges(e: Evidence) -> Advice | None:
     """A record on which the simulation runs away."""
     if not e.diverged:
         return None
-    change = {} if e.ridge or e.continued else {"ridge": "auto"}
+    change = {} if e.ridge or e.continued or e.proven else {"ridge": "auto"}
     ridge = _written(change) if change else "a larger ridge" if e.ridge else "ridge=1e-3"
     loud = any(e.louder.get(name, 0.0) > EXTRAPOLATES for name in e.diverged)
     return Advice(
@@ -176,7 +176,7 @@ def overfits(e: Evidence) -> Advice | None:
         )
     else:
         return None
-    change = {} if e.searched or e.ridge or e.continued else {"ridge": "auto"}
+    change = {} if e.searched or e.ridge or e.continued or e.proven else {"ridge": "auto"}
     ridge = f"{_written(change)}, or " if change else ""
     return Advice(f"Overfit: {ridge}more data.", evidence, change or None)
 
@@ -310,7 +310,7 @@ def tests_are_louder(e: Evidence) -> Advice | None:
 
 def choose_sizes(e: Evidence) -> Advice | None:
     """Sizes that were guessed, and validation records that can choose them."""
-    if e.searched or e.continued or e.validation is None or e.parts_differ:
+    if e.searched or e.continued or e.proven or e.validation is None or e.parts_differ:
         return None
     static = "degree" if e.sizes.get("degree") else "nn"
     change: dict[str, Any] = dict.fromkeys(["nx", "nz", "nw", static], "auto")

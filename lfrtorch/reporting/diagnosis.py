@@ -196,6 +196,11 @@ class Evidence:
         ratio = self.linear_validation / self.linear_train
         return not 1.0 / UNLIKE <= ratio <= UNLIKE and self.unlike_chance <= 0.01
 
+    @property
+    def proven(self) -> bool:
+        """Whether every step kept a proof, so that no sizes or ridge can be chosen."""
+        return getattr(self.trainer, "guarantee", None) not in (None, "stable")
+
 
 def evidence(
     result: FitResult,

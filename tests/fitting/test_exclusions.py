@@ -102,6 +102,17 @@ def test_a_fit_cannot_have_both(row: Exclusion, given: dict, record: Record, lin
         lfrtorch.fit(models, record, trainer=trainer, **options)
 
 
+@pytest.mark.parametrize("guarantee", ["contracting", 0.9])
+def test_sizes_are_not_chosen_with_a_proof_of_every_step(guarantee: Any):
+    trainer = lfrtorch.LevenbergMarquardt(guarantee=guarantee)
+    with pytest.raises(
+        InputError, match=r"nn, ridge: auto\. Every step .* give what a fit without"
+    ):
+        Settings(nx=2, nn="auto", ridge="auto", trainer=trainer)
+    stable = lfrtorch.LevenbergMarquardt(guarantee="stable")
+    assert Settings(nx=2, nn="auto", trainer=stable).searched == ("nn",)
+
+
 def test_what_is_usual_is_the_default():
     own = {"static": Settings(nx=2).static, "guarantee": lfrtorch.LevenbergMarquardt().guarantee}
     assert own == {name: USUAL[name] for name in own}

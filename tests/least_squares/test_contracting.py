@@ -104,6 +104,8 @@ def test_what_has_no_certificate_is_not_admitted():
     far[0] = 1.5  # A
     admitted = problem.admissible(far)
     assert 0.9 < float(admitted[0]) < 1.0
+    admitted = problem.admissible(1e200 * far)  # finite, and its slopes are not
+    assert problem.admissible(admitted) is admitted
 
 
 def test_a_start_without_a_certificate_is_refused():

@@ -6,6 +6,7 @@ import ast
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -287,3 +288,11 @@ def test_advice_asks_for_settings_that_there_are():
     asked = re.findall(r"(?<![\w.])([a-z_.]+)=", "\n".join(texts))
     assert {"validation", "ridge", "starts", "skip", "init_from", "max_iter"} <= set(asked)
     assert [name for name in asked if name not in known] == []
+
+
+@pytest.mark.parametrize("guarantee", ["contracting", 0.98, "stable"])
+def test_nothing_is_to_be_chosen_beside_a_proof_of_every_step(guarantee: Any):
+    trainer = lfrtorch.LevenbergMarquardt(guarantee=guarantee)
+    e = replace(GOOD, searched=False, ridge=False, trainer=trainer)
+    assert (advice.choose_sizes(e) is None) == (guarantee != "stable")
+    assert e.proven == (guarantee != "stable")
