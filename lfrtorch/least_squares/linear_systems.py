@@ -13,12 +13,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Int
 from scipy.sparse.linalg import ArpackError, eigsh
 from torch import Tensor
 
-from lfrtorch._support.threads import spread
+from lfrtorch._support.threads import spread, to_float64
 from lfrtorch._support.types import Array
 from lfrtorch.distributed import Ranks
 
@@ -57,7 +58,7 @@ class SVDSystem:
     def __init__(self, R: Float[Tensor, "K P"], truncation: float) -> None:
         self.scale, self.rank = float("nan"), 0
         if torch.isfinite(R).all():
-            _, s, Vh = torch.linalg.svd(R, full_matrices=False)
+            s, Vh = _singular(R)
             kept = s > truncation * s[:1]  # of no rows there is none
             # A parameter that R does not see stays as it is, to the last bit.
             self._squares, self._Vh = s[kept].square(), Vh[kept].masked_fill((R == 0).all(0), 0.0)
@@ -71,6 +72,15 @@ class SVDSystem:
     def inverse(self) -> Float[Tensor, "P P"]:
         """Pseudo-inverse of JᵀJ."""
         return (self._Vh.mT / self._squares) @ self._Vh
+
+
+def _singular(R: Float[Tensor, "K P"]) -> tuple[Tensor, Tensor]:
+    """Singular values and right singular vectors, also of a matrix on which the fast way ends."""
+    try:
+        _, s, Vh = torch.linalg.svd(R, full_matrices=False)
+    except RuntimeError:  # divide and conquer; the sweeps of QR always converge
+        _, s, Vh = scipy.linalg.svd(to_float64(R), full_matrices=False, lapack_driver="gesvd")
+    return torch.as_tensor(s).to(R), torch.as_tensor(Vh).to(R)
 
 
 class CholeskySystem:

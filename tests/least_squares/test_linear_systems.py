@@ -193,3 +193,17 @@ def test_squares_beyond_single_precision_have_no_scale_and_give_no_warning():
     G = GramAccumulator()
     G.fold(torch.full((3, 2), 1e20))
     assert not math.isfinite(CholeskySystem(G.G, 2).scale)
+
+
+def test_a_matrix_on_which_the_fast_factorisation_ends_is_factorised_by_the_sure_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    J = torch.randn(9, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = SVDSystem(J, 1e-12)
+
+    def ends(*_: object, **__: object) -> None:
+        raise torch.linalg.LinAlgError("the algorithm did not converge")  # pyright: ignore[reportPrivateImportUsage]
+
+    monkeypatch.setattr(torch.linalg, "svd", ends)
+    found = SVDSystem(J, 1e-12)
+    torch.testing.assert_close(found.inverse, expected.inverse)
